@@ -1,0 +1,1 @@
+"""Real2Sim: drive a policy through a reconstructed street over the network."""

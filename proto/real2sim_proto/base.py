@@ -1,0 +1,58 @@
+"""Base model and the value types that all messages share."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}$"
+
+Identifier = Annotated[str, Field(pattern=ID_PATTERN)]
+"""Id of a scene, object, camera or scenario: letters, digits, ``_``, ``.``, ``-``; 80 at most."""
+
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Microseconds = Annotated[int, Field(ge=-(2**62), le=2**62)]
+Codec = Literal["raw", "jpeg", "png"]
+Modality = Literal["rgb", "depth", "instance"]
+Vector3 = tuple[Metres, Metres, Metres]
+
+
+def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    norm = sum(q * q for q in quaternion) ** 0.5
+    if abs(norm - 1.0) > 1e-3:
+        raise ValueError(
+            f"quaternion {quaternion!r} has length {norm:.6g}; a rotation needs a unit one, wxyz"
+        )
+    w, x, y, z = quaternion
+    return (w / norm, x / norm, y / norm, z / norm)
+
+
+Quaternion = Annotated[
+    tuple[float, float, float, float],
+    AfterValidator(_unit),
+    Field(description="wxyz, unit length within 1e-3"),
+]
+
+
+class Model(BaseModel):
+    """Immutable, closed to unknown fields, finite numbers only."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, ser_json_inf_nan="constants"
+    )
+
+
+class Pose(Model):
+    """Rigid pose ``T_world_x``."""
+
+    position: Vector3 = Field(description="origin of the frame in the world [m]")
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+class Track(Model):
+    """Poses at increasing time stamps; T entries each."""
+
+    times_us: list[Microseconds] = Field(min_length=1, max_length=100_000)
+    positions: list[Vector3]
+    quaternions: list[Quaternion]

@@ -1,0 +1,115 @@
+"""msgpack with arrays, strict on the way in.
+
+Maps have string keys; allowed values are None, bool, int, float, str, bytes, lists, maps and
+NumPy arrays. An array travels as ext type 1, whose payload is the msgpack array
+``[dtype, shape, bytes]``: dtype one of :data:`ARRAY_DTYPES` (little-endian), bytes in C order.
+There is no pickle anywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgpack
+import numpy as np
+
+ARRAY_EXT = 1
+ARRAY_DTYPES = ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f2", "<f4", "<f8")
+MAX_DEPTH = 16
+MAX_ARRAY_NDIM = 8
+DEFAULT_MAX_BYTES = 64 * 1024 * 1024
+MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
+"""A worker accepts messages up to this size from a client; plans and edits are small."""
+
+
+class CodecError(ValueError):
+    """Bytes that are not a valid message. The sentence says what was found and what is allowed."""
+
+
+def encode(message: dict[str, Any]) -> bytes:
+    """Bytes of a message.
+
+    Raises:
+        CodecError: a value of a type that the wire does not carry.
+    """
+    try:
+        packed: bytes = msgpack.packb(message, default=_pack_array, use_bin_type=True)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CodecError(f"message cannot be encoded: {error}") from error
+    return packed
+
+
+def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]:
+    """The message in ``data``; arrays are read-only views into it.
+
+    Raises:
+        CodecError: too large, not msgpack, trailing bytes, not a map with string keys, nested
+            deeper than MAX_DEPTH, an unknown ext type, or an array whose parts disagree.
+    """
+    if len(data) > max_bytes:
+        raise CodecError(f"message of {len(data)} bytes is larger than the allowed {max_bytes}")
+    try:
+        message = msgpack.unpackb(data, raw=False, strict_map_key=True, ext_hook=_unpack_array)
+    except CodecError:
+        raise
+    except (
+        ValueError,
+        TypeError,
+        RecursionError,
+    ) as error:
+        reason = str(error) or type(error).__name__
+        raise CodecError(f"message is not valid msgpack: {reason}") from error
+    if not isinstance(message, dict):
+        raise CodecError(f"a message must be a map, not {type(message).__name__}")
+    _check_values(message, MAX_DEPTH)
+    return message
+
+
+def _pack_array(value: object) -> msgpack.ExtType:
+    if isinstance(value, np.generic):
+        value = np.asarray(value)
+    if not isinstance(value, np.ndarray):
+        raise TypeError(f"values of type {type(value).__name__} have no place on the wire")
+    dtype = value.dtype.newbyteorder("<").str
+    if dtype not in ARRAY_DTYPES:
+        raise TypeError(f"arrays of dtype {value.dtype} have no place on the wire")
+    array = np.ascontiguousarray(value, dtype=dtype)
+    payload = msgpack.packb([dtype, list(value.shape), array.data.cast("B") if array.size else b""])
+    return msgpack.ExtType(ARRAY_EXT, payload)
+
+
+def _unpack_array(code: int, payload: bytes) -> np.ndarray:
+    if code != ARRAY_EXT:
+        raise CodecError(f"ext type {code} is unknown; arrays are ext type {ARRAY_EXT}")
+    parts = msgpack.unpackb(payload, raw=False)
+    if not (isinstance(parts, list) and len(parts) == 3 and isinstance(parts[2], bytes)):
+        raise CodecError("an array must be [dtype, shape, bytes]")
+    dtype, shape, data = parts
+    if dtype not in ARRAY_DTYPES:
+        raise CodecError(
+            f"array dtype {dtype!r} is not allowed; allowed are {', '.join(ARRAY_DTYPES)}"
+        )
+    if not isinstance(shape, list) or len(shape) > MAX_ARRAY_NDIM:
+        raise CodecError(f"array shape {shape!r} is not a list of at most {MAX_ARRAY_NDIM} sizes")
+    if not all(type(n) is int and 0 <= n < 2**31 for n in shape):
+        raise CodecError(f"array shape {shape!r} holds something that is not a size")
+    expected = math.prod(shape) * np.dtype(dtype).itemsize
+    if expected != len(data):
+        raise CodecError(f"array {dtype} {shape} needs {expected} bytes, {len(data)} were sent")
+    return np.frombuffer(data, dtype=dtype).reshape(shape)
+
+
+def _check_values(value: Any, depth: int) -> None:
+    if depth < 0:
+        raise CodecError(f"message is nested deeper than {MAX_DEPTH} levels")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise CodecError(f"map keys must be strings, not {key!r}")
+            _check_values(item, depth - 1)
+    elif isinstance(value, list):
+        for item in value:
+            _check_values(item, depth - 1)
+    elif not isinstance(value, str | bytes | int | float | bool | np.ndarray | None):
+        raise CodecError(f"values of type {type(value).__name__} are not allowed")

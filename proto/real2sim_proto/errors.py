@@ -1,0 +1,133 @@
+"""Stable error codes, their HTTP status, and the RFC 9457 problem document that carries them."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from pydantic import BaseModel, ConfigDict, Field
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+
+
+class ErrorCode(StrEnum):
+    """What went wrong, for programs. Codes are never renamed."""
+
+    INVALID_REQUEST = "INVALID_REQUEST"
+    UNAUTHORIZED = "UNAUTHORIZED"
+    NOT_FOUND = "NOT_FOUND"
+    METHOD_NOT_ALLOWED = "METHOD_NOT_ALLOWED"
+    NOT_ACCEPTABLE = "NOT_ACCEPTABLE"
+    UNKNOWN_SCENE = "UNKNOWN_SCENE"
+    UNKNOWN_SCENARIO = "UNKNOWN_SCENARIO"
+    UNKNOWN_SESSION = "UNKNOWN_SESSION"
+    UNKNOWN_OBJECT = "UNKNOWN_OBJECT"
+    UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
+    TIME_OUT_OF_RANGE = "TIME_OUT_OF_RANGE"
+    SCENE_BROKEN = "SCENE_BROKEN"
+    SCENE_IN_USE = "SCENE_IN_USE"
+    IMPORT_FAILED = "IMPORT_FAILED"
+    ALREADY_EXISTS = "ALREADY_EXISTS"
+    INVALID_OPERATION = "INVALID_OPERATION"
+    STALE_REVISION = "STALE_REVISION"
+    NOTHING_TO_UNDO = "NOTHING_TO_UNDO"
+    NOTHING_TO_REDO = "NOTHING_TO_REDO"
+    IDEMPOTENCY_CONFLICT = "IDEMPOTENCY_CONFLICT"
+    PAYLOAD_TOO_LARGE = "PAYLOAD_TOO_LARGE"
+    OVER_CAPACITY = "OVER_CAPACITY"
+    QUEUE_FULL = "QUEUE_FULL"
+    OUT_OF_MEMORY = "OUT_OF_MEMORY"
+    DRAINING = "DRAINING"
+    UNSUPPORTED_PROTOCOL = "UNSUPPORTED_PROTOCOL"
+    BAD_MESSAGE = "BAD_MESSAGE"
+    INVALID_ACTION = "INVALID_ACTION"
+    NOT_RESET = "NOT_RESET"
+    EPISODE_OVER = "EPISODE_OVER"
+    STEP_CONFLICT = "STEP_CONFLICT"
+    STALE_STEP = "STALE_STEP"
+    BAD_STEP = "BAD_STEP"
+    CONTROLLER_TAKEN = "CONTROLLER_TAKEN"
+    NOT_CONTROLLER = "NOT_CONTROLLER"
+    SESSION_CLOSED = "SESSION_CLOSED"
+    TIMEOUT = "TIMEOUT"
+    INTERNAL = "INTERNAL"
+
+
+HTTP_STATUS: dict[ErrorCode, int] = {
+    ErrorCode.INVALID_REQUEST: 422,
+    ErrorCode.UNAUTHORIZED: 401,
+    ErrorCode.NOT_FOUND: 404,
+    ErrorCode.METHOD_NOT_ALLOWED: 405,
+    ErrorCode.NOT_ACCEPTABLE: 406,
+    ErrorCode.UNKNOWN_SCENE: 404,
+    ErrorCode.UNKNOWN_SCENARIO: 404,
+    ErrorCode.UNKNOWN_SESSION: 404,
+    ErrorCode.UNKNOWN_OBJECT: 404,
+    ErrorCode.UNKNOWN_CAMERA: 404,
+    ErrorCode.TIME_OUT_OF_RANGE: 422,
+    ErrorCode.SCENE_BROKEN: 409,
+    ErrorCode.SCENE_IN_USE: 409,
+    ErrorCode.IMPORT_FAILED: 422,
+    ErrorCode.ALREADY_EXISTS: 409,
+    ErrorCode.INVALID_OPERATION: 422,
+    ErrorCode.STALE_REVISION: 412,
+    ErrorCode.NOTHING_TO_UNDO: 409,
+    ErrorCode.NOTHING_TO_REDO: 409,
+    ErrorCode.IDEMPOTENCY_CONFLICT: 422,
+    ErrorCode.PAYLOAD_TOO_LARGE: 413,
+    ErrorCode.OVER_CAPACITY: 429,
+    ErrorCode.QUEUE_FULL: 503,
+    ErrorCode.OUT_OF_MEMORY: 507,
+    ErrorCode.DRAINING: 503,
+    ErrorCode.UNSUPPORTED_PROTOCOL: 426,
+    ErrorCode.BAD_MESSAGE: 400,
+    ErrorCode.INVALID_ACTION: 422,
+    ErrorCode.NOT_RESET: 409,
+    ErrorCode.EPISODE_OVER: 409,
+    ErrorCode.STEP_CONFLICT: 409,
+    ErrorCode.STALE_STEP: 409,
+    ErrorCode.BAD_STEP: 409,
+    ErrorCode.CONTROLLER_TAKEN: 409,
+    ErrorCode.NOT_CONTROLLER: 403,
+    ErrorCode.SESSION_CLOSED: 410,
+    ErrorCode.TIMEOUT: 504,
+    ErrorCode.INTERNAL: 500,
+}
+
+RETRYABLE = frozenset(
+    {ErrorCode.OVER_CAPACITY, ErrorCode.QUEUE_FULL, ErrorCode.DRAINING, ErrorCode.TIMEOUT}
+)
+"""Codes after which the same request may succeed later, unchanged."""
+
+
+class ProblemDetail(BaseModel):
+    """One invalid value in a request."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    pointer: str = Field(description="JSON pointer into the request, e.g. '/operations/0/x'")
+    message: str
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem document; the body of every answer with status 400 or above.
+
+    Readers ignore unknown members, so that newer workers can add some.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = Field(default="about:blank", description="URI reference of the kind of problem")
+    title: str = Field(description="short sentence, the same for every problem of this code")
+    status: int
+    code: ErrorCode
+    detail: str = Field(description="what was given, what is allowed")
+    hint: str | None = Field(default=None, description="what to do next")
+    instance: str | None = Field(default=None, description="path of the request")
+    request_id: str | None = None
+    retryable: bool = False
+    errors: list[ProblemDetail] = Field(default_factory=list)
+
+
+def title_of(code: ErrorCode) -> str:
+    """Human form of a code: ``Unknown scene``."""
+    return code.value.replace("_", " ").capitalize()

@@ -1,0 +1,129 @@
+"""REST models of the worker itself, its scenes and single renders."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from .base import Track
+
+
+class Reply(BaseModel):
+    """Base of answers. Readers ignore unknown members, so that newer workers can add some."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class SceneState(StrEnum):
+    """Where a scene is on its way into memory."""
+
+    AVAILABLE = "available"
+    LOADING = "loading"
+    RESIDENT = "resident"
+    BROKEN = "broken"
+
+
+class CameraInfo(Reply):
+    """A camera of the recording vehicle."""
+
+    name: str
+    width: int
+    height: int
+    K: list[list[float]] = Field(description="3x3 intrinsics [px]")
+    T_vehicle_camera: list[list[float]] = Field(description="4x4")
+
+
+class ObjectInfo(Reply):
+    """A movable thing of a scene or a scenario."""
+
+    object_id: str
+    category: str
+    size: tuple[float, float, float] = Field(description="length, width, height [m]")
+    instance_id: int = Field(description="value of its pixels in instance images")
+    gaussians: int
+    start_us: int
+    end_us: int
+    trajectory: Track | None = Field(
+        default=None, description="T_world_object; in single views only"
+    )
+
+
+class SceneInfo(Reply):
+    """One available scene, resident or not."""
+
+    scene: str = Field(description="name to use in paths")
+    state: SceneState
+    reason: str | None = Field(default=None, description="why it is broken")
+    content_hash: str = ""
+    gaussians: int = 0
+    bytes: int = Field(default=0, description="memory it takes when resident")
+    start_us: int = 0
+    end_us: int = 0
+    frame_times_us: list[int] = Field(default_factory=list)
+    cameras: list[CameraInfo] = Field(default_factory=list)
+    objects: list[ObjectInfo] = Field(default_factory=list)
+    extent_min: tuple[float, float, float] | None = Field(default=None, description="[m], world")
+    extent_max: tuple[float, float, float] | None = None
+    ego: Track | None = Field(default=None, description="T_world_vehicle of the recording")
+    provenance: dict[str, Any] = Field(default_factory=dict)
+
+
+class SceneList(Reply):
+    """All scenes below the worker's scene folder."""
+
+    scenes: list[SceneInfo]
+
+
+class SceneImport(BaseModel):
+    """Body of `POST /v1/scenes`: a bundle or splat file below the worker's import folder."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    path: str = Field(min_length=1, max_length=4096, description="relative to the import folder")
+    scene: str | None = Field(default=None, description="name to give it; default: the file's name")
+
+
+class Limits(Reply):
+    """What a worker refuses to exceed."""
+
+    max_sessions: int
+    max_request_bytes: int
+    max_message_bytes: int
+    max_operations_per_request: int
+    max_cameras_per_step: int
+    max_pixels_per_step: int
+    max_steps_per_request: int
+    scene_memory_bytes: int
+    queue_length: int
+
+
+class DeviceInfo(Reply):
+    """Where scenes live and what draws them."""
+
+    backend: str
+    reason: str = Field(description="why this backend was chosen")
+    device: str
+    threads: int
+
+
+class ServerInfo(Reply):
+    """Answer of `GET /v1/server`."""
+
+    version: str
+    protocol_version: int
+    subprotocols: list[str]
+    worker_id: str
+    device: DeviceInfo
+    limits: Limits
+    codecs: list[str]
+    modalities: list[str]
+    conventions: dict[str, str]
+
+
+class Readiness(Reply):
+    """Answer of `GET /readyz`; status 503 while `ready` is false."""
+
+    ready: bool
+    reasons: list[str] = Field(default_factory=list)

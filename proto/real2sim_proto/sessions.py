@@ -1,0 +1,73 @@
+"""REST models of sessions: the same world as the drive socket, by plain requests."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from .base import Microseconds, Model
+from .drive import MAX_SENSORS, AgentState, EgoState, Event, Plan, ResetSpec, SensorSpec
+from .scenes import Reply
+
+MAX_STEPS_PER_REQUEST = 1000
+
+
+class SessionCreate(Model):
+    """Optional body of `POST /v1/sessions?scene=` or `?scenario=`; the episode is reset with it."""
+
+    reset: ResetSpec = ResetSpec()
+
+
+class SessionInfo(Reply):
+    """A session."""
+
+    session_id: str = Field(description="names its worker: <worker>.<random>")
+    scene: str
+    scenario_id: str | None = None
+    ws_url: str = Field(description="drive socket")
+    token: str = Field(description="authorises the drive socket and this session's REST calls")
+    created_at: str
+    step: int | None = None
+    t_us: Microseconds | None = None
+    controller: bool = Field(default=False, description="whether a controller is connected")
+    reset: ResetSpec
+
+
+class SessionList(Reply):
+    """All sessions of a worker. Tokens are left empty."""
+
+    sessions: list[SessionInfo]
+
+
+class StepRequest(Model):
+    """Body of `POST /v1/sessions/{id}/step`: n clock steps under one plan."""
+
+    n: int = Field(default=1, ge=1, le=MAX_STEPS_PER_REQUEST)
+    dt_us: int | None = Field(default=None, description="must equal the session's dt_us when given")
+    plan: Plan | None = Field(
+        default=None, description="default: keep the last one, else follow the log"
+    )
+
+
+class SessionState(Reply):
+    """Answer of step and `GET .../state`."""
+
+    session_id: str
+    step: int
+    t_us: Microseconds
+    revision: int
+    ego: EgoState
+    agents: list[AgentState]
+    events: list[Event] = Field(
+        default_factory=list, description="since the previous answer of step"
+    )
+    metrics: dict[str, float]
+    terminated: bool
+    truncated: bool
+    reason: str | None = None
+    timing: dict[str, float] = Field(default_factory=dict)
+
+
+class SessionRender(Model):
+    """Body of `POST /v1/sessions/{id}/render`."""
+
+    sensors: list[SensorSpec] = Field(min_length=1, max_length=MAX_SENSORS)

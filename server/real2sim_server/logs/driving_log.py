@@ -1,0 +1,125 @@
+"""The one type every log reader yields."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import CameraRig, Trajectory
+
+
+class LogError(ValueError):
+    """A log that cannot be read; the message names the file, what is wrong and what is expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class LidarSweep:
+    """One turn of all LiDARs, brought to one instant.
+
+    Attributes:
+        points: [N, 3] float32, vehicle frame at the frame's time stamp [m]; the motion of the
+            recording vehicle during the sweep is compensated.
+        intensity: [N] float32 in [0, 1].
+        offset_us: [N] int32, when each point was measured relative to the frame's time stamp
+            [us]; a moving object has moved by its own velocity times this.
+        origin: [3] float32, sensor position in the vehicle frame [m].
+    """
+
+    points: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    offset_us: NDArray[np.int32]
+    origin: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTrack:
+    """A tracked box.
+
+    Attributes:
+        object_id: unique in the log, ``<category>_<id>`` such as ``car_3``.
+        category: ``car``, ``truck``, ``van``, ``bus``, ``pedestrian``, ``cyclist``, ``other`` ...
+        size: (length, width, height) along the object's x, y, z [m].
+        trajectory: ``T_world_object``, origin at the box centre, x forward, z up.
+    """
+
+    object_id: str
+    category: str
+    size: tuple[float, float, float]
+    trajectory: Trajectory
+
+
+class FrameSource(Protocol):
+    """Reads the heavy parts of a log, one file at a time."""
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """RGB [H, W, 3] of a camera at a frame. Raises LogError naming a file it cannot read."""
+        ...
+
+    def lidar(self, frame: int) -> LidarSweep:
+        """The sweep of a frame. Raises LogError naming a file it cannot read."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DrivingLog:
+    """A recorded drive; images and sweeps are read when they are asked for.
+
+    World frame: x forward, y left, z up [m]; it is the vehicle frame of the first frame unless
+    the dataset says otherwise, so that coordinates stay small.
+
+    Attributes:
+        name: short name, from the folder.
+        rig: calibrated cameras, distortion already removed from the images.
+        frame_times_us: [F] int64 [us], increasing.
+        ego: ``T_world_vehicle`` at least over all frames (rear axle centre on the ground).
+        tracks: every tracked object, in a stable order.
+        source: where images and sweeps come from.
+        ego_size: (length, width, height) of the recording vehicle [m].
+        provenance: dataset, sequence, licence, reader (JSON values only).
+    """
+
+    name: str
+    rig: CameraRig
+    frame_times_us: NDArray[np.int64]
+    ego: Trajectory
+    tracks: tuple[ObjectTrack, ...]
+    source: FrameSource
+    ego_size: tuple[float, float, float] = (4.6, 1.85, 1.6)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames F."""
+        return len(self.frame_times_us)
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """RGB uint8 [H, W, 3] of ``camera`` at ``frame``, the camera's size.
+
+        Raises:
+            LogError: the image is missing, broken or of another size.
+        """
+        expected = self.rig[camera]
+        image = self.source.image(camera, self._checked(frame))
+        if image.shape != (expected.height, expected.width, 3):
+            raise LogError(
+                f"log {self.name!r}: image of camera {camera!r} at frame {frame} is {image.shape}, "
+                f"its calibration says ({expected.height}, {expected.width}, 3)"
+            )
+        return image
+
+    def lidar(self, frame: int) -> LidarSweep:
+        """The LiDAR sweep of ``frame``; it may be empty.
+
+        Raises:
+            LogError: the sweep is missing or broken.
+        """
+        return self.source.lidar(self._checked(frame))
+
+    def _checked(self, frame: int) -> int:
+        if not 0 <= frame < self.frame_count:
+            raise LogError(f"log {self.name!r} has frames 0 to {self.frame_count - 1}, not {frame}")
+        return frame

@@ -1,0 +1,1 @@
+"""From Gaussians to pictures: one rasterize() call, three backends."""

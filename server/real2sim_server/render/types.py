@@ -1,0 +1,82 @@
+"""What goes into rasterize() and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..scene import GaussianCloud, Sky
+
+
+class RenderError(ValueError):
+    """A render request that cannot be answered; the message says what is allowed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One cluster of Gaussians placed in the world. The cloud is shared, never copied.
+
+    Attributes:
+        cloud: Gaussians in their own frame.
+        T_world_object: [4, 4] float64 rigid transform; None for the identity (background).
+        instance_id: value in instance images, 0 (background) to 65535.
+        scale: [3] multiplies the cloud about its own origin along its own axes.
+        covars: [N, 3, 3] float32, covariances in the cloud's frame that replace quats and scales
+            (deformed clouds), or None.
+    """
+
+    cloud: GaussianCloud
+    T_world_object: NDArray[np.float64] | None = None
+    instance_id: int = 0
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    covars: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """Options of rasterize(), named after gsplat.rasterization.
+
+    Attributes:
+        near_plane, far_plane: Gaussians whose centre depth is outside are dropped [m].
+        eps2d: added to the diagonal of projected covariances [px^2].
+        radius_clip: Gaussians whose extent on screen is not larger are dropped [px].
+        rasterize_mode: ``classic``, or ``antialiased`` (opacity compensated for ``eps2d``).
+        background: RGB in [0, 1] behind everything where there is no sky.
+        depth, instance: whether these images are made besides RGB and alpha.
+    """
+
+    near_plane: float = 0.01
+    far_plane: float = 1e10
+    eps2d: float = 0.3
+    radius_clip: float = 0.0
+    rasterize_mode: str = "classic"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    depth: bool = True
+    instance: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class RenderOutput:
+    """Images of C cameras.
+
+    Attributes:
+        rgb: [C, H, W, 3] float32, blended over sky or background, not clamped above 1.
+        alpha: [C, H, W] float32 in [0, 1], accumulated opacity.
+        depth: [C, H, W] float32, expected depth along the camera z axis [m], that is
+            sum(w z) / sum(w); 0 where alpha is 0. None when not asked for.
+        instance: [C, H, W] uint16, instance_id of the Gaussian at which transmittance first falls
+            to 0.5 or below; 0 where it never does. None when not asked for.
+        timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    instance: Tensor | None
+    timing_ms: dict[str, float] = field(default_factory=dict)
+
+
+__all__ = ["Instance", "RasterOptions", "RenderError", "RenderOutput", "Sky"]

@@ -1,0 +1,141 @@
+"""The immutable scene that all sessions share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .camera import CameraRig
+from .cloud import GaussianCloud
+from .errors import SceneError, UnknownObjectError
+from .sky import Sky
+from .trajectory import Trajectory
+
+MAX_OBJECTS = 65_534
+"""Instance images are uint16: 0 is the background, 65535 is kept free."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """One movable thing: a cluster of Gaussians in its own frame, with a box and a trajectory.
+
+    Attributes:
+        object_id: unique in the scene, for example ``car_3``.
+        category: class of the thing, for example ``car``, ``truck``, ``pedestrian``.
+        size: (length, width, height) along the object's x, y, z [m].
+        cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
+        trajectory: ``T_world_object`` over time; the object exists only in its range.
+    """
+
+    object_id: str
+    category: str
+    size: tuple[float, float, float]
+    cloud: GaussianCloud
+    trajectory: Trajectory
+
+    def __post_init__(self) -> None:
+        if len(self.size) != 3 or not all(np.isfinite(self.size)) or min(self.size) <= 0:
+            raise SceneError(f"object {self.object_id!r}: size {self.size} must be three positive lengths")
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the Gaussians [bytes]."""
+        return self.cloud.nbytes
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A reconstructed drive. Immutable; sessions hold only what differs from it.
+
+    World frame: right-handed, x forward, y left, z up [m], recentred near the drive.
+
+    Attributes:
+        name: human name, also the last part of its folder.
+        background: static Gaussians in the world frame.
+        objects: by id, in a stable order; ``instance_id`` is 1 + position in that order.
+        sky: cube map, or None for black.
+        rig: cameras of the recording vehicle.
+        ego: ``T_world_vehicle`` of the recording vehicle (rear axle centre on the ground).
+        frame_times_us: [F] int64 time stamps of the recorded frames [us], increasing.
+        ego_size: (length, width, height) of the recording vehicle's box [m].
+        provenance: where it comes from: source, reader, settings, versions (JSON values only).
+        content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
+    """
+
+    name: str
+    background: GaussianCloud
+    objects: Mapping[str, SceneObject]
+    sky: Sky | None
+    rig: CameraRig
+    ego: Trajectory
+    frame_times_us: NDArray[np.int64]
+    ego_size: tuple[float, float, float] = (4.6, 1.85, 1.6)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    content_hash: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.objects) > MAX_OBJECTS:
+            raise SceneError(f"{len(self.objects)} objects; instance images allow {MAX_OBJECTS}")
+        for object_id, scene_object in self.objects.items():
+            if object_id != scene_object.object_id:
+                raise SceneError(f"object {scene_object.object_id!r} is stored under {object_id!r}")
+        times = np.asarray(self.frame_times_us, dtype=np.int64)
+        if times.ndim != 1 or (np.diff(times) <= 0).any():
+            raise SceneError("frame_times_us must be one-dimensional and increase strictly")
+        object.__setattr__(self, "frame_times_us", times)
+        object.__setattr__(self, "objects", MappingProxyType(dict(self.objects)))
+        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+
+    def object(self, object_id: str) -> SceneObject:
+        """The object of that id.
+
+        Raises:
+            UnknownObjectError: with the ids there are.
+        """
+        try:
+            return self.objects[object_id]
+        except KeyError:
+            known = ", ".join(self.objects) or "none"
+            raise UnknownObjectError(f"no object {object_id!r} in scene {self.name!r}; it has: {known}") from None
+
+    def instance_id(self, object_id: str) -> int:
+        """Value of that object's pixels in instance images: 1 + its position in ``objects``."""
+        self.object(object_id)
+        return 1 + list(self.objects).index(object_id)
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians of background and objects together."""
+        return len(self.background) + sum(len(o.cloud) for o in self.objects.values())
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all Gaussians and the sky [bytes]."""
+        sky = self.sky.nbytes if self.sky else 0
+        return self.background.nbytes + sky + sum(o.nbytes for o in self.objects.values())
+
+    @property
+    def start_us(self) -> int:
+        """First time the ego path knows [us]."""
+        return self.ego.start_us
+
+    @property
+    def end_us(self) -> int:
+        """Last time the ego path knows [us]."""
+        return self.ego.end_us
+
+    def to(self, device: torch.device | str) -> Scene:
+        """The scene on another device."""
+        objects = {k: replace(o, cloud=o.cloud.to(device)) for k, o in self.objects.items()}
+        return replace(
+            self,
+            background=self.background.to(device),
+            objects=objects,
+            sky=self.sky.to(device) if self.sky else None,
+        )

@@ -1,0 +1,124 @@
+"""Poses over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import SceneError, TimeOutOfRangeError
+from .rotation import Float, apply_transform, invert_transform, matrix_to_quaternion, slerp, transform_from
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Rigid poses at increasing time stamps; in between positions are linear, rotations slerped.
+
+    Attributes:
+        times_us: [T] int64, strictly increasing [us], T >= 1.
+        positions: [T, 3] float64, origin of the moving frame in the fixed frame [m].
+        quaternions: [T, 4] float64, wxyz, unit; rotation from the moving to the fixed frame.
+
+    Raises:
+        SceneError: shapes differ, values are not finite, or times do not increase.
+    """
+
+    times_us: NDArray[np.int64]
+    positions: Float
+    quaternions: Float
+
+    def __post_init__(self) -> None:
+        times = np.atleast_1d(np.asarray(self.times_us, dtype=np.int64))
+        positions = np.atleast_2d(np.asarray(self.positions, dtype=np.float64))
+        quaternions = np.atleast_2d(np.asarray(self.quaternions, dtype=np.float64))
+        if positions.shape != (len(times), 3) or quaternions.shape != (len(times), 4):
+            raise SceneError(
+                f"a trajectory of {len(times)} time stamps needs positions [{len(times)}, 3] and "
+                f"quaternions [{len(times)}, 4], not {positions.shape} and {quaternions.shape}"
+            )
+        if len(times) == 0:
+            raise SceneError("a trajectory needs at least one pose")
+        if not (np.isfinite(positions).all() and np.isfinite(quaternions).all()):
+            raise SceneError("a trajectory holds a pose that is not finite")
+        if (np.diff(times) <= 0).any():
+            raise SceneError("time stamps of a trajectory must increase strictly")
+        norms = np.linalg.norm(quaternions, axis=1)
+        if (np.abs(norms - 1) > 1e-2).any():
+            raise SceneError("quaternions of a trajectory must have unit length (wxyz)")
+        object.__setattr__(self, "times_us", times)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "quaternions", quaternions / norms[:, None])
+
+    @classmethod
+    def from_transforms(cls, times_us: ArrayLike, transforms: ArrayLike) -> Trajectory:
+        """Build from ``T_fixed_moving`` [T, 4, 4]."""
+        t = np.asarray(transforms, dtype=np.float64)
+        return cls(np.asarray(times_us), t[:, :3, 3], matrix_to_quaternion(t[:, :3, :3]))
+
+    @property
+    def start_us(self) -> int:
+        """First time stamp [us]."""
+        return int(self.times_us[0])
+
+    @property
+    def end_us(self) -> int:
+        """Last time stamp [us]."""
+        return int(self.times_us[-1])
+
+    def covers(self, t_us: int) -> bool:
+        """Whether a pose is known at ``t_us``."""
+        return self.start_us <= t_us <= self.end_us
+
+    def pose(self, t_us: int) -> tuple[Float, Float]:
+        """Position [3] [m] and quaternion [4] wxyz at ``t_us``.
+
+        Raises:
+            TimeOutOfRangeError: outside [start_us, end_us].
+        """
+        if not self.covers(t_us):
+            raise TimeOutOfRangeError(
+                f"t_us={t_us} is outside this trajectory's range "
+                f"[{self.start_us}, {self.end_us}]; trajectories do not extrapolate"
+            )
+        after = int(np.searchsorted(self.times_us, t_us, side="left"))
+        if self.times_us[after] == t_us:
+            return self.positions[after].copy(), self.quaternions[after].copy()
+        before = after - 1
+        span = float(self.times_us[after] - self.times_us[before])
+        fraction = float(t_us - self.times_us[before]) / span
+        position = (1 - fraction) * self.positions[before] + fraction * self.positions[after]
+        return position, slerp(self.quaternions[before], self.quaternions[after], fraction)
+
+    def transform(self, t_us: int) -> Float:
+        """``T_fixed_moving`` [4, 4] at ``t_us``. Raises like :meth:`pose`."""
+        return transform_from(*self.pose(t_us))
+
+    def velocity(self, t_us: int) -> Float:
+        """Velocity [3] [m/s] in the fixed frame of the segment that holds ``t_us``.
+
+        At an inner time stamp the later segment counts, at the end the last one. A trajectory of
+        one pose stands still. Raises like :meth:`pose`.
+        """
+        self.pose(t_us)
+        if len(self.times_us) == 1:
+            return np.zeros(3)
+        after = int(np.searchsorted(self.times_us, t_us, side="right"))
+        after = min(max(after, 1), len(self.times_us) - 1)
+        span = float(self.times_us[after] - self.times_us[after - 1]) * 1e-6
+        return (self.positions[after] - self.positions[after - 1]) / span
+
+    def moved(self, T_new_fixed: ArrayLike) -> Trajectory:
+        """The same motion in another fixed frame, by ``T_new_fixed`` [4, 4]."""
+        matrix = np.asarray(T_new_fixed, dtype=np.float64)
+        return Trajectory.from_transforms(
+            self.times_us, matrix @ transform_from(self.positions, self.quaternions)
+        )
+
+
+def relative_transform(T_world_a: ArrayLike, T_world_b: ArrayLike) -> Float:
+    """``T_a_b`` [4, 4] of two poses in the world."""
+    return invert_transform(T_world_a) @ np.asarray(T_world_b, dtype=np.float64)
+
+
+__all__ = ["Trajectory", "apply_transform", "relative_transform"]
