@@ -15,7 +15,6 @@ from .base import Codec, Identifier, Metres, Microseconds, Modality, Model, Quat
 from .operations import Operation
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import CameraInfo, ObjectInfo
-from .version import PROTOCOL_VERSION
 
 MAX_SENSORS = 16
 MAX_PLAN_POSES = 1024
@@ -45,7 +44,7 @@ PlanPoses = Annotated[
 class Envelope(Model):
     """What every message has."""
 
-    v: Literal[1] = PROTOCOL_VERSION
+    v: Literal[1] = 1
     id: int = Field(default=0, ge=0, le=2**53)
 
 
@@ -57,9 +56,7 @@ class SensorSpec(Model):
 
     camera: Identifier
     modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=3)
-    width: int | None = Field(
-        default=None, ge=16, le=8192, description="[px]; default: as recorded"
-    )
+    width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
     codec: Codec = Field(default="raw", description="of rgb; depth and instance are raw or png")
     quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
     period_us: int | None = Field(

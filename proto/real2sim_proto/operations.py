@@ -52,7 +52,7 @@ class Scale(Model):
     z: Annotated[float, Field(ge=0.01, le=100.0)] = 1.0
     anchor: Literal["bottom", "centre"] = Field(
         default="bottom",
-        description="point that stays: the centre of the box's bottom, or of the box",
+        description="what stays: the centre of the box's bottom, or of the box",
     )
 
 

@@ -61,10 +61,8 @@ class OperationResult(Reply):
 
     revision: int
     etag: str
-    created: list[str] = Field(default_factory=list, description="ids of objects made by the batch")
-    inverse: list[Operation] = Field(
-        default_factory=list, description="operations that take it back"
-    )
+    created: list[str] = Field(default_factory=list, description="ids of new objects")
+    inverse: list[Operation] = Field(default_factory=list, description="what takes it back")
     warnings: list[EditWarning] = Field(default_factory=list)
     dry_run: bool = False
 

@@ -45,9 +45,7 @@ class ObjectInfo(Reply):
     gaussians: int
     start_us: int
     end_us: int
-    trajectory: Track | None = Field(
-        default=None, description="T_world_object; in single views only"
-    )
+    trajectory: Track | None = Field(default=None, description="T_world_object; single views only")
 
 
 class SceneInfo(Reply):

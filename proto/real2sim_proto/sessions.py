@@ -42,9 +42,9 @@ class StepRequest(Model):
     """Body of `POST /v1/sessions/{id}/step`: n clock steps under one plan."""
 
     n: int = Field(default=1, ge=1, le=MAX_STEPS_PER_REQUEST)
-    dt_us: int | None = Field(default=None, description="must equal the session's dt_us when given")
+    dt_us: int | None = Field(default=None, description="must equal the session's dt_us")
     plan: Plan | None = Field(
-        default=None, description="default: keep the last one, else follow the log"
+        default=None, description="default: the last one, else follow the log"
     )
 
 
@@ -57,9 +57,7 @@ class SessionState(Reply):
     revision: int
     ego: EgoState
     agents: list[AgentState]
-    events: list[Event] = Field(
-        default_factory=list, description="since the previous answer of step"
-    )
+    events: list[Event] = Field(default_factory=list, description="since the previous step answer")
     metrics: dict[str, float]
     terminated: bool
     truncated: bool
