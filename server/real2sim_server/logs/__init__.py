@@ -1,5 +1,18 @@
-"""Driving logs: one reader per dataset and the synthetic generator, behind one DrivingLog type."""
+"""Driving logs: one reader per dataset and the synthetic generator, behind one DrivingLog type.
+
+The generator lives in :mod:`.synthetic` and is not imported here: it compiles kernels.
+"""
 
 from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTrack
+from .native_writer import write_native_log
+from .open import open_log
 
-__all__ = ["DrivingLog", "FrameSource", "LidarSweep", "LogError", "ObjectTrack"]
+__all__ = [
+    "DrivingLog",
+    "FrameSource",
+    "LidarSweep",
+    "LogError",
+    "ObjectTrack",
+    "open_log",
+    "write_native_log",
+]

@@ -1,0 +1,40 @@
+"""Opens a log of any known format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .driving_log import DrivingLog, LogError
+from .readers import READERS, LogReader
+
+
+def open_log(
+    path: str | Path, *, format: str | None = None, sequence: str | None = None
+) -> DrivingLog:
+    """Open the driving log in a folder.
+
+    Args:
+        path: the log's folder.
+        format: a reader's name; by default the first reader that recognises the folder.
+        sequence: which drive, where the folder holds several; the only one is the default.
+
+    Raises:
+        LogError: no such folder, an unknown format, or anything the reader finds wrong.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise LogError(f"{folder}: no such folder; a log is a folder\n{_known_formats()}")
+    return _reader_for(folder, format).read(folder, sequence=sequence)
+
+
+def _reader_for(folder: Path, format_name: str | None) -> LogReader:
+    for reader in READERS:
+        if reader.name == format_name or (format_name is None and reader.recognises(folder)):
+            return reader
+    if format_name is not None:
+        raise LogError(f"unknown log format {format_name!r}\n{_known_formats()}")
+    raise LogError(f"{folder}: not a log of any known format\n{_known_formats()}")
+
+
+def _known_formats() -> str:
+    return "known formats:\n" + "\n".join(f"  {r.name}: {r.expects}" for r in READERS)

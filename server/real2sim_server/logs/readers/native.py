@@ -1,0 +1,250 @@
+"""The project's own folder layout for logs; ``docs/log_format.md`` describes it for users."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
+from ..images import IMAGE_SUFFIXES, read_image
+from .tables import check_ego_covers, check_frame_times, check_images
+
+FORMAT = "real2sim-log"
+VERSION = 1
+MANIFEST = "log.json"
+LIDAR_SHAPES = {"points": (3,), "intensity": (), "offset_us": ()}
+
+
+class NativeReader:
+    """Reads ``log.json`` with ``images/<camera>/%06d.png`` and ``lidar/%06d.npz``."""
+
+    name = "native"
+    expects = "log.json, images/<camera>/%06d.png (or .jpg), lidar/%06d.npz; see docs/log_format.md"
+
+    def recognises(self, path: Path) -> bool:
+        """Whether there is a ``log.json``."""
+        return (path / MANIFEST).is_file()
+
+    def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
+        """The log in the folder ``path``. ``sequence`` is refused: a folder holds one log.
+
+        Raises:
+            LogError: see :class:`LogReader`.
+        """
+        manifest = path / MANIFEST
+        if sequence is not None:
+            raise LogError(f"{path}: holds one log; it has no sequence {sequence!r}")
+        content = _Section(_load(manifest), str(manifest))
+        times_us = check_frame_times(content.integers("frame_times_us"), str(manifest))
+        rig = _read_rig(content)
+        ego = content.section("ego")
+        trajectory = _read_trajectory(ego)
+        check_ego_covers(trajectory, times_us, str(manifest))
+        images = _image_files(path, rig, len(times_us))
+        check_images(images, rig)
+        return DrivingLog(
+            name=str(content.get("name", str)),
+            rig=rig,
+            frame_times_us=times_us,
+            ego=trajectory,
+            tracks=_read_tracks(content),
+            source=_NativeSource(images, _sweep_files(path, content, len(times_us))),
+            ego_size=ego.size("size"),
+            provenance=dict(content.get("provenance", dict)),
+        )
+
+
+def _load(manifest: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(manifest.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LogError(f"{manifest}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise LogError(f"{manifest}: is no JSON file ({error})") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise LogError(f'{manifest}: expected an object with "format": "{FORMAT}"')
+    if content.get("version") != VERSION:
+        raise LogError(
+            f"{manifest}: is version {content.get('version')!r}; this program reads {VERSION}"
+        )
+    return content
+
+
+@dataclass(frozen=True, eq=False)
+class _Section:
+    """A JSON object with checked access; ``where`` names it in errors."""
+
+    content: Mapping[str, Any]
+    where: str
+
+    def get(self, key: str, kind: type) -> Any:
+        value = self.content.get(key)
+        if not isinstance(value, kind) or isinstance(value, bool) != (kind is bool):
+            found = "nothing" if key not in self.content else repr(value)[:80]
+            raise LogError(f"{self.where}: {key!r} must be {kind.__name__}, found {found}")
+        return value
+
+    def section(self, key: str) -> _Section:
+        return _Section(self.get(key, dict), f"{self.where}: {key}")
+
+    def sections(self, key: str) -> list[_Section]:
+        found = []
+        for i, item in enumerate(self.get(key, list)):
+            where = f"{self.where}: {key}[{i}]"
+            if not isinstance(item, dict):
+                raise LogError(f"{where} must be an object, found {item!r}")
+            found.append(_Section(item, where))
+        return found
+
+    def numbers(self, key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Finite float64 array; -1 in ``shape`` stands for any length."""
+        try:
+            values = np.array(self.get(key, list), dtype=np.float64)
+        except (ValueError, TypeError) as error:
+            raise LogError(f"{self.where}: {key!r} must be an array of numbers") from error
+        if values.size == 0 and shape[0] == -1:
+            values = values.reshape(0, *shape[1:])
+        fits = len(values.shape) == len(shape) and all(
+            want in (-1, given) for want, given in zip(shape, values.shape, strict=True)
+        )
+        if not fits:
+            wanted = [n if n >= 0 else "N" for n in shape]
+            raise LogError(f"{self.where}: {key!r} must be {wanted}, not {list(values.shape)}")
+        if not np.isfinite(values).all():
+            raise LogError(f"{self.where}: {key!r} holds a value that is not finite")
+        return values
+
+    def integers(self, key: str) -> NDArray[np.int64]:
+        values = self.get(key, list)
+        if not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
+            raise LogError(f"{self.where}: {key!r} must be whole numbers [us]")
+        return np.array(values, dtype=np.int64)
+
+    def size(self, key: str) -> tuple[float, float, float]:
+        length, width, height = (float(v) for v in self.numbers(key, (3,)))
+        if min(length, width, height) <= 0:
+            raise LogError(
+                f"{self.where}: {key!r} must be positive (length, width, height), "
+                f"not {[length, width, height]}"
+            )
+        return length, width, height
+
+
+def _read_rig(content: _Section) -> CameraRig:
+    cameras = []
+    for entry in content.sections("cameras"):
+        name = entry.get("name", str)
+        if not name or Path(name).name != name:
+            raise LogError(f"{entry.where}: 'name' must be usable as a folder name, not {name!r}")
+        k, pose = entry.numbers("K", (3, 3)), entry.numbers("T_vehicle_camera", (4, 4))
+        try:
+            cameras.append(Camera(name, entry.get("width", int), entry.get("height", int), k, pose))
+        except SceneError as error:
+            raise LogError(f"{entry.where}: {error}") from error
+    if not cameras:
+        raise LogError(f"{content.where}: 'cameras' must name at least one camera")
+    try:
+        return CameraRig(tuple(cameras))
+    except SceneError as error:
+        raise LogError(f"{content.where}: {error}") from error
+
+
+def _read_trajectory(section: _Section) -> Trajectory:
+    times_us = section.integers("times_us")
+    positions = section.numbers("positions", (-1, 3))
+    quaternions = section.numbers("quaternions", (-1, 4))
+    try:
+        return Trajectory(times_us, positions, quaternions)
+    except SceneError as error:
+        raise LogError(f"{section.where}: {error}") from error
+
+
+def _read_tracks(content: _Section) -> tuple[ObjectTrack, ...]:
+    tracks: dict[str, ObjectTrack] = {}
+    for entry in content.sections("tracks"):
+        object_id = entry.get("object_id", str)
+        if not object_id or object_id in tracks:
+            raise LogError(f"{entry.where}: 'object_id' {object_id!r} is empty or used twice")
+        tracks[object_id] = ObjectTrack(
+            object_id=object_id,
+            category=entry.get("category", str),
+            size=entry.size("size"),
+            trajectory=_read_trajectory(entry),
+        )
+    return tuple(tracks.values())
+
+
+def _image_files(path: Path, rig: CameraRig, frame_count: int) -> dict[str, list[Path]]:
+    images = {}
+    for camera in rig:
+        folder = path / "images" / camera.name
+        if not folder.is_dir():
+            raise LogError(f"{folder}: no such folder; camera {camera.name!r} needs its images")
+        suffix = next((s for s in IMAGE_SUFFIXES if (folder / f"000000{s}").exists()), ".png")
+        images[camera.name] = [folder / f"{f:06d}{suffix}" for f in range(frame_count)]
+    return images
+
+
+def _sweep_files(path: Path, content: _Section, frame_count: int) -> list[Path] | None:
+    if not content.get("lidar", bool):
+        return None
+    files = [path / "lidar" / f"{f:06d}.npz" for f in range(frame_count)]
+    for file in files:
+        if not file.is_file():
+            raise LogError(f"{file}: no such file; log.json says that every frame has a sweep")
+        if file.stat().st_size == 0:
+            raise LogError(f"{file}: is empty")
+    return files
+
+
+@dataclass(frozen=True, eq=False)
+class _NativeSource:
+    images: dict[str, list[Path]]
+    sweeps: list[Path] | None
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        return read_image(self.images[camera][frame])
+
+    def lidar(self, frame: int) -> LidarSweep:
+        if self.sweeps is None:
+            return LidarSweep(
+                points=np.zeros((0, 3), np.float32),
+                intensity=np.zeros(0, np.float32),
+                offset_us=np.zeros(0, np.int32),
+                origin=np.zeros(3, np.float32),
+            )
+        return _read_sweep(self.sweeps[frame])
+
+
+def _read_sweep(path: Path) -> LidarSweep:
+    import zipfile
+
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            points, intensity, offset_us, origin = (
+                arrays[key] for key in ("points", "intensity", "offset_us", "origin")
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise LogError(
+            f"{path}: expected an .npz with points, intensity, offset_us and origin ({error})"
+        ) from error
+    arrays_by_name = {"points": points, "intensity": intensity, "offset_us": offset_us}
+    for name, array in arrays_by_name.items():
+        expected = (len(points), *LIDAR_SHAPES[name])
+        if array.shape != expected:
+            raise LogError(f"{path}: {name} must be {expected}, not {array.shape}")
+    if origin.shape != (3,) or not (np.isfinite(points).all() and np.isfinite(origin).all()):
+        raise LogError(f"{path}: points and origin must be finite, origin (3,)")
+    return LidarSweep(
+        points=points.astype(np.float32),
+        intensity=intensity.astype(np.float32),
+        offset_us=offset_us.astype(np.int32),
+        origin=origin.astype(np.float32),
+    )
