@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from real2sim_proto import drive, operations, version
+from real2sim_proto.base import Pose
+from real2sim_proto.drive import CLIENT_MESSAGE, PLAN
+from real2sim_proto.errors import HTTP_STATUS, ErrorCode, Problem, title_of
+from real2sim_proto.operations import OPERATION
+from real2sim_proto.scenarios import OperationBatch
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_actions_that_are_not_finite_are_refused(value):
+    with pytest.raises(ValidationError):
+        PLAN.validate_python({"kind": "control", "acceleration": value, "steering": 0.0})
+    with pytest.raises(ValidationError):
+        PLAN.validate_python({"kind": "trajectory", "times_us": [1], "poses": [[value, 0, 0]]})
+
+
+def test_a_plan_takes_arrays_and_lists_alike():
+    lists = {"kind": "trajectory", "times_us": [1, 2], "poses": [[0, 0, 0], [1, 0, 0]]}
+    arrays = {
+        "kind": "trajectory",
+        "times_us": np.array([1, 2]),
+        "poses": np.array([[0.0, 0, 0], [1, 0, 0]]),
+    }
+    assert PLAN.validate_python(lists) == PLAN.validate_python(arrays)
+
+
+@pytest.mark.parametrize(
+    ("times", "poses"),
+    [([1, 2], [[0, 0, 0]]), ([2, 1], [[0, 0, 0]] * 2), ([1, 1], [[0, 0, 0]] * 2), ([], [])],
+)
+def test_plans_of_wrong_length_or_order_are_refused(times, poses):
+    with pytest.raises(ValidationError):
+        PLAN.validate_python({"kind": "trajectory", "times_us": times, "poses": poses})
+
+
+def test_a_quaternion_that_is_no_rotation_is_refused_with_its_length():
+    with pytest.raises(ValidationError, match="has length 2"):
+        Pose(position=(0, 0, 0), quaternion=(2, 0, 0, 0))
+
+
+def test_quaternions_are_normalised_to_full_precision():
+    pose = Pose(position=(0, 0, 0), quaternion=(0.7071, 0, 0, 0.7071))
+    assert sum(q * q for q in pose.quaternion) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_unknown_fields_are_refused():
+    with pytest.raises(ValidationError, match="extra"):
+        OPERATION.validate_python({"op": "delete", "object_id": "car_1", "force": True})
+
+
+def test_unknown_operations_are_refused_with_the_known_ones():
+    with pytest.raises(ValidationError, match="translate"):
+        OPERATION.validate_python({"op": "explode", "object_id": "car_1"})
+
+
+@pytest.mark.parametrize("object_id", ["", "../etc", "a b", "x" * 81, "-car"])
+def test_ids_cannot_be_paths_or_prose(object_id):
+    with pytest.raises(ValidationError):
+        operations.Delete(object_id=object_id)
+
+
+def test_a_rotation_needs_an_axis():
+    with pytest.raises(ValidationError, match="no direction"):
+        operations.Rotate(object_id="car_1", angle=1.0, axis=(0, 0, 0))
+
+
+def test_batches_are_capped():
+    one = {"op": "delete", "object_id": "a"}
+    with pytest.raises(ValidationError):
+        OperationBatch.model_validate({"operations": [one] * 257})
+    with pytest.raises(ValidationError):
+        OperationBatch.model_validate({"operations": []})
+
+
+def test_messages_are_told_apart_by_type():
+    message = CLIENT_MESSAGE.validate_python(
+        {"v": 1, "type": "hello", "id": 1, "protocols": ["real2sim.v1.msgpack"]}
+    )
+    assert isinstance(message, drive.Hello)
+
+
+def test_a_message_of_another_protocol_version_is_refused():
+    with pytest.raises(ValidationError):
+        CLIENT_MESSAGE.validate_python({"v": 2, "type": "bye", "id": 1})
+
+
+def test_mismatch_sentence_names_both_versions():
+    sentence = version.protocol_mismatch(["real2sim.v9.msgpack"])
+    assert "real2sim.v9.msgpack" in sentence
+    assert version.DRIVE_SUBPROTOCOL in sentence
+
+
+def test_every_error_code_has_a_status_of_an_error():
+    assert set(HTTP_STATUS) == set(ErrorCode)
+    assert all(400 <= status < 600 for status in HTTP_STATUS.values())
+
+
+def test_a_problem_keeps_members_it_does_not_know():
+    problem = Problem.model_validate(
+        {
+            "title": title_of(ErrorCode.STALE_REVISION),
+            "status": 412,
+            "code": "STALE_REVISION",
+            "detail": "d",
+            "missed": [1],
+        }
+    )
+    assert problem.title == "Stale revision"
+    assert problem.model_extra == {"missed": [1]}
+
+
+def test_a_sensor_cannot_name_a_modality_twice():
+    with pytest.raises(ValidationError, match="repeat"):
+        drive.SensorSpec(camera="front", modalities=["rgb", "rgb"])
