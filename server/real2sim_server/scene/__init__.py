@@ -1,13 +1,19 @@
-"""The world as data: Gaussians, objects with trajectories, sky, cameras. Knows neither time nor HTTP."""
+"""The world as data: Gaussians, objects with trajectories, sky, cameras.
 
+Knows neither the passing of time nor HTTP.
+"""
+
+from .asset import Asset
 from .camera import Camera, CameraRig
 from .cloud import GaussianCloud
-from .errors import SceneError
+from .errors import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from .scene import Scene, SceneObject
 from .sky import Sky
 from .trajectory import Trajectory
 
 __all__ = [
+    "Asset",
+    "BundleError",
     "Camera",
     "CameraRig",
     "GaussianCloud",
@@ -15,5 +21,7 @@ __all__ = [
     "SceneError",
     "SceneObject",
     "Sky",
+    "TimeOutOfRangeError",
     "Trajectory",
+    "UnknownObjectError",
 ]

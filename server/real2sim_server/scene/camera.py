@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SceneError
-from .rotation import Float, invert_transform, is_rotation
+from .rotation import Float, invert_transform, is_rigid
 
 T_VEHICLE_OPTICAL = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64
@@ -39,13 +39,17 @@ class Camera:
     T_vehicle_camera: Float
 
     def __post_init__(self) -> None:
-        k = np.asarray(self.K, dtype=np.float64)
-        pose = np.asarray(self.T_vehicle_camera, dtype=np.float64)
+        k = np.array(self.K, dtype=np.float64)
+        pose = np.array(self.T_vehicle_camera, dtype=np.float64)
         if self.width < 1 or self.height < 1:
-            raise SceneError(f"camera {self.name!r}: size {self.width}x{self.height} is not positive")
+            raise SceneError(
+                f"camera {self.name!r}: size {self.width}x{self.height} is not positive"
+            )
         if k.shape != (3, 3) or not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0:
-            raise SceneError(f"camera {self.name!r}: K must be 3x3 with positive focal lengths, not {k}")
-        if pose.shape != (4, 4) or not is_rotation(pose[:3, :3]) or not np.isfinite(pose).all():
+            raise SceneError(
+                f"camera {self.name!r}: K must be 3x3 with positive focal lengths, not {k.tolist()}"
+            )
+        if not is_rigid(pose):
             raise SceneError(f"camera {self.name!r}: T_vehicle_camera is not a rigid transform")
         object.__setattr__(self, "K", k)
         object.__setattr__(self, "T_vehicle_camera", pose)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from .errors import SceneError
+from .harmonics import rotate_sh
+from .rotation import is_rigid, matrix_to_quaternion
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 
@@ -23,10 +27,11 @@ class GaussianCloud:
         opacities: [N] float32 in [0, 1].
         sh: [N, K, 3] float32, spherical harmonics, K = (degree + 1)^2, degree 0 to 3; RGB is
             ``clamp(sum_k sh_k Y_k(direction) + 0.5, min=0)`` with the direction in the cloud's
-            own frame.
+            own frame, the basis of :func:`~.harmonics.sh_basis`.
 
     Raises:
-        SceneError: on shapes that do not fit together or a dtype other than float32.
+        SceneError: on shapes that do not fit together, a dtype other than float32, or tensors on
+            different devices. Values are not looked at; :meth:`check_values` does that.
     """
 
     means: Tensor
@@ -36,6 +41,8 @@ class GaussianCloud:
     sh: Tensor
 
     def __post_init__(self) -> None:
+        if self.means.ndim != 2:
+            raise SceneError(f"means must be [N, 3], not {list(self.means.shape)}")
         n = self.means.shape[0]
         expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         for name, shape in expected.items():
@@ -43,13 +50,22 @@ class GaussianCloud:
             if given != shape:
                 raise SceneError(f"{name} of a cloud of {n} Gaussians must be {shape}, not {given}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3:
-            raise SceneError(f"sh of a cloud of {n} Gaussians must be ({n}, K, 3), not {tuple(self.sh.shape)}")
+            raise SceneError(
+                f"sh of a cloud of {n} Gaussians must be ({n}, K, 3), not {tuple(self.sh.shape)}"
+            )
         if self.sh.shape[1] not in SH_DEGREES:
-            raise SceneError(f"sh has {self.sh.shape[1]} bands; allowed are {sorted(SH_DEGREES)}")
+            raise SceneError(
+                f"sh has {self.sh.shape[1]} coefficients; allowed are {sorted(SH_DEGREES)}"
+            )
         for field in fields(self):
-            dtype = getattr(self, field.name).dtype
-            if dtype != torch.float32:
-                raise SceneError(f"{field.name} of a cloud must be float32, not {dtype}")
+            tensor = getattr(self, field.name)
+            if tensor.dtype != torch.float32:
+                raise SceneError(f"{field.name} of a cloud must be float32, not {tensor.dtype}")
+            if tensor.device != self.means.device:
+                raise SceneError(
+                    f"{field.name} is on {tensor.device}, means are on {self.means.device}; "
+                    "a cloud lives on one device"
+                )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -68,7 +84,8 @@ class GaussianCloud:
     def nbytes(self) -> int:
         """Memory of all tensors [bytes]."""
         return sum(
-            getattr(self, f.name).numel() * getattr(self, f.name).element_size() for f in fields(self)
+            getattr(self, f.name).numel() * getattr(self, f.name).element_size()
+            for f in fields(self)
         )
 
     @classmethod
@@ -76,7 +93,11 @@ class GaussianCloud:
         """A cloud without Gaussians."""
         k = (sh_degree + 1) ** 2
         return cls(
-            torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, k, 3)
+            torch.zeros(0, 3),
+            torch.zeros(0, 4),
+            torch.zeros(0, 3),
+            torch.zeros(0),
+            torch.zeros(0, k, 3),
         )
 
     def to(self, device: torch.device | str) -> GaussianCloud:
@@ -99,9 +120,53 @@ class GaussianCloud:
         sh[:, :kept] = self.sh[:, :kept]
         return replace(self, sh=sh)
 
+    def moved(self, T_dst_src: ArrayLike, *, scale: float = 1.0) -> GaussianCloud:
+        """The Gaussians in another frame: scaled about the origin, then placed by ``T_dst_src``.
+
+        Turns the spherical harmonics too, so that the cloud looks the same from every side.
+
+        Args:
+            T_dst_src: [4, 4] rigid transform from this cloud's frame to the new one.
+            scale: factor on positions and sizes, > 0.
+
+        Raises:
+            SceneError: for a transform that is not rigid or a scale that is not positive.
+        """
+        matrix = np.asarray(T_dst_src, dtype=np.float64)
+        if not is_rigid(matrix):
+            raise SceneError(f"T_dst_src must be a rigid [4, 4] transform, not {matrix.tolist()}")
+        if not (np.isfinite(scale) and scale > 0):
+            raise SceneError(f"scale of a cloud must be positive, not {scale}")
+        turn = torch.from_numpy(matrix_to_quaternion(matrix[:3, :3])).to(self.device)
+        placed = torch.from_numpy(matrix).to(self.device)
+        means = (self.means.double() * scale) @ placed[:3, :3].T + placed[:3, 3]
+        return GaussianCloud(
+            means.float(),
+            _hamilton(turn, self.quats.double()).float(),
+            self.scales * scale,
+            self.opacities,
+            rotate_sh(self.sh, matrix[:3, :3]),
+        )
+
+    def check_values(self, what: str) -> None:
+        """Look at every value, as is due where a cloud comes from outside.
+
+        Args:
+            what: name of the cloud for the message.
+
+        Raises:
+            SceneError: values that are not finite, scales not positive, opacities outside [0, 1]
+                or quaternions that are not unit length, each with the count.
+        """
+        for field in fields(self):
+            _refuse(~torch.isfinite(getattr(self, field.name)), what, f"{field.name} not finite")
+        _refuse(self.scales <= 0, what, "scales not positive")
+        _refuse((self.opacities < 0) | (self.opacities > 1), what, "opacities outside [0, 1]")
+        _refuse((self.quats.norm(dim=-1) - 1).abs() > 1e-3, what, "quats not of unit length")
+
     @staticmethod
     def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
-        """All Gaussians of ``clouds`` (same frame, same device) in one, at the highest SH degree."""
+        """All Gaussians of ``clouds`` (one frame, one device) in one, at the highest SH degree."""
         if not clouds:
             return GaussianCloud.empty()
         degree = max(c.sh_degree for c in clouds)
@@ -109,3 +174,16 @@ class GaussianCloud:
         return GaussianCloud(
             *(torch.cat([getattr(c, f.name) for c in padded]) for f in fields(GaussianCloud))
         )
+
+
+def _hamilton(left: Tensor, right: Tensor) -> Tensor:
+    """Hamilton product [N, 4] of one wxyz quaternion [4] with many [N, 4]."""
+    w, x, y, z = left.tolist()
+    matrix = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return right @ torch.tensor(matrix, dtype=right.dtype, device=right.device).T
+
+
+def _refuse(bad: Tensor, what: str, reason: str) -> None:
+    count = int(bad.sum())
+    if count:
+        raise SceneError(f"{what}: {count} of {bad.numel()} values: {reason}")

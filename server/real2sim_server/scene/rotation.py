@@ -40,7 +40,11 @@ def matrix_to_quaternion(matrix: ArrayLike) -> Float:
         ],
         axis=-1,
     )
-    yz, zx, xy = (m[..., 2, 1], m[..., 1, 2]), (m[..., 0, 2], m[..., 2, 0]), (m[..., 1, 0], m[..., 0, 1])
+    yz, zx, xy = (
+        (m[..., 2, 1], m[..., 1, 2]),
+        (m[..., 0, 2], m[..., 2, 0]),
+        (m[..., 1, 0], m[..., 0, 1]),
+    )
     (dx, sx), (dy, sy), (dz, sz) = ((a - b, a + b) for a, b in (yz, zx, xy))
     candidates = np.stack(
         [
@@ -134,6 +138,28 @@ def quaternion_yaw(quaternion: ArrayLike) -> Float:
 def is_rotation(matrix: ArrayLike, *, tolerance: float = 1e-3) -> bool:
     """Whether a [3, 3] matrix is finite, orthonormal and right-handed within ``tolerance``."""
     m = np.asarray(matrix, dtype=np.float64)
-    if m.shape != (3, 3) or not np.isfinite(m).all():
-        return False
-    return bool(np.abs(m @ m.T - np.eye(3)).max() < tolerance and np.linalg.det(m) > 0)
+    return m.shape == (3, 3) and bool(_are_rotations(m, tolerance))
+
+
+def is_rigid(matrix: ArrayLike, *, tolerance: float = 1e-3) -> bool:
+    """Whether a [4, 4] matrix is a finite rigid transform: rotation, shift, row [0, 0, 0, 1]."""
+    m = np.asarray(matrix, dtype=np.float64)
+    return m.shape == (4, 4) and bool(are_rigid(m, tolerance=tolerance))
+
+
+def are_rigid(matrices: ArrayLike, *, tolerance: float = 1e-3) -> NDArray[np.bool_]:
+    """Which of [..., 4, 4] matrices are rigid transforms, [...] bool; like :func:`is_rigid`."""
+    m = np.asarray(matrices, dtype=np.float64)
+    last_row = np.abs(m[..., 3, :] - [0, 0, 0, 1]).max(axis=-1) < tolerance
+    shift = np.isfinite(m[..., :3, 3]).all(axis=-1)
+    return np.asarray(last_row & shift & _are_rotations(m[..., :3, :3], tolerance))
+
+
+def _are_rotations(matrices: Float, tolerance: float) -> NDArray[np.bool_]:
+    finite = np.isfinite(matrices).all(axis=(-1, -2))
+    m = np.where(finite[..., None, None], matrices, 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(m @ np.swapaxes(m, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    orthonormal = error < tolerance
+    upright = np.where(orthonormal[..., None, None], m, np.eye(3))
+    return np.asarray(finite & orthonormal & (np.linalg.det(upright) > 0))

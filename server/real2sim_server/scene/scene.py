@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -11,14 +11,28 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .box import box_corners
 from .camera import CameraRig
 from .cloud import GaussianCloud
 from .errors import SceneError, UnknownObjectError
+from .rotation import Float
 from .sky import Sky
 from .trajectory import Trajectory
 
 MAX_OBJECTS = 65_534
 """Instance images are uint16: 0 is the background, 65535 is kept free."""
+
+
+def box_size(size: Iterable[float], what: str) -> tuple[float, float, float]:
+    """(length, width, height) [m] as plain floats.
+
+    Raises:
+        SceneError: naming ``what``, when ``size`` is anything but three positive lengths.
+    """
+    lengths = tuple(float(v) for v in size)
+    if len(lengths) != 3 or not all(np.isfinite(lengths)) or min(lengths) <= 0:
+        raise SceneError(f"{what}: size {lengths} must be three positive lengths")
+    return lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +54,15 @@ class SceneObject:
     trajectory: Trajectory
 
     def __post_init__(self) -> None:
-        if len(self.size) != 3 or not all(np.isfinite(self.size)) or min(self.size) <= 0:
-            raise SceneError(f"object {self.object_id!r}: size {self.size} must be three positive lengths")
+        object.__setattr__(self, "size", box_size(self.size, f"object {self.object_id!r}"))
+
+    def box_at(self, t_us: int) -> Float:
+        """Corners [8, 3] [m] of the box in the world at ``t_us``; order of ``box_corners``.
+
+        Raises:
+            TimeOutOfRangeError: outside the trajectory.
+        """
+        return box_corners(self.trajectory.transform(t_us), self.size)
 
     @property
     def nbytes(self) -> int:
@@ -85,7 +106,8 @@ class Scene:
         for object_id, scene_object in self.objects.items():
             if object_id != scene_object.object_id:
                 raise SceneError(f"object {scene_object.object_id!r} is stored under {object_id!r}")
-        times = np.asarray(self.frame_times_us, dtype=np.int64)
+        object.__setattr__(self, "ego_size", box_size(self.ego_size, f"ego of scene {self.name!r}"))
+        times = np.array(self.frame_times_us, dtype=np.int64)
         if times.ndim != 1 or (np.diff(times) <= 0).any():
             raise SceneError("frame_times_us must be one-dimensional and increase strictly")
         object.__setattr__(self, "frame_times_us", times)
@@ -102,7 +124,9 @@ class Scene:
             return self.objects[object_id]
         except KeyError:
             known = ", ".join(self.objects) or "none"
-            raise UnknownObjectError(f"no object {object_id!r} in scene {self.name!r}; it has: {known}") from None
+            raise UnknownObjectError(
+                f"no object {object_id!r} in scene {self.name!r}; it has: {known}"
+            ) from None
 
     def instance_id(self, object_id: str) -> int:
         """Value of that object's pixels in instance images: 1 + its position in ``objects``."""

@@ -25,7 +25,13 @@ class Sky:
 
     def __post_init__(self) -> None:
         shape = tuple(self.faces.shape)
-        if len(shape) != 4 or shape[0] != 6 or shape[1] != shape[2] or shape[3] != 3 or shape[1] < 1:
+        if (
+            len(shape) != 4
+            or shape[0] != 6
+            or shape[1] != shape[2]
+            or shape[3] != 3
+            or shape[1] < 1
+        ):
             raise SceneError(f"sky faces must be [6, R, R, 3], not {list(shape)}")
         if self.faces.dtype != torch.float32:
             raise SceneError(f"sky faces must be float32, not {self.faces.dtype}")
@@ -43,7 +49,9 @@ class Sky:
     @classmethod
     def uniform(cls, rgb: tuple[float, float, float], *, resolution: int = 1) -> Sky:
         """One colour everywhere."""
-        return cls(torch.tensor(rgb, dtype=torch.float32).expand(6, resolution, resolution, 3).contiguous())
+        return cls(
+            torch.tensor(rgb, dtype=torch.float32).expand(6, resolution, resolution, 3).contiguous()
+        )
 
     def to(self, device: torch.device | str) -> Sky:
         """The sky on another device."""
@@ -80,13 +88,18 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         torch.where(on_y, torch.where(y > 0, 2, 3), torch.where(z > 0, 4, 5)),
     )
     major = torch.where(on_x, ax, torch.where(on_y, ay, az))
-    u = torch.where(on_x, torch.where(x > 0, -y, y), torch.where(on_y, torch.where(y > 0, x, -x), -y))
+    u = torch.where(
+        on_x, torch.where(x > 0, -y, y), torch.where(on_y, torch.where(y > 0, x, -x), -y)
+    )
     v = torch.where(on_x | on_y, -z, torch.where(z > 0, x, -x))
     return face, u / major, v / major
 
 
 def face_directions(resolution: int) -> np.ndarray:
-    """Unit world directions [6, R, R, 3] float32 of all pixel centres; inverse of face_coordinates."""
+    """Unit world directions [6, R, R, 3] float32 of all pixel centres.
+
+    Inverse of :func:`face_coordinates`.
+    """
     centre = (np.arange(resolution) + 0.5) / resolution * 2 - 1
     v, u = np.meshgrid(centre, centre, indexing="ij")
     one = np.ones_like(u)

@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import SceneError, TimeOutOfRangeError
-from .rotation import Float, apply_transform, invert_transform, matrix_to_quaternion, slerp, transform_from
+from .rotation import (
+    Float,
+    apply_transform,
+    are_rigid,
+    invert_transform,
+    matrix_to_quaternion,
+    slerp,
+    transform_from,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +37,16 @@ class Trajectory:
     quaternions: Float
 
     def __post_init__(self) -> None:
-        times = np.atleast_1d(np.asarray(self.times_us, dtype=np.int64))
-        positions = np.atleast_2d(np.asarray(self.positions, dtype=np.float64))
-        quaternions = np.atleast_2d(np.asarray(self.quaternions, dtype=np.float64))
+        times = _whole_microseconds(self.times_us)
+        positions = np.atleast_2d(np.array(self.positions, dtype=np.float64))
+        quaternions = np.atleast_2d(np.array(self.quaternions, dtype=np.float64))
+        if len(times) == 0:
+            raise SceneError("a trajectory needs at least one pose")
         if positions.shape != (len(times), 3) or quaternions.shape != (len(times), 4):
             raise SceneError(
                 f"a trajectory of {len(times)} time stamps needs positions [{len(times)}, 3] and "
                 f"quaternions [{len(times)}, 4], not {positions.shape} and {quaternions.shape}"
             )
-        if len(times) == 0:
-            raise SceneError("a trajectory needs at least one pose")
         if not (np.isfinite(positions).all() and np.isfinite(quaternions).all()):
             raise SceneError("a trajectory holds a pose that is not finite")
         if (np.diff(times) <= 0).any():
@@ -48,12 +56,29 @@ class Trajectory:
             raise SceneError("quaternions of a trajectory must have unit length (wxyz)")
         object.__setattr__(self, "times_us", times)
         object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "quaternions", quaternions / norms[:, None])
+        # Unit quaternions stay bit for bit as they are, so that reading back what was written
+        # gives the same trajectory.
+        unit = np.abs(norms - 1) < 1e-15
+        object.__setattr__(
+            self, "quaternions", np.where(unit[:, None], quaternions, quaternions / norms[:, None])
+        )
 
     @classmethod
     def from_transforms(cls, times_us: ArrayLike, transforms: ArrayLike) -> Trajectory:
-        """Build from ``T_fixed_moving`` [T, 4, 4]."""
+        """Build from ``T_fixed_moving`` [T, 4, 4].
+
+        Raises:
+            SceneError: for a matrix that is not a rigid transform, with its place, and as above.
+        """
         t = np.asarray(transforms, dtype=np.float64)
+        if t.ndim != 3 or t.shape[1:] != (4, 4):
+            raise SceneError(f"transforms of a trajectory must be [T, 4, 4], not {list(t.shape)}")
+        bad = np.flatnonzero(~are_rigid(t))
+        if len(bad):
+            raise SceneError(
+                f"{len(bad)} of {len(t)} poses are no rigid transforms, the first at index "
+                f"{bad[0]}: {t[bad[0]].tolist()}"
+            )
         return cls(np.asarray(times_us), t[:, :3, 3], matrix_to_quaternion(t[:, :3, :3]))
 
     @property
@@ -114,6 +139,15 @@ class Trajectory:
         return Trajectory.from_transforms(
             self.times_us, matrix @ transform_from(self.positions, self.quaternions)
         )
+
+
+def _whole_microseconds(times_us: ArrayLike) -> NDArray[np.int64]:
+    given = np.atleast_1d(np.asarray(times_us))
+    with np.errstate(invalid="ignore"):
+        times = given.astype(np.int64)
+    if given.ndim != 1 or not np.array_equal(times, given):
+        raise SceneError("times_us must be a list of whole microseconds")
+    return times
 
 
 def relative_transform(T_world_a: ArrayLike, T_world_b: ArrayLike) -> Float:
