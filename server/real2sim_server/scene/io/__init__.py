@@ -1,0 +1,18 @@
+"""Scenes, assets and splats on disk."""
+
+from .bundle import load_asset, load_scene, save_asset, save_scene
+from .splats import import_splats, read_splats, write_ply
+from .summary import ObjectSummary, SceneSummary, read_scene_summary
+
+__all__ = [
+    "ObjectSummary",
+    "SceneSummary",
+    "import_splats",
+    "load_asset",
+    "load_scene",
+    "read_scene_summary",
+    "read_splats",
+    "save_asset",
+    "save_scene",
+    "write_ply",
+]

@@ -1,0 +1,256 @@
+"""Scenes and assets as bundles: self-contained folders. Format: docs/scene_format.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..asset import Asset
+from ..cloud import GaussianCloud
+from ..errors import BundleError, SceneError
+from ..scene import Scene, SceneObject
+from ..sky import Sky
+from .container import read_container, write_container
+from .document import (
+    AssetContent,
+    AssetDocument,
+    Bounds,
+    CameraPart,
+    CloudPart,
+    EgoPart,
+    ObjectPart,
+    SceneContent,
+    SceneDocument,
+    SkyPart,
+    TrajectoryPart,
+)
+from .tensors import TensorFile, cloud_shapes, cloud_tensors, tensor_hashes
+
+BACKGROUND_FILE = "background.safetensors"
+OBJECTS_FILE = "objects.safetensors"
+SKY_FILE = "sky.safetensors"
+ASSET_FILE = "asset.safetensors"
+
+_UNWRITTEN = {"format": "", "version": 0, "content_hash": "0" * 64, "files": {}}
+
+
+def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = False) -> Scene:
+    """Write ``scene`` as a bundle; the same scene with its content hash.
+
+    The folder appears whole or not at all. An existing bundle is replaced only with
+    ``overwrite``; any other folder with something in it is never touched.
+
+    Args:
+        scene: on any device.
+        path: folder to write, by custom ``<name>.r2s``.
+        overwrite: replace an existing bundle.
+
+    Raises:
+        BundleError: ``path`` exists and may not be replaced.
+        SceneError: values that are not finite or out of range, provenance that is not JSON.
+        OSError: the folder cannot be written.
+    """
+    background = _outgoing(scene.background, "background")
+    objects = [_outgoing(o.cloud, f"object {k!r}") for k, o in scene.objects.items()]
+    sky = _outgoing_sky(scene.sky)
+    content = SceneContent(
+        cameras=[CameraPart.of(c) for c in scene.rig],
+        ego=EgoPart(size=scene.ego_size, trajectory=TrajectoryPart.of(scene.ego)),
+        frame_times_us=scene.frame_times_us.tolist(),
+        background=_cloud_part(background),
+        objects=[
+            _object_part(o, tensors)
+            for o, tensors in zip(scene.objects.values(), objects, strict=True)
+        ],
+        sky=SkyPart(resolution=sky["faces"].shape[1], tensors=tensor_hashes(sky)) if sky else None,
+    )
+    document = SceneDocument(
+        kind="scene",
+        name=scene.name,
+        provenance=_json_values(scene.provenance),
+        bounds=_bounds(background["means"]),
+        content=content,
+        **_UNWRITTEN,
+    )
+    keyed = {f"{i}.{name}": t for i, part in enumerate(objects) for name, t in part.items()}
+    files = {BACKGROUND_FILE: background, OBJECTS_FILE: keyed} | ({SKY_FILE: sky} if sky else {})
+    written = write_container(document, Path(path), tensors=files, overwrite=overwrite)
+    return replace(scene, content_hash=written.content_hash)
+
+
+def load_scene(
+    path: str | PathLike[str], *, device: torch.device | str = "cpu", verify: bool = True
+) -> Scene:
+    """Read a scene bundle. On the CPU its tensors are memory-mapped.
+
+    Args:
+        path: folder of the bundle.
+        device: where the tensors shall live.
+        verify: compare every hash and look at every value; without it only shapes, types and
+            file sizes are checked.
+
+    Raises:
+        BundleError: with the file and the reason: missing, cut short, changed, of a newer version.
+    """
+    folder = Path(path)
+    document = read_container(folder, SceneDocument, verify=verify)
+    content = document.content
+    background = _open(folder, BACKGROUND_FILE, document.files, verify)
+    objects = _open(folder, OBJECTS_FILE, document.files, verify)
+    with _as_bundle_error(folder):
+        scene = Scene(
+            name=document.name,
+            background=_cloud(background, "", content.background, "background"),
+            objects=_objects(objects, content.objects),
+            sky=_sky(folder, document, verify) if content.sky else None,
+            rig=content.build_rig(),
+            ego=content.ego.trajectory.build(),
+            frame_times_us=np.array(content.frame_times_us, dtype=np.int64),
+            ego_size=content.ego.size,
+            provenance=document.provenance,
+            content_hash=document.content_hash,
+        )
+    return scene.to(device)
+
+
+def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = False) -> Asset:
+    """Write ``asset`` as a bundle; the same asset with its content hash.
+
+    Arguments and errors are those of :func:`save_scene`.
+    """
+    cloud = _outgoing(asset.cloud, f"asset {asset.asset_id!r}")
+    document = AssetDocument(
+        kind="asset",
+        name=asset.asset_id,
+        provenance=_json_values(asset.provenance),
+        content=AssetContent(category=asset.category, size=asset.size, cloud=_cloud_part(cloud)),
+        **_UNWRITTEN,
+    )
+    written = write_container(
+        document, Path(path), tensors={ASSET_FILE: cloud}, overwrite=overwrite
+    )
+    return replace(asset, content_hash=written.content_hash)
+
+
+def load_asset(
+    path: str | PathLike[str], *, device: torch.device | str = "cpu", verify: bool = True
+) -> Asset:
+    """Read an asset bundle. Arguments and errors are those of :func:`load_scene`."""
+    folder = Path(path)
+    document = read_container(folder, AssetDocument, verify=verify)
+    file = _open(folder, ASSET_FILE, document.files, verify)
+    with _as_bundle_error(folder):
+        asset = Asset(
+            asset_id=document.name,
+            category=document.content.category,
+            size=document.content.size,
+            cloud=_cloud(file, "", document.content.cloud, "asset"),
+            provenance=document.provenance,
+            content_hash=document.content_hash,
+        )
+    return asset.to(device)
+
+
+def _outgoing(cloud: GaussianCloud, what: str) -> dict[str, Tensor]:
+    cloud.check_values(what)
+    return cloud_tensors(cloud)
+
+
+def _outgoing_sky(sky: Sky | None) -> dict[str, Tensor]:
+    if sky is None:
+        return {}
+    if not bool(torch.isfinite(sky.faces).all()):
+        raise SceneError("sky: faces hold values that are not finite")
+    return {"faces": sky.faces.detach().cpu().contiguous()}
+
+
+def _cloud_part(tensors: Mapping[str, Tensor]) -> CloudPart:
+    n, coefficients, _ = tensors["sh"].shape
+    degree = round(coefficients**0.5) - 1
+    return CloudPart(gaussians=n, sh_degree=degree, tensors=tensor_hashes(tensors))
+
+
+def _object_part(scene_object: SceneObject, tensors: Mapping[str, Tensor]) -> ObjectPart:
+    return ObjectPart(
+        object_id=scene_object.object_id,
+        category=scene_object.category,
+        size=scene_object.size,
+        trajectory=TrajectoryPart.of(scene_object.trajectory),
+        cloud=_cloud_part(tensors),
+    )
+
+
+def _json_values(provenance: Mapping[str, Any]) -> Any:
+    try:
+        return json.loads(json.dumps(dict(provenance), allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"provenance must hold JSON values only: {error}") from error
+
+
+def _bounds(means: Tensor) -> Bounds | None:
+    if not len(means):
+        return None
+    low, high = means.amin(0).tolist(), means.amax(0).tolist()
+    return (tuple(low), tuple(high))
+
+
+def _open(folder: Path, name: str, sizes: Mapping[str, int], verify: bool) -> TensorFile:
+    # Names come from here, never from scene.json, so no bundle can point outside its folder.
+    if name not in sizes:
+        raise BundleError(f"{folder}: scene.json does not list {name!r} under 'files'")
+    return TensorFile(folder / name, nbytes=sizes[name], verify=verify)
+
+
+def _cloud(file: TensorFile, prefix: str, part: CloudPart, what: str) -> GaussianCloud:
+    shapes = cloud_shapes(part.gaussians, part.sh_degree)
+    cloud = GaussianCloud(**file.take(prefix, shapes=shapes, hashes=part.tensors))
+    if file.verify:
+        cloud.check_values(what)
+    return cloud
+
+
+def _objects(file: TensorFile, parts: list[ObjectPart]) -> dict[str, SceneObject]:
+    objects: dict[str, SceneObject] = {}
+    for index, part in enumerate(parts):
+        if part.object_id in objects:
+            raise SceneError(f"object {part.object_id!r} is listed twice")
+        objects[part.object_id] = SceneObject(
+            object_id=part.object_id,
+            category=part.category,
+            size=part.size,
+            cloud=_cloud(file, f"{index}.", part.cloud, f"object {part.object_id!r}"),
+            trajectory=part.trajectory.build(),
+        )
+    return objects
+
+
+def _sky(folder: Path, document: SceneDocument, verify: bool) -> Sky | None:
+    part = document.content.sky
+    if part is None:
+        return None
+    file = _open(folder, SKY_FILE, document.files, verify)
+    r = part.resolution
+    sky = Sky(**file.take("", shapes={"faces": (6, r, r, 3)}, hashes=part.tensors))
+    if verify and not bool(torch.isfinite(sky.faces).all()):
+        raise SceneError("sky: faces hold values that are not finite")
+    return sky
+
+
+@contextmanager
+def _as_bundle_error(folder: Path) -> Iterator[None]:
+    """Say which bundle it is when its parts are well-formed but make no scene."""
+    try:
+        yield
+    except BundleError:
+        raise
+    except (SceneError, OverflowError) as error:
+        raise BundleError(f"{folder}: {error}") from error

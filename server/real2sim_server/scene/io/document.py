@@ -1,0 +1,165 @@
+"""The JSON part of a bundle: its models, and the way from and to the scene types."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from ..camera import Camera, CameraRig
+from ..trajectory import Trajectory
+
+Count = Annotated[int, Field(ge=0)]
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+Bounds = tuple[Vector3, Vector3]
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class TrajectoryPart(_Part):
+    """Poses over time; see :class:`~real2sim_server.scene.Trajectory`."""
+
+    times_us: list[int]
+    positions: list[Vector3]
+    quaternions: list[Vector4]
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> TrajectoryPart:
+        """The part that describes ``trajectory``, exact to the last bit."""
+        return cls(
+            times_us=trajectory.times_us.tolist(),
+            positions=trajectory.positions.tolist(),
+            quaternions=trajectory.quaternions.tolist(),
+        )
+
+    def build(self) -> Trajectory:
+        """The trajectory. Raises SceneError like its constructor."""
+        return Trajectory(
+            np.array(self.times_us, dtype=np.int64),
+            np.array(self.positions, dtype=np.float64),
+            np.array(self.quaternions, dtype=np.float64),
+        )
+
+
+class CameraPart(_Part):
+    """A camera; see :class:`~real2sim_server.scene.Camera`."""
+
+    name: str
+    width: int
+    height: int
+    K: tuple[Vector3, Vector3, Vector3]
+    T_vehicle_camera: tuple[Vector4, Vector4, Vector4, Vector4]
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraPart:
+        """The part that describes ``camera``, exact to the last bit."""
+        return cls(
+            name=camera.name,
+            width=camera.width,
+            height=camera.height,
+            K=camera.K.tolist(),
+            T_vehicle_camera=camera.T_vehicle_camera.tolist(),
+        )
+
+    def build(self) -> Camera:
+        """The camera. Raises SceneError like its constructor."""
+        return Camera(
+            self.name,
+            self.width,
+            self.height,
+            np.array(self.K, dtype=np.float64),
+            np.array(self.T_vehicle_camera, dtype=np.float64),
+        )
+
+
+class CloudPart(_Part):
+    """Size and hashes of a cloud; the numbers themselves lie in a tensor file."""
+
+    gaussians: Count
+    sh_degree: Annotated[int, Field(ge=0, le=3)]
+    tensors: dict[str, Sha256]
+
+
+class SkyPart(_Part):
+    """Size and hash of a sky."""
+
+    resolution: Annotated[int, Field(ge=1)]
+    tensors: dict[str, Sha256]
+
+
+class EgoPart(_Part):
+    """The recording vehicle."""
+
+    size: Vector3
+    trajectory: TrajectoryPart
+
+
+class ObjectPart(_Part):
+    """One object of a scene; its tensors are keyed by its position in the list."""
+
+    object_id: str
+    category: str
+    size: Vector3
+    trajectory: TrajectoryPart
+    cloud: CloudPart
+
+
+class SceneContent(_Part):
+    """Everything that makes a scene what it is; the content hash is taken over this."""
+
+    cameras: list[CameraPart]
+    ego: EgoPart
+    frame_times_us: list[int]
+    background: CloudPart
+    objects: list[ObjectPart]
+    sky: SkyPart | None
+
+    def build_rig(self) -> CameraRig:
+        """The camera rig. Raises SceneError like its constructor."""
+        return CameraRig(tuple(c.build() for c in self.cameras))
+
+
+class AssetContent(_Part):
+    """Everything that makes an asset what it is; the content hash is taken over this."""
+
+    category: str
+    size: Vector3
+    cloud: CloudPart
+
+
+class _Document(_Part):
+    format: str
+    version: int
+    name: str
+    content_hash: Sha256
+    provenance: dict[str, Any]
+    files: dict[str, Count]
+
+
+class SceneDocument(_Document):
+    """``scene.json`` of a scene as a whole.
+
+    Attributes:
+        files: bytes of each tensor file by name.
+        bounds: lowest and highest Gaussian centre of the background [m], None without any.
+    """
+
+    kind: Literal["scene"]
+    bounds: Bounds | None
+    content: SceneContent
+
+
+class AssetDocument(_Document):
+    """``scene.json`` of an asset as a whole.
+
+    Attributes:
+        files: bytes of each tensor file by name.
+    """
+
+    kind: Literal["asset"]
+    content: AssetContent

@@ -1,0 +1,110 @@
+"""What every splat format can do, and what their readers share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...cloud import GaussianCloud
+from ...errors import BundleError
+
+SMALLEST_SCALE = 1e-20
+"""Scales whose exponential underflows are lifted to this [m], since a scale is positive."""
+
+
+class SplatFormat(Protocol):
+    """A format of splat files."""
+
+    @property
+    def name(self) -> str:
+        """What the format is called in messages."""
+
+    def recognises(self, head: bytes) -> bool:
+        """Whether a file that starts with ``head`` (up to 64 KiB) is of this format."""
+
+    def read(self, path: Path) -> GaussianCloud:
+        """The Gaussians of a file, in the file's own frame and units.
+
+        Raises:
+            BundleError: naming the file and the reason.
+        """
+
+
+def require_properties(
+    path: Path, element: str, names: tuple[str, ...] | None, needed: tuple[str, ...]
+) -> None:
+    """Raise BundleError unless ``element`` exists (``names`` is not None) with all ``needed``."""
+    if names is None:
+        raise BundleError(f"{path}: has no {element!r} element")
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise BundleError(
+            f"{path}: element {element!r} lacks the properties {missing}; "
+            "a splat file needs them (a plain point cloud has no Gaussians)"
+        )
+
+
+def column(path: Path, records: NDArray[np.void], name: str, *, infinite: bool = False) -> NDArray:
+    """A property [N] of records as float64.
+
+    Raises:
+        BundleError: for NaN and, unless ``infinite`` is allowed, for infinite values.
+    """
+    values = np.asarray(records[name], dtype=np.float64)
+    bad = np.isnan(values) if infinite else ~np.isfinite(values)
+    if bad.any():
+        raise BundleError(
+            f"{path}: property {name!r} is NaN{'' if infinite else ' or infinite'} in "
+            f"{int(bad.sum())} of {len(values)} splats, the first at {int(np.argmax(bad))}"
+        )
+    return values
+
+
+def columns(path: Path, records: NDArray[np.void], names: tuple[str, ...]) -> NDArray[np.float64]:
+    """Properties [N, len(names)] of records as finite float64. Raises like :func:`column`."""
+    values = np.empty((len(records), len(names)))
+    for index, name in enumerate(names):
+        values[:, index] = column(path, records, name)
+    return values
+
+
+def build_cloud(
+    path: Path,
+    *,
+    means: NDArray[np.float64],
+    quats: NDArray[np.float64],
+    log_scales: NDArray[np.float64],
+    opacities: NDArray[np.float64],
+    sh: NDArray[np.float64],
+) -> GaussianCloud:
+    """A cloud of parameters as files hold them: quats [N, 4] wxyz of any length, log scales.
+
+    Raises:
+        BundleError: for quaternions of length zero and values beyond the range of float32.
+    """
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    zero = norms[:, 0] < 1e-12
+    if zero.any():
+        raise BundleError(
+            f"{path}: {int(zero.sum())} of {len(quats)} rotations have length zero, "
+            f"the first at {int(np.argmax(zero))}"
+        )
+    with np.errstate(over="ignore", under="ignore"):
+        scales = np.maximum(np.exp(log_scales), SMALLEST_SCALE)
+        parts = {
+            "means": means,
+            "quats": quats / norms,
+            "scales": scales,
+            "opacities": opacities,
+            "sh": sh,
+        }
+        arrays = {name: np.ascontiguousarray(v, dtype=np.float32) for name, v in parts.items()}
+    for name, array in arrays.items():
+        count = int((~np.isfinite(array)).sum())
+        if count:
+            raise BundleError(f"{path}: {count} values of {name} are beyond the range of float32")
+    return GaussianCloud(**{name: torch.from_numpy(array) for name, array in arrays.items()})

@@ -1,0 +1,200 @@
+"""Splat files of other programs: read them, write them, make scenes and assets of them."""
+
+from __future__ import annotations
+
+import hashlib
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+
+from ..asset import Asset
+from ..camera import T_VEHICLE_OPTICAL, Camera, CameraRig
+from ..cloud import GaussianCloud
+from ..errors import BundleError, SceneError
+from ..rotation import Float, quaternion_to_matrix, yaw_quaternion
+from ..scene import Scene
+from ..trajectory import Trajectory
+from .formats import FORMATS, inria_ply
+
+HEAD_BYTES = 1 << 16
+
+UpAxis = Literal["z", "y", "-y"]
+
+_ROTATIONS: dict[str, list[list[float]]] = {
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "y": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+    "-y": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+}
+"""Rotations from the file's axes to x forward, y left, z up. ``y`` is that of glTF (z forward),
+``-y`` that of OpenCV and COLMAP (z forward, x right)."""
+
+VIEW_DURATION_US = 10_000_000
+"""How long the ego of an imported scene stands: long enough to drive through it."""
+
+
+def read_splats(path: str | PathLike[str]) -> GaussianCloud:
+    """Read a splat file of any known format, in its own frame and units.
+
+    Raises:
+        BundleError: naming the file and the reason: not there, of no known format, cut short,
+            wrong counts, values that are not finite, rotations of length zero.
+    """
+    file = Path(path)
+    head = _head(file)
+    for splat_format in FORMATS:
+        if splat_format.recognises(head):
+            return splat_format.read(file)
+    known = ", ".join(f.name for f in FORMATS)
+    raise BundleError(f"{file}: not a ply nor any other known splat format; known are: {known}")
+
+
+def write_ply(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
+    """Write ``cloud`` as an INRIA-style PLY, atomically; see :func:`.formats.inria_ply.write_ply`.
+
+    Raises:
+        SceneError: values that are not finite or out of range.
+        OSError: the file cannot be written.
+    """
+    cloud.check_values(f"cloud for {path}")
+    inria_ply.write_ply(cloud, Path(path))
+
+
+@overload
+def import_splats(
+    path: str | PathLike[str],
+    *,
+    name: str,
+    as_asset: Literal[False] = False,
+    up_axis: UpAxis = "z",
+    yaw: float = 0.0,
+    scale: float = 1.0,
+) -> Scene: ...
+
+
+@overload
+def import_splats(
+    path: str | PathLike[str],
+    *,
+    name: str,
+    as_asset: Literal[True],
+    category: str = "object",
+    up_axis: UpAxis = "z",
+    yaw: float = 0.0,
+    scale: float = 1.0,
+) -> Asset: ...
+
+
+def import_splats(
+    path: str | PathLike[str],
+    *,
+    name: str,
+    as_asset: bool = False,
+    category: str = "object",
+    up_axis: UpAxis = "z",
+    yaw: float = 0.0,
+    scale: float = 1.0,
+) -> Scene | Asset:
+    """Read a splat file as a scene (background only) or as an asset (centred on its box).
+
+    Args:
+        path: splat file of any known format.
+        name: name of the scene, or id of the asset.
+        as_asset: make an asset instead of a scene.
+        category: class of the asset.
+        up_axis: which axis of the file points up; trained splats mostly have ``-y``.
+        yaw: turn about z after that [rad], to bring the front of a thing to x.
+        scale: metres per unit of the file.
+
+    Raises:
+        BundleError: like :func:`read_splats`, and for a file without splats.
+        SceneError: for an unknown ``up_axis`` or a scale that is not positive.
+    """
+    file = Path(path)
+    cloud = read_splats(file)
+    if not len(cloud):
+        raise BundleError(f"{file}: holds no splats; nothing to import")
+    placed = cloud.moved(_upright(up_axis, yaw), scale=scale)
+    provenance = {
+        "source": "splat file",
+        "file": file.name,
+        "sha256": _file_hash(file),
+        "up_axis": up_axis,
+        "yaw": yaw,
+        "scale": scale,
+    }
+    if as_asset:
+        return asset_from_cloud(placed, name=name, category=category, provenance=provenance)
+    return scene_from_cloud(placed, name=name, provenance=provenance)
+
+
+def asset_from_cloud(
+    cloud: GaussianCloud, *, name: str, category: str, provenance: dict[str, Any]
+) -> Asset:
+    """An asset of ``cloud`` (x forward, z up [m]), moved to the centre of its robust box."""
+    low, high = robust_bounds(cloud)
+    to_centre = np.eye(4)
+    to_centre[:3, 3] = -(low + high) / 2
+    length, width, height = np.maximum(high - low, 1e-3).tolist()
+    return Asset(name, category, (length, width, height), cloud.moved(to_centre), provenance)
+
+
+def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, Any]) -> Scene:
+    """A scene with ``cloud`` as background, seen along x by one camera that holds its robust box.
+
+    The ego stands behind the box for ten seconds; its camera ``front`` looks at the box's centre.
+    """
+    low, high = robust_bounds(cloud)
+    centre, extent = (low + high) / 2, np.maximum(high - low, 1e-3)
+    focal, width, height = 800.0, 960, 640
+    # Near face of the box fits into the image with a tenth to spare.
+    distance = 1.1 * focal * max(extent[1] / width, extent[2] / height)
+    position = [low[0] - distance, centre[1], low[2]]
+    pose = T_VEHICLE_OPTICAL.copy()
+    pose[2, 3] = centre[2] - low[2]
+    camera = Camera(
+        "front",
+        width,
+        height,
+        np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
+        pose,
+    )
+    times = np.array([0, VIEW_DURATION_US], dtype=np.int64)
+    ego = Trajectory(times, np.array([position] * 2), np.array([[1.0, 0, 0, 0]] * 2))
+    return Scene(name, cloud, {}, None, CameraRig((camera,)), ego, times, provenance=provenance)
+
+
+def robust_bounds(cloud: GaussianCloud, *, opacity: float = 0.1) -> tuple[Float, Float]:
+    """Lowest and highest corner [3] [m] of what one sees, without the floaters.
+
+    Between the 0.5 and 99.5 percentiles of the centres of Gaussians above ``opacity``; of all
+    where none is.
+    """
+    visible = cloud.means[cloud.opacities >= opacity]
+    means = (visible if len(visible) else cloud.means).detach().cpu().numpy().astype(np.float64)
+    low, high = np.percentile(means, [0.5, 99.5], axis=0)
+    return low, high
+
+
+def _head(file: Path) -> bytes:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(HEAD_BYTES)
+    except OSError as error:
+        raise BundleError(f"{file}: cannot be read: {error.strerror}") from error
+
+
+def _upright(up_axis: str, yaw: float) -> Float:
+    if up_axis not in _ROTATIONS:
+        raise SceneError(f"up_axis {up_axis!r}; allowed are {list(_ROTATIONS)}")
+    if not np.isfinite(yaw):
+        raise SceneError(f"yaw must be finite, not {yaw}")
+    turn = np.eye(4)
+    turn[:3, :3] = quaternion_to_matrix(yaw_quaternion(yaw)) @ np.array(_ROTATIONS[up_axis])
+    return turn
+
+
+def _file_hash(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

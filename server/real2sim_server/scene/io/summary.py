@@ -1,0 +1,114 @@
+"""What a scene bundle holds, without reading its Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import CameraRig
+from ..errors import BundleError, SceneError
+from ..trajectory import Trajectory
+from .container import read_container
+from .document import Bounds, SceneDocument, Vector3
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectSummary:
+    """What is known of an object without its Gaussians.
+
+    Attributes:
+        object_id, category, size, trajectory: as in SceneObject.
+        gaussians: number of Gaussians.
+    """
+
+    object_id: str
+    category: str
+    size: Vector3
+    trajectory: Trajectory
+    gaussians: int
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSummary:
+    """What is known of a scene bundle without its Gaussians.
+
+    Attributes:
+        path: folder of the bundle.
+        name, content_hash, rig, ego, ego_size, frame_times_us, provenance: as in Scene.
+        objects: in the scene's order.
+        background_gaussians: number of Gaussians of the background.
+        sky_resolution: edge length of the sky's faces [px], 0 without sky.
+        bounds: lowest and highest Gaussian centre of the background [m], None without any.
+        nbytes: bytes of the tensor files, nearly what the scene takes in memory.
+    """
+
+    path: Path
+    name: str
+    content_hash: str
+    rig: CameraRig
+    ego: Trajectory
+    ego_size: Vector3
+    frame_times_us: NDArray[np.int64]
+    provenance: Mapping[str, Any]
+    objects: tuple[ObjectSummary, ...]
+    background_gaussians: int
+    sky_resolution: int
+    bounds: Bounds | None
+    nbytes: int
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians of background and objects together."""
+        return self.background_gaussians + sum(o.gaussians for o in self.objects)
+
+    @property
+    def start_us(self) -> int:
+        """First time the ego path knows [us]."""
+        return self.ego.start_us
+
+    @property
+    def end_us(self) -> int:
+        """Last time the ego path knows [us]."""
+        return self.ego.end_us
+
+
+def read_scene_summary(path: str | PathLike[str]) -> SceneSummary:
+    """Read ``scene.json`` of a bundle and nothing else; hashes are not compared.
+
+    Raises:
+        BundleError: no scene bundle, a newer version, or not as the format asks.
+    """
+    folder = Path(path)
+    document = read_container(folder, SceneDocument, verify=False)
+    try:
+        return _summary(folder, document)
+    except (SceneError, OverflowError) as error:
+        raise BundleError(f"{folder}: {error}") from error
+
+
+def _summary(folder: Path, document: SceneDocument) -> SceneSummary:
+    content = document.content
+    return SceneSummary(
+        path=folder,
+        name=document.name,
+        content_hash=document.content_hash,
+        rig=content.build_rig(),
+        ego=content.ego.trajectory.build(),
+        ego_size=content.ego.size,
+        frame_times_us=np.array(content.frame_times_us, dtype=np.int64),
+        provenance=document.provenance,
+        objects=tuple(
+            ObjectSummary(o.object_id, o.category, o.size, o.trajectory.build(), o.cloud.gaussians)
+            for o in content.objects
+        ),
+        background_gaussians=content.background.gaussians,
+        sky_resolution=content.sky.resolution if content.sky else 0,
+        bounds=document.bounds,
+        nbytes=sum(document.files.values()),
+    )

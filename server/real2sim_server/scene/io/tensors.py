@@ -1,0 +1,120 @@
+"""Tensor files of a bundle: safetensors, hashed tensor by tensor."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+from torch import Tensor
+
+from ..cloud import GaussianCloud
+from ..errors import BundleError
+
+CLOUD_FIELDS = tuple(f.name for f in fields(GaussianCloud))
+
+
+def cloud_tensors(cloud: GaussianCloud) -> dict[str, Tensor]:
+    """Tensors of a cloud by field name, on the CPU and contiguous."""
+    return {name: getattr(cloud, name).detach().cpu().contiguous() for name in CLOUD_FIELDS}
+
+
+def cloud_shapes(gaussians: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of a cloud's tensors by field name."""
+    n = gaussians
+    return {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "scales": (n, 3),
+        "opacities": (n,),
+        "sh": (n, (sh_degree + 1) ** 2, 3),
+    }
+
+
+def tensor_hash(tensor: Tensor) -> str:
+    """SHA-256 of the bytes of a contiguous CPU tensor, little-endian, row-major."""
+    return hashlib.sha256(tensor.reshape(-1).view(torch.uint8).numpy()).hexdigest()
+
+
+def tensor_hashes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """:func:`tensor_hash` of each."""
+    return {name: tensor_hash(tensor) for name, tensor in tensors.items()}
+
+
+def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> int:
+    """Write a new safetensors file; its length in bytes."""
+    save_file({name: tensor.numpy() for name, tensor in tensors.items()}, path)
+    return path.stat().st_size
+
+
+class TensorFile:
+    """A safetensors file of a bundle, memory-mapped.
+
+    Args:
+        path: the file.
+        nbytes: how long it must be.
+        verify: compare the hash of every tensor taken.
+
+    Raises:
+        BundleError: missing, a link, of another length, or no safetensors file.
+    """
+
+    def __init__(self, path: Path, *, nbytes: int, verify: bool) -> None:
+        self.path = path
+        self.verify = verify
+        _check_file(path, nbytes)
+        try:
+            with safe_open(path, framework="pt", device="cpu") as file:
+                self._tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError) as error:
+            raise BundleError(f"{path}: no readable safetensors file: {error}") from error
+
+    def take(
+        self,
+        prefix: str,
+        *,
+        shapes: Mapping[str, tuple[int, ...]],
+        hashes: Mapping[str, str],
+    ) -> dict[str, Tensor]:
+        """The tensors stored under ``prefix`` + name, float32, for each name in ``shapes``.
+
+        Raises:
+            BundleError: one is missing, has another shape or type or, when verifying, another
+                hash than in ``hashes``.
+        """
+        if set(hashes) != set(shapes):
+            raise BundleError(
+                f"{self.path}: scene.json gives hashes of {sorted(hashes)}, not of {list(shapes)}"
+            )
+        return {name: self._one(prefix + name, shapes[name], hashes[name]) for name in shapes}
+
+    def _one(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
+        tensor = self._tensors.get(key)
+        if tensor is None:
+            raise BundleError(f"{self.path}: has no tensor {key!r}")
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+            raise BundleError(
+                f"{self.path}: tensor {key!r} is {tensor.dtype} {list(tensor.shape)}, "
+                f"scene.json asks for torch.float32 {list(shape)}"
+            )
+        if self.verify and tensor_hash(tensor) != expected:
+            raise BundleError(
+                f"{self.path}: tensor {key!r} does not have the SHA-256 that scene.json gives; "
+                "the bundle was changed or damaged, copy or save it again"
+            )
+        return tensor
+
+
+def _check_file(path: Path, nbytes: int) -> None:
+    if path.is_symlink() or not path.is_file():
+        raise BundleError(f"{path}: missing or no plain file; the bundle is incomplete")
+    actual = path.stat().st_size
+    if actual != nbytes:
+        raise BundleError(
+            f"{path}: has {actual} bytes where scene.json says {nbytes}; "
+            "the bundle is cut short or damaged, copy or save it again"
+        )
