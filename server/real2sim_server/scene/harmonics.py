@@ -57,6 +57,8 @@ def sh_rotation(rotation: Float, degree: int) -> Float:
     for band in range(degree + 1):
         part = slice(band * band, (band + 1) ** 2)
         matrix[part, part] = np.linalg.lstsq(after[:, part], before[:, part], rcond=None)[0]
+    # Rounding noise, which would make turning by nothing change bits.
+    matrix[np.abs(matrix) < 1e-12] = 0
     return matrix
 
 

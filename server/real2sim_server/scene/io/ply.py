@@ -115,7 +115,8 @@ def read_ply_elements(path: Path) -> dict[str, NDArray[np.void]]:
     """
     header = read_ply_header(path)
     _check_size(path, header)
-    offset, arrays = header.nbytes, {}
+    arrays: dict[str, NDArray[np.void]] = {}
+    offset = header.nbytes
     for element in header.elements.values():
         if element.nbytes:
             arrays[element.name] = np.memmap(

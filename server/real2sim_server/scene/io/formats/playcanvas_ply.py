@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
 from ...harmonics import SH_C0
+from ...rotation import Float
 from ..ply import read_ply_elements
 from .types import build_cloud, columns, require_properties
 
@@ -44,7 +45,7 @@ class PlayCanvasPly:
         vertex, chunks = self._checked(path, elements)
         chunk_of = np.arange(len(vertex)) // CHUNK_SIZE
 
-        def between(low: tuple[str, ...], high: tuple[str, ...], fraction: NDArray) -> NDArray:
+        def between(low: tuple[str, ...], high: tuple[str, ...], fraction: Float) -> Float:
             a, b = columns(path, chunks, low)[chunk_of], columns(path, chunks, high)[chunk_of]
             return a * (1 - fraction) + b * fraction
 
@@ -68,7 +69,7 @@ class PlayCanvasPly:
         vertex, chunks = elements.get("vertex"), elements.get("chunk")
         vertex_names = vertex.dtype.names or () if vertex is not None else None
         chunk_names = chunks.dtype.names or () if chunks is not None else None
-        needed = LOW_POSITION + HIGH_POSITION + LOW_SCALE + HIGH_SCALE
+        needed: tuple[str, ...] = LOW_POSITION + HIGH_POSITION + LOW_SCALE + HIGH_SCALE
         if chunk_names and LOW_COLOUR[0] in chunk_names:
             needed += LOW_COLOUR + HIGH_COLOUR
         require_properties(path, "chunk", chunk_names, needed)
@@ -86,19 +87,19 @@ class PlayCanvasPly:
         return vertex, chunks
 
 
-def _unpack_11_10_11(words: Words) -> NDArray[np.float64]:
+def _unpack_11_10_11(words: Words) -> Float:
     """Fractions [N, 3] in [0, 1]; the first component is in the highest bits."""
     w = np.asarray(words, dtype=np.uint32)
     return np.stack([(w >> 21) / 2047, (w >> 11 & 1023) / 1023, (w & 2047) / 2047], axis=-1)
 
 
-def _unpack_8888(words: Words) -> NDArray[np.float64]:
+def _unpack_8888(words: Words) -> Float:
     """Red, green, blue, alpha [N, 4] in [0, 1]; red is in the highest bits."""
     w = np.asarray(words, dtype=np.uint32)
     return np.stack([(w >> shift & 255) / 255 for shift in (24, 16, 8, 0)], axis=-1)
 
 
-def _unpack_rotation(words: Words) -> NDArray[np.float64]:
+def _unpack_rotation(words: Words) -> Float:
     """Quaternions [N, 4] wxyz.
 
     The highest two bits say which component is largest and left out; the other three follow in
@@ -116,7 +117,7 @@ def _unpack_rotation(words: Words) -> NDArray[np.float64]:
     return quats
 
 
-def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> NDArray[np.float64]:
+def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> Float:
     """Harmonics past the first [N, K - 1, 3]: bytes over [-4, 4], channel by channel."""
     if sh is None:
         return np.empty((count, 0, 3))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...cloud import GaussianCloud
 from ...errors import BundleError
+from ...rotation import Float
 
 SMALLEST_SCALE = 1e-20
 """Scales whose exponential underflows are lifted to this [m], since a scale is positive."""
@@ -48,7 +49,7 @@ def require_properties(
         )
 
 
-def column(path: Path, records: NDArray[np.void], name: str, *, infinite: bool = False) -> NDArray:
+def column(path: Path, records: NDArray[np.void], name: str, *, infinite: bool = False) -> Float:
     """A property [N] of records as float64.
 
     Raises:
@@ -64,7 +65,7 @@ def column(path: Path, records: NDArray[np.void], name: str, *, infinite: bool =
     return values
 
 
-def columns(path: Path, records: NDArray[np.void], names: tuple[str, ...]) -> NDArray[np.float64]:
+def columns(path: Path, records: NDArray[np.void], names: tuple[str, ...]) -> Float:
     """Properties [N, len(names)] of records as finite float64. Raises like :func:`column`."""
     values = np.empty((len(records), len(names)))
     for index, name in enumerate(names):
@@ -75,11 +76,11 @@ def columns(path: Path, records: NDArray[np.void], names: tuple[str, ...]) -> ND
 def build_cloud(
     path: Path,
     *,
-    means: NDArray[np.float64],
-    quats: NDArray[np.float64],
-    log_scales: NDArray[np.float64],
-    opacities: NDArray[np.float64],
-    sh: NDArray[np.float64],
+    means: Float,
+    quats: Float,
+    log_scales: Float,
+    opacities: Float,
+    sh: Float,
 ) -> GaussianCloud:
     """A cloud of parameters as files hold them: quats [N, 4] wxyz of any length, log scales.
 
