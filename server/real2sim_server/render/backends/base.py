@@ -1,0 +1,96 @@
+"""What every rasterizer backend takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..types import Instance, RasterOptions, RenderOutput, Sky
+
+ALPHA_MAX = 0.999
+"""No single Gaussian covers a pixel more than this, so that transmittance stays above 0."""
+ALPHA_MIN = 1.0 / 255.0
+"""Contributions below this are skipped; it also bounds the extent of a Gaussian on screen."""
+TRANSMITTANCE_MIN = 1e-4
+"""A pixel is finished when the next Gaussian would bring its transmittance to this or below."""
+CLAMP_MARGIN = 0.3
+"""x/z and y/z of the projection Jacobian may leave the image by this times tan(fov / 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RasterRequest:
+    """A checked rasterize() call.
+
+    Attributes:
+        instances: what is drawn; order breaks ties of depth.
+        viewmats: [C, 4, 4] float64 torch, ``T_camera_world``.
+        Ks: [C, 3, 3] float64 torch [px].
+        width, height: size of all images [px].
+        sky: what is seen behind everything, or None for ``options.background``.
+        options: the rest.
+    """
+
+    instances: tuple[Instance, ...]
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    sky: Sky | None
+    options: RasterOptions
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras C."""
+        return int(self.viewmats.shape[0])
+
+
+class Backend(Protocol):
+    """One way to rasterize. All members give the same pictures within 1/255."""
+
+    name: str
+
+    def rasterize(self, request: RasterRequest) -> RenderOutput:
+        """Draw the request. Images lie on the device the backend works on."""
+        ...
+
+    def warm_up(self) -> None:
+        """Compile or load whatever the first call would otherwise wait for."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where I instances stand before C cameras; float64, so that only the result is rounded.
+
+    Attributes:
+        linear: [C, I, 3, 3] maps cloud coordinates to the camera frame, scale included.
+        offset: [C, I, 3] position of the clouds' origins in the camera frame [m].
+        camera_position: [C, I, 3] camera centre in the instance's unscaled frame [m]; colours
+            are seen along ``scale * mean - camera_position``.
+        scale: [I, 3].
+    """
+
+    linear: Tensor
+    offset: Tensor
+    camera_position: Tensor
+    scale: Tensor
+
+
+def place_instances(instances: Sequence[Instance], viewmats: Tensor) -> Placement:
+    """Compose ``viewmats`` [C, 4, 4] float64 with the pose and scale of each instance."""
+    like = {"dtype": torch.float64, "device": viewmats.device}
+    identity = torch.eye(4, dtype=torch.float64)
+    poses = [
+        identity if i.T_world_object is None else torch.as_tensor(i.T_world_object)
+        for i in instances
+    ]
+    T_world_object = torch.stack(poses).to(**like) if poses else torch.zeros(0, 4, 4, **like)
+    scale = torch.tensor([i.scale for i in instances], **like).reshape(-1, 3)
+    T_camera_object = viewmats[:, None] @ T_world_object[None]
+    rotation, offset = T_camera_object[..., :3, :3], T_camera_object[..., :3, 3]
+    camera_position = -(rotation.mT @ offset[..., None])[..., 0]
+    return Placement(rotation * scale[None, :, None, :], offset, camera_position, scale)

@@ -1,0 +1,147 @@
+"""Front-to-back blending of the tiles.
+
+Tiles are dealt to tasks by a fixed pattern and share nothing, so any number of threads gives the
+same bits. Numba's disk cache follows the time stamp of this file only, not of cpu_simd.
+"""
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from .cpu_records import (
+    BLUE,
+    DEPTH,
+    EXPONENT_LIMIT,
+    EXTENT_Y,
+    FALLOFF,
+    GREEN,
+    INSTANCE,
+    LEVEL,
+    MEAN_X,
+    MEAN_Y,
+    RED,
+    SHARPNESS,
+    SLOPE,
+    TILE,
+)
+from .cpu_simd import (
+    LANES,
+    PLANES,
+    blend_rgb,
+    blend_rgb_depth,
+    blend_rgb_depth_instance,
+    blend_rgb_instance,
+    prefetch,
+)
+
+TASKS = 64
+"""Tiles are dealt to this many tasks in turn, which spreads dense parts of an image."""
+LOOK_AHEAD = 6
+HALVES = TILE // LANES
+F32 = np.float32
+LIMIT, HALF, LAST_LANE = F32(EXPONENT_LIMIT), F32(0.5), F32(LANES - 1)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, background, images):
+    """Blend tiles [first_tile, last_tile) into Images.
+
+    Args:
+        values: [M, RECORD] float32.
+        lists: record indices by tile, near to far.
+        starts: [tiles + 1] int64, where the list of each tile starts.
+        background: [3] float32.
+    """
+    extras = (1 if images.depth.shape[0] else 0) + (2 if images.instance.shape[0] else 0)
+    # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
+    rgb, alpha, depth, instance = images.rgb, images.alpha, images.depth, images.instance
+    for task in prange(TASKS):
+        pixels = np.empty(TILE * HALVES * PLANES * LANES, np.float32)
+        for tile in range(first_tile + task, last_tile, TASKS):
+            x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+            going = open_tile(pixels, x0, y0, alpha.shape)
+            members = lists[starts[tile] : starts[tile + 1]]
+            blend_tile(values, members, F32(x0), F32(y0), pixels, going, extras)
+            write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance)
+
+
+@njit(inline="always")
+def open_tile(pixels, x0, y0, shape):
+    """Clear the state; finish pixels outside the image. Returns a bit for each open half row."""
+    pixels[:] = 0
+    alive = np.int64(0)
+    for row in range(min(TILE, shape[0] - y0)):
+        for column in range(min(TILE, shape[1] - x0)):
+            half = row * HALVES + column // LANES
+            pixels[half * PLANES * LANES + column % LANES] = 1
+            alive |= np.int64(1) << half
+    return alive
+
+
+@njit(error_model="numpy")
+def blend_tile(values, members, x0, y0, pixels, alive, extras):
+    """Blend records near to far until the list ends or every pixel is finished."""
+    for position in range(members.shape[0]):
+        prefetch(values, np.int64(members[min(position + LOOK_AHEAD, members.shape[0] - 1)]))
+        record = values[members[position]]
+        top = record[MEAN_Y] - record[EXTENT_Y] - y0
+        bottom = record[MEAN_Y] + record[EXTENT_Y] - y0
+        first = np.int64(max(top + HALF, F32(0)))
+        last = np.int64(min(bottom + HALF, F32(TILE)))
+        for row in range(first, last):
+            dy = F32(row) + HALF + y0 - record[MEAN_Y]
+            rest = record[FALLOFF] * dy * dy + record[LEVEL]
+            offset = x0 + HALF - record[MEAN_X] - record[SLOPE] * dy
+            for side in range(HALVES):
+                half = row * HALVES + side
+                start = offset + F32(side * LANES)
+                gap = max(start, -start - LAST_LANE, F32(0)) * record[SHARPNESS]
+                if (alive >> half) & 1 and gap * gap + rest <= LIMIT:
+                    going = blend_half(pixels, half, record, start, rest, extras)
+                    alive &= ~(np.int64(going == 0) << half)
+        if alive == 0:
+            break
+
+
+@njit(inline="always")
+def blend_half(pixels, half, record, start, rest, extras):
+    """Blend one record over eight pixels; zero when all of them are finished."""
+    sharpness, depth, instance = record[SHARPNESS], record[DEPTH], record[INSTANCE]
+    red, green, blue = record[RED], record[GREEN], record[BLUE]
+    if extras == 3:
+        return blend_rgb_depth_instance(
+            pixels, half, sharpness, start, rest, red, green, blue, depth, instance
+        )
+    if extras == 1:
+        return blend_rgb_depth(
+            pixels, half, sharpness, start, rest, red, green, blue, depth, instance
+        )
+    if extras == 2:
+        return blend_rgb_instance(
+            pixels, half, sharpness, start, rest, red, green, blue, depth, instance
+        )
+    return blend_rgb(pixels, half, sharpness, start, rest, red, green, blue, depth, instance)
+
+
+@njit(inline="always", error_model="numpy")
+def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
+    """Put the background behind the tile and write it to the"""
+    height, width = alpha.shape
+    for row in range(min(TILE, height - y0)):
+        for column in range(min(TILE, width - x0)):
+            p = (row * HALVES + column // LANES) * PLANES * LANES + column % LANES
+            y, x = y0 + row, x0 + column
+            left = abs(pixels[p])
+            alpha[y, x] = F32(1) - left
+            for channel in range(3):
+                seen = pixels[p + (1 + channel) * LANES]
+                rgb[y, x, channel] = seen + left * background[channel]
+            if depth.shape[0]:
+                total = F32(1) - left
+                depth[y, x] = pixels[p + 4 * LANES] / total if total > 0 else F32(0)
+            if instance.shape[0]:
+                instance[y, x] = np.uint16(pixels[p + 5 * LANES])

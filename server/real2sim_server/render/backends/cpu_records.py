@@ -1,0 +1,98 @@
+"""What the CPU kernels hand to each other."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+CHUNK = 2048
+"""Gaussians that one task projects; also the size of a chunk's region of records."""
+TILE = 16
+"""Edge length of a tile [px]."""
+RECORD = 16
+"""float32 values of a record: one cache line for each Gaussian that may be seen."""
+
+MEAN_X, MEAN_Y = 0, 1
+"""Centre on the image [px]."""
+SHARPNESS, SLOPE, FALLOFF = 2, 3, 4
+"""exponent = (SHARPNESS (x - MEAN_X - SLOPE dy))^2 + FALLOFF dy^2 + LEVEL with dy = y - MEAN_Y.
+
+The Cholesky form of the conic: a sum of squares keeps its precision for needles, where
+a dx^2 + 2 b dx dy + c dy^2 loses all digits.
+"""
+LEVEL = 5
+"""-ln(opacity) in EXPONENT_UNIT."""
+RED, GREEN, BLUE, DEPTH, INSTANCE = 6, 7, 8, 9, 10
+"""Colour, depth of the centre [m], instance id as a float."""
+EXTENT_X, EXTENT_Y, TIP_Y = 11, 12, 13
+"""Half-size of the bounding box of alpha >= 1/255 [px]; dy of its rightmost point [px]."""
+
+EXPONENT_UNIT = 16.0
+"""Exponents are stored over this: exp(-s) = polynomial(s / 16)^16."""
+EXPONENT_LIMIT = math.log(255.0) / EXPONENT_UNIT
+"""Beyond this alpha is below 1/255."""
+
+
+class Cluster(NamedTuple):
+    """Arrays of one cloud, float32 and contiguous; ``covars`` is [0, 3, 3] where not given."""
+
+    means: NDArray[np.float32]
+    quats: NDArray[np.float32]
+    scales: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+    sh: NDArray[np.float32]
+    covars: NDArray[np.float32]
+    linear: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    camera_position: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    instance_id: np.float32
+
+
+class View(NamedTuple):
+    """Camera and options as float32 numbers; see Camera and RasterOptions."""
+
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+    width: np.float32
+    height: np.float32
+    near_plane: np.float32
+    far_plane: np.float32
+    eps2d: np.float32
+    radius_clip: np.float32
+    antialiased: np.float32
+
+
+class Records(NamedTuple):
+    """Gaussians on the image plane. Each chunk of CHUNK fills its region from the start.
+
+    Attributes:
+        values: [M, RECORD] float32.
+        depths: [M] float32, depth of the centres [m].
+        counts: [M / CHUNK] int64, records in use of each region.
+    """
+
+    values: NDArray[np.float32]
+    depths: NDArray[np.float32]
+    counts: NDArray[np.int64]
+
+
+class Images(NamedTuple):
+    """Pictures of one camera; ``depth`` and ``instance`` are [0, 0] where not asked for.
+
+    Attributes:
+        rgb: [H, W, 3] float32.
+        alpha: [H, W] float32.
+        depth: [H, W] float32 [m].
+        instance: [H, W] uint16.
+    """
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    instance: NDArray[np.uint16]

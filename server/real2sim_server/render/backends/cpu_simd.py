@@ -1,0 +1,203 @@
+"""The innermost step of blending as explicit vector code: one record over eight pixels.
+
+LLVM's loop vectoriser needs checks for overlapping arrays that cost more than a row of pixels, so
+the eight lanes are spelled out as LLVM vectors. They run as one AVX register, as two SSE or NEON
+registers where those are all there is, and give the same bits in each case as long as the machine
+has fused multiply-add.
+
+State of eight pixels is PLANES vectors in a row: transmittance (negative once finished), red,
+green, blue, depth, instance. After editing, remove the cached kernels of cpu_blend.
+"""
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from .base import ALPHA_MAX, TRANSMITTANCE_MIN
+from .cpu_records import EXPONENT_LIMIT, EXPONENT_UNIT
+
+LANES = 8
+PLANES = 6
+FLOAT = ir.FloatType()
+VECTOR = ir.VectorType(FLOAT, LANES)
+
+
+def _exponential_coefficients(degree: int) -> list[float]:
+    """Coefficients, constant first, of a polynomial near exp(-u) on [0, EXPONENT_LIMIT].
+
+    Interpolates at Chebyshev nodes; with degree 4 the sixteenth power is right to 2e-6.
+    """
+    nodes = np.cos((2 * np.arange(degree + 1) + 1) / (2 * degree + 2) * np.pi)
+    nodes = (nodes + 1) / 2 * EXPONENT_LIMIT
+    return [float(c) for c in np.polynomial.polynomial.polyfit(nodes, np.exp(-nodes), degree)]
+
+
+EXPONENTIAL = _exponential_coefficients(4)
+SQUARINGS = int(np.log2(EXPONENT_UNIT))
+
+
+class _Lanes:
+    """Eight floats in a function under construction, so that formulas read like formulas."""
+
+    def __init__(self, builder: ir.IRBuilder, value: Any) -> None:
+        self.builder = builder
+        self.value = value
+
+    def _lift(self, other: _Lanes | float) -> Any:
+        if isinstance(other, _Lanes):
+            return other.value
+        return ir.Constant(VECTOR, [float(np.float32(other))] * LANES)
+
+    def __add__(self, other: _Lanes | float) -> _Lanes:
+        return _Lanes(self.builder, self.builder.fadd(self.value, self._lift(other)))
+
+    def __sub__(self, other: _Lanes | float) -> _Lanes:
+        return _Lanes(self.builder, self.builder.fsub(self.value, self._lift(other)))
+
+    def __mul__(self, other: _Lanes | float) -> _Lanes:
+        return _Lanes(self.builder, self.builder.fmul(self.value, self._lift(other)))
+
+    def __neg__(self) -> _Lanes:
+        return _Lanes(self.builder, self.builder.fneg(self.value))
+
+    def fused(self, factor: _Lanes | float, addend: _Lanes | float) -> _Lanes:
+        """self * factor + addend, rounded once where the machine can."""
+        return self._call("llvm.fmuladd", self._lift(factor), self._lift(addend))
+
+    def magnitude(self) -> _Lanes:
+        """Absolute value."""
+        return self._call("llvm.fabs")
+
+    def _call(self, intrinsic_name: str, *others: Any) -> _Lanes:
+        kind = ir.FunctionType(VECTOR, [VECTOR] * (1 + len(others)))
+        function = cgutils.get_or_insert_function(
+            self.builder.module, kind, f"{intrinsic_name}.v{LANES}f32"
+        )
+        return _Lanes(self.builder, self.builder.call(function, [self.value, *others]))
+
+    def compare(self, operator: str, other: _Lanes | float) -> Any:
+        """Mask of eight bits; false for NaN."""
+        return self.builder.fcmp_ordered(operator, self.value, self._lift(other))
+
+    def where(self, mask: Any, other: _Lanes | float) -> _Lanes:
+        """Self where ``mask`` holds, else ``other``."""
+        return _Lanes(self.builder, self.builder.select(mask, self.value, self._lift(other)))
+
+
+class _PixelState:
+    """The state vectors of eight pixels in memory."""
+
+    def __init__(self, builder: ir.IRBuilder, data: Any, half: Any) -> None:
+        self.builder = builder
+        first = builder.mul(half, ir.Constant(half.type, PLANES * LANES))
+        self.pointer = builder.gep(data, [first], source_etype=FLOAT)
+
+    def _plane(self, index: int) -> Any:
+        offset = ir.Constant(ir.IntType(64), index * LANES)
+        plane = self.builder.gep(self.pointer, [offset], source_etype=FLOAT)
+        return self.builder.bitcast(plane, VECTOR.as_pointer())
+
+    def load(self, index: int) -> _Lanes:
+        """Vector of a plane."""
+        value = self.builder.load(self._plane(index), typ=VECTOR, align=4)
+        return _Lanes(self.builder, value)
+
+    def store(self, index: int, lanes: _Lanes) -> None:
+        """Write a plane."""
+        self.builder.store(lanes.value, self._plane(index), align=4)
+
+
+def _splat(builder: ir.IRBuilder, scalar: Any) -> _Lanes:
+    undefined = ir.Constant(VECTOR, ir.Undefined)
+    zero = ir.Constant(ir.IntType(32), 0)
+    single = builder.insert_element(undefined, scalar, zero)
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return _Lanes(builder, builder.shuffle_vector(single, undefined, mask))
+
+
+def _build_blend(builder: ir.IRBuilder, state: _PixelState, scalars: list[Any], extras: int) -> Any:
+    """Emit the blending of one record; returns eight bits, set where a pixel goes on."""
+    sharpness, offset, rest, *values = (_splat(builder, scalar) for scalar in scalars)
+    lanes = _Lanes(builder, ir.Constant(VECTOR, [float(i) for i in range(LANES)]))
+    distance = (lanes + offset) * sharpness
+    exponent = distance.fused(distance, rest)
+    alpha = _Lanes(builder, ir.Constant(VECTOR, [EXPONENTIAL[-1]] * LANES))
+    for coefficient in EXPONENTIAL[-2::-1]:
+        alpha = alpha.fused(exponent, coefficient)
+    for _ in range(SQUARINGS):
+        alpha = alpha * alpha
+    alpha = alpha.where(alpha.compare("<", ALPHA_MAX), ALPHA_MAX)
+
+    before = state.load(0)
+    weight = alpha * before
+    after = before - weight
+    touched = exponent.compare("<=", EXPONENT_LIMIT)
+    goes_on = after.compare(">", TRANSMITTANCE_MIN)
+    blended = builder.and_(touched, goes_on)
+    finished = (-before.magnitude()).where(touched, before)
+    new = after.where(blended, finished)
+    weight = weight.where(blended, 0.0)
+    state.store(0, new)
+    for plane, value in enumerate(values[: 3 + (extras & 1)], start=1):
+        state.store(plane, weight.fused(value, state.load(plane)))
+    if extras & 2:
+        crossing = builder.and_(
+            blended, builder.and_(before.compare(">", 0.5), after.compare("<=", 0.5))
+        )
+        state.store(5, values[-1].where(crossing, state.load(5)))
+    mask = builder.bitcast(new.compare(">", 0.0), ir.IntType(LANES))
+    return builder.zext(mask, ir.IntType(64))
+
+
+def _blend_intrinsic(extras: int) -> Any:
+    """The intrinsic for RGB (0), with depth (+1), with instance (+2).
+
+    In kernels: blend(pixels, half, sharpness, offset, rest, red, green, blue, depth, instance)
+    with exponent = (sharpness (lane + offset))^2 + rest; returns zero when all are finished.
+    """
+
+    def blend(  # type: ignore[no-untyped-def]
+        typingctx, pixels, half, sharpness, offset, rest, red, green, blue, depth, instance
+    ):
+        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+            state = _PixelState(builder, array.data, arguments[1])
+            return _build_blend(builder, state, list(arguments[2:]), extras)
+
+        floats = (types.float32,) * 8
+        return types.int64(pixels, types.int64, *floats), generate
+
+    return intrinsic(blend)
+
+
+blend_rgb = _blend_intrinsic(0)
+blend_rgb_depth = _blend_intrinsic(1)
+blend_rgb_instance = _blend_intrinsic(2)
+blend_rgb_depth_instance = _blend_intrinsic(3)
+
+
+@intrinsic
+def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
+    """Ask for the cache line of ``array[index]`` (2-D float32) without waiting for it."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        values = context.make_array(signature.args[0])(context, builder, arguments[0])
+        stride = cgutils.unpack_tuple(builder, values.shape)[1]
+        position = builder.mul(arguments[1], stride)
+        pointer = builder.gep(values.data, [position], source_etype=FLOAT)
+        i32 = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [pointer, i32(0), i32(3), i32(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate

@@ -1,0 +1,72 @@
+"""The sky behind the picture: the twin of Sky.sample in Numba."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+F32 = np.float32
+ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
+OPAQUE = F32(1 - 1e-5)
+"""Nothing of the sky is seen through alpha at or above this."""
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def add_sky(faces, matrix, rgb, alpha):
+    """Add ``(1 - alpha) * sky`` to ``rgb``.
+
+    Args:
+        faces: [6, R, R, 3] float32, as in Sky.
+        matrix: [3, 3] float32 ``R_world_camera K^-1``, maps (x, y, 1) [px] to directions.
+        rgb: [H, W, 3] float32, added to.
+        alpha: [H, W] float32.
+    """
+    height, width = alpha.shape
+    for row in prange(height):
+        y = F32(row) + HALF
+        for column in range(width):
+            if alpha[row, column] < OPAQUE:
+                x = F32(column) + HALF
+                direction = (
+                    x * matrix[0, 0] + y * matrix[0, 1] + matrix[0, 2],
+                    x * matrix[1, 0] + y * matrix[1, 1] + matrix[1, 2],
+                    x * matrix[2, 0] + y * matrix[2, 1] + matrix[2, 2],
+                )
+                add_sample(faces, direction, ONE - alpha[row, column], rgb[row, column])
+
+
+@njit(inline="always", error_model="numpy")
+def add_sample(faces, direction, weight, color):
+    """Add the bilinear sample along ``direction`` times ``weight`` to ``color`` [3]."""
+    size = faces.shape[1]
+    face, u, v = face_coordinates(direction)
+    limit = F32(size - 1)
+    column = min(max((u + ONE) / F32(2) * F32(size) - HALF, ZERO), limit)
+    row = min(max((v + ONE) / F32(2) * F32(size) - HALF, ZERO), limit)
+    c0, r0 = np.int64(math.floor(column)), np.int64(math.floor(row))
+    c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
+    fc, fr = column - F32(c0), row - F32(r0)
+    for k in range(3):
+        top = faces[face, r0, c0, k] * (ONE - fc) + faces[face, r0, c1, k] * fc
+        bottom = faces[face, r1, c0, k] * (ONE - fc) + faces[face, r1, c1, k] * fc
+        color[k] += weight * (top * (ONE - fr) + bottom * fr)
+
+
+@njit(inline="always", error_model="numpy")
+def face_coordinates(direction):
+    """Face index and u, v in [-1, 1]; see scene.sky.face_coordinates."""
+    x, y, z = direction
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        if x > ZERO:
+            return 0, -y / ax, -z / ax
+        return 1, y / ax, -z / ax
+    if ay >= az:
+        if y > ZERO:
+            return 2, x / ay, -z / ay
+        return 3, -x / ay, -z / ay
+    if z > ZERO:
+        return 4, -y / az, x / az
+    return 5, -y / az, -x / az

@@ -1,0 +1,256 @@
+"""The plain torch rasterizer: slow, obvious, differentiable. The oracle of the others.
+
+Semantics are those of gsplat 1.5.3 ``rasterization`` (classic EWA splatting, Zwicker et al. 2001;
+Kerbl et al. 2023), except that depths are compared after rounding the float64 depth to float32.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..types import Instance, RenderOutput
+from .base import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    CLAMP_MARGIN,
+    TRANSMITTANCE_MIN,
+    Placement,
+    RasterRequest,
+    place_instances,
+)
+from .spherical_harmonics import evaluate_sh
+
+TILE = 32
+
+
+class ReferenceBackend:
+    """Plain torch on the CPU; gradients flow to clouds, covariances and view matrices.
+
+    Args:
+        dtype: float32 or float64 of everything after placement.
+    """
+
+    name = "reference"
+
+    def __init__(self, dtype: torch.dtype = torch.float64) -> None:
+        self.dtype = dtype
+
+    def warm_up(self) -> None:
+        """Nothing to compile."""
+
+    def rasterize(self, request: RasterRequest) -> RenderOutput:
+        """Draw one camera after the other, tile by tile."""
+        start = time.perf_counter()
+        placement = place_instances(request.instances, request.viewmats)
+        images = [self._camera(request, placement, c) for c in range(request.cameras)]
+        rgb, alpha, depth, instance = (
+            torch.stack([image[k] for image in images]) for k in range(4)
+        )
+        options = request.options
+        return RenderOutput(
+            rgb=rgb.float(),
+            alpha=alpha.float(),
+            depth=depth.float() if options.depth else None,
+            instance=instance.to(torch.uint16) if options.instance else None,
+            timing_ms={"total": (time.perf_counter() - start) * 1e3},
+        )
+
+    def _camera(
+        self, request: RasterRequest, placement: Placement, camera: int
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        splats = _concatenate(
+            [
+                _project(request, placement, camera, index, self.dtype)
+                for index in range(len(request.instances))
+            ],
+            self.dtype,
+        )
+        splats = splats.select(torch.argsort(splats.depth_key, stable=True))
+        images = _blend_image(splats, request.width, request.height)
+        behind = _behind(request, camera, self.dtype)
+        rgb = images[0] + (1 - images[1])[..., None] * behind
+        return rgb, *images[1:]
+
+
+@dataclass(frozen=True, eq=False)
+class _Splats:
+    """Gaussians on the image plane: V of them, in the order of blending once sorted."""
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    colors: Tensor
+    depths: Tensor
+    depth_key: Tensor
+    extents: Tensor
+    instance_ids: Tensor
+
+    def select(self, index: Tensor) -> _Splats:
+        return _Splats(*(tensor[index] for tensor in vars(self).values()))
+
+
+def _concatenate(parts: list[_Splats], dtype: torch.dtype) -> _Splats:
+    if not parts:
+        shapes = ((0, 2), (0, 3), (0,), (0, 3), (0,), (0,), (0, 2), (0,))
+        return _Splats(*(torch.zeros(shape, dtype=dtype) for shape in shapes))
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return _Splats(*(torch.cat(column) for column in columns))
+
+
+def _project(
+    request: RasterRequest, placement: Placement, camera: int, index: int, dtype: torch.dtype
+) -> _Splats:
+    """Gaussians of one instance that may touch the image of one camera."""
+    instance, options = request.instances[index], request.options
+    cloud = instance.cloud
+    linear64, offset64 = placement.linear[camera, index], placement.offset[camera, index]
+    means64 = cloud.means.double()
+    depths64 = (linear64[2, 0] * means64[:, 0] + linear64[2, 1] * means64[:, 1]) + linear64[
+        2, 2
+    ] * means64[:, 2]
+    depths64 = depths64 + offset64[2]
+    depth_key = depths64.detach().float()
+    in_range = (depth_key >= options.near_plane) & (depth_key <= options.far_plane)
+
+    linear = linear64.to(dtype)
+    means = (means64 @ linear64.mT + offset64).to(dtype)
+    covars = linear @ _covariances(instance, dtype) @ linear.mT
+    K = request.Ks[camera].to(dtype)
+    z = torch.where(in_range, means[:, 2], 1.0)
+    means2d = torch.stack(
+        [K[0, 0] * means[:, 0] / z + K[0, 2], K[1, 1] * means[:, 1] / z + K[1, 2]], dim=-1
+    )
+    jacobian = _jacobian(means, z, K, request.width, request.height)
+    sharp = jacobian @ covars @ jacobian.mT
+    blurred = sharp + options.eps2d * torch.eye(2, dtype=dtype)
+    determinant = torch.linalg.det(blurred)
+    opacities = cloud.opacities.to(dtype)
+    if options.rasterize_mode == "antialiased":
+        ratio = torch.linalg.det(sharp).clamp(min=0) / determinant
+        opacities = opacities * ratio.clamp(min=1e-30).sqrt()
+
+    reach = (2 * (opacities.detach() / ALPHA_MIN).clamp(min=1).log()).sqrt()
+    extents = reach[:, None] * blurred.detach().diagonal(dim1=-2, dim2=-1).sqrt()
+    large = (extents.ceil() > options.radius_clip).any(-1)
+    kept = in_range & (determinant > 0) & (opacities >= ALPHA_MIN) & large
+    conics = torch.stack([blurred[:, 1, 1], -blurred[:, 0, 1], blurred[:, 0, 0]], dim=-1)
+    directions = means64 * placement.scale[index] - placement.camera_position[camera, index]
+    splats = _Splats(
+        means2d=means2d,
+        conics=conics / determinant[:, None],
+        opacities=opacities,
+        colors=(evaluate_sh(cloud.sh.to(dtype), directions.to(dtype)) + 0.5).clamp(min=0),
+        depths=means[:, 2],
+        depth_key=depth_key,
+        extents=extents,
+        instance_ids=torch.full((len(cloud),), instance.instance_id),
+    )
+    return splats.select(kept.nonzero()[:, 0])
+
+
+def _covariances(instance: Instance, dtype: torch.dtype) -> Tensor:
+    """Covariances [N, 3, 3] in the cloud's frame."""
+    if instance.covars is not None:
+        return instance.covars.to(dtype)
+    quats = torch.nn.functional.normalize(instance.cloud.quats.to(dtype), dim=-1)
+    w, x, y, z = quats.unbind(-1)
+    rotation = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        dim=-2,
+    )
+    factor = rotation * instance.cloud.scales.to(dtype)[:, None, :]
+    return factor @ factor.mT
+
+
+def _jacobian(means: Tensor, z: Tensor, K: Tensor, width: int, height: int) -> Tensor:
+    """Jacobians [N, 2, 3] of the pinhole projection, its angles clamped near the image."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = CLAMP_MARGIN * 0.5 * width / fx, CLAMP_MARGIN * 0.5 * height / fy
+    tx = (means[:, 0] / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
+    ty = (means[:, 1] / z).clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    return torch.stack(
+        [
+            torch.stack([fx / z, zero, -fx * tx / z], -1),
+            torch.stack([zero, fy / z, -fy * ty / z], -1),
+        ],
+        dim=-2,
+    )
+
+
+def _blend_image(splats: _Splats, width: int, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """RGB without background, alpha, depth and instance of the whole image, from square tiles."""
+    rows = []
+    for y0 in range(0, height, TILE):
+        y1 = min(y0 + TILE, height)
+        touches_rows = _overlaps(splats, 1, y0, y1)
+        tiles = []
+        for x0 in range(0, width, TILE):
+            x1 = min(x0 + TILE, width)
+            touching = splats.select((touches_rows & _overlaps(splats, 0, x0, x1)).nonzero()[:, 0])
+            tiles.append(_blend_pixels(touching, x0, x1, y0, y1))
+        rows.append([torch.cat(column, dim=1) for column in zip(*tiles, strict=True)])
+    rgb, alpha, depth, instance = (torch.cat(c, dim=0) for c in zip(*rows, strict=True))
+    return rgb, alpha, depth, instance
+
+
+def _overlaps(splats: _Splats, axis: int, low: int, high: int) -> Tensor:
+    centre, extent = splats.means2d[:, axis].detach(), splats.extents[:, axis]
+    return (centre + extent >= low) & (centre - extent <= high)
+
+
+def _blend_pixels(
+    splats: _Splats, x0: int, x1: int, y0: int, y1: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Front-to-back blending of sorted splats in the pixels [y0, y1) x [x0, x1)."""
+    dtype, size = splats.means2d.dtype, (y1 - y0, x1 - x0)
+    py, px = torch.meshgrid(
+        torch.arange(y0, y1, dtype=dtype) + 0.5,
+        torch.arange(x0, x1, dtype=dtype) + 0.5,
+        indexing="ij",
+    )
+    dx = px.reshape(1, -1) - splats.means2d[:, :1]
+    dy = py.reshape(1, -1) - splats.means2d[:, 1:]
+    a, b, c = splats.conics[:, 0:1], splats.conics[:, 1:2], splats.conics[:, 2:3]
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+    alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0.0)
+
+    after = torch.cumprod(1 - alpha, dim=0)
+    alpha = torch.where(after > TRANSMITTANCE_MIN, alpha, 0.0)
+    after = torch.cumprod(1 - alpha, dim=0)
+    before = torch.cat([torch.ones(1, after.shape[1], dtype=dtype), after[:-1]])[: len(after)]
+    weights = alpha * before
+    total = 1 - torch.prod(1 - alpha, dim=0)
+    rgb = weights.mT @ splats.colors
+    depth = (weights.mT @ splats.depths) / torch.where(total > 0, total, 1.0)
+
+    crossing = (before > 0.5) & (after <= 0.5)
+    instance = (crossing * splats.instance_ids[:, None]).sum(0)
+    return rgb.reshape(*size, 3), total.reshape(size), depth.reshape(size), instance.reshape(size)
+
+
+def _behind(request: RasterRequest, camera: int, dtype: torch.dtype) -> Tensor:
+    """Colour behind everything, [3] or [H, W, 3]."""
+    if request.sky is None:
+        return torch.tensor(request.options.background, dtype=dtype)
+    return request.sky.sample(pixel_directions(request, camera)).to(dtype)
+
+
+def pixel_directions(request: RasterRequest, camera: int) -> Tensor:
+    """World directions [H, W, 3] float32 of pixel centres: ``R_world_camera K^-1 (x, y, 1)``."""
+    rotation = request.viewmats[camera, :3, :3].detach()
+    matrix = (rotation.mT @ torch.linalg.inv(request.Ks[camera])).float()
+    x = torch.arange(request.width, dtype=torch.float32) + 0.5
+    y = torch.arange(request.height, dtype=torch.float32) + 0.5
+    along_x = x[None, :, None] * matrix[:, 0]
+    along_y = y[:, None, None] * matrix[:, 1]
+    return (along_x + along_y) + matrix[:, 2]

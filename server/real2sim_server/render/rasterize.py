@@ -1,0 +1,160 @@
+"""The one call that turns Gaussians into pictures."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from ..scene import GaussianCloud
+from ..scene.rotation import is_rotation
+from .backends.base import Backend, RasterRequest
+from .backends.select import select_backend
+from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
+
+DEFAULT_OPTIONS = RasterOptions()
+RASTERIZE_MODES = ("classic", "antialiased")
+MAX_IMAGE_SIZE = 16_384
+MAX_INSTANCE_ID = 65_535
+
+_checked_clouds: weakref.WeakSet[GaussianCloud] = weakref.WeakSet()
+
+
+def rasterize(
+    instances: Sequence[Instance],
+    viewmats: Tensor | ArrayLike,
+    Ks: Tensor | ArrayLike,
+    width: int,
+    height: int,
+    *,
+    sky: Sky | None = None,
+    options: RasterOptions = DEFAULT_OPTIONS,
+    backend: str | Backend = "auto",
+) -> RenderOutput:
+    """Draw instances from C cameras of one size, with the semantics of gsplat 1.5.3.
+
+    Gaussians are projected by the local affine approximation (EWA, Zwicker et al. 2001), sorted
+    by the depth of their centres (ties keep list order) and blended front to back
+    (Kerbl et al. 2023). Pixel centres lie at +0.5.
+
+    Args:
+        instances: clusters with their poses; the first of two at the same depth is in front.
+        viewmats: [C, 4, 4] ``T_camera_world``, rigid; cameras are OpenCV (x right, y down,
+            z forward).
+        Ks: [C, 3, 3] intrinsics [px], without skew.
+        width, height: size of all C images [px].
+        sky: behind everything, in place of ``options.background``.
+        options: planes, blur, mode and which images are made.
+        backend: ``auto``, ``cpu``, ``cuda``, ``reference``, or a Backend.
+
+    Raises:
+        RenderError: for anything that is not as said above; nothing is drawn then.
+    """
+    request = RasterRequest(
+        instances=tuple(instances),
+        viewmats=_float64(viewmats, "viewmats", (4, 4)),
+        Ks=_float64(Ks, "Ks", (3, 3)),
+        width=width,
+        height=height,
+        sky=sky,
+        options=options,
+    )
+    _check_cameras(request)
+    _check_options(options)
+    for index, instance in enumerate(request.instances):
+        _check_instance(index, instance)
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    return chosen.rasterize(request)
+
+
+def _float64(values: Tensor | ArrayLike, name: str, matrix: tuple[int, int]) -> Tensor:
+    tensor = torch.as_tensor(values, dtype=torch.float64)
+    if tensor.ndim != 3 or tuple(tensor.shape[1:]) != matrix:
+        raise RenderError(f"{name} must be [C, {matrix[0]}, {matrix[1]}], not {list(tensor.shape)}")
+    if not torch.isfinite(tensor).all():
+        raise RenderError(f"{name} hold values that are not finite")
+    return tensor
+
+
+def _check_cameras(request: RasterRequest) -> None:
+    if len(request.Ks) != request.cameras:
+        raise RenderError(f"{request.cameras} viewmats but {len(request.Ks)} Ks; give one each")
+    for name, size in (("width", request.width), ("height", request.height)):
+        if not 1 <= size <= MAX_IMAGE_SIZE:
+            raise RenderError(f"{name} must be 1 to {MAX_IMAGE_SIZE} px, not {size!r}")
+    for index in range(request.cameras):
+        _check_rigid(request.viewmats[index].detach().cpu().numpy(), f"viewmats[{index}]")
+        K = request.Ks[index].detach().cpu().numpy()
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise RenderError(f"Ks[{index}] must have positive focal lengths, not {K.tolist()}")
+        if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], (0, 0, 1)):
+            raise RenderError(
+                f"Ks[{index}] must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], not {K.tolist()}"
+            )
+
+
+def _check_rigid(matrix: np.ndarray, name: str) -> None:
+    if matrix.shape != (4, 4):
+        raise RenderError(f"{name} must be [4, 4], not {list(matrix.shape)}")
+    bottom = np.array_equal(matrix[3], (0, 0, 0, 1))
+    if not np.isfinite(matrix).all() or not bottom or not is_rotation(matrix[:3, :3]):
+        raise RenderError(f"{name} must be a rigid transform, not {matrix.tolist()}")
+
+
+def _check_options(options: RasterOptions) -> None:
+    if options.rasterize_mode not in RASTERIZE_MODES:
+        raise RenderError(
+            f"rasterize_mode must be one of {list(RASTERIZE_MODES)}, not {options.rasterize_mode!r}"
+        )
+    if not 0 < options.near_plane < options.far_plane:
+        raise RenderError(
+            "near_plane and far_plane must be positive and increase, "
+            f"not {options.near_plane!r} and {options.far_plane!r}"
+        )
+    for name in ("eps2d", "radius_clip"):
+        if not 0 <= getattr(options, name) < np.inf:
+            raise RenderError(f"{name} must be finite and >= 0, not {getattr(options, name)!r}")
+    if not np.isfinite(options.background).all() or len(options.background) != 3:
+        raise RenderError(f"background must be three finite numbers, not {options.background!r}")
+
+
+def _check_instance(index: int, instance: Instance) -> None:
+    name = f"instances[{index}]"
+    if instance.T_world_object is not None:
+        _check_rigid(np.asarray(instance.T_world_object), f"{name}.T_world_object")
+    if not 0 <= instance.instance_id <= MAX_INSTANCE_ID:
+        raise RenderError(
+            f"{name}.instance_id must be 0 to {MAX_INSTANCE_ID}, not {instance.instance_id!r}"
+        )
+    scale = np.asarray(instance.scale, dtype=np.float64)
+    if scale.shape != (3,) or not np.isfinite(scale).all() or (scale <= 0).any():
+        raise RenderError(f"{name}.scale must be three positive numbers, not {instance.scale!r}")
+    if instance.covars is not None:
+        expected = (len(instance.cloud), 3, 3)
+        if tuple(instance.covars.shape) != expected or instance.covars.dtype != torch.float32:
+            raise RenderError(
+                f"{name}.covars must be {list(expected)} float32, "
+                f"not {list(instance.covars.shape)} {instance.covars.dtype}"
+            )
+        if not torch.isfinite(instance.covars).all():
+            raise RenderError(f"{name}.covars hold values that are not finite")
+    if instance.cloud not in _checked_clouds:
+        _check_cloud(instance.cloud, f"{name}.cloud")
+        _checked_clouds.add(instance.cloud)
+
+
+def _check_cloud(cloud: GaussianCloud, name: str) -> None:
+    """Values of a cloud; once for each cloud, since clouds are immutable."""
+    for part in ("means", "quats", "scales", "opacities", "sh"):
+        finite = torch.isfinite(getattr(cloud, part).detach())
+        if not finite.all():
+            row = int((~finite).reshape(len(cloud), -1).any(1).nonzero()[0])
+            raise RenderError(f"{name}.{part} of Gaussian {row} is not finite; drop it first")
+    if (cloud.scales < 0).any():
+        raise RenderError(f"{name}.scales must be linear and >= 0; were logarithms given?")
+    if ((cloud.opacities < 0) | (cloud.opacities > 1)).any():
+        raise RenderError(f"{name}.opacities must lie in [0, 1]; were logits given?")
