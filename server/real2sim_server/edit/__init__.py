@@ -1,0 +1,26 @@
+"""Edits: typed operations onto objects, and scenarios as append-only logs of them."""
+
+from .apply import EditOutcome, advance, apply_operations
+from .compose import compose, instances_at
+from .errors import EditError
+from .review import GroundHeight
+from .scenario import LogEntry, Planned, Scenario
+from .state import ObjectState, ScenarioState
+from .tracks import PackedTracks, Placed
+
+__all__ = [
+    "EditError",
+    "EditOutcome",
+    "GroundHeight",
+    "LogEntry",
+    "ObjectState",
+    "PackedTracks",
+    "Placed",
+    "Planned",
+    "Scenario",
+    "ScenarioState",
+    "advance",
+    "apply_operations",
+    "compose",
+    "instances_at",
+]

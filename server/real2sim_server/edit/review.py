@@ -1,0 +1,123 @@
+"""What a person should look at after an edit: overlaps, floating objects, objects far outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.scenarios import EditWarning
+
+from ..scene.box import box_corners, boxes_overlap
+from .state import ObjectState, ScenarioState
+from .tracks import Float, sample
+
+GroundHeight = Callable[[Float], Float]
+"""Ground height [S] [m] below points [S, 2] of the world."""
+
+SAMPLE_PERIOD_US = 100_000
+MAX_SAMPLES = 201
+OFF_GROUND = 0.3
+"""A box bottom this much higher or lower above ground than in the recording is reported [m]."""
+
+OUTSIDE_MAP = 100.0
+"""An object this far outside the rectangle that the recording reached is reported [m]."""
+
+NAMED_OVERLAPS = 5
+
+
+def review(
+    state: ScenarioState, touched: Sequence[str], *, ground: GroundHeight | None = None
+) -> Iterator[EditWarning]:
+    """Warnings about the objects ``touched``, looked at every 0.1 s of their trajectories.
+
+    Very long trajectories are looked at 201 times at most, evenly spread.
+
+    Args:
+        state: after the edit.
+        touched: ids that the edit named or created; deleted ones are passed over.
+        ground: height of the ground; without it the ground counts as flat.
+    """
+    subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
+    for subject in subjects:
+        times = _sample_times(subject)
+        transforms, _ = sample(subject.trajectory, times)
+        yield from _overlaps(subject, state, times, transforms)
+        yield from _off_ground(subject, state.recorded[subject.source_id], transforms, ground)
+        yield from _outside_map(subject, state.extent, transforms)
+
+
+def _sample_times(subject: ObjectState) -> NDArray[np.int64]:
+    start, end = subject.trajectory.start_us, subject.trajectory.end_us
+    count = min(2 + (end - start) // SAMPLE_PERIOD_US, MAX_SAMPLES)
+    steps = np.arange(count, dtype=object) * (end - start) // (count - 1)
+    return np.unique((start + steps).astype(np.int64))
+
+
+def _overlaps(
+    subject: ObjectState, state: ScenarioState, times: NDArray[np.int64], own: Float
+) -> Iterator[EditWarning]:
+    hit: dict[str, float] = {}
+    for other in _within_reach(subject, state, own):
+        theirs, covered = sample(other.trajectory, times)
+        if not covered.any():
+            continue
+        size_a, size_b = subject.scaled_size, other.scaled_size
+        overlapping = boxes_overlap(own[covered], size_a, theirs[covered], size_b)
+        if overlapping.any():
+            hit[other.object_id] = int(times[covered][np.argmax(overlapping)]) * 1e-6
+    if hit:
+        named = [f"{i!r} from t={t:.2f} s" for i, t in list(hit.items())[:NAMED_OVERLAPS]]
+        more = f" and {len(hit) - len(named)} more" if len(hit) > len(named) else ""
+        yield EditWarning(
+            code="overlap",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} overlaps {', '.join(named)}{more}",
+        )
+
+
+def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
+    """Visible objects whose path, as a box around it, comes near that of ``subject``."""
+    tracks = state.tracks
+    radii = np.linalg.norm([o.scaled_size for o in tracks.objects], axis=1) / 2
+    reach = (radii + np.linalg.norm(subject.scaled_size) / 2)[:, None]
+    at = own[:, :3, 3]
+    apart = (tracks.lower - reach > at.max(axis=0)) | (tracks.upper + reach < at.min(axis=0))
+    for i in np.flatnonzero(~apart.any(axis=1)):
+        if tracks.objects[i].object_id != subject.object_id:
+            yield tracks.objects[i]
+
+
+def _off_ground(
+    subject: ObjectState, recorded: ObjectState, own: Float, ground: GroundHeight | None
+) -> Iterator[EditWarning]:
+    theirs, _ = sample(recorded.trajectory, _sample_times(recorded))
+    usual = float(np.median(_clearance(theirs, recorded, ground)))
+    off = _clearance(own, subject, ground) - usual
+    worst = float(off[np.argmax(np.abs(off))])
+    if abs(worst) > OFF_GROUND:
+        side = "above" if worst > 0 else "below"
+        yield EditWarning(
+            code="off_ground",
+            object_id=subject.object_id,
+            message=f"the bottom of {subject.object_id!r} is {abs(worst):.2f} m {side} where it "
+            "stood in the recording",
+        )
+
+
+def _clearance(transforms: Float, subject: ObjectState, ground: GroundHeight | None) -> Float:
+    lowest: Float = box_corners(transforms, subject.scaled_size)[..., 2].min(axis=-1)
+    return lowest - ground(transforms[:, :2, 3]) if ground else lowest
+
+
+def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iterator[EditWarning]:
+    at = transforms[:, :2, 3]
+    beyond = np.maximum(np.maximum(extent[0] - at, at - extent[1]), 0.0)
+    farthest = float(np.linalg.norm(beyond, axis=1).max())
+    if farthest > OUTSIDE_MAP:
+        yield EditWarning(
+            code="outside_map",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} gets {farthest:.0f} m away from everything recorded",
+        )

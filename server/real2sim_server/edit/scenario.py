@@ -1,0 +1,249 @@
+"""A scenario: a scene and an append-only log of edits, undos and redos."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.operations import Operation
+
+from .apply import EditOutcome, advance, apply_operations
+from .errors import EditError
+from .review import GroundHeight
+from .state import ScenarioState
+
+KEPT_STATES = 32
+"""States kept in memory; older ones are rebuilt from the log when an undo needs them."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogEntry:
+    """One revision.
+
+    Attributes:
+        revision: grows by one with each entry, from 1.
+        kind: what it did.
+        operations: of an edit; empty for an undo or redo.
+        target: revision of the edit that was undone or redone; None for an edit.
+        created_at: UTC, ISO 8601.
+    """
+
+    revision: int
+    kind: Literal["edit", "undo", "redo"]
+    operations: tuple[Operation, ...]
+    target: int | None
+    created_at: str
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """An entry that may be stored, and what it leads to once committed."""
+
+    entry: LogEntry
+    outcome: EditOutcome
+
+
+class Scenario:
+    """State of a scenario, moved only by committing planned entries of its log.
+
+    Planning changes nothing: store the entry, then commit it, so that nothing takes effect that
+    is not on record. Undo returns to the very state before the edit, never by inverse arithmetic.
+    Instance ids of copies that an undo took back may be given to later copies.
+
+    Attributes:
+        scene: name of the scene.
+        scene_hash: its content hash.
+        state: after all entries.
+        entries: the log, oldest first.
+    """
+
+    def __init__(self, state: ScenarioState, *, scene: str = "", scene_hash: str = "") -> None:
+        self.scene = scene
+        self.scene_hash = scene_hash
+        self.state = state
+        self.entries: list[LogEntry] = []
+        self._done: list[LogEntry] = []
+        self._undone: list[LogEntry] = []
+        self._states: OrderedDict[int, ScenarioState] = OrderedDict({0: state})
+
+    @classmethod
+    def replay(
+        cls,
+        initial_state: ScenarioState,
+        entries: Iterable[LogEntry],
+        *,
+        scene: str = "",
+        scene_hash: str = "",
+    ) -> Scenario:
+        """The scenario after ``entries``, bit for bit as it was when they were committed.
+
+        Raises:
+            EditError: INVALID_OPERATION when the entries are no complete log of this scene.
+        """
+        scenario = cls(initial_state, scene=scene, scene_hash=scene_hash)
+        for entry in entries:
+            scenario._append(entry)
+        scenario.state = scenario._state_after(len(scenario._done))
+        return scenario
+
+    @property
+    def revision(self) -> int:
+        """Number of entries so far."""
+        return len(self.entries)
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether an edit is in effect."""
+        return bool(self._done)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether the last entries undid an edit."""
+        return bool(self._undone)
+
+    def plan_edit(
+        self,
+        operations: Sequence[Operation],
+        *,
+        base_revision: int | None = None,
+        ground: GroundHeight | None = None,
+    ) -> Planned:
+        """What ``operations`` would lead to.
+
+        Args:
+            operations: applied all, or none.
+            base_revision: the revision they were made for; None for any.
+            ground: see :func:`~.apply.apply_operations`.
+
+        Raises:
+            EditError: STALE_REVISION when ``base_revision`` is not the current one; also as
+                :func:`~.apply.apply_operations`.
+        """
+        self._refuse_stale(base_revision)
+        outcome = apply_operations(self.state, operations, ground=ground)
+        return Planned(self._entry("edit", tuple(operations), None), outcome)
+
+    def plan_undo(self, *, base_revision: int | None = None) -> Planned:
+        """What taking back the last edit in effect would lead to.
+
+        Raises:
+            EditError: NOTHING_TO_UNDO or STALE_REVISION.
+        """
+        self._refuse_stale(base_revision)
+        if not self._done:
+            raise EditError(ErrorCode.NOTHING_TO_UNDO, "no edit is in effect; nothing to undo")
+        edit = self._done[-1]
+        state = self._state_after(len(self._done) - 1)
+        outcome = EditOutcome(state=state, created=(), inverse=edit.operations, warnings=())
+        return Planned(self._entry("undo", (), edit.revision), outcome)
+
+    def plan_redo(
+        self, *, base_revision: int | None = None, ground: GroundHeight | None = None
+    ) -> Planned:
+        """What bringing back the last undone edit would lead to.
+
+        Raises:
+            EditError: NOTHING_TO_REDO or STALE_REVISION.
+        """
+        self._refuse_stale(base_revision)
+        if not self._undone:
+            raise EditError(
+                ErrorCode.NOTHING_TO_REDO,
+                "no edit was undone since the last edit; nothing to redo",
+            )
+        edit = self._undone[-1]
+        outcome = apply_operations(self.state, edit.operations, ground=ground)
+        return Planned(self._entry("redo", (), edit.revision), outcome)
+
+    def commit(self, planned: Planned) -> EditOutcome:
+        """Let a planned entry take effect; the outcome.
+
+        Raises:
+            EditError: STALE_REVISION when another entry was committed since it was planned.
+        """
+        self._append(planned.entry)
+        self.state = planned.outcome.state
+        self._keep(len(self._done), self.state)
+        return planned.outcome
+
+    def edit(self, operations: Sequence[Operation], *, dry_run: bool = False) -> EditOutcome:
+        """Plan and, unless ``dry_run``, commit an edit. Raises like :meth:`plan_edit`."""
+        planned = self.plan_edit(operations)
+        return planned.outcome if dry_run else self.commit(planned)
+
+    def undo(self) -> EditOutcome:
+        """Plan and commit an undo. Raises like :meth:`plan_undo`."""
+        return self.commit(self.plan_undo())
+
+    def redo(self) -> EditOutcome:
+        """Plan and commit a redo. Raises like :meth:`plan_redo`."""
+        return self.commit(self.plan_redo())
+
+    def _refuse_stale(self, base_revision: int | None) -> None:
+        if base_revision is not None and base_revision != self.revision:
+            raise EditError(
+                ErrorCode.STALE_REVISION,
+                f"made for revision {base_revision}; the scenario is at {self.revision}",
+                hint=f"read what changed after {base_revision} and send it again",
+            )
+
+    def _entry(
+        self,
+        kind: Literal["edit", "undo", "redo"],
+        operations: tuple[Operation, ...],
+        target: int | None,
+    ) -> LogEntry:
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        return LogEntry(self.revision + 1, kind, operations, target, now)
+
+    def _append(self, entry: LogEntry) -> None:
+        """Book an entry; states are not touched, but those of another past are forgotten."""
+        if entry.revision != self.revision + 1:
+            raise EditError(
+                ErrorCode.STALE_REVISION,
+                f"entry {entry.revision} does not follow revision {self.revision}",
+                hint="plan it again on the present state",
+            )
+        match entry.kind:
+            case "edit":
+                self._forget_states_after(len(self._done))
+                self._done.append(entry)
+                self._undone.clear()
+            case "undo":
+                self._undone.append(self._take(self._done, entry))
+            case "redo":
+                self._done.append(self._take(self._undone, entry))
+        self.entries.append(entry)
+
+    def _take(self, stack: list[LogEntry], entry: LogEntry) -> LogEntry:
+        if not stack or stack[-1].revision != entry.target:
+            raise EditError(
+                ErrorCode.INVALID_OPERATION,
+                f"the log is broken: its {entry.kind} {entry.revision} names edit {entry.target}",
+                hint="the scenario cannot be rebuilt; start a new one",
+            )
+        return stack.pop()
+
+    def _state_after(self, count: int) -> ScenarioState:
+        """State after the first ``count`` edits in effect, from the nearest one kept."""
+        nearest = max(n for n in self._states if n <= count)
+        state = self._states[nearest]
+        for edit in self._done[nearest:count]:
+            state = advance(state, edit.operations)
+        self._keep(count, state)
+        return state
+
+    def _keep(self, count: int, state: ScenarioState) -> None:
+        self._states[count] = state
+        self._states.move_to_end(count)
+        for old in list(self._states)[: len(self._states) - KEPT_STATES]:
+            if old:
+                del self._states[old]
+
+    def _forget_states_after(self, count: int) -> None:
+        for later in [n for n in self._states if n > count]:
+            del self._states[later]

@@ -1,0 +1,138 @@
+"""What a scenario looks like at one revision: objects without their Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import Trajectory
+from .tracks import PackedTracks
+
+
+class ObjectSource(Protocol):
+    """What is needed of an object of a scene; its Gaussians are not."""
+
+    @property
+    def object_id(self) -> str: ...  # noqa: D102
+    @property
+    def category(self) -> str: ...  # noqa: D102
+    @property
+    def size(self) -> tuple[float, float, float]: ...  # noqa: D102
+    @property
+    def trajectory(self) -> Trajectory: ...  # noqa: D102
+
+
+class SceneSource(Protocol):
+    """What is needed of a scene: a Scene, or the summary of one that is not in memory."""
+
+    @property
+    def objects(self) -> Mapping[str, ObjectSource] | Iterable[ObjectSource]: ...  # noqa: D102
+    @property
+    def ego(self) -> Trajectory: ...  # noqa: D102
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectState:
+    """One object of a scenario.
+
+    Attributes:
+        object_id: unique in the scenario, also among deleted objects.
+        source_id: object of the scene whose Gaussians it shows.
+        category: as in the scene.
+        size: (length, width, height) in the scene, before ``scale`` [m].
+        scale: factors along the object's x, y, z, about its origin.
+        trajectory: ``T_world_object``; origin at the box centre; exists only in its range.
+        instance_id: value of its pixels in instance images; fixed while the object exists.
+        deleted: a tombstone: not shown, not hit, its id stays taken.
+    """
+
+    object_id: str
+    source_id: str
+    category: str
+    size: tuple[float, float, float]
+    scale: tuple[float, float, float]
+    trajectory: Trajectory
+    instance_id: int
+    deleted: bool = False
+
+    @property
+    def scaled_size(self) -> tuple[float, float, float]:
+        """(length, width, height) of the box as it is now [m]."""
+        (length, width, height), (x, y, z) = self.size, self.scale
+        return (length * x, width * y, height * z)
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioState:
+    """All objects of a scenario at one revision. Immutable; edits make new ones that share parts.
+
+    Attributes:
+        objects: by id in a stable order: those of the scene, then copies as they were made.
+        next_instance_id: what the next new object gets.
+        time_range: first and last time of the scene's clock [us].
+        recorded: the objects as the scene has them, by id.
+        extent: [2, 2] lowest and highest x, y that the ego or an object reaches in the scene [m].
+    """
+
+    objects: Mapping[str, ObjectState]
+    next_instance_id: int
+    time_range: tuple[int, int]
+    recorded: Mapping[str, ObjectState] = field(repr=False)
+    extent: NDArray[np.float64] = field(repr=False)
+
+    @classmethod
+    def of(cls, scene: SceneSource) -> ScenarioState:
+        """The state before any edit, of a Scene or of a summary of one."""
+        given = scene.objects
+        sources = list(given.values() if isinstance(given, Mapping) else given)
+        objects = {
+            o.object_id: ObjectState(
+                object_id=o.object_id,
+                source_id=o.object_id,
+                category=o.category,
+                size=o.size,
+                scale=(1.0, 1.0, 1.0),
+                trajectory=o.trajectory,
+                instance_id=1 + i,
+            )
+            for i, o in enumerate(sources)
+        }
+        reached = np.concatenate([t.positions[:, :2] for t in _trajectories(scene, sources)])
+        frozen = MappingProxyType(objects)
+        return cls(
+            objects=frozen,
+            next_instance_id=1 + len(objects),
+            time_range=(scene.ego.start_us, scene.ego.end_us),
+            recorded=frozen,
+            extent=np.stack([reached.min(axis=0), reached.max(axis=0)]),
+        )
+
+    def with_object(self, changed: ObjectState) -> ScenarioState:
+        """The state in which ``changed`` stands in for the object of its id, or is added last."""
+        objects = dict(self.objects)
+        objects[changed.object_id] = changed
+        return replace(
+            self,
+            objects=MappingProxyType(objects),
+            next_instance_id=max(self.next_instance_id, changed.instance_id + 1),
+        )
+
+    @property
+    def visible(self) -> tuple[ObjectState, ...]:
+        """Objects that are not deleted, in order."""
+        return self.tracks.objects
+
+    @cached_property
+    def tracks(self) -> PackedTracks[ObjectState]:
+        """Trajectories of the visible objects, packed once for look-ups at one instant."""
+        return PackedTracks(tuple(o for o in self.objects.values() if not o.deleted))
+
+
+def _trajectories(scene: SceneSource, sources: list[ObjectSource]) -> list[Trajectory]:
+    return [scene.ego, *(o.trajectory for o in sources)]
