@@ -1,17 +1,27 @@
 """From Gaussians to pictures: one rasterize() call, three backends."""
 
 from .backends import Backend, BackendStatus, describe_backends, select_backend
+from .encode import EncodedImage, encode_depth, encode_image, encode_instance, encode_rgb
+from .frame import Frame, render_cameras, warm_up
 from .rasterize import rasterize
 from .types import Instance, RasterOptions, RenderError, RenderOutput
 
 __all__ = [
     "Backend",
     "BackendStatus",
+    "EncodedImage",
+    "Frame",
     "Instance",
     "RasterOptions",
     "RenderError",
     "RenderOutput",
     "describe_backends",
+    "encode_depth",
+    "encode_image",
+    "encode_instance",
+    "encode_rgb",
     "rasterize",
+    "render_cameras",
     "select_backend",
+    "warm_up",
 ]

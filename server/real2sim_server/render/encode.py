@@ -1,0 +1,123 @@
+"""Images to bytes. Pure functions of arrays; they run on any thread and never touch the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .types import RenderError
+
+RGB_CODECS = ("raw", "jpeg", "png")
+EXACT_CODECS = ("raw", "png")
+DEPTH_PNG_UNIT = 1 / 256
+"""Metres of one level of a depth png, as in KITTI: 4 mm steps up to 255.99 m."""
+PNG_COMPRESSION = 1
+"""zlib level; higher ones are several times slower and shrink pictures little more."""
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """Bytes of one image and what is needed to read them.
+
+    Attributes:
+        data: the bytes; of codec ``raw`` the array in C order, little-endian.
+        codec: ``raw``, ``jpeg`` or ``png``.
+        dtype: of the decoded array: ``uint8``, ``uint16`` or ``float32``. Depth as ``uint16``
+            is in steps of DEPTH_PNG_UNIT.
+        shape: of the decoded array.
+    """
+
+    data: bytes
+    codec: str
+    dtype: str
+    shape: tuple[int, ...]
+
+
+def encode_image(
+    image: NDArray[Any], modality: str, codec: str, *, quality: int = 90
+) -> EncodedImage:
+    """Encode an image of a modality; depth and instance become png where jpeg is asked for.
+
+    Args:
+        image: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` [m], or [H, W] uint16 ``instance``.
+        codec: ``raw``, ``jpeg`` or ``png``.
+        quality: of jpeg, 1 to 100.
+
+    Raises:
+        RenderError: unknown modality or codec, or an image of another kind.
+    """
+    if modality == "rgb":
+        data = encode_rgb(image, codec, quality=quality)
+        return EncodedImage(data, codec, "uint8", image.shape)
+    exact = "png" if codec == "jpeg" else codec
+    if modality == "depth":
+        dtype = "uint16" if exact == "png" else "float32"
+        return EncodedImage(encode_depth(image, exact), exact, dtype, image.shape)
+    if modality == "instance":
+        return EncodedImage(encode_instance(image, exact), exact, "uint16", image.shape)
+    raise RenderError(f"unknown modality {modality!r}; allowed are 'rgb', 'depth', 'instance'")
+
+
+def encode_rgb(image: NDArray[np.uint8], codec: str, *, quality: int = 90) -> bytes:
+    """RGB [H, W, 3] uint8 as raw bytes, jpeg (4:4:4, no loss beyond ``quality``) or png."""
+    _check_codec("rgb", codec, RGB_CODECS)
+    _check_array("rgb", image, np.uint8, 3)
+    contiguous = np.ascontiguousarray(image)
+    if codec == "raw":
+        return contiguous.tobytes()
+    if codec == "png":
+        return _png(contiguous[..., ::-1])
+    if not 1 <= quality <= 100:
+        raise RenderError(f"quality must be 1 to 100, not {quality!r}")
+    import simplejpeg
+
+    encoded: bytes = simplejpeg.encode_jpeg(contiguous, quality, "RGB", "444")
+    return encoded
+
+
+def encode_depth(depth: NDArray[np.float32], codec: str) -> bytes:
+    """Depth [H, W] float32 [m] as raw float32, or 16-bit png in steps of DEPTH_PNG_UNIT.
+
+    In a png a hit is never 0, and everything beyond the range has the largest level.
+    """
+    _check_codec("depth", codec, EXACT_CODECS)
+    _check_array("depth", depth, np.float32, 2)
+    if codec == "raw":
+        return depth.astype("<f4", order="C", copy=False).tobytes()
+    levels = np.clip(np.rint(depth / DEPTH_PNG_UNIT), 1, np.iinfo(np.uint16).max)
+    return _png(np.where(depth > 0, levels, 0).astype(np.uint16))
+
+
+def encode_instance(instance: NDArray[np.uint16], codec: str) -> bytes:
+    """Instance ids [H, W] uint16 as raw uint16 or 16-bit png."""
+    _check_codec("instance", codec, EXACT_CODECS)
+    _check_array("instance", instance, np.uint16, 2)
+    if codec == "raw":
+        return instance.astype("<u2", order="C", copy=False).tobytes()
+    return _png(instance)
+
+
+def _check_codec(name: str, codec: str, codecs: tuple[str, ...]) -> None:
+    if codec not in codecs:
+        raise RenderError(f"{name} cannot be encoded as {codec!r}; allowed are {list(codecs)}")
+
+
+def _check_array(name: str, image: NDArray[Any], dtype: type, ndim: int) -> None:
+    fits = image.dtype == dtype and image.ndim == ndim and (ndim == 2 or image.shape[2] == 3)
+    if not fits or image.size == 0:
+        shape = "[H, W, 3]" if ndim == 3 else "[H, W]"
+        raise RenderError(
+            f"{name} must be {shape} {np.dtype(dtype)}, not {list(image.shape)} {image.dtype}"
+        )
+
+
+def _png(image: NDArray[Any]) -> bytes:
+    import cv2
+
+    done, encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    if not done:
+        raise RenderError(f"png encoding failed for an image {list(image.shape)} {image.dtype}")
+    return bytes(encoded)

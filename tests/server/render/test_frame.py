@@ -1,0 +1,101 @@
+"""Frames of the cameras of a vehicle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.render import Instance, RasterOptions, RenderError, render_cameras, warm_up
+from real2sim_server.render.quantize import solid_depth, to_uint8
+from real2sim_server.scene import Camera, GaussianCloud, Sky
+from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
+from real2sim_server.scene.rotation import transform_from, yaw_quaternion
+
+
+def camera(name: str, width: int, height: int) -> Camera:
+    K = np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]])
+    return Camera(name, width, height, K, T_VEHICLE_OPTICAL)
+
+
+def ball(position: tuple[float, float, float], rgb: tuple[float, float, float]) -> GaussianCloud:
+    sh = ((torch.tensor(rgb) - 0.5) / 0.2820947917738781).reshape(1, 1, 3)
+    return GaussianCloud(
+        torch.tensor([position]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), 0.5),
+        torch.ones(1),
+        sh,
+    )
+
+
+def test_frames_come_in_the_order_of_cameras_of_mixed_sizes() -> None:
+    cameras = [camera("a", 32, 20), camera("b", 20, 32), camera("c", 32, 20)]
+    frames = render_cameras([], cameras, np.eye(4), backend="cpu")
+    assert [frame.camera for frame in frames] == ["a", "b", "c"]
+    assert [frame.rgb.shape for frame in frames] == [(20, 32, 3), (32, 20, 3), (20, 32, 3)]
+
+
+def test_camera_of_a_turned_vehicle_sees_what_lies_ahead_of_it() -> None:
+    red = Instance(ball((0.0, 5.0, 0.0), (1.0, 0.0, 0.0)), instance_id=4)
+    ahead = transform_from([0, 0, 0], yaw_quaternion(np.pi / 2))
+    looking, away = (
+        render_cameras([red], [camera("front", 41, 31)], pose, backend="cpu")[0]
+        for pose in (ahead, np.eye(4))
+    )
+    assert looking.rgb[15, 20].tolist() == [255, 0, 0]
+    assert looking.instance is not None
+    assert looking.instance[15, 20] == 4
+    assert looking.depth is not None
+    assert looking.depth[15, 20] == pytest.approx(5.0, abs=1e-4)
+    assert away.rgb.max() == 0
+
+
+def test_depth_is_zero_where_alpha_is_below_half() -> None:
+    faint = ball((5.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    faint = GaussianCloud(faint.means, faint.quats, faint.scales, torch.tensor([0.4]), faint.sh)
+    frame = render_cameras([Instance(faint)], [camera("front", 21, 21)], np.eye(4), backend="cpu")
+    assert frame[0].rgb.max() > 50
+    assert frame[0].depth is not None
+    assert frame[0].depth.max() == 0
+
+
+def test_pose_of_a_frame_is_the_camera_in_the_world() -> None:
+    vehicle = transform_from([3, 4, 5], yaw_quaternion(0.3))
+    frame = render_cameras([], [camera("front", 8, 8)], vehicle, backend="cpu")[0]
+    np.testing.assert_allclose(frame.T_world_camera, vehicle @ T_VEHICLE_OPTICAL)
+
+
+def test_only_what_is_asked_for_is_made() -> None:
+    options = RasterOptions(depth=False, instance=False)
+    frame = render_cameras(
+        [],
+        [camera("front", 8, 8)],
+        np.eye(4),
+        options=options,
+        sky=Sky.uniform((1, 0.5, 0)),
+        backend="cpu",
+    )[0]
+    assert (frame.depth, frame.instance) == (None, None)
+    assert frame.rgb[0, 0].tolist() == [255, 128, 0]
+
+
+def test_broken_vehicle_pose_is_refused() -> None:
+    with pytest.raises(RenderError, match="T_world_vehicle"):
+        render_cameras([], [camera("front", 8, 8)], np.full((4, 4), np.nan))
+
+
+def test_rounding_to_bytes_clamps_and_rounds_halves_up() -> None:
+    levels = torch.tensor([-1.0, 0.0, 0.5 / 255, 0.49 / 255, 0.5, 1.0, 7.0, float("nan")])
+    assert to_uint8(levels).tolist() == [0, 0, 1, 0, 128, 255, 255, 0]
+
+
+def test_solid_depth_keeps_exactly_half_covered_pixels() -> None:
+    depth = solid_depth(torch.tensor([2.0, 3.0]), torch.tensor([0.5, 0.4999]))
+    assert depth.tolist() == [2.0, 0.0]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_warm_up_leaves_a_backend_ready(backend: str) -> None:
+    warm_up(backend)
+    assert len(render_cameras([], [camera("a", 4, 4)], np.eye(4), backend=backend)) == 1
