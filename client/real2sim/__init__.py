@@ -1,1 +1,135 @@
-"""Real2Sim: drive a policy through a reconstructed street over the network."""
+"""Real2Sim: drive a policy through a reconstructed street over the network.
+
+::
+
+    import real2sim
+    from real2sim.planners import FollowRoute
+
+    with real2sim.connect("http://127.0.0.1:8600") as client:
+        with client.session(scene="street") as session:
+            planner = FollowRoute(speed=8.0)
+            obs = session.reset(seed=0, sensors=["front"], privileged=True)
+            planner.reset(obs)
+            while not obs.over:
+                obs = session.step(planner.plan(obs))
+            print(obs.reason, obs.metrics, obs.image("front").shape)
+
+Frames, units and image layouts: ``real2sim_proto.CONVENTIONS``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from real2sim_proto.drive import Control, PoseCommand, SensorSpec, TrajectoryPlan
+
+    from .client import AsyncClient, Client, connect, connect_async
+    from .drive_session import AsyncDriveSession, DriveSession
+    from .errors import (
+        BadStepError,
+        CapacityError,
+        ConflictError,
+        ConnectionLostError,
+        ControllerTakenError,
+        EpisodeOverError,
+        ImageDecodeError,
+        InvalidActionError,
+        InvalidOperationError,
+        InvalidRequestError,
+        MalformedReplyError,
+        NotFoundError,
+        NotOpenError,
+        NotResetError,
+        ProtocolMismatchError,
+        Real2SimError,
+        ReplyTimeoutError,
+        SessionClosedError,
+        StaleRevisionError,
+        StaleStepError,
+        StatusError,
+        StepConflictError,
+        UnauthorizedError,
+        UnreachableError,
+        WorkerFailedError,
+    )
+    from .images import Frame, Image
+    from .observation import Observation, View
+    from .version import VERSION as __version__
+
+__all__ = [
+    "AsyncClient",
+    "AsyncDriveSession",
+    "BadStepError",
+    "CapacityError",
+    "Client",
+    "ConflictError",
+    "ConnectionLostError",
+    "Control",
+    "ControllerTakenError",
+    "DriveSession",
+    "EpisodeOverError",
+    "Frame",
+    "Image",
+    "ImageDecodeError",
+    "InvalidActionError",
+    "InvalidOperationError",
+    "InvalidRequestError",
+    "MalformedReplyError",
+    "NotFoundError",
+    "NotOpenError",
+    "NotResetError",
+    "Observation",
+    "PoseCommand",
+    "ProtocolMismatchError",
+    "Real2SimError",
+    "ReplyTimeoutError",
+    "SensorSpec",
+    "SessionClosedError",
+    "StaleRevisionError",
+    "StaleStepError",
+    "StatusError",
+    "StepConflictError",
+    "TrajectoryPlan",
+    "UnauthorizedError",
+    "UnreachableError",
+    "View",
+    "WorkerFailedError",
+    "__version__",
+    "connect",
+    "connect_async",
+]
+
+_ELSEWHERE = {
+    "AsyncClient": "real2sim.client",
+    "AsyncDriveSession": "real2sim.drive_session",
+    "Client": "real2sim.client",
+    "Control": "real2sim_proto.drive",
+    "DriveSession": "real2sim.drive_session",
+    "Frame": "real2sim.images",
+    "Image": "real2sim.images",
+    "Observation": "real2sim.observation",
+    "PoseCommand": "real2sim_proto.drive",
+    "SensorSpec": "real2sim_proto.drive",
+    "TrajectoryPlan": "real2sim_proto.drive",
+    "View": "real2sim.observation",
+    "connect": "real2sim.client",
+    "connect_async": "real2sim.client",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # Names are fetched when they are used, so that importing the package costs nothing.
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "__version__":
+        value: Any = importlib.import_module("real2sim.version").VERSION
+    else:
+        value = getattr(importlib.import_module(_ELSEWHERE.get(name, "real2sim.errors")), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

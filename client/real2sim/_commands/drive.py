@@ -1,0 +1,153 @@
+"""``real2sim drive``: run a planner in the loop and say what it cost."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .options import DEFAULT_URL, JsonFile, Timeout, Token, Url, connected, console, write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.console import Console
+
+    from real2sim import Observation
+    from real2sim.planners import EpisodeSummary
+
+app = typer.Typer()
+
+
+@app.command()
+def drive(
+    *,
+    scene: Annotated[str | None, typer.Option(help="Name of a scene.")] = None,
+    scenario: Annotated[str | None, typer.Option(help="Id of a scenario.")] = None,
+    planner: Annotated[
+        str, typer.Option(help="'follow_route', or 'module:Class' of your own.")
+    ] = "follow_route",
+    steps: Annotated[int, typer.Option(min=1, help="Clock steps; fewer when it ends.")] = 100,
+    cameras: Annotated[str, typer.Option(help="Names, with commas between; 'all'.")] = "",
+    width: Annotated[int | None, typer.Option(min=16, help="Pixels; default: recorded.")] = None,
+    codec: Annotated[str, typer.Option(help="auto, raw, jpeg or png.")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="Of the episode.")] = 0,
+    dt_us: Annotated[int, typer.Option(help="Clock step.")] = 100_000,
+    out: Annotated[
+        Path | None, typer.Option(help="Save frames there: CAMERA/STEP.jpg, summary.json.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    timeout: Timeout = 60.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Drive a scene or scenario with a planner, over the drive socket."""
+    from real2sim.planners import load_planner, run_episode
+
+    if (scene is None) == (scenario is None):
+        raise typer.BadParameter("give exactly one of --scene and --scenario")
+    driver = load_planner(planner)
+    with (
+        connected(url, token, timeout) as client,
+        _session(client, scene=scene, scenario=scenario, codec=codec) as session,
+    ):
+        names = session.cameras if cameras == "all" else [c for c in cameras.split(",") if c]
+        with _progress(steps) as advance, _saver(out) as save:
+
+            def on_observation(obs: Observation) -> None:
+                save(obs)
+                advance(obs)
+
+            summary = run_episode(
+                session,
+                driver,
+                steps=steps,
+                sensors=[{"camera": name, "width": width} for name in names],
+                on_observation=on_observation,
+                seed=seed,
+                dt_us=dt_us,
+                privileged=True,
+            )
+    _report(summary, out=out, json_file=json_file)
+
+
+@contextlib.contextmanager
+def _session(client: Any, **options: Any) -> Iterator[Any]:
+    from rich.console import Console
+
+    session = client.session(**options)
+    with Console(stderr=True).status("the worker opens the session"):
+        session.open()
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+@contextlib.contextmanager
+def _progress(steps: int) -> Iterator[Callable[[Observation], None]]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    columns = (TextColumn("driving"), BarColumn(), MofNCompleteColumn(), Remaining())
+    columns_end = TextColumn("{task.fields[speed]:.1f} m/s")
+    with Progress(*columns, columns_end, console=Console(stderr=True)) as progress:
+        task = progress.add_task("driving", total=steps, speed=0.0)
+        yield lambda obs: progress.update(task, completed=obs.step, speed=obs.ego.speed)
+
+
+@contextlib.contextmanager
+def _saver(folder: Path | None) -> Iterator[Callable[[Observation], None]]:
+    if folder is None:
+        yield lambda _obs: None
+        return
+    # Coding and disk happen beside the loop, so that they do not slow what is measured.
+    with ThreadPoolExecutor(2) as pool:
+        pending = []
+
+        def save(obs: Observation) -> None:
+            for camera, modalities in obs.frames.items():
+                if "rgb" in modalities:
+                    path = folder / camera / f"{obs.step:06d}.jpg"
+                    pending.append(pool.submit(modalities["rgb"].save, path))
+
+        yield save
+        for future in pending:
+            future.result()
+
+
+def _report(summary: EpisodeSummary, *, out: Path | None, json_file: Path | None) -> None:
+    figures = summary.to_dict()
+    if out is not None:
+        write_json(out / "summary.json", figures)
+    if json_file is not None:
+        write_json(json_file, figures)
+    if json_file is None or str(json_file) != "-":
+        _print_summary(console(), summary)
+
+
+def _print_summary(out: Console, summary: EpisodeSummary) -> None:
+    from rich.table import Table
+
+    ending = summary.reason or ("over" if summary.terminated or summary.truncated else "steps done")
+    out.print(
+        f"{summary.steps} steps, {(summary.end_us - summary.start_us) * 1e-6:.1f} s, "
+        f"{summary.distance:.1f} m; ended: {ending}; {summary.steps_per_second:.1f} steps/s",
+        highlight=False,
+    )
+    for event in summary.events:
+        what = f"{event.type} {event.object_id or ''}".strip()
+        out.print(f"{(event.t_us - summary.start_us) * 1e-6:8.1f} s  {what}", highlight=False)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("milliseconds")
+    for heading in ("p50", "p95", "p99", "mean"):
+        table.add_column(heading, justify="right")
+    for stage, times in summary.stages.items():
+        figures = (times.p50, times.p95, times.p99, times.mean)
+        table.add_row(stage, *(f"{figure:.2f}" for figure in figures))
+    out.print(table)

@@ -1,0 +1,63 @@
+"""Options that several commands share, and what they make of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from real2sim import Client
+    from real2sim.images import Image
+
+Url = Annotated[str, typer.Option("--url", envvar="REAL2SIM_URL", help="Address of the worker.")]
+Token = Annotated[
+    str | None,
+    typer.Option(
+        "--token", envvar="REAL2SIM_TOKEN", show_envvar=True, help="Bearer token of the worker."
+    ),
+]
+Timeout = Annotated[
+    float, typer.Option("--timeout", min=0.1, help="Seconds that a reply may take.")
+]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write the figures there; '-' prints them."),
+]
+
+DEFAULT_URL = "http://127.0.0.1:8600"
+
+
+def connected(url: str, token: str | None, timeout: float = 30.0) -> Client:
+    """A client of the worker that the options name."""
+    import real2sim
+
+    return real2sim.connect(url, token=token, timeout=timeout)
+
+
+def console() -> Console:
+    """Where tables go; not used with ``--json -``, which owns standard output."""
+    from rich.console import Console
+
+    return Console()
+
+
+def write_json(path: Path, figures: Any) -> None:
+    """Write figures atomically; '-' is standard output."""
+    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    if str(path) == "-":
+        typer.echo(text, nl=False)
+        return
+    from real2sim.images import write_atomically
+
+    write_atomically(path, text.encode())
+
+
+def save_image(image: Image, path: Path) -> None:
+    """Write an image and say so."""
+    saved = image.save(path)
+    typer.echo(f"wrote {saved} ({saved.stat().st_size / 1024:.0f} KiB)")

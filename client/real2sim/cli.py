@@ -1,0 +1,83 @@
+"""The ``real2sim`` command: the client's commands, and those that installed packages add.
+
+Packages add commands through the entry-point group ``real2sim.commands``; each entry is a Typer
+app whose commands appear beside the client's own.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.metadata import entry_points
+
+import typer
+
+from ._commands import drive, edit, scenes, status
+
+COMMAND_GROUP = "real2sim.commands"
+DEBUG_VARIABLE = "REAL2SIM_DEBUG"
+
+
+def main() -> None:
+    """Run the command; errors become one sentence, a hint and exit code 1."""
+    try:
+        build_app()()
+    except Exception as error:
+        if os.environ.get(DEBUG_VARIABLE) == "1":
+            raise
+        print_error(error)
+        sys.exit(1)
+
+
+def build_app() -> typer.Typer:
+    """The command with everything that is installed."""
+    app = typer.Typer(
+        name="real2sim",
+        help="Drive a policy through a reconstructed street, over the network.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+    )
+    app.callback(invoke_without_command=True)(_options)
+    for module in (status, scenes, edit, drive):
+        app.add_typer(module.app)
+    for entry in sorted(entry_points(group=COMMAND_GROUP), key=lambda e: e.name):
+        try:
+            app.add_typer(entry.load())
+        except Exception as error:
+            # A broken extension must not take the client's own commands away.
+            typer.echo(f"warning: the commands of {entry.value!r} are missing: {error}", err=True)
+    return app
+
+
+def print_error(error: Exception) -> None:
+    """One sentence about what went wrong, and what to do, on standard error."""
+    said = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    known = isinstance(error, ValueError | OSError | KeyError) or hasattr(error, "hint")
+    sentence = said if said and known else f"{type(error).__name__}: {said or 'no reason given'}"
+    hint = getattr(error, "hint", None)
+    if hint is None and not known:
+        hint = f"{DEBUG_VARIABLE}=1 shows where it happened"
+    typer.echo(f"{typer.style('error:', fg='red', bold=True)} {sentence}", err=True)
+    if hint:
+        typer.echo(f"{typer.style('hint:', fg='cyan', bold=True)} {hint}", err=True)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from .version import VERSION
+
+        typer.echo(f"real2sim {VERSION}")
+        raise typer.Exit
+
+
+def _options(
+    _version_wanted: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and leave."
+    ),
+) -> None:
+    return None
+
+
+if __name__ == "__main__":
+    main()

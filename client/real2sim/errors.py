@@ -1,0 +1,249 @@
+"""Everything the SDK raises.
+
+::
+
+    Real2SimError                      all of the below; has .hint
+    ├── UnreachableError               no worker answers there            (also a ConnectionError)
+    │   └── ConnectionLostError        the drive socket broke
+    ├── ReplyTimeoutError              no reply in time                   (also a TimeoutError)
+    ├── ProtocolMismatchError          client and worker speak different protocol versions
+    ├── MalformedReplyError            the worker sent something that is not a valid reply
+    ├── ImageDecodeError               an image of this codec cannot be decoded here
+    ├── NotOpenError                   the session was never opened, or is closed
+    └── StatusError                    the worker refused; has .status .code .detail .request_id ...
+        ├── InvalidRequestError        a value is not allowed             (422, 400, 413)
+        │   ├── InvalidOperationError      of an edit
+        │   └── InvalidActionError         of a plan
+        ├── UnauthorizedError          token missing or wrong             (401, 403)
+        ├── NotFoundError              no such scene, scenario, session, object, camera (404)
+        ├── ConflictError              not in this state                  (409)
+        │   ├── StaleRevisionError         somebody else edited first     (412); has .missed
+        │   ├── StepConflictError          this step was answered with other content
+        │   ├── StaleStepError             the session is past this step
+        │   ├── BadStepError               the session is not there yet
+        │   ├── NotResetError              reset comes first
+        │   ├── EpisodeOverError           the episode has ended; reset starts another
+        │   └── ControllerTakenError       another client drives this session
+        ├── CapacityError              the worker is full; has .retry_after (429, 503, 507)
+        ├── SessionClosedError         the session is over                (410)
+        └── WorkerFailedError          a fault of the worker              (500, 502, 504)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from real2sim_proto.scenarios import HistoryEntry
+
+
+class Real2SimError(Exception):
+    """Base of all errors of the SDK."""
+
+    def __init__(self, message: str, *, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+class UnreachableError(Real2SimError, ConnectionError):
+    """No worker answers at the address."""
+
+
+class ConnectionLostError(UnreachableError):
+    """The drive socket broke while a reply was awaited."""
+
+
+class ReplyTimeoutError(Real2SimError, TimeoutError):
+    """A reply did not come in time."""
+
+    def __init__(self, awaited: str, seconds: float, *, hint: str | None = None) -> None:
+        super().__init__(f"no {awaited} within {seconds:g} s", hint=hint)
+        self.awaited = awaited
+        self.seconds = seconds
+
+
+class ProtocolMismatchError(Real2SimError):
+    """Client and worker speak different versions of the protocol."""
+
+
+class MalformedReplyError(Real2SimError):
+    """The worker sent something that is not a valid reply."""
+
+
+class ImageDecodeError(Real2SimError):
+    """An image cannot be turned into an array here; its bytes are still there."""
+
+
+class NotOpenError(Real2SimError):
+    """A drive session was used before it was opened or after it was closed."""
+
+
+@dataclass(frozen=True)
+class InvalidValue:
+    """One value that the worker did not accept."""
+
+    pointer: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """What a worker says about a request that it refuses."""
+
+    status: int
+    code: str
+    detail: str
+    hint: str | None = None
+    request_id: str | None = None
+    errors: Sequence[InvalidValue] = ()
+    retry_after: float | None = None
+    step: int | None = None
+    revision: int | None = None
+    missed: Sequence[HistoryEntry] = ()
+
+
+class StatusError(Real2SimError):
+    """The worker refused a request or a message.
+
+    Attributes:
+        status: HTTP status; for messages of the drive socket the status that its code has there.
+        code: stable code, see ``real2sim_proto.ErrorCode``; newer workers may have others.
+        detail: what was given and what is allowed.
+        request_id: names the request in the worker's log.
+        errors: values that were not accepted, with JSON pointers into the request.
+        retry_after: seconds after which the worker wants to be asked again.
+        step: step that the drive session is at, where the worker says so.
+    """
+
+    def __init__(self, refusal: Refusal) -> None:
+        places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in refusal.errors)
+        message = f"{refusal.detail} ({places})" if places else refusal.detail
+        super().__init__(f"{message} [{refusal.code}]", hint=refusal.hint)
+        self.status = refusal.status
+        self.code = refusal.code
+        self.detail = refusal.detail
+        self.request_id = refusal.request_id
+        self.errors = tuple(refusal.errors)
+        self.retry_after = refusal.retry_after
+        self.step = refusal.step
+
+
+class InvalidRequestError(StatusError):
+    """A value of the request is not allowed."""
+
+
+class InvalidOperationError(InvalidRequestError):
+    """An edit names something that does not exist or cannot be done."""
+
+
+class InvalidActionError(InvalidRequestError):
+    """A plan is not of the session's kind, or not drivable."""
+
+
+class UnauthorizedError(StatusError):
+    """The token is missing, wrong, or not enough for this."""
+
+
+class NotFoundError(StatusError):
+    """No scene, scenario, session, object or camera of that name."""
+
+
+class ConflictError(StatusError):
+    """The request does not fit the state that the worker is in."""
+
+
+class StaleRevisionError(ConflictError):
+    """Somebody else edited first; look at what they did and apply again.
+
+    Attributes:
+        revision: revision that the scenario is at, where the worker says so.
+        missed: history entries that this client had not seen, oldest first.
+    """
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal)
+        self.revision = refusal.revision
+        self.missed = tuple(refusal.missed)
+
+
+class StepConflictError(ConflictError):
+    """This step was answered before, with other content."""
+
+
+class StaleStepError(ConflictError):
+    """The session is past this step."""
+
+
+class BadStepError(ConflictError):
+    """The session has not come to this step yet."""
+
+
+class NotResetError(ConflictError):
+    """No episode has been started; ``reset`` comes first."""
+
+
+class EpisodeOverError(ConflictError):
+    """The episode has ended; ``reset`` starts another."""
+
+
+class ControllerTakenError(ConflictError):
+    """Another client drives this session."""
+
+
+class CapacityError(StatusError):
+    """The worker has no room for this now."""
+
+
+class SessionClosedError(StatusError):
+    """The session is over."""
+
+
+class WorkerFailedError(StatusError):
+    """A fault of the worker, not of the request."""
+
+
+_BY_CODE: dict[str, type[StatusError]] = {
+    "INVALID_OPERATION": InvalidOperationError,
+    "INVALID_ACTION": InvalidActionError,
+    "UNAUTHORIZED": UnauthorizedError,
+    "NOT_CONTROLLER": UnauthorizedError,
+    "STALE_REVISION": StaleRevisionError,
+    "STEP_CONFLICT": StepConflictError,
+    "STALE_STEP": StaleStepError,
+    "BAD_STEP": BadStepError,
+    "NOT_RESET": NotResetError,
+    "EPISODE_OVER": EpisodeOverError,
+    "CONTROLLER_TAKEN": ControllerTakenError,
+    "OVER_CAPACITY": CapacityError,
+    "QUEUE_FULL": CapacityError,
+    "OUT_OF_MEMORY": CapacityError,
+    "DRAINING": CapacityError,
+    "SESSION_CLOSED": SessionClosedError,
+}
+
+_BY_STATUS: dict[int, type[StatusError]] = {
+    400: InvalidRequestError,
+    401: UnauthorizedError,
+    403: UnauthorizedError,
+    404: NotFoundError,
+    409: ConflictError,
+    410: SessionClosedError,
+    412: StaleRevisionError,
+    413: InvalidRequestError,
+    422: InvalidRequestError,
+    429: CapacityError,
+    503: CapacityError,
+    507: CapacityError,
+}
+
+
+def error_for(refusal: Refusal) -> Real2SimError:
+    """The exception of a refusal: by code where it is known, else by status."""
+    if refusal.code == "UNSUPPORTED_PROTOCOL" or refusal.status == 426:
+        return ProtocolMismatchError(refusal.detail, hint=refusal.hint)
+    by_status = _BY_STATUS.get(
+        refusal.status, WorkerFailedError if refusal.status >= 500 else StatusError
+    )
+    return _BY_CODE.get(refusal.code, by_status)(refusal)

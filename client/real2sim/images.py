@@ -1,0 +1,208 @@
+"""Images as a worker sends them: bytes at once, an array when asked for."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import io
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ImageDecodeError, MalformedReplyError
+
+if TYPE_CHECKING:
+    from real2sim_proto.drive import Frame as WireFrame
+
+SUFFIX = {"jpeg": ".jpg", "png": ".png", "raw": ".npy"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Image:
+    """One image.
+
+    Attributes:
+        data: encoded bytes; of codec ``raw`` the array in C order, little-endian.
+        codec: ``raw``, ``jpeg`` or ``png``.
+        modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` (float32 [H, W], metres along the camera z
+            axis, 0 where nothing was hit) or ``instance`` (uint16 [H, W], 0 is background).
+        dtype: of the array.
+        shape: of the array; empty where only the image itself tells.
+    """
+
+    data: bytes = field(repr=False)
+    codec: str
+    modality: str
+    dtype: str
+    shape: tuple[int, ...] = ()
+
+    @cached_property
+    def array(self) -> NDArray[Any]:
+        """The image, decoded at the first use; read-only where it is a view of ``data``.
+
+        Raises:
+            ImageDecodeError: broken data, or a png where neither Pillow nor OpenCV is installed.
+        """
+        array = _DECODERS[self.codec](self)
+        if (self.shape and array.shape != self.shape) or array.dtype != np.dtype(self.dtype):
+            raise ImageDecodeError(
+                f"{self.codec} image holds {array.dtype} {array.shape} where "
+                f"{self.dtype} {self.shape or ''} was announced"
+            )
+        return array
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the image atomically and return its path.
+
+        The bytes go out as they came where the suffix fits the codec (``.jpg``, ``.png``,
+        ``.npy`` for raw); rgb can also be written as ``.jpg``, and anything as ``.npy``.
+        """
+        target = Path(path)
+        write_atomically(target, self._bytes_for(target.suffix.lower()))
+        return target
+
+    def _bytes_for(self, suffix: str) -> bytes:
+        as_sent = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
+        if suffix in as_sent[self.codec]:
+            return self.data
+        if suffix == ".npy":
+            buffer = io.BytesIO()
+            np.save(buffer, self.array)
+            return buffer.getvalue()
+        if suffix in {".jpg", ".jpeg"} and self.modality == "rgb":
+            import simplejpeg
+
+            encoded: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(self.array), quality=92)
+            return encoded
+        raise ValueError(
+            f"a {self.modality} image of codec {self.codec!r} cannot be written as {suffix!r}; "
+            f"use {SUFFIX[self.codec]!r} or '.npy'"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame(Image):
+    """One image of one camera of an observation.
+
+    Attributes:
+        sensor: name of the camera.
+        t_us: instant shown.
+        T_world_sensor: [4, 4] float64, camera frame (x right, y down, z forward) to world.
+        K: [3, 3] float64 intrinsics [px].
+    """
+
+    sensor: str
+    t_us: int
+    T_world_sensor: NDArray[np.float64] = field(repr=False)
+    K: NDArray[np.float64] = field(repr=False)
+
+
+def frame_from_wire(wire: WireFrame) -> Frame:
+    """The frame of a message, its matrices checked.
+
+    Raises:
+        MalformedReplyError: matrices of another shape.
+    """
+    return Frame(
+        data=wire.data,
+        codec=wire.codec,
+        modality=wire.modality,
+        dtype=wire.dtype,
+        shape=tuple(wire.shape),
+        sensor=wire.sensor,
+        t_us=wire.t_us,
+        T_world_sensor=_matrix(wire.T_world_sensor, (4, 4), "T_world_sensor"),
+        K=_matrix(wire.K, (3, 3), "K"),
+    )
+
+
+def frames_by_camera(wires: Sequence[WireFrame]) -> dict[str, Mapping[str, Frame]]:
+    """Frames by camera, then by modality."""
+    frames: dict[str, dict[str, Frame]] = {}
+    for wire in wires:
+        frames.setdefault(wire.sensor, {})[wire.modality] = frame_from_wire(wire)
+    return dict(frames)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that nobody ever sees half of it; makes the folder where it is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def _matrix(value: Any, shape: tuple[int, int], name: str) -> NDArray[np.float64]:
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MalformedReplyError(f"{name} of a frame is not a matrix: {error}") from error
+    if matrix.shape != shape:
+        raise MalformedReplyError(f"{name} of a frame has shape {matrix.shape}, not {shape}")
+    return matrix
+
+
+def _decode_raw(image: Image) -> NDArray[Any]:
+    dtype = np.dtype(image.dtype).newbyteorder("<")
+    try:
+        return np.frombuffer(image.data, dtype=dtype).reshape(image.shape)
+    except ValueError as error:
+        raise ImageDecodeError(
+            f"raw image of {len(image.data)} bytes is not {image.dtype} {image.shape}"
+        ) from error
+
+
+def _decode_jpeg(image: Image) -> NDArray[Any]:
+    import simplejpeg
+
+    try:
+        array: NDArray[Any] = simplejpeg.decode_jpeg(image.data, colorspace="RGB")
+    except ValueError as error:
+        raise ImageDecodeError(f"jpeg image cannot be decoded: {error}") from error
+    return array
+
+
+def _decode_png(image: Image) -> NDArray[Any]:
+    try:
+        if importlib.util.find_spec("PIL") is not None:
+            return _decode_png_pillow(image.data)
+        if importlib.util.find_spec("cv2") is not None:
+            return _decode_png_opencv(image.data)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise ImageDecodeError(f"png image cannot be decoded: {error}") from error
+    raise ImageDecodeError(
+        "png images need Pillow or OpenCV to become arrays",
+        hint="pip install pillow, or ask for codec 'raw' or 'jpeg'; .data holds the png bytes",
+    )
+
+
+def _decode_png_pillow(data: bytes) -> NDArray[Any]:
+    pil = importlib.import_module("PIL.Image")
+    with pil.open(io.BytesIO(data), formats=["PNG"]) as picture:
+        wide = picture.mode.startswith("I")
+        array = np.asarray(picture)
+    return array.astype(np.uint16) if wide else array
+
+
+def _decode_png_opencv(data: bytes) -> NDArray[Any]:
+    cv2 = importlib.import_module("cv2")
+    array: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if array is None:
+        raise ValueError("not a png")
+    return array[..., ::-1] if array.ndim == 3 else array
+
+
+_DECODERS = {"raw": _decode_raw, "jpeg": _decode_jpeg, "png": _decode_png}

@@ -1,0 +1,121 @@
+"""What a session shows: observations of the loop, and views beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import MalformedReplyError
+from .images import Frame, frames_by_camera
+
+if TYPE_CHECKING:
+    from real2sim_proto.drive import AgentState, EgoState, Event, Obs
+    from real2sim_proto.drive import Frame as WireFrame
+
+Frames = Mapping[str, Mapping[str, Frame]]
+"""Frames by camera, then by modality."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """Images of one committed instant.
+
+    Attributes:
+        t_us: that instant.
+        revision: of the session's edits.
+        frames: camera -> modality -> frame.
+        timing: milliseconds by stage, measured by the worker.
+    """
+
+    t_us: int
+    revision: int
+    frames: Frames = field(repr=False)
+    timing: Mapping[str, float] = field(default_factory=dict, repr=False)
+
+    def image(self, camera: str, modality: str = "rgb") -> NDArray[Any]:
+        """The decoded image of a camera, e.g. rgb: uint8 [H, W, 3].
+
+        Raises:
+            KeyError: this instant has no such frame; the sentence names those it has.
+        """
+        try:
+            return self.frames[camera][modality].array
+        except KeyError:
+            there = ", ".join(f"{c}/{m}" for c, ms in self.frames.items() for m in ms) or "none"
+            raise KeyError(
+                f"no frame {camera}/{modality} at {self.t_us} us; there: {there}"
+            ) from None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observation(View):
+    """What the vehicle perceives at step ``step``.
+
+    Attributes:
+        step: number of the instant; 0 after reset.
+        ego: state of the controlled vehicle; ``position`` is the rear axle's centre on the ground.
+        route: [R, 2] float64, x and y of the route ahead in the vehicle frame [m].
+        command: ``straight``, ``left`` or ``right``.
+        agents: other road users in the world frame; filled when reset with ``privileged=True``.
+        events: what happened in this step.
+        metrics: scores so far, by name.
+        terminated: the episode ended by something that happened in it.
+        truncated: the episode ended because its time was over.
+        reason: why it ended.
+    """
+
+    step: int
+    ego: EgoState
+    route: NDArray[np.float64] = field(repr=False)
+    command: str
+    agents: Sequence[AgentState] = field(default=(), repr=False)
+    events: Sequence[Event] = ()
+    metrics: Mapping[str, float] = field(default_factory=dict, repr=False)
+    terminated: bool = False
+    truncated: bool = False
+    reason: str | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended, either way."""
+        return self.terminated or self.truncated
+
+
+def observation_from_wire(obs: Obs) -> Observation:
+    """The observation in a message.
+
+    Raises:
+        MalformedReplyError: a route or matrix of another shape.
+    """
+    route = np.asarray(obs.route, dtype=np.float64)
+    if route.size == 0:
+        route = route.reshape(0, 2)
+    if route.ndim != 2 or route.shape[1] != 2:
+        raise MalformedReplyError(f"the route has shape {route.shape}, not [R, 2]")
+    return Observation(
+        step=obs.step,
+        t_us=obs.t_us,
+        revision=obs.revision,
+        ego=obs.ego,
+        route=route,
+        command=obs.command,
+        frames=frames_by_camera(obs.frames),
+        agents=tuple(obs.agents),
+        events=tuple(obs.events),
+        metrics=obs.metrics,
+        terminated=obs.terminated,
+        truncated=obs.truncated,
+        reason=obs.reason,
+        timing=obs.timing,
+    )
+
+
+def view_from_frames(
+    frames: Sequence[WireFrame], *, t_us: int, revision: int, timing: Mapping[str, float]
+) -> View:
+    """The view in a message."""
+    return View(t_us=t_us, revision=revision, frames=frames_by_camera(frames), timing=timing)

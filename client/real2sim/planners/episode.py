@@ -1,0 +1,150 @@
+"""One episode: observe, plan, step, until it is over."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from real2sim_proto.drive import Event
+
+    from .._sensors import ResetOptions, Sensor
+    from ..drive_session import DriveSession
+    from ..observation import Observation
+    from .planner import Planner
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """Milliseconds that one stage took over an episode."""
+
+    count: int
+    mean: float
+    p50: float
+    p95: float
+    p99: float
+
+    @classmethod
+    def of(cls, milliseconds: Sequence[float]) -> StageTimes:
+        """Statistics of at least one measurement."""
+        p50, p95, p99 = np.percentile(milliseconds, (50, 95, 99))
+        mean = float(np.mean(milliseconds))
+        return cls(len(milliseconds), mean, float(p50), float(p95), float(p99))
+
+
+@dataclass(frozen=True)
+class EpisodeSummary:
+    """What happened in an episode, and what it cost.
+
+    Attributes:
+        steps: clock steps driven.
+        start_us, end_us: first and last instant.
+        distance: metres that the rear axle moved.
+        terminated, truncated, reason: how it ended; none of them when the steps ran out first.
+        metrics: the worker's scores at the end.
+        events: what happened, oldest first.
+        wall_seconds: duration of the loop, without reset.
+        stages: milliseconds by stage. ``plan``, ``step`` (round trip) and ``loop`` (both) are
+            measured here; ``worker.*`` are the worker's own figures.
+    """
+
+    steps: int
+    start_us: int
+    end_us: int
+    distance: float
+    terminated: bool
+    truncated: bool
+    reason: str | None
+    metrics: dict[str, float]
+    events: tuple[Event, ...]
+    wall_seconds: float
+    stages: dict[str, StageTimes] = field(default_factory=dict)
+
+    @property
+    def steps_per_second(self) -> float:
+        """Rate of the whole loop."""
+        return self.steps / self.wall_seconds if self.wall_seconds > 0 else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        fields = {k: v for k, v in vars(self).items() if k not in {"events", "stages"}}
+        return fields | {
+            "steps_per_second": self.steps_per_second,
+            "events": [event.model_dump() for event in self.events],
+            "stages_ms": {name: asdict(times) for name, times in self.stages.items()},
+        }
+
+
+def run_episode(
+    session: DriveSession,
+    planner: Planner,
+    *,
+    steps: int | None = None,
+    sensors: Sequence[Sensor] = (),
+    on_observation: Callable[[Observation], None] | None = None,
+    **options: Unpack[ResetOptions],
+) -> EpisodeSummary:
+    """Reset the session and let the planner drive.
+
+    Args:
+        session: open.
+        planner: who drives.
+        steps: stop after so many; default: when the episode is over.
+        sensors: what every observation shows.
+        on_observation: called with every observation, the first included; its time is not counted.
+        options: of reset.
+    """
+    obs = session.reset(sensors=sensors, **options)
+    planner.reset(obs)
+    log = _EpisodeLog(obs)
+    if on_observation is not None:
+        on_observation(obs)
+    while not obs.over and (steps is None or log.steps < steps):
+        started = time.perf_counter()
+        plan = planner.plan(obs)
+        planned = time.perf_counter()
+        obs = session.step(plan)
+        log.add(obs, plan_s=planned - started, step_s=time.perf_counter() - planned)
+        if on_observation is not None:
+            on_observation(obs)
+    return log.summary()
+
+
+class _EpisodeLog:
+    def __init__(self, first: Observation) -> None:
+        self._first = self._last = first
+        self._events: list[Event] = list(first.events)
+        self._stages: dict[str, list[float]] = {}
+        self._distance = 0.0
+        self.steps = 0
+
+    def add(self, obs: Observation, *, plan_s: float, step_s: float) -> None:
+        moved = np.subtract(obs.ego.position, self._last.ego.position)
+        self._distance += float(np.linalg.norm(moved))
+        self._events.extend(obs.events)
+        self._last = obs
+        self.steps += 1
+        own = {"plan": plan_s * 1e3, "step": step_s * 1e3, "loop": (plan_s + step_s) * 1e3}
+        theirs: Mapping[str, float] = {f"worker.{k}": v for k, v in obs.timing.items()}
+        for stage, milliseconds in (own | dict(theirs)).items():
+            self._stages.setdefault(stage, []).append(milliseconds)
+
+    def summary(self) -> EpisodeSummary:
+        last = self._last
+        return EpisodeSummary(
+            steps=self.steps,
+            start_us=self._first.t_us,
+            end_us=last.t_us,
+            distance=self._distance,
+            terminated=last.terminated,
+            truncated=last.truncated,
+            reason=last.reason,
+            metrics=dict(last.metrics),
+            events=tuple(self._events),
+            wall_seconds=sum(self._stages.get("loop", ())) * 1e-3,
+            stages={name: StageTimes.of(times) for name, times in self._stages.items()},
+        )

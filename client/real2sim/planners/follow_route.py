@@ -1,0 +1,264 @@
+"""Follows the route, slower in bends and behind others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.drive import TrajectoryPlan
+
+if TYPE_CHECKING:
+    from real2sim_proto.drive import AgentState, EgoState
+
+    from ..observation import Observation
+
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Comfort:
+    """How a :class:`FollowRoute` drives; SI units.
+
+    Attributes:
+        lateral: largest acceleration sideways; sets the speed in bends.
+        acceleration, braking: largest along the route, ``braking`` where it can be chosen.
+        gap: metres kept free between bumpers at standstill.
+        headway: seconds kept behind another who moves.
+        clearance: metres to either side of the vehicle that must be free.
+        recovery: metres along the route over which an offset from it is driven back.
+    """
+
+    lateral: float = 2.0
+    acceleration: float = 1.5
+    braking: float = 2.5
+    gap: float = 4.0
+    headway: float = 1.0
+    clearance: float = 0.4
+    recovery: float = 8.0
+
+
+class FollowRoute:
+    """A planner for examples and tests: the route as a path, a speed limit at each point of it.
+
+    Others are only seen in sessions that are reset with ``privileged=True``.
+    """
+
+    def __init__(
+        self,
+        *,
+        speed: float = 8.0,
+        horizon: float = 3.0,
+        spacing: float = 0.25,
+        comfort: Comfort | None = None,
+    ) -> None:
+        """Make a planner.
+
+        Args:
+            speed: cruising speed [m/s].
+            horizon: length of a plan [s].
+            spacing: time between its poses [s].
+            comfort: accelerations and gaps; default: ``Comfort()``.
+        """
+        if not (speed > 0 and 0 < spacing <= horizon):
+            raise ValueError(
+                f"speed {speed!r}, horizon {horizon!r}, spacing {spacing!r}: give a speed "
+                "above 0 and a spacing above 0 that fits the horizon"
+            )
+        self.speed = speed
+        self.comfort = comfort or Comfort()
+        self._delays = np.arange(1, int(horizon / spacing + 1e-9) + 1) * spacing
+
+    def reset(self, obs: Observation) -> None:
+        """Nothing is remembered between plans."""
+
+    def plan(self, obs: Observation) -> TrajectoryPlan:
+        """Poses over the next seconds in the vehicle frame of ``obs``."""
+        path = Path.along(obs.route)
+        limits = speed_limits(path, cruise=self.speed, comfort=self.comfort)
+        for hindrance in hindrances(path, obs.ego, obs.agents, clearance=self.comfort.clearance):
+            limits = np.minimum(limits, behind(hindrance, path.arc, self.comfort))
+        travelled = drive_profile(
+            path.arc, limits, speed=obs.ego.speed, delays=self._delays, comfort=self.comfort
+        )
+        return TrajectoryPlan(
+            times_us=[obs.t_us + round(delay * 1e6) for delay in self._delays],
+            poses=[tuple(pose) for pose in path.poses(travelled, self.comfort.recovery).tolist()],
+        )
+
+
+@dataclass(frozen=True)
+class Path:
+    """The part of a route that lies ahead, as a polyline with arc length.
+
+    Attributes:
+        arc: [N] float64, metres from the point of the route nearest to the vehicle; from 0.
+        points: [N, 2] float64, vehicle frame [m].
+        offset: [2] float64, from that nearest point to the vehicle [m].
+    """
+
+    arc: Array
+    points: Array
+    offset: Array
+
+    @classmethod
+    def along(cls, route: Array, *, spacing: float = 0.5) -> Path:
+        """The route [R, 2] from the vehicle on, resampled; a standing point where it is empty."""
+        if len(route) == 0:
+            return cls(np.zeros(1), np.zeros((1, 2)), np.zeros(2))
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
+        start = _nearest_arc(route, arc)
+        count = max(int((arc[-1] - start) / spacing), 0) + 1
+        samples = start + np.arange(count) * spacing
+        points = np.stack([np.interp(samples, arc, route[:, k]) for k in (0, 1)], axis=1)
+        return cls(samples - start, points, -points[0])
+
+    def curvature(self) -> Array:
+        """[N] float64, 1/m, unsigned; over about two metres, to be deaf to noise."""
+        if len(self.points) < 3:
+            return np.zeros(len(self.points))
+        heading = np.unwrap(np.arctan2(*np.gradient(self.points, self.arc, axis=0).T[::-1]))
+        window = np.ones(5) / 5
+        smooth = np.convolve(np.pad(heading, 2, mode="edge"), window, mode="valid")
+        bend: Array = np.abs(np.gradient(smooth, self.arc))
+        return bend
+
+    def poses(self, travelled: Array, recovery: float) -> Array:
+        """[K, 3] x [m], y [m], yaw [rad] after so many metres [K]; the offset from the route fades.
+
+        Yaw is the direction of the path driven, so that it is what a car can do.
+        """
+        reach = 0.25
+        here, ahead = self._at(travelled, recovery), self._at(travelled + reach, recovery)
+        direction = ahead - here
+        moving = np.linalg.norm(direction, axis=1) > 1e-6
+        yaw = np.where(moving, np.arctan2(direction[:, 1], direction[:, 0]), 0.0)
+        return np.concatenate([here, np.unwrap(yaw)[:, None]], axis=1)
+
+    def _at(self, travelled: Array, recovery: float) -> Array:
+        inside = np.stack([np.interp(travelled, self.arc, self.points[:, k]) for k in (0, 1)], 1)
+        beyond = np.maximum(travelled - self.arc[-1], 0.0)[:, None] * self._last_direction()
+        fade = np.exp(-travelled / recovery)[:, None]
+        points: Array = inside + beyond + self.offset * fade
+        return points
+
+    def _last_direction(self) -> Array:
+        if len(self.points) < 2:
+            return np.array([1.0, 0.0])
+        step = self.points[-1] - self.points[-2]
+        length = float(np.linalg.norm(step))
+        return step / length if length > 1e-9 else np.array([1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Hindrance:
+    """Something in the way: where it begins along the path [m], and its speed along it [m/s]."""
+
+    arc: float
+    speed: float
+
+
+def speed_limits(path: Path, *, cruise: float, comfort: Comfort) -> Array:
+    """[N] float64 m/s along the path: cruising, slower in bends, standing at its end."""
+    bend = np.sqrt(comfort.lateral / np.maximum(path.curvature(), 1e-6))
+    limits = np.minimum(bend, cruise)
+    to_end = path.arc[-1] - path.arc
+    limits = np.minimum(limits, np.sqrt(2.0 * comfort.braking * to_end))
+    return brake_ahead(path.arc, limits, braking=comfort.braking)
+
+
+def brake_ahead(arc: Array, limits: Array, *, braking: float) -> Array:
+    """Limits lowered so that each can be reached from the one before by braking."""
+    lowered = limits.copy()
+    for i in range(len(lowered) - 2, -1, -1):
+        reachable = math.sqrt(lowered[i + 1] ** 2 + 2.0 * braking * (arc[i + 1] - arc[i]))
+        lowered[i] = min(lowered[i], reachable)
+    return lowered
+
+
+def hindrances(
+    path: Path, ego: EgoState, agents: Sequence[AgentState], *, clearance: float
+) -> list[Hindrance]:
+    """Agents whose box reaches into the strip that the vehicle sweeps along the path.
+
+    Counted from where the vehicle's origin must stand for its front to touch.
+    """
+    found: list[Hindrance] = []
+    direction = np.gradient(path.points, path.arc, axis=0) if len(path.arc) > 1 else None
+    if direction is None:
+        return found
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    front = 0.75 * ego.size[0]
+    for agent in agents:
+        corners, velocity = _in_vehicle_frame(ego, agent)
+        apart = np.linalg.norm(corners[:, None] - path.points, axis=2)
+        nearest = apart.argmin(axis=1)
+        along = direction[nearest]
+        shift = corners - path.points[nearest]
+        arcs = path.arc[nearest] + (along * shift).sum(axis=1)
+        aside = along[:, 0] * shift[:, 1] - along[:, 1] * shift[:, 0]
+        reach = 0.5 * ego.size[1] + clearance
+        in_strip = aside.min() < reach and aside.max() > -reach
+        if in_strip and arcs.max() > 0.0 and arcs.min() < path.arc[-1]:
+            speed = float(velocity @ direction[nearest[arcs.argmin()]])
+            found.append(Hindrance(float(arcs.min()) - front, speed))
+    return found
+
+
+def behind(hindrance: Hindrance, arc: Array, comfort: Comfort) -> Array:
+    """[N] float64 m/s at which one can still stop, or fall in, behind a hindrance."""
+    speed = max(hindrance.speed, 0.0)
+    room = hindrance.arc - comfort.gap - comfort.headway * speed - arc
+    limits: Array = np.sqrt(np.maximum(speed**2 + 2.0 * comfort.braking * room, 0.0))
+    return limits
+
+
+def drive_profile(
+    arc: Array, limits: Array, *, speed: float, delays: Array, comfort: Comfort
+) -> Array:
+    """[K] float64 metres travelled after each delay [s], from ``speed``, within limits.
+
+    Braking may exceed ``comfort.braking`` where somebody is already too near.
+    """
+    travelled, now, speed = np.empty(len(delays)), 0.0, max(speed, 0.0)
+    position = 0.0
+    for k, delay in enumerate(delays):
+        steps = max(round((delay - now) / 0.05), 1)
+        dt = (delay - now) / steps
+        for _ in range(steps):
+            limit = float(np.interp(position + speed * dt, arc, limits))
+            target = min(limit, speed + comfort.acceleration * dt)
+            following = max(target, speed - 2.0 * comfort.braking * dt, 0.0)
+            position += 0.5 * (speed + following) * dt
+            speed = following
+        travelled[k], now = position, delay
+    return travelled
+
+
+def _nearest_arc(route: Array, arc: Array) -> float:
+    """Arc length of the point of the polyline nearest to the vehicle's origin."""
+    if len(route) == 1:
+        return 0.0
+    begin, step = route[:-1], np.diff(route, axis=0)
+    length2 = np.maximum((step**2).sum(axis=1), 1e-12)
+    share = np.clip(-(begin * step).sum(axis=1) / length2, 0.0, 1.0)
+    distance = np.linalg.norm(begin + share[:, None] * step, axis=1)
+    i = int(distance.argmin())
+    return float(arc[i] + share[i] * math.sqrt(length2[i]))
+
+
+def _in_vehicle_frame(ego: EgoState, agent: AgentState) -> tuple[Array, Array]:
+    """Box corners [4, 2] and velocity [2] of an agent, vehicle frame."""
+    w, x, y, z = agent.quaternion
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) - ego.yaw
+    c, s = math.cos(ego.yaw), math.sin(ego.yaw)
+    to_vehicle = np.array([[c, s], [-s, c]])
+    centre = to_vehicle @ np.subtract(agent.position, ego.position)[:2]
+    ahead = np.array([math.cos(yaw), math.sin(yaw)]) * 0.5 * agent.size[0]
+    left = np.array([-math.sin(yaw), math.cos(yaw)]) * 0.5 * agent.size[1]
+    corners = centre + np.array([ahead + left, ahead - left, -ahead - left, -ahead + left])
+    return corners, to_vehicle @ np.array(agent.velocity[:2])
