@@ -48,6 +48,8 @@ def tensor_hashes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
 def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> int:
     """Write a new safetensors file; its length in bytes."""
     save_file({name: tensor.numpy() for name, tensor in tensors.items()}, path)
+    # The library writes for the owner alone; a service often runs as somebody else.
+    path.chmod(path.parent.stat().st_mode & 0o666)
     return path.stat().st_size
 
 

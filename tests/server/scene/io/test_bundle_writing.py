@@ -63,6 +63,10 @@ def test_a_failure_while_writing_leaves_the_old_bundle(
     assert [f.name for f in tmp_path.iterdir()] == ["street.r2s"]
 
 
+def test_tensor_files_are_readable_by_whom_the_json_is(bundle):
+    assert len({file.stat().st_mode for file in bundle.iterdir()}) == 1
+
+
 def test_values_that_are_not_finite_are_not_written(scene, tmp_path):
     means = scene.object("car_3").cloud.means.clone()
     means[4, 1] = float("nan")
