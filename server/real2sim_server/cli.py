@@ -1,7 +1,205 @@
-"""The worker's part of the ``real2sim`` command. Heavy modules are imported by the command that runs."""
+"""The worker's part of the ``real2sim`` command.
+
+This module is imported by every ``real2sim --help``, so it loads nothing heavy: each command
+checks that its extra is installed and only then imports its room.
+"""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 app = typer.Typer(no_args_is_help=True)
+bench = typer.Typer(no_args_is_help=True, help="Measure this machine; ratios to a reference.")
+app.add_typer(bench, name="bench")
+
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", help="Also write the figures to this file.", dir_okay=False)
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Option("--out", help="Folder of the log to write.")],
+    frames: Annotated[int, typer.Option(min=2, max=10_000)] = 60,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    width: Annotated[int, typer.Option(min=32, max=4096, help="Image width [px].")] = 480,
+    height: Annotated[int, typer.Option(min=32, max=4096, help="Image height [px].")] = 320,
+    moving_cars: Annotated[int, typer.Option(min=0, max=40)] = 4,
+    parked_cars: Annotated[int, typer.Option(min=0, max=80)] = 14,
+    json: JsonFile = None,
+) -> None:
+    """Generate a driving log of a procedural street: cameras, LiDAR, exact poses and boxes."""
+    from .commands import synth as command
+
+    _run(
+        command.run,
+        out=out,
+        sizes={"frames": frames, "seed": seed, "width": width, "height": height},
+        cars={"moving_cars": moving_cars, "parked_cars": parked_cars},
+        json_path=json,
+    )
+
+
+@app.command()
+def reconstruct(
+    log: Annotated[Path, typer.Argument(help="Folder of a driving log (KITTI tracking, native).")],
+    out: Annotated[Path, typer.Option("--out", help="Scene bundle to write.")],
+    iterations: Annotated[
+        int, typer.Option(min=0, help="0 builds from LiDAR without training.")
+    ] = 0,
+    log_format: Annotated[str | None, typer.Option("--format", help="Default: recognised.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Where a dataset holds several.")] = None,
+    overwrite: Overwrite = False,
+    json: JsonFile = None,
+) -> None:
+    """Turn a driving log into a scene of Gaussians."""
+    from .commands import reconstruct as command
+
+    _run(
+        command.run,
+        log=log,
+        out=out,
+        iterations=iterations,
+        log_format=log_format,
+        sequence=sequence,
+        overwrite=overwrite,
+        json_path=json,
+    )
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(help="Gaussian splats: INRIA .ply, .compressed.ply")],
+    out: Annotated[Path, typer.Option("--out", help="Bundle to write.")],
+    asset: Annotated[
+        bool, typer.Option("--asset", help="As an object to insert, not a scene.")
+    ] = False,
+    category: Annotated[str, typer.Option(help="Class of an asset.")] = "car",
+    up_axis: Annotated[
+        str, typer.Option(help="Axis that points up in the file: z, y or -y.")
+    ] = "z",
+    overwrite: Overwrite = False,
+    json: JsonFile = None,
+) -> None:
+    """Turn a splat file into a scene or an asset."""
+    from .commands import import_splats as command
+
+    _run(
+        command.run,
+        file=file,
+        out=out,
+        category=category if asset else None,
+        up_axis=up_axis,
+        overwrite=overwrite,
+        json_path=json,
+    )
+
+
+@app.command()
+def render(
+    scene: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Image to write: .png or .jpg")],
+    camera: Annotated[str | None, typer.Option(help="Default: the first one.")] = None,
+    frame: Annotated[int | None, typer.Option(min=0, help="Recorded frame; default 0.")] = None,
+    t_us: Annotated[int | None, typer.Option(help="Or a time stamp [us].")] = None,
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="[px]")] = None,
+    modality: Annotated[str, typer.Option(help="rgb, depth or instance")] = "rgb",
+    delete: Annotated[list[str] | None, typer.Option(help="Objects to leave out.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Compare with this log's image: PSNR.")] = None,
+    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference")] = "auto",
+    json: JsonFile = None,
+) -> None:
+    """Draw one logged camera of a scene; with --log print PSNR against the recorded image."""
+    from .commands import render as command
+
+    _run(
+        command.run,
+        scene=scene,
+        out=out,
+        view=command.View(camera=camera, frame=frame, t_us=t_us, width=width, modality=modality),
+        delete=delete or [],
+        log=log,
+        backend=backend,
+        json_path=json,
+    )
+
+
+@app.command()
+def serve(
+    host: Annotated[
+        str | None, typer.Option(help="Default 127.0.0.1; others need a token.")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 picks a free one.")] = None,
+    scenes: Annotated[Path | None, typer.Option(help="Folder of scene bundles.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder for scenarios and sessions.")] = None,
+    token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
+    backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda or reference")] = None,
+) -> None:
+    """Start a worker. Settings not given here come from REAL2SIM_* variables."""
+    from .commands import serve as command
+
+    _run(
+        command.run,
+        overrides={
+            "host": host,
+            "port": port,
+            "scenes_dir": scenes,
+            "data_dir": data,
+            "token": token,
+            "backend": backend,
+        },
+    )
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Where results go.")] = Path("out/demo"),
+    steps: Annotated[int, typer.Option(min=1, max=10_000)] = 100,
+    serve: Annotated[bool, typer.Option("--serve", help="Leave the worker up afterwards.")] = False,
+) -> None:
+    """Build a street, edit it over REST, drive it over WebSocket, leave video and figures."""
+    from .demo import run as command
+
+    _run(command.run, out=out, steps=steps, leave_serving=serve)
+
+
+@app.command()
+def doctor(
+    warm: Annotated[
+        bool, typer.Option("--warm", help="Compile all kernels into the cache.")
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Say what this machine can do, what is missing, and how to mend it."""
+    from .commands import doctor as command
+
+    command.run(warm=warm, json_path=json)
+
+
+@bench.command("render")
+def bench_render(
+    splat: Annotated[Path | None, typer.Option(help="Splat file for the first case.")] = None,
+    json: JsonFile = None,
+) -> None:
+    """Milliseconds by stage and Gaussians per second, as ratio to the plain reference."""
+    from .commands import bench_render as command
+
+    _run(command.run, splat=splat, json_path=json)
+
+
+@bench.command("serve")
+def bench_serve(json: JsonFile = None) -> None:
+    """Latency of a drive step, share of rendering, lag of the event loop, memory per session."""
+    from .commands import bench_serve as command
+
+    _run(command.run, json_path=json)
+
+
+def _run(command: Any, **arguments: Any) -> None:
+    from .commands.console import run_command
+
+    run_command(command, **arguments)

@@ -1,0 +1,1 @@
+"""What each command of the worker does, one module a command."""

@@ -1,0 +1,153 @@
+"""``real2sim demo``: make a street, serve it, edit it over REST, drive it over WebSocket."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import numpy as np
+
+from real2sim import connect
+from real2sim.planners import FollowRoute
+
+from ..commands.console import console, print_figures, staged_progress, write_json
+from ..logs.synthetic import SyntheticConfig, synthesize
+from ..reconstruct import reconstruct
+from .drive import Drive, drive_through
+from .edits import Edits, make_room
+from .pictures import draw_map, write_png
+from .worker import own_worker
+
+SCENE = "demo_street"
+CAMERAS = ("front_left", "front", "front_right")
+LOG_HZ = 4.0
+STEP_US = 100_000
+
+
+def run(*, out: Path, steps: int, leave_serving: bool) -> None:
+    """Run the whole demo; results lie below ``out`` afterwards.
+
+    Args:
+        out: folder; what an earlier demo left there is replaced.
+        steps: clock steps of 0.1 s to drive.
+        leave_serving: keep the worker up until Ctrl-C, and print what to try next.
+    """
+    clock = Clock()
+    scenes = _build_street(out, steps, clock)
+    with own_worker(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
+        with connect(worker.url) as client:
+            with clock("start the worker"):
+                client.wait_ready()
+                client.scenes.load(SCENE)
+            with clock("edit over REST"):
+                scenario = client.scenarios.create(scene=SCENE, name="demo")
+                edits = make_room(scenario, client.scenes.get(SCENE), camera="front")
+            with clock("drive over WebSocket"):
+                session = client.session(scenario=scenario.scenario_id)
+                drive = drive_through(
+                    session,
+                    FollowRoute(speed=8.0),
+                    cameras=CAMERAS,
+                    steps=steps,
+                    dt_us=STEP_US,
+                    video_path=out / "drive.webm",
+                )
+        with clock("leave pictures"):
+            _leave_pictures(out, edits, drive)
+        figures = _summary(edits, drive, clock)
+        write_json(out / "summary.json", figures)
+        _report(out, drive, clock)
+        if leave_serving:
+            _stay(worker.url, scenario.scenario_id)
+
+
+class Clock:
+    """Wall seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Measure the block as ``stage``, and say on the console that it runs."""
+        start = time.perf_counter()
+        with console.status(stage) if console.is_terminal else nullcontext():
+            yield
+        self.seconds[stage] = time.perf_counter() - start
+
+
+def _build_street(out: Path, steps: int, clock: Clock) -> Path:
+    log, scenes = out / "log", out / "scenes"
+    for stale in (log, scenes, out / "worker"):
+        shutil.rmtree(stale, ignore_errors=True)
+    duration_s = (steps + 2) * STEP_US * 1e-6
+    frames = int(np.ceil(duration_s * LOG_HZ)) + 1
+    config = SyntheticConfig(frames=frames, hz=LOG_HZ, width=480, height=320)
+    with staged_progress() as report:
+        begun = time.perf_counter()
+        synthesize(config, log, on_progress=lambda done, total: report("record", done, total))
+        clock.seconds["record a synthetic drive"] = time.perf_counter() - begun
+        begun = time.perf_counter()
+        reconstruct(log, scenes / SCENE, iterations=0, on_progress=report)
+        clock.seconds["reconstruct it"] = time.perf_counter() - begun
+    return scenes
+
+
+def _leave_pictures(out: Path, edits: Edits, drive: Drive) -> None:
+    write_png(out / "edit_before.png", edits.before)
+    write_png(out / "edit_after.png", edits.after)
+    for step, picture in drive.stills.items():
+        write_png(out / f"drive_{step:03d}.png", picture)
+    draw_map(out / "map.png", logged=edits.logged, driven=drive.path, boxes=edits.footprints)
+
+
+def _summary(edits: Edits, drive: Drive, clock: Clock) -> dict[str, object]:
+    return {
+        "scene": SCENE,
+        "gaussians": edits.gaussians,
+        "objects": len(edits.footprints),
+        "moved": edits.moved,
+        "duplicated": edits.duplicated,
+        "cameras": list(CAMERAS),
+        "stages_s": clock.seconds,
+        "episode": drive.summary.to_dict(),
+    }
+
+
+def _report(out: Path, drive: Drive, clock: Clock) -> None:
+    episode = drive.summary
+    figures: dict[str, object] = {f"{k} [s]": v for k, v in clock.seconds.items()}
+    figures |= {
+        "steps driven": episode.steps,
+        "distance [m]": episode.distance,
+        "ended by": episode.reason or "steps done",
+        "steps per second": episode.steps_per_second,
+    }
+    figures |= {f"{name} p50 [ms]": times.p50 for name, times in episode.stages.items()}
+    print_figures("demo", figures)
+    console.print(
+        f"in {out}: drive.webm, edit_before.png, edit_after.png, map.png, summary.json",
+        highlight=False,
+    )
+
+
+def _stay(url: str, scenario_id: str) -> None:
+    preview = f"{url}/v1/scenarios/{scenario_id}/preview?camera=front"
+    operations = '{"operations": [{"op": "rotate", "object_id": "car_1", "angle": 0.26}]}'
+    console.print(
+        f"\nthe worker stays up at {url} until Ctrl-C; next, in another terminal:\n\n"
+        f"  curl '{preview}' -o now.jpg\n"
+        f"  curl -X POST {url}/v1/scenarios/{scenario_id}/operations \\\n"
+        f"       -H 'Content-Type: application/json' -d '{operations}'\n"
+        f"  real2sim drive --url {url} --scenario {scenario_id} --steps 50 --out out/drive\n",
+        highlight=False,
+        soft_wrap=True,
+    )
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        console.print("stopped")
