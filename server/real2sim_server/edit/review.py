@@ -18,6 +18,7 @@ GroundHeight = Callable[[Float], Float]
 
 SAMPLE_PERIOD_US = 100_000
 MAX_SAMPLES = 201
+MAX_GROUND_SAMPLES = 21
 OFF_GROUND = 0.3
 """A box bottom this much higher or lower above ground than in the recording is reported [m]."""
 
@@ -107,8 +108,9 @@ def _off_ground(
 
 
 def _clearance(transforms: Float, subject: ObjectState, ground: GroundHeight | None) -> Float:
-    lowest: Float = box_corners(transforms, subject.scaled_size)[..., 2].min(axis=-1)
-    return lowest - ground(transforms[:, :2, 3]) if ground else lowest
+    sparse = transforms[:: -(-len(transforms) // MAX_GROUND_SAMPLES)]
+    lowest: Float = box_corners(sparse, subject.scaled_size)[..., 2].min(axis=-1)
+    return lowest - ground(sparse[:, :2, 3]) if ground else lowest
 
 
 def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iterator[EditWarning]:

@@ -1,0 +1,91 @@
+"""Whether an episode can run as asked, and its clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.drive import ResetSpec, SensorSpec
+
+from ..scene import Scene
+from .errors import WorldError
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Times of an episode.
+
+    Attributes:
+        start_us: time of step 0 [us].
+        dt_us: from step to step [us].
+        horizon: number of steps after which the episode is cut off.
+    """
+
+    start_us: int
+    dt_us: int
+    horizon: int
+
+    def at(self, step: int) -> int:
+        """Time of a step [us]."""
+        return self.start_us + step * self.dt_us
+
+
+def plan_episode(scene: Scene, spec: ResetSpec) -> Clock:
+    """The clock of an episode on ``scene``.
+
+    Raises:
+        WorldError: TIME_OUT_OF_RANGE when start or horizon leave the log; UNKNOWN_CAMERA;
+            INVALID_REQUEST when a sensor's period and the clock step do not divide, or a camera
+            is listed twice.
+    """
+    clock = _clock(scene, spec)
+    for sensor in spec.sensors:
+        _check_sensor(scene, spec, sensor)
+    cameras = [s.camera for s in spec.sensors]
+    twice = {c for c in cameras if cameras.count(c) > 1}
+    if twice:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"cameras {sorted(twice)} are listed more than once",
+            hint="list a camera once, with all its modalities",
+        )
+    return clock
+
+
+def _clock(scene: Scene, spec: ResetSpec) -> Clock:
+    start = scene.start_us if spec.start_us is None else spec.start_us
+    latest = scene.end_us - spec.dt_us
+    if not scene.start_us <= start <= latest:
+        raise WorldError(
+            ErrorCode.TIME_OUT_OF_RANGE,
+            f"an episode from start_us={start} with steps of {spec.dt_us} us does not fit the log, "
+            f"which covers [{scene.start_us}, {scene.end_us}]",
+            hint=f"start between {scene.start_us} and {latest}"
+            if latest >= scene.start_us
+            else f"the log is only {scene.end_us - scene.start_us} us long; take a smaller dt_us",
+        )
+    longest = (scene.end_us - start) // spec.dt_us
+    if spec.horizon is not None and spec.horizon > longest:
+        raise WorldError(
+            ErrorCode.TIME_OUT_OF_RANGE,
+            f"horizon {spec.horizon} is longer than the {longest} steps of {spec.dt_us} us that "
+            f"are left of the log after {start}",
+            hint=f"ask for {longest} steps at most, or leave horizon out",
+        )
+    return Clock(start, spec.dt_us, spec.horizon or longest)
+
+
+def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
+    if sensor.camera not in scene.rig.names:
+        raise WorldError(
+            ErrorCode.UNKNOWN_CAMERA,
+            f"scene {scene.name!r} has no camera {sensor.camera!r}",
+            hint=f"cameras of this scene: {', '.join(scene.rig.names)}",
+        )
+    if sensor.period_us is not None and sensor.period_us % spec.dt_us:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"period_us {sensor.period_us} of camera {sensor.camera!r} is no multiple of dt_us "
+            f"{spec.dt_us}",
+            hint="all sensors show committed instants; choose a period of whole clock steps",
+        )
