@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from hypothesis import settings
 
 from real2sim_server.scene import (
     Camera,
@@ -20,10 +19,6 @@ from real2sim_server.scene import (
 )
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 from real2sim_server.scene.rotation import yaw_quaternion
-
-# Machines under load are slow now and then, and a failure must come back on the next run.
-settings.register_profile("repeatable", deadline=None, derandomize=True)
-settings.load_profile("repeatable")
 
 MakeCloud = Callable[..., GaussianCloud]
 
