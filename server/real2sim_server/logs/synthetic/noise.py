@@ -1,0 +1,73 @@
+"""Hash noise for textures: the same everywhere, faded where it is finer than a pixel."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+_MASK = 0xFFFFFFFF
+
+
+@njit(cache=True)
+def hash01(x, y, seed):
+    """A number in [0, 1) from two integers and a seed (32-bit finaliser of MurmurHash3)."""
+    h = (int(x) * 0x9E3779B1 + int(y) * 0x85EBCA77 + int(seed) * 0xC2B2AE3D) & _MASK
+    h = ((h ^ (h >> 16)) * 0x85EBCA6B) & _MASK
+    h = ((h ^ (h >> 13)) * 0xC2B2AE35) & _MASK
+    return (h ^ (h >> 16)) / 4294967296.0
+
+
+@njit(cache=True, error_model="numpy")
+def value_noise(x, y, seed):
+    """Smooth noise in [0, 1] with features of size 1."""
+    fx, fy = math.floor(x), math.floor(y)
+    u, v = x - fx, y - fy
+    u, v = u * u * (3 - 2 * u), v * v * (3 - 2 * v)
+    a = hash01(fx, fy, seed)
+    b = hash01(fx + 1, fy, seed)
+    c = hash01(fx, fy + 1, seed)
+    d = hash01(fx + 1, fy + 1, seed)
+    return a + (b - a) * u + (c - a) * v + (a - b - c + d) * u * v
+
+
+@njit(cache=True, error_model="numpy")
+def layered_noise(x, y, octaves, footprint, seed):
+    """Sum of octaves of noise, about [-1, 1] around 0.
+
+    ``footprint`` is the size of a pixel in units of x: octaves finer than two pixels are faded
+    out, so that the texture is band-limited at any distance.
+    """
+    total, amplitude, scale = 0.0, 0.5, 1.0
+    for octave in range(octaves):
+        fade = 1.5 - 2.0 * footprint * scale
+        if fade <= 0.0:
+            break
+        total += (
+            amplitude
+            * min(fade, 1.0)
+            * (2.0 * value_noise(x * scale, y * scale, seed + octave) - 1.0)
+        )
+        amplitude *= 0.55
+        scale *= 2.03
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def band(x, low, high, footprint):
+    """Share of a pixel of width ``footprint`` around x that lies in [low, high]."""
+    half = 0.5 * max(footprint, 1e-6)
+    return max(0.0, min(x + half, high) - max(x - half, low)) / (2.0 * half)
+
+
+@njit(cache=True, error_model="numpy")
+def blend(a, b, weight):
+    """a for weight 0, b for weight 1."""
+    return a + (b - a) * weight
+
+
+@njit(cache=True, error_model="numpy")
+def ramp(x, low, high):
+    """Smooth step from 0 at ``low`` to 1 at ``high``."""
+    t = min(max((x - low) / (high - low), 0.0), 1.0)
+    return t * t * (3.0 - 2.0 * t)
