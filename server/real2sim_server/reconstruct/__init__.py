@@ -1,0 +1,17 @@
+"""From driving logs to scenes of Gaussians."""
+
+from .evaluate import EvaluationReport, ViewScore, evaluate_views
+from .initialise import initialise_scene
+from .options import InitialiseOptions, ReconstructError
+from .run import ReconstructReport, reconstruct
+
+__all__ = [
+    "EvaluationReport",
+    "InitialiseOptions",
+    "ReconstructError",
+    "ReconstructReport",
+    "ViewScore",
+    "evaluate_views",
+    "initialise_scene",
+    "reconstruct",
+]

@@ -1,0 +1,168 @@
+"""How close rendered views come to the logged images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..logs import DrivingLog
+from ..render import Instance, RasterOptions, render_cameras
+from ..scene import Camera, Scene
+from ..scene.rotation import apply_transform, invert_transform
+from .options import ReconstructError
+
+NEAR = 0.5
+"""LiDAR points nearer to the camera plane do not count as covering [m]."""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One rendered view against its logged image.
+
+    Attributes:
+        camera, frame: which view.
+        psnr: over all pixels [dB].
+        psnr_lidar: over the pixels that LiDAR covers [dB]; nan where there are none.
+        lidar_share: share of pixels that LiDAR covers, 0 to 1.
+    """
+
+    camera: str
+    frame: int
+    psnr: float
+    psnr_lidar: float
+    lidar_share: float
+
+
+@dataclass(frozen=True)
+class EvaluationReport:
+    """Scores of several views.
+
+    Attributes:
+        views: one score each, camera by camera within a frame.
+        psnr, psnr_lidar: means of the views' values [dB].
+    """
+
+    views: tuple[ViewScore, ...]
+    psnr: float
+    psnr_lidar: float
+
+
+def evaluate_views(
+    scene: Scene,
+    log: DrivingLog,
+    *,
+    frames: Sequence[int],
+    cameras: Sequence[str] | None = None,
+    width: int | None = None,
+) -> EvaluationReport:
+    """Render logged views and compare them with the logged images.
+
+    A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least NEAR in
+    front of the camera, projects into it or into one of the pixels around it, up to 1/600 of the
+    image width away (2 px at 1242 px). Points are taken as the log gives them, without an
+    occlusion test.
+
+    Args:
+        scene: reconstructed from ``log``.
+        frames: indices of frames.
+        cameras: names; all by default.
+        width: of the compared images [px]; the logged width by default.
+
+    Raises:
+        ReconstructError: no frames or no cameras were named, or the scene lacks a frame.
+        LogError: unknown frames, or files that cannot be read.
+    """
+    names = list(log.rig.names if cameras is None else cameras)
+    if not names or len(frames) == 0:
+        raise ReconstructError("name at least one camera and one frame to evaluate")
+    views = tuple(
+        _score(scene, log, log.rig[name], frame, width) for frame in frames for name in names
+    )
+    return EvaluationReport(
+        views=views,
+        psnr=_mean([v.psnr for v in views]),
+        psnr_lidar=_mean([v.psnr_lidar for v in views]),
+    )
+
+
+def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.uint8]:
+    """RGB [H, W, 3] of ``camera`` on the recording vehicle at ``t_us``, objects as recorded.
+
+    Raises:
+        TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
+    """
+    instances = [Instance(scene.background)]
+    for index, item in enumerate(scene.objects.values()):
+        if item.trajectory.covers(t_us):
+            pose = item.trajectory.transform(t_us)
+            instances.append(Instance(item.cloud, pose, instance_id=index + 1))
+    options = RasterOptions(depth=False, instance=False)
+    [frame] = render_cameras(
+        instances, [camera], scene.ego.transform(t_us), sky=scene.sky, options=options
+    )
+    return frame.rgb
+
+
+def lidar_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
+    """[H, W] bool, pixels of ``camera`` that the sweep of ``frame`` covers.
+
+    Defined in :func:`evaluate_views`.
+    """
+    import cv2
+
+    T_camera_vehicle = invert_transform(camera.T_vehicle_camera)
+    points = apply_transform(T_camera_vehicle, log.lidar(frame).points)
+    points = points[points[:, 2] > NEAR]
+    u = np.floor(camera.K[0, 0] * points[:, 0] / points[:, 2] + camera.K[0, 2])
+    v = np.floor(camera.K[1, 1] * points[:, 1] / points[:, 2] + camera.K[1, 2])
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    mask[v[inside].astype(np.int64), u[inside].astype(np.int64)] = 1
+    reach = max(1, round(camera.width / 600))
+    return np.asarray(cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
+
+
+def psnr(
+    image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> float:
+    """Peak signal-to-noise ratio [dB] of RGB images [H, W, 3] over ``mask`` [H, W].
+
+    Infinite for equal pixels, nan where the mask is empty.
+    """
+    difference = image.astype(np.float64) - truth
+    if mask is not None:
+        difference = difference[mask]
+    if difference.size == 0:
+        return float("nan")
+    error = float((difference**2).mean())
+    return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
+
+
+def _score(
+    scene: Scene, log: DrivingLog, camera: Camera, frame: int, width: int | None
+) -> ViewScore:
+    truth = log.image(camera.name, frame)
+    camera = camera if width is None else camera.resized(width)
+    truth = _resized(truth, camera)
+    image = render_logged_view(scene, camera, int(log.frame_times_us[frame]))
+    mask = lidar_mask(log, camera, frame)
+    return ViewScore(
+        camera.name, frame, psnr(image, truth), psnr(image, truth, mask), float(mask.mean())
+    )
+
+
+def _resized(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    import cv2
+
+    if image.shape[1] == camera.width:
+        return image
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _mean(values: list[float]) -> float:
+    known = [v for v in values if not np.isnan(v)]
+    return float(np.mean(known)) if known else float("nan")

@@ -1,0 +1,269 @@
+"""Stage 0: from a log to a scene of Gaussians without training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..logs import DrivingLog, ObjectTrack
+from ..scene import GaussianCloud, Scene, SceneObject, Sky
+from ..scene.harmonics import SH_C0
+from .accumulate import Accumulation, accumulate, drive_path
+from .ground import GroundSurface, box_footprints, fit_ground, spread_ground
+from .object_shape import add_box_surface
+from .options import InitialiseOptions, ReconstructError
+from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
+from .sky_map import SkySamples
+from .stages import OnProgress, Stages
+from .surfels import Surfels, fit_surfels
+from .unseen import (
+    ColourPrior,
+    fill_from_mirror,
+    fill_from_neighbours,
+    fill_ground,
+)
+from .views import Placed, View, chosen_frames, gather_views
+
+OPACITY = 0.95
+ABOVE_GROUND = 0.1
+"""Points this close to the ground surface are replaced by it [m]."""
+SKY_FRAMES = 15
+BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
+OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """All Gaussians in the making, in this order: ground, structure, then object by object."""
+
+    surfels: Surfels
+    intensity: NDArray[np.float32]
+    instance: NDArray[np.uint16]
+    ground_count: int
+
+
+def initialise_scene(
+    log: DrivingLog,
+    *,
+    options: InitialiseOptions | None = None,
+    on_progress: OnProgress | None = None,
+    timing_s: dict[str, float] | None = None,
+) -> Scene:
+    """Build a scene from a log in seconds, without training.
+
+    LiDAR is accumulated in the world and in each tracked box, thinned, turned into flat Gaussians
+    and coloured from the cameras; the road becomes a closed surface, also where cars hide it;
+    pixels that nothing covers become the sky. The same log gives the same bits.
+
+    Args:
+        log: a drive with LiDAR and at least one camera; boxes may be missing.
+        options: see InitialiseOptions.
+        on_progress: told the stage and how far it is.
+        timing_s: filled with the seconds of each stage.
+
+    Returns:
+        The scene in the log's world frame, objects under their track's id, SH of degree 0.
+
+    Raises:
+        ReconstructError: the log has no camera, no frame or no usable LiDAR point.
+        LogError: a file of the log cannot be read.
+    """
+    options = options or InitialiseOptions()
+    stages = Stages(on_progress, timing_s)
+    if len(log.rig) == 0 or log.frame_count == 0:
+        raise ReconstructError(f"log {log.name!r} has no camera images; colours come from them")
+    with stages("accumulate") as tell:
+        measured = accumulate(log, options, lambda f: tell(f + 1, log.frame_count))
+    if len(measured.background) == 0:
+        raise ReconstructError(
+            f"log {log.name!r} has no usable LiDAR points; stage 0 builds everything from LiDAR"
+        )
+    with stages("shape"):
+        surface = _fit_ground(log, measured.background)
+        parts = _shape(log, measured, surface, options)
+    with stages("colour") as tell:
+        colours, known, sky_samples = _look(log, parts, options, tell)
+    with stages("fill"):
+        colours = _fill_unseen(log, parts, surface, colours, known)
+        sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
+    return _assemble(log, parts, colours, sky, options)
+
+
+def _fit_ground(log: DrivingLog, background: PointSet) -> GroundSurface:
+    poses = np.array([log.ego.transform(int(t)) for t in log.frame_times_us])
+    footprints = box_footprints(log.tracks, log.frame_times_us)
+    return fit_ground(background.points, poses, footprints)
+
+
+def _shape(
+    log: DrivingLog, measured: Accumulation, surface: GroundSurface, options: InitialiseOptions
+) -> _Parts:
+    """Gaussians without colour: the ground, what stands on it, and the objects."""
+    path = drive_path(log)
+    ground = _ground_surfels(surface, options)
+    above = _above_ground(measured.background, surface)
+    distance = path_distance(above.points, path)
+    supported = well_supported(above.points, 0.1 + 0.015 * distance)
+    above, distance = above.select(supported), distance[supported]
+    levels = voxel_levels(distance, options.voxel, options.voxel_per_metre)
+    limit = max(1, options.max_background - len(ground))
+    above = thin_to(above, options.voxel, limit, levels)
+    largest = 0.03 + 0.006 * path_distance(above.points, path)
+    surfels = [ground, fit_surfels(above.points, largest=largest)]
+    intensity = [np.zeros(len(ground), np.float32), above.intensity]
+    instance = [np.zeros(len(ground) + len(above), np.uint16)]
+    for index, track in enumerate(log.tracks):
+        points = _object_points(measured.objects[track.object_id], track, options)
+        surfels.append(fit_surfels(points.points, largest=0.1, smallest=0.004))
+        intensity.append(points.intensity)
+        instance.append(np.full(len(points), index + 1, np.uint16))
+    return _Parts(
+        Surfels.join(surfels), np.concatenate(intensity), np.concatenate(instance), len(ground)
+    )
+
+
+def _ground_surfels(surface: GroundSurface, options: InitialiseOptions) -> Surfels:
+    ground = spread_ground(surface, options.ground_spacing, options.max_background // 2)
+    normal = ground.normals
+    forward = np.cross([0.0, 1.0, 0.0], normal)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    axes = np.stack([forward, np.cross(normal, forward), normal], axis=2)
+    scales = ground.spacing[:, None] * np.array([0.6, 0.6, 0.1], dtype=np.float32)
+    return Surfels(ground.points, axes.astype(np.float32), scales.astype(np.float32))
+
+
+def _above_ground(background: PointSet, surface: GroundSurface) -> PointSet:
+    xy = background.points[:, :2].astype(np.float64)
+    height = background.points[:, 2] - surface.height_at(xy)
+    return background.select(~surface.covers(xy) | (height > ABOVE_GROUND))
+
+
+def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOptions) -> PointSet:
+    thinned = thin_to(points, options.object_voxel, options.max_object)
+    if len(thinned) < options.min_object_points:
+        return add_box_surface(thinned, track.size)
+    return thinned
+
+
+def _look(
+    log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], SkySamples]:
+    frames = chosen_frames(log, options.max_colour_frames)
+    sky_frames = set(frames[:: -(-len(frames) // SKY_FRAMES)])
+    sky = SkySamples(options.sky_resolution)
+    done = 0
+
+    def on_view(view: View) -> None:
+        nonlocal done
+        done += 1
+        if view.frame in sky_frames:
+            sky.add(view)
+        tell(done, len(frames) * len(log.rig))
+
+    colours, known = gather_views(
+        log,
+        Placed(parts.surfels, parts.instance),
+        frames=frames,
+        slots=options.samples,
+        on_view=on_view,
+    )
+    return colours, known, sky
+
+
+def _fill_unseen(
+    log: DrivingLog,
+    parts: _Parts,
+    surface: GroundSurface,
+    colours: NDArray[np.float32],
+    known: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    points, filled = parts.surfels.points, colours.copy()
+    ground = slice(0, parts.ground_count)
+    filled[ground] = fill_ground(surface, points[ground], colours[ground], known[ground])
+    structure = np.flatnonzero(parts.instance == 0)[parts.ground_count :]
+    xy = points[structure, :2].astype(np.float64)
+    height = points[structure, 2] - surface.height_at(xy)
+    intensity = parts.intensity[structure]
+    prior = ColourPrior(height, intensity, colours[structure], known[structure], BACKGROUND_HEIGHTS)
+    filled[structure] = fill_from_neighbours(
+        points[structure], colours[structure], known[structure], prior.colour(height, intensity)
+    )
+    return _fill_objects(log, parts, filled, known)
+
+
+def _fill_objects(
+    log: DrivingLog, parts: _Parts, colours: NDArray[np.float32], known: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    members = [np.flatnonzero(parts.instance == i + 1) for i in range(len(log.tracks))]
+    if not members:
+        return colours
+    relative = np.zeros(len(colours), dtype=np.float32)
+    for track, mine in zip(log.tracks, members, strict=True):
+        relative[mine] = parts.surfels.points[mine, 2] / track.size[2]
+    every = np.concatenate(members)
+    prior = ColourPrior(
+        relative[every], parts.intensity[every], colours[every], known[every], OBJECT_HEIGHTS
+    )
+    for mine in members:
+        points = parts.surfels.points[mine]
+        mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
+        likely = prior.colour(relative[mine], parts.intensity[mine])
+        colours[mine] = fill_from_neighbours(points, mirrored, now_known, likely)
+    return colours
+
+
+def _median_colour(colours: NDArray[np.float32]) -> NDArray[np.float32]:
+    if len(colours) == 0:
+        return np.full(3, 0.4, dtype=np.float32)
+    return np.median(colours, axis=0).astype(np.float32)
+
+
+def _assemble(
+    log: DrivingLog,
+    parts: _Parts,
+    colours: NDArray[np.float32],
+    sky: Sky,
+    options: InitialiseOptions,
+) -> Scene:
+    clouds = [
+        _cloud(parts, colours, np.flatnonzero(parts.instance == i))
+        for i in range(len(log.tracks) + 1)
+    ]
+    objects = {
+        t.object_id: SceneObject(t.object_id, t.category, t.size, cloud, t.trajectory)
+        for t, cloud in zip(log.tracks, clouds[1:], strict=True)
+    }
+    return Scene(
+        name=log.name,
+        background=clouds[0],
+        objects=objects,
+        sky=sky,
+        rig=log.rig,
+        ego=log.ego,
+        frame_times_us=log.frame_times_us,
+        ego_size=log.ego_size,
+        provenance={
+            **log.provenance,
+            "reconstruction": {"stage": 0, "iterations": 0, "options": asdict(options)},
+        },
+    )
+
+
+def _cloud(
+    parts: _Parts, colours: NDArray[np.float32], members: NDArray[np.int64]
+) -> GaussianCloud:
+    surfels = Surfels(
+        parts.surfels.points[members], parts.surfels.axes[members], parts.surfels.scales[members]
+    )
+    dc = (colours[members] - 0.5) / SH_C0
+    return GaussianCloud(
+        means=torch.from_numpy(surfels.points.copy()),
+        quats=torch.from_numpy(surfels.quats),
+        scales=torch.from_numpy(surfels.scales.copy()),
+        opacities=torch.full((len(members),), OPACITY),
+        sh=torch.from_numpy(dc[:, None].astype(np.float32)),
+    )

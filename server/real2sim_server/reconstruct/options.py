@@ -1,0 +1,53 @@
+"""Options of stage 0, and the error of this room."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+
+class ReconstructError(ValueError):
+    """A log that cannot be reconstructed as asked; the message says what is missing or allowed."""
+
+
+@dataclass(frozen=True)
+class InitialiseOptions:
+    """How a log becomes Gaussians without training.
+
+    Attributes:
+        max_background, max_object: upper bounds of Gaussians in the background and in one object.
+        voxel: edge of the smallest thinning voxels [m]; they double with the distance from the
+            drive so that they never exceed ``voxel + voxel_per_metre * distance`` much.
+        voxel_per_metre: growth of voxels with the distance from the drive.
+        object_voxel: edge of thinning voxels in objects [m].
+        ground_spacing: distance of the Gaussians on the road near the drive [m].
+        max_range: LiDAR points farther from the sensor are dropped [m].
+        box_margin: how far outside its box a point still belongs to an object [m] (mirrors).
+        ground_clearance: height above the box bottom below which points are road, not object [m].
+        min_object_points: objects with fewer points get a coarse box surface besides.
+        max_colour_frames: at most so many frames, evenly spread, give colours.
+        samples: best views that are averaged for the colour of a Gaussian.
+        sky_resolution: edge of a face of the sky's cube map [px].
+
+    Raises:
+        ReconstructError: for a value out of range.
+    """
+
+    max_background: int = 600_000
+    max_object: int = 40_000
+    voxel: float = 0.05
+    voxel_per_metre: float = 0.004
+    object_voxel: float = 0.025
+    ground_spacing: float = 0.06
+    max_range: float = 120.0
+    box_margin: float = 0.12
+    ground_clearance: float = 0.12
+    min_object_points: int = 60
+    max_colour_frames: int = 60
+    samples: int = 8
+    sky_resolution: int = 512
+
+    def __post_init__(self) -> None:
+        may_be_zero = {"voxel_per_metre", "box_margin", "ground_clearance", "min_object_points"}
+        for name, value in asdict(self).items():
+            if not (value > 0 or (value == 0 and name in may_be_zero)) or value == float("inf"):
+                raise ReconstructError(f"{name}={value!r} of InitialiseOptions must be positive")

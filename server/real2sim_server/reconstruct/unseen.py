@@ -1,0 +1,119 @@
+"""Colours of Gaussians that no camera saw."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .ground import GroundSurface
+from .pull_push import pull_push
+
+MIRROR_REACH = 0.15
+"""An unseen point takes the colour of its mirror image when that was seen this near [m]."""
+TRUST = 1.0
+"""Distance at which a seen neighbour's colour has lost most of its say [m]."""
+GREY = np.array([0.4, 0.4, 0.4], dtype=np.float32)
+
+Colours = NDArray[np.float32]
+Known = NDArray[np.bool_]
+
+
+class ColourPrior:
+    """What colour a point is likely to have, by its height and its LiDAR intensity.
+
+    Learnt from the seen points of the same log: mean colours by height and intensity class.
+    """
+
+    def __init__(
+        self,
+        heights: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        colours: Colours,
+        known: Known,
+        edges: tuple[float, ...],
+    ) -> None:
+        self._edges = np.array(edges)
+        seen = intensity[known]
+        self._quantiles = (
+            np.quantile(seen, [0.2, 0.4, 0.6, 0.8]) if len(seen) else np.linspace(0.2, 0.8, 4)
+        )
+        mean = colours[known].mean(axis=0) if len(seen) else GREY
+        shape = (len(edges) + 1, len(self._quantiles) + 1)
+        self._table = np.empty((*shape, 3), dtype=np.float32)
+        rows, columns = self._classes(heights[known], seen)
+        for row in range(shape[0]):
+            for column in range(shape[1]):
+                members = colours[known][(rows == row) & (columns == column)]
+                # A few members more of the overall mean keep small classes from being odd.
+                total = members.sum(axis=0, dtype=np.float64) + 20 * mean
+                self._table[row, column] = total / (len(members) + 20)
+
+    def colour(self, heights: NDArray[np.float32], intensity: NDArray[np.float32]) -> Colours:
+        """Likely colours [N, 3] of points with ``heights`` [N] [m] and ``intensity`` [N]."""
+        rows, columns = self._classes(heights, intensity)
+        return self._table[rows, columns]
+
+    def _classes(
+        self, heights: NDArray[np.float32], intensity: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return np.searchsorted(self._edges, heights), np.searchsorted(self._quantiles, intensity)
+
+
+def fill_from_neighbours(
+    points: NDArray[np.float32], colours: Colours, known: Known, prior: Colours
+) -> Colours:
+    """Colour unseen points from seen ones nearby, and from ``prior`` [N, 3] where none is near."""
+    from scipy.spatial import cKDTree
+
+    if known.all():
+        return colours
+    filled = np.where(known[:, None], colours, prior)
+    if known.any():
+        count = min(6, int(known.sum()))
+        tree = cKDTree(points[known])
+        distance, index = tree.query(points[~known], k=[*range(1, count + 1)], workers=-1)
+        weight = 1 / (distance + 0.05)
+        near = (colours[known][index] * weight[..., None]).sum(axis=1) / weight.sum(1)[:, None]
+        trust = np.exp(-distance[:, :1] / TRUST)
+        filled[~known] = trust * near + (1 - trust) * prior[~known]
+    return filled.astype(np.float32)
+
+
+def fill_from_mirror(
+    points: NDArray[np.float32], colours: Colours, known: Known
+) -> tuple[Colours, Known]:
+    """Colour unseen points of an object from its other side, across y = 0.
+
+    Vehicles look alike from the left and the right; their unseen side is best guessed so.
+    """
+    from scipy.spatial import cKDTree
+
+    if known.all() or not known.any():
+        return colours, known
+    mirrored = points[~known] * np.array([1, -1, 1], dtype=np.float32)
+    distance, index = cKDTree(points[known]).query(mirrored, workers=-1)
+    near = distance < MIRROR_REACH
+    colours, now_known = colours.copy(), known.copy()
+    unseen = np.flatnonzero(~known)[near]
+    colours[unseen] = colours[known][index[near]]
+    now_known[unseen] = True
+    return colours, now_known
+
+
+def fill_ground(
+    surface: GroundSurface, points: NDArray[np.float32], colours: Colours, known: Known
+) -> Colours:
+    """Colour unseen ground points from the seen ground around them, ever more smoothly inwards."""
+    if known.all() or not known.any():
+        return np.where(known[:, None], colours, GREY)
+    shape = surface.heights.shape
+    cell = np.floor((points[:, :2] - surface.origin) / surface.cell).astype(np.int64)
+    flat = np.ravel_multi_index(np.clip(cell, 0, np.array(shape) - 1).T, shape)
+    counts = np.bincount(flat[known], minlength=shape[0] * shape[1])
+    sums = np.stack(
+        [np.bincount(flat[known], colours[known, c], shape[0] * shape[1]) for c in range(3)], -1
+    )
+    mean = (sums / np.maximum(counts, 1)[:, None]).astype(np.float32).reshape(*shape, 3)
+    weights = np.minimum(counts / 2, 1).astype(np.float32).reshape(shape)
+    raster = pull_push(mean, weights)
+    return np.where(known[:, None], colours, raster.reshape(-1, 3)[flat])
