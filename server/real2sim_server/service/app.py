@@ -1,0 +1,68 @@
+"""The worker as an ASGI application."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+from fastapi import APIRouter, Depends, FastAPI
+from fastapi.routing import APIRoute
+
+from real2sim_proto import Problem
+
+from ..settings import Settings
+from .auth import require_token
+from .problems import install_problem_handlers
+from .requests import BodyLimit, RequestContext
+from .routes import health, scenarios, scene_imports, scenes, server
+from .worker import Worker
+
+PROTECTED: tuple[APIRouter, ...] = (
+    server.router,
+    scenes.router,
+    scene_imports.router,
+    scenarios.router,
+)
+"""Routers behind the worker's token."""
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The application of one worker; it starts and stops with the application's lifespan.
+
+    Raises:
+        RenderError: the backend of the settings cannot be used here.
+    """
+    worker = Worker.build(settings)
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        async with worker.running():
+            # Made on demand it would keep the event loop busy for a tenth of a second.
+            await asyncio.to_thread(app.openapi)
+            yield
+
+    app = FastAPI(
+        title="Real2Sim worker",
+        version=version("real2sim"),
+        lifespan=lifespan,
+        generate_unique_id_function=operation_id,
+        responses={"default": {"model": Problem, "description": "problem+json (RFC 9457)"}},
+        redoc_url=None,
+    )
+    app.state.worker = worker
+    uploads = dict.fromkeys(scene_imports.UPLOAD_PATHS, settings.max_upload_bytes)
+    install_problem_handlers(app)
+    app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
+    app.add_middleware(RequestContext, metrics=worker.metrics)
+    app.include_router(health.router)
+    for router in PROTECTED:
+        app.include_router(router, dependencies=[Depends(require_token)])
+    return app
+
+
+def operation_id(route: APIRoute) -> str:
+    """Name of a call in OpenAPI, stable as long as its function's name is: ``scenes-render``."""
+    subject = str(route.tags[0]) if route.tags else "worker"
+    return f"{subject}-{route.name}"

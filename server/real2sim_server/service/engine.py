@@ -1,0 +1,291 @@
+"""The one thread that owns the device."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any, ParamSpec, TypeVar
+
+import structlog
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+IDLE_TICK_S = 0.25
+SWITCH_INTERVAL_S = 0.0005
+"""How soon a thread that runs Python bytecode hands over to the event loop. The interpreter's
+default of 5 ms would by itself be the whole of the lag we allow the loop."""
+
+log = structlog.get_logger(__name__)
+
+
+class EngineError(RuntimeError):
+    """The engine cannot take or finish a job."""
+
+
+class QueueFullError(EngineError):
+    """Too many jobs wait already."""
+
+
+class EngineStoppedError(EngineError):
+    """The engine is stopping, or was never started."""
+
+
+class DeviceLostError(EngineError):
+    """The device reported an error after which nothing on it works; only a new process helps."""
+
+
+@dataclass(eq=False)
+class _Job:
+    run: Callable[[], Any]
+    label: str
+    future: Future[Any] = field(default_factory=Future)
+    queued_at: float = field(default_factory=time.perf_counter)
+
+
+class Engine:
+    """Runs jobs one after the other, in the order they came, on a thread of its own.
+
+    Everything that computes runs here, so that kernels never compete for cores and the event loop
+    never waits for them. Jobs are plain functions; their exceptions travel to the caller.
+
+    Args:
+        queue_length: jobs that may wait.
+        threads: of torch and numba, 0 for one per core.
+        on_job: called on the engine thread after each job with its label, the seconds it waited
+            and the seconds it ran.
+
+    Attributes:
+        on_failure: called on the engine thread when the device is lost.
+    """
+
+    def __init__(
+        self,
+        *,
+        queue_length: int = 64,
+        threads: int = 0,
+        on_job: Callable[[str, float, float], None] | None = None,
+    ) -> None:
+        self.queue_length = queue_length
+        self.on_failure: Callable[[], object] = lambda: None
+        self._threads = threads
+        self._on_job = on_job
+        self._jobs: deque[_Job] = deque()
+        self._changed = threading.Condition()
+        self._accepting = False
+        self._running: str | None = None
+        self._last_tick = time.monotonic()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="engine", daemon=True)
+
+    # --- life -------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start the thread and set the thread counts of torch and numba once and for all."""
+        sys.setswitchinterval(min(SWITCH_INTERVAL_S, sys.getswitchinterval()))
+        self._accepting = True
+        self._last_tick = time.monotonic()
+        self._thread.start()
+        self.call_sync(set_thread_counts, self._threads, label="threads")
+
+    def stop(self, *, drain: bool = True, timeout_s: float | None = None) -> None:
+        """Take no more jobs and end the thread; without ``drain``, waiting jobs are dropped.
+
+        Raises:
+            TimeoutError: a job still runs after ``timeout_s``.
+        """
+        with self._changed:
+            self._accepting = False
+            dropped = deque() if drain else self._take_all()
+            self._changed.notify_all()
+        _refuse(dropped, EngineStoppedError("the worker stopped before this job's turn"))
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+            if self._thread.is_alive():
+                raise TimeoutError(f"job {self._running!r} still runs after {timeout_s:g} s")
+
+    # --- work -------------------------------------------------------------------------------
+
+    async def call(
+        self, fn: Callable[P, T], *args: P.args, label: str = "work", **kwargs: Any
+    ) -> T:
+        """``fn(*args, **kwargs)`` on the engine thread, awaited.
+
+        When the awaiting task is cancelled, a job that still waits is dropped; one that runs
+        finishes, and its result is thrown away.
+
+        Raises:
+            QueueFullError: ``queue_length`` jobs wait already.
+            EngineStoppedError: the engine does not run, or stopped before the job's turn.
+            DeviceLostError: an earlier job lost the device.
+        """
+        job = self._submit(lambda: fn(*args, **kwargs), label)
+        try:
+            return await asyncio.wrap_future(job.future)  # type: ignore[no-any-return]
+        except asyncio.CancelledError:
+            self._drop(job)
+            raise
+
+    def call_sync(
+        self,
+        fn: Callable[P, T],
+        *args: P.args,
+        label: str = "work",
+        timeout_s: float | None = None,
+        **kwargs: Any,
+    ) -> T:
+        """Like :meth:`call` for callers without an event loop; on the engine thread, just runs.
+
+        Raises:
+            TimeoutError: no result after ``timeout_s``.
+        """
+        if threading.current_thread() is self._thread:
+            return fn(*args, **kwargs)
+        job = self._submit(lambda: fn(*args, **kwargs), label)
+        try:
+            return job.future.result(timeout_s)  # type: ignore[no-any-return]
+        except TimeoutError:
+            if not job.future.done():
+                self._drop(job)
+            raise
+
+    def tick(self) -> None:
+        """Say that a long job makes progress."""
+        self._last_tick = time.monotonic()
+
+    # --- state ------------------------------------------------------------------------------
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs and the device is not lost."""
+        return self._thread.is_alive() and self._failure is None
+
+    @property
+    def failure(self) -> BaseException | None:
+        """The error that lost the device, if one did."""
+        return self._failure
+
+    @property
+    def seconds_since_tick(self) -> float:
+        """Age of the last sign of life; grows while one job runs."""
+        return time.monotonic() - self._last_tick
+
+    @property
+    def queue_depth(self) -> int:
+        """Jobs that wait."""
+        with self._changed:
+            self._forget_cancelled()
+            return len(self._jobs)
+
+    @property
+    def running(self) -> str | None:
+        """Label of the job under way."""
+        return self._running
+
+    # --- inside -----------------------------------------------------------------------------
+
+    def _submit(self, run: Callable[[], Any], label: str) -> _Job:
+        job = _Job(run, label)
+        with self._changed:
+            if self._failure is not None:
+                raise DeviceLostError(f"the device was lost: {self._failure}")
+            if not self._accepting:
+                raise EngineStoppedError("the engine does not take jobs: it is stopping")
+            if len(self._jobs) >= self.queue_length:
+                self._forget_cancelled()
+            if len(self._jobs) >= self.queue_length:
+                raise QueueFullError(
+                    f"{len(self._jobs)} jobs wait for the engine, {self.queue_length} may; "
+                    f"it runs {self._running!r}"
+                )
+            self._jobs.append(job)
+            self._changed.notify()
+        return job
+
+    def _drop(self, job: _Job) -> None:
+        job.future.cancel()
+        with self._changed:
+            self._forget_cancelled()
+
+    def _forget_cancelled(self) -> None:
+        if any(job.future.cancelled() for job in self._jobs):
+            self._jobs = deque(job for job in self._jobs if not job.future.cancelled())
+
+    def _take_all(self) -> deque[_Job]:
+        waiting, self._jobs = self._jobs, deque()
+        return waiting
+
+    def _work(self) -> None:
+        while (job := self._next()) is not None:
+            if job.future.set_running_or_notify_cancel():
+                self._run(job)
+            # The job holds arguments and result; an idle engine must not keep them alive.
+            del job
+
+    def _next(self) -> _Job | None:
+        with self._changed:
+            while True:
+                self._last_tick = time.monotonic()
+                if self._jobs:
+                    return self._jobs.popleft()
+                if not self._accepting:
+                    return None
+                self._changed.wait(IDLE_TICK_S)
+
+    def _run(self, job: _Job) -> None:
+        started = time.perf_counter()
+        self._running = job.label
+        try:
+            result = job.run()
+        except BaseException as error:
+            if _loses_device(error):
+                self._lose_device(error)
+            job.future.set_exception(error)
+        else:
+            job.future.set_result(result)
+        finally:
+            self._running = None
+        if self._on_job is not None:
+            self._on_job(job.label, started - job.queued_at, time.perf_counter() - started)
+
+    def _lose_device(self, error: BaseException) -> None:
+        log.error("device lost", error=str(error))
+        with self._changed:
+            self._failure = error
+            self._accepting = False
+            waiting = self._take_all()
+        _refuse(waiting, DeviceLostError(f"the device was lost: {error}"))
+        self.on_failure()
+
+
+def set_thread_counts(threads: int) -> None:
+    """Set the threads of torch and numba in this process; 0 leaves one per core."""
+    import numba
+    import torch
+
+    count = threads or numba.config.NUMBA_NUM_THREADS
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    torch.set_num_threads(count)
+
+
+def _refuse(jobs: Iterable[_Job], error: EngineError) -> None:
+    for job in jobs:
+        if job.future.set_running_or_notify_cancel():
+            job.future.set_exception(error)
+
+
+def _loses_device(error: BaseException) -> bool:
+    """Whether CUDA refuses everything after this error. Running out of memory is not such a one."""
+    torch = sys.modules.get("torch")
+    if torch is None or isinstance(error, torch.OutOfMemoryError):
+        return False
+    accelerator_error = getattr(torch, "AcceleratorError", None)
+    if accelerator_error is not None and isinstance(error, accelerator_error):
+        return True
+    return isinstance(error, RuntimeError) and "CUDA error" in str(error)

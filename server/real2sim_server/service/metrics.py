@@ -1,0 +1,91 @@
+"""Prometheus metrics of one worker. No session id is ever a label."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
+from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+
+FAST_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
+LOAD_BUCKETS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120)
+
+
+class Metrics:
+    """All metrics, on a registry of their own, so that one process may hold several workers."""
+
+    def __init__(self) -> None:
+        registry = self.registry = CollectorRegistry()
+        self.build = Info("real2sim_build", "version and backend", registry=registry)
+        self.requests = Histogram(
+            "real2sim_http_request_duration_seconds",
+            "time to answer a request",
+            ("method", "route", "status"),
+            buckets=FAST_BUCKETS,
+            registry=registry,
+        )
+        self.queue_wait = Histogram(
+            "real2sim_engine_queue_wait_seconds",
+            "time a job waited for the engine",
+            buckets=FAST_BUCKETS,
+            registry=registry,
+        )
+        self.jobs = Histogram(
+            "real2sim_engine_job_duration_seconds",
+            "time a job ran on the engine",
+            ("label",),
+            buckets=FAST_BUCKETS,
+            registry=registry,
+        )
+        self.queue_depth = Gauge(
+            "real2sim_engine_queue_depth", "jobs that wait for the engine", registry=registry
+        )
+        self.scenes = Gauge("real2sim_scenes", "scenes by state", ("state",), registry=registry)
+        self.scene_bytes = Gauge(
+            "real2sim_scene_memory_bytes", "bytes of resident scenes", registry=registry
+        )
+        self.scene_loads = Histogram(
+            "real2sim_scene_load_duration_seconds",
+            "time to load a scene",
+            buckets=LOAD_BUCKETS,
+            registry=registry,
+        )
+        self.stages = Histogram(
+            "real2sim_frame_stage_duration_seconds",
+            "time of one stage on the way to frames",
+            ("stage",),
+            buckets=FAST_BUCKETS,
+            registry=registry,
+        )
+        self.frames = Counter(
+            "real2sim_frames", "images sent", ("stream", "codec"), registry=registry
+        )
+        self.edits = Counter(
+            "real2sim_edits", "operations in effect, by kind", ("op",), registry=registry
+        )
+        self.edit_conflicts = Counter(
+            "real2sim_edit_conflicts", "edits refused as stale", registry=registry
+        )
+        self.replays = Counter(
+            "real2sim_idempotent_replays", "requests answered from memory", registry=registry
+        )
+        self.sessions = Gauge("real2sim_sessions", "open sessions", registry=registry)
+        self.loop_lag = Histogram(
+            "real2sim_event_loop_lag_seconds",
+            "how late the event loop runs",
+            buckets=(0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5),
+            registry=registry,
+        )
+
+    def observe_job(self, label: str, waited_s: float, ran_s: float) -> None:
+        """Note one engine job."""
+        self.queue_wait.observe(waited_s)
+        self.jobs.labels(label).observe(ran_s)
+
+    def watch(self, gauge: Gauge, read: Callable[[], float]) -> None:
+        """Let ``gauge`` call ``read`` whenever metrics are collected."""
+        gauge.set_function(read)
+
+    def exposition(self) -> tuple[bytes, str]:
+        """Body and media type of ``/metrics``."""
+        return generate_latest(self.registry), CONTENT_TYPE_LATEST

@@ -1,0 +1,143 @@
+"""What surrounds every request: its id, its log line, its duration, its last line of defence."""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from real2sim_proto import ErrorCode
+
+from .problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
+
+if TYPE_CHECKING:
+    from .metrics import Metrics
+
+REQUEST_ID_HEADER = "X-Request-Id"
+_REQUEST_ID = re.compile(r"[A-Za-z0-9_.\-]{1,80}")
+_QUIET = ("/livez", "/readyz", "/metrics")
+
+log = structlog.get_logger(__name__)
+
+
+class RequestContext:
+    """ASGI middleware, outermost of ours.
+
+    Takes the request id from ``X-Request-Id`` or makes one, sends it back, binds it for logs,
+    measures the request, and answers INTERNAL for what nobody else caught.
+    """
+
+    def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        request_id = _request_id(Headers(scope=scope))
+        scope[REQUEST_ID_KEY] = request_id
+        with structlog.contextvars.bound_contextvars(request_id=request_id):
+            if scope["type"] == "http":
+                await self._serve(scope, receive, send, request_id)
+            else:
+                await self._app(scope, receive, send)
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
+        started = time.perf_counter()
+        status = 0
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_with_id)
+        except Exception as error:
+            refused = _told(error)
+            if status:  # the answer is under way; the server must cut it short
+                raise
+            response = problem_response(refused, path=scope["path"], request_id=request_id)
+            await response(scope, receive, send_with_id)
+        finally:
+            self._note(scope, status, time.perf_counter() - started)
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", None) or "unmatched"
+        self._metrics.requests.labels(scope["method"], route, str(status)).observe(seconds)
+        write = log.debug if scope["path"] in _QUIET else log.info
+        write(
+            "request",
+            method=scope["method"],
+            path=scope["path"],
+            status=status,
+            ms=round(seconds * 1e3, 2),
+        )
+
+
+class BodyLimit:
+    """ASGI middleware that refuses request bodies above a size, whether announced or streamed.
+
+    Args:
+        app: the application.
+        limit: of all requests [bytes].
+        uploads: of multipart forms to these paths instead [bytes].
+    """
+
+    def __init__(self, app: ASGIApp, *, limit: int, uploads: Mapping[str, int]) -> None:
+        self._app = app
+        self._limit = limit
+        self._uploads = dict(uploads)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        limit = self._limit
+        if headers.get("Content-Type", "").startswith("multipart/form-data"):
+            limit = self._uploads.get(scope["path"], limit)
+        announced = headers.get("Content-Length", "")
+        if announced.isdecimal() and int(announced) > limit:
+            raise _too_large(int(announced), limit)
+        received = 0
+
+        async def receive_limited() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > limit:
+                raise HTTPException(413, f"more than the allowed {limit} bytes were sent")
+            return message
+
+        await self._app(scope, receive_limited, send)
+
+
+def _too_large(size: int, limit: int) -> ServiceError:
+    return ServiceError(
+        ErrorCode.PAYLOAD_TOO_LARGE, f"the request has {size} bytes; this call takes {limit}"
+    )
+
+
+def _request_id(headers: Headers) -> str:
+    given = headers.get(REQUEST_ID_HEADER, "")
+    return given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+
+
+def _told(error: Exception) -> ServiceError:
+    refused = service_error(error)
+    if refused.status == 500:
+        log.error("unexpected error", exc_info=error)
+    return refused

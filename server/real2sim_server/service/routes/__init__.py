@@ -1,0 +1,1 @@
+"""REST routes and sockets, one module a subject."""

@@ -1,0 +1,61 @@
+"""What a single frame is asked for with, the same for scenes and scenarios."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Header, Query
+
+from real2sim_proto.base import Identifier, Microseconds, Modality
+from real2sim_proto.drive import SensorSpec
+
+from ...edit import ScenarioState, instances_at
+from ...scene import Scene
+from ..answers import CODEC_OF, choose_media_type
+from ..pictures import Shot
+
+
+@dataclass(frozen=True)
+class FrameQuery:
+    """Query and headers of a render or preview."""
+
+    camera: Annotated[Identifier, Query(description="camera of the rig")]
+    t_us: Annotated[
+        Microseconds | None, Query(description="simulation time; default: start of the recording")
+    ] = None
+    width: Annotated[
+        int | None, Query(ge=16, le=8192, description="[px]; default: as recorded")
+    ] = None
+    modality: Modality = "rgb"
+    accept: Annotated[
+        str | None, Header(description="image/jpeg, image/png or application/msgpack")
+    ] = None
+
+    def media_type(self) -> str:
+        """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
+        return choose_media_type(self.accept, self.modality)
+
+    def shot(self, scene: Scene, state: ScenarioState, media_type: str) -> Shot:
+        """What to draw, from where the recording vehicle was.
+
+        Raises:
+            TimeOutOfRangeError: ``t_us`` outside the recording.
+        """
+        t_us = scene.start_us if self.t_us is None else self.t_us
+        sensor = SensorSpec(
+            camera=self.camera,
+            modalities=[self.modality],
+            width=self.width,
+            codec=CODEC_OF[media_type],
+        )
+        return Shot(
+            scene=scene,
+            instances=instances_at(scene, state, t_us),
+            T_world_vehicle=scene.ego.transform(t_us),
+            t_us=t_us,
+            sensors=(sensor,),
+        )
+
+
+FrameQueryOf = Annotated[FrameQuery, Depends()]

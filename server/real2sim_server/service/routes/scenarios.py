@@ -1,0 +1,173 @@
+"""Scenarios: create, edit, undo, look."""
+
+from __future__ import annotations
+
+import re
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.scenarios import (
+    History,
+    OperationBatch,
+    OperationResult,
+    ScenarioCreate,
+    ScenarioInfo,
+    ScenarioList,
+)
+
+from ..answers import FRAME_RESPONSES, frame_response, info_response
+from ..idempotency import IdempotencyKey, Once
+from ..problems import ServiceError
+from ..scenarios import created_headers, tag
+from ..worker import Worker, WorkerOf
+from .frame_query import FrameQueryOf
+
+router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
+
+IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        description='refuse the change unless the scenario has this ETag, e.g. "r41"',
+        examples=['"r41"'],
+    ),
+]
+_ETAG = re.compile(r'"r(0|[1-9][0-9]{0,8})"')
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a request that changes a scenario may carry."""
+
+    request: Request
+    if_match: IfMatch = None
+    idempotency_key: IdempotencyKey = None
+
+    @property
+    def expected(self) -> int | None:
+        """Revision that the change was made for. Raises ServiceError: INVALID_REQUEST."""
+        return expected_revision(self.if_match)
+
+    def once(self, worker: Worker) -> AbstractAsyncContextManager[Once]:
+        """See :meth:`Idempotency.once`."""
+        return worker.idempotency.once(self.request, self.idempotency_key)
+
+
+ChangeOf = Annotated[Change, Depends()]
+
+
+@router.post("", status_code=201, response_model=ScenarioInfo)
+async def create(
+    worker: WorkerOf, body: ScenarioCreate, request: Request, idempotency_key: IdempotencyKey = None
+) -> Response:
+    """A new scenario on a scene; it is stored and survives a restart."""
+    async with worker.idempotency.once(request, idempotency_key) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        info = await worker.scenarios.create(body, once=once)
+        return info_response(info, status=201, headers=created_headers(info))
+
+
+@router.get("")
+async def list_scenarios(worker: WorkerOf) -> ScenarioList:
+    """All scenarios of this worker, oldest first, without their objects."""
+    return ScenarioList(scenarios=await worker.scenarios.list())
+
+
+@router.get("/{scenario_id}", response_model=ScenarioInfo)
+async def describe(worker: WorkerOf, scenario_id: str) -> Response:
+    """One scenario with all its objects as they are now."""
+    info = await worker.scenarios.info(scenario_id)
+    return info_response(info, headers={"ETag": info.etag})
+
+
+@router.delete("/{scenario_id}", status_code=204, response_class=Response)
+async def delete(worker: WorkerOf, scenario_id: str) -> Response:
+    """Remove a scenario and its history. Sessions that began from it go on."""
+    await worker.scenarios.delete(scenario_id)
+    return Response(status_code=204)
+
+
+@router.post("/{scenario_id}/operations", response_model=OperationResult)
+async def edit(
+    worker: WorkerOf,
+    scenario_id: str,
+    body: OperationBatch,
+    change: ChangeOf,
+) -> Response:
+    """Apply a batch of operations, all or none; 412 with the missed entries when it is stale."""
+    async with change.once(worker) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        result = await worker.scenarios.edit(
+            scenario_id, body.operations, expected=change.expected, dry_run=body.dry_run, once=once
+        )
+        return info_response(result, headers=tag(result))
+
+
+@router.get("/{scenario_id}/operations")
+async def history(
+    worker: WorkerOf, scenario_id: str, after: Annotated[int, Query(ge=0)] = 0
+) -> History:
+    """Revisions behind ``after``, oldest first."""
+    return await worker.scenarios.history(scenario_id, after=after)
+
+
+@router.post("/{scenario_id}/undo", response_model=OperationResult)
+async def undo(
+    worker: WorkerOf,
+    scenario_id: str,
+    change: ChangeOf,
+) -> Response:
+    """Take back the last batch that is in effect."""
+    async with change.once(worker) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        result = await worker.scenarios.undo(scenario_id, expected=change.expected, once=once)
+        return info_response(result, headers=tag(result))
+
+
+@router.post("/{scenario_id}/redo", response_model=OperationResult)
+async def redo(
+    worker: WorkerOf,
+    scenario_id: str,
+    change: ChangeOf,
+) -> Response:
+    """Bring back the last batch that was undone."""
+    async with change.once(worker) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        result = await worker.scenarios.redo(scenario_id, expected=change.expected, once=once)
+        return info_response(result, headers=tag(result))
+
+
+@router.get("/{scenario_id}/preview", responses=FRAME_RESPONSES, response_class=Response)
+async def preview(worker: WorkerOf, scenario_id: str, asked: FrameQueryOf) -> Response:
+    """One frame of the scenario as it is now, from where the recording vehicle was at ``t_us``."""
+    media_type = asked.media_type()
+    view = await worker.scenarios.view(scenario_id)
+    scene = await worker.residency.get(view.row.scene)
+    pictured = await worker.pictures.take(asked.shot(scene, view.state, media_type))
+    return frame_response(pictured, media_type, revision=view.revision)
+
+
+def expected_revision(if_match: str | None) -> int | None:
+    """Revision that ``If-Match`` names; None where any will do.
+
+    Raises:
+        ServiceError: INVALID_REQUEST for anything but ``"r<number>"`` or ``*``.
+    """
+    if if_match is None or if_match.strip() == "*":
+        return None
+    match = _ETAG.fullmatch(if_match.strip())
+    if match is None:
+        raise ServiceError(
+            ErrorCode.INVALID_REQUEST,
+            f'If-Match {if_match!r} is no revision of ours; it looks like "r41", quotes included',
+            hint="send the ETag of the last answer unchanged",
+        )
+    return int(match.group(1))

@@ -1,0 +1,172 @@
+"""Starting a worker: for good, or for the length of a ``with`` block."""
+
+from __future__ import annotations
+
+import http.client
+import ipaddress
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import uvicorn
+from fastapi import FastAPI
+
+from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
+
+from ..settings import Settings
+from .app import create_app
+from .auth import check_bind
+from .logging_setup import configure_logging
+from .worker import Worker
+
+PING_INTERVAL_S = 10.0
+PING_TIMEOUT_S = 20.0
+POLL_S = 0.02
+
+
+@dataclass(frozen=True)
+class RunningWorker:
+    """A worker in a thread of this process.
+
+    Attributes:
+        url: where it listens, for example ``http://127.0.0.1:41234``.
+        token: what it wants from clients.
+        worker: its inside.
+    """
+
+    url: str
+    token: str | None
+    worker: Worker
+
+
+def run(settings: Settings) -> int:
+    """Serve until SIGINT or SIGTERM; the exit code: 1 where the device was lost.
+
+    Raises:
+        OpenBindError: another address than loopback, and no token.
+        RenderError: the backend of the settings cannot be used here.
+        OSError: the address is taken.
+    """
+    check_bind(settings.host, _token(settings))
+    configure_logging(level=settings.log_level, log_format=settings.log_format)
+    app = create_app(settings)
+    listener = _listen(settings.host, settings.port)
+    url = _url(settings.host, listener)
+    worker: Worker = app.state.worker
+    print(
+        f"Real2Sim worker {settings.worker_id} on {url} ({worker.device.backend}: "
+        f"{worker.device.reason}); scenes in {settings.scenes_path}",
+        file=sys.stderr,
+        flush=True,
+    )
+    server = uvicorn.Server(server_config(app, settings))
+    # A lost device poisons the process: it ends, so that whoever supervises it starts a new one.
+    worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
+    server.run(sockets=[listener])
+    return 0 if worker.engine.failure is None and server.started else 1
+
+
+@contextmanager
+def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[RunningWorker]:
+    """A worker in a background thread, ready to be used; for tests, demo and benches.
+
+    Args:
+        settings: ``port`` 0 takes a free one.
+        timeout_s: for it to become ready.
+
+    Raises:
+        OpenBindError: another address than loopback, and no token.
+        RuntimeError: it ended, or was not ready in time; with its reasons.
+    """
+    check_bind(settings.host, _token(settings))
+    app = create_app(settings)
+    listener = _listen(settings.host, settings.port)
+    url = _url(settings.host, listener)
+    server = uvicorn.Server(server_config(app, settings))
+    thread = threading.Thread(
+        target=server.run, kwargs={"sockets": [listener]}, name="worker", daemon=True
+    )
+    thread.start()
+    try:
+        _wait_until_ready(listener.getsockname(), thread, timeout_s)
+        yield RunningWorker(url, _token(settings), app.state.worker)
+    finally:
+        server.should_exit = True
+        thread.join(settings.graceful_seconds + 30)
+        listener.close()
+
+
+def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
+    """How uvicorn serves a worker."""
+    return uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        lifespan="on",
+        ws="websockets-sansio",
+        # Deflating a frame takes 20 ms and gains nothing: images do not compress.
+        ws_per_message_deflate=False,
+        ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
+        ws_ping_interval=PING_INTERVAL_S,
+        ws_ping_timeout=PING_TIMEOUT_S,
+        timeout_graceful_shutdown=max(1, round(settings.graceful_seconds)),
+    )
+
+
+def _token(settings: Settings) -> str | None:
+    return settings.token.get_secret_value() if settings.token else None
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """A listening socket, made here so that the port is known before the server runs."""
+    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(2048)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def _url(host: str, listener: socket.socket) -> str:
+    port = listener.getsockname()[1]
+    try:
+        version = ipaddress.ip_address(host).version
+    except ValueError:
+        version = 4
+    shown = f"[{host}]" if version == 6 else host
+    return f"http://{shown}:{port}"
+
+
+def _wait_until_ready(address: tuple[str, int], thread: threading.Thread, timeout_s: float) -> None:
+    deadline = time.monotonic() + timeout_s
+    answer = "no answer yet"
+    while time.monotonic() < deadline:
+        if not thread.is_alive():
+            raise RuntimeError("the worker ended while it started; see its log")
+        ready, answer = _ask_readiness(address, timeout_s=min(5.0, timeout_s))
+        if ready:
+            return
+        time.sleep(POLL_S)
+    raise RuntimeError(f"the worker was not ready after {timeout_s:g} s: {answer}")
+
+
+def _ask_readiness(address: tuple[str, int], *, timeout_s: float) -> tuple[bool, str]:
+    connection = http.client.HTTPConnection(address[0], address[1], timeout=timeout_s)
+    try:
+        connection.request("GET", "/readyz")
+        response = connection.getresponse()
+        body = response.read().decode("utf-8", "replace")
+        return response.status == 200, body
+    except (OSError, http.client.HTTPException) as error:
+        return False, str(error)
+    finally:
+        connection.close()

@@ -1,0 +1,366 @@
+"""Durable memory of a worker: scenarios, sessions, and answers that may be asked for again."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, make_url
+from sqlalchemy.exc import IntegrityError
+
+from . import tables as t
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+REPLY_LIFETIME_US = 24 * 3600 * 1_000_000
+
+
+class StoreError(RuntimeError):
+    """The store cannot be used; the message says why and what to do."""
+
+
+class ConflictError(StoreError):
+    """A row that must be new exists already: another writer was first."""
+
+
+@dataclass(frozen=True)
+class ScenarioRow:
+    """A scenario as created; its edits are in the log."""
+
+    scenario_id: str
+    name: str
+    scene: str
+    scene_hash: str
+    created_us: int
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """A session as created.
+
+    Attributes:
+        scenario_id, scenario_revision: what it began from; None for the bare scene.
+        closed_us, reason: None while it is open.
+    """
+
+    session_id: str
+    worker_id: str
+    scene: str
+    scene_hash: str
+    scenario_id: str | None
+    scenario_revision: int | None
+    token: str
+    created_us: int
+    closed_us: int | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """One thing that happened to a session.
+
+    Attributes:
+        seq: position in the session's log, from 0.
+        kind: ``reset``, ``action`` or ``edit``.
+        step: step of the clock it belongs to.
+        payload: msgpack or JSON of the message.
+    """
+
+    seq: int
+    kind: str
+    step: int | None
+    payload: bytes
+    created_us: int
+
+
+@dataclass(frozen=True)
+class StoredReply:
+    """An answer kept for a request that may be repeated with the same Idempotency-Key.
+
+    Attributes:
+        key: the header's value together with the call it was sent to.
+        fingerprint: SHA-256 of what was asked; another one under the same key is refused.
+    """
+
+    key: str
+    fingerprint: str
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+
+class Store:
+    """SQLAlchemy Core on one thread of its own, so that the event loop never waits for a disk.
+
+    One thread is enough: an append takes about 0.1 ms in SQLite's write-ahead mode, which has one
+    writer at a time anyway, and the order of appends is the order of the calls.
+
+    Args:
+        url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="store")
+        self._engine: sa.Engine | None = None
+
+    async def open(self) -> None:
+        """Connect and create what is missing.
+
+        Raises:
+            StoreError: the database cannot be opened, or is of a newer version.
+        """
+        await self._run(self._open)
+
+    async def close(self) -> None:
+        """Finish what was begun and disconnect."""
+        await self._run(self._close)
+        self._executor.shutdown()
+
+    # --- scenarios --------------------------------------------------------------------------
+
+    async def create_scenario(self, row: ScenarioRow, *, reply: StoredReply | None = None) -> None:
+        """Add a scenario, and in the same transaction the answer to the request for it."""
+        await self._write(_insert(t.scenarios, asdict(row)), *_keep(reply))
+
+    async def scenario(self, scenario_id: str) -> ScenarioRow | None:
+        """The scenario of that id."""
+        query = sa.select(t.scenarios).where(t.scenarios.c.scenario_id == scenario_id)
+        rows = await self._read(query)
+        return ScenarioRow(**rows[0]) if rows else None
+
+    async def scenarios(self) -> list[ScenarioRow]:
+        """All scenarios, oldest first."""
+        query = sa.select(t.scenarios).order_by(t.scenarios.c.created_us, t.scenarios.c.scenario_id)
+        return [ScenarioRow(**row) for row in await self._read(query)]
+
+    async def delete_scenario(self, scenario_id: str) -> bool:
+        """Remove a scenario and its log; whether there was one."""
+        of_scenario = t.scenario_log.c.scenario_id == scenario_id
+        counts = await self._write(
+            sa.delete(t.scenario_log).where(of_scenario),
+            sa.delete(t.scenarios).where(t.scenarios.c.scenario_id == scenario_id),
+        )
+        return counts[-1] > 0
+
+    async def append_scenario_entry(
+        self,
+        scenario_id: str,
+        revision: int,
+        entry: Mapping[str, Any],
+        *,
+        created_us: int,
+        reply: StoredReply | None = None,
+    ) -> None:
+        """Append one revision, and in the same transaction the answer to the request for it.
+
+        Args:
+            scenario_id: of the scenario.
+            revision: next of its log.
+            entry: JSON values; ``kind`` among them.
+            created_us: wall clock [us].
+            reply: kept for a repeated request.
+
+        Raises:
+            ConflictError: the revision exists, or the scenario does not.
+        """
+        row = {
+            "scenario_id": scenario_id,
+            "revision": revision,
+            "kind": entry["kind"],
+            "entry": json.dumps(entry, allow_nan=False),
+            "created_us": created_us,
+        }
+        await self._write(_insert(t.scenario_log, row), *_keep(reply))
+
+    async def scenario_entries(self, scenario_id: str) -> list[dict[str, Any]]:
+        """The log of a scenario, oldest first."""
+        log = t.scenario_log
+        query = sa.select(log.c.entry).where(log.c.scenario_id == scenario_id)
+        rows = await self._read(query.order_by(log.c.revision))
+        return [json.loads(row["entry"]) for row in rows]
+
+    async def scenario_kinds(self) -> dict[str, list[str]]:
+        """Kinds of all log entries by scenario, oldest first."""
+        log = t.scenario_log
+        query = sa.select(log.c.scenario_id, log.c.kind)
+        kinds: dict[str, list[str]] = {}
+        for row in await self._read(query.order_by(log.c.scenario_id, log.c.revision)):
+            kinds.setdefault(row["scenario_id"], []).append(row["kind"])
+        return kinds
+
+    # --- sessions ---------------------------------------------------------------------------
+
+    async def create_session(self, row: SessionRow, *, reply: StoredReply | None = None) -> None:
+        """Add a session, and in the same transaction the answer to the request for it."""
+        await self._write(_insert(t.sessions, asdict(row)), *_keep(reply))
+
+    async def session(self, session_id: str) -> SessionRow | None:
+        """The session of that id, open or closed."""
+        query = sa.select(t.sessions).where(t.sessions.c.session_id == session_id)
+        rows = await self._read(query)
+        return SessionRow(**rows[0]) if rows else None
+
+    async def open_sessions(self, worker_id: str) -> list[SessionRow]:
+        """Sessions of a worker that were never closed, oldest first."""
+        own = (t.sessions.c.worker_id == worker_id) & t.sessions.c.closed_us.is_(None)
+        query = sa.select(t.sessions).where(own)
+        rows = await self._read(query.order_by(t.sessions.c.created_us, t.sessions.c.session_id))
+        return [SessionRow(**row) for row in rows]
+
+    async def close_session(self, session_id: str, *, reason: str) -> None:
+        """Note that a session is over; a second time changes nothing."""
+        still_open = (t.sessions.c.session_id == session_id) & t.sessions.c.closed_us.is_(None)
+        values = {"closed_us": now_us(), "reason": reason}
+        await self._write(sa.update(t.sessions).where(still_open).values(values))
+
+    async def append_session_entries(
+        self, session_id: str, entries: Sequence[SessionEntry]
+    ) -> None:
+        """Append to a session's log, all or nothing.
+
+        Raises:
+            ConflictError: a ``seq`` is taken, or the session does not exist.
+        """
+        rows = [{"session_id": session_id} | asdict(entry) for entry in entries]
+        await self._write(*(_insert(t.session_log, row) for row in rows))
+
+    async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
+        """The log of a session behind ``after``, oldest first."""
+        log = t.session_log
+        query = sa.select(log.c.seq, log.c.kind, log.c.step, log.c.payload, log.c.created_us)
+        query = query.where((log.c.session_id == session_id) & (log.c.seq > after))
+        return [SessionEntry(**row) for row in await self._read(query.order_by(log.c.seq))]
+
+    # --- answers ----------------------------------------------------------------------------
+
+    async def reply(self, key: str) -> StoredReply | None:
+        """The answer kept under ``key``, for 24 hours."""
+        table = t.idempotent_replies
+        fresh = table.c.created_us > now_us() - REPLY_LIFETIME_US
+        rows = await self._read(sa.select(table).where((table.c.key == key) & fresh))
+        if not rows:
+            return None
+        row = rows[0]
+        headers = json.loads(row["headers"])
+        return StoredReply(key, row["fingerprint"], row["status"], headers, row["body"])
+
+    # --- inside -----------------------------------------------------------------------------
+
+    async def _run(self, fn: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        loop = asyncio.get_running_loop()
+        # Shielded: what was handed over is written even when the caller is cancelled.
+        work = loop.run_in_executor(self._executor, lambda: fn(*args, **kwargs))
+        return await asyncio.shield(work)
+
+    async def _read(self, query: sa.Select[Any]) -> list[dict[str, Any]]:
+        def read() -> list[dict[str, Any]]:
+            with self._connected().connect() as connection:
+                return [dict(row) for row in connection.execute(query).mappings()]
+
+        return await self._run(read)
+
+    async def _write(self, *statements: sa.Executable) -> list[int]:
+        """Rows changed by each statement, in one transaction."""
+
+        def write() -> list[int]:
+            try:
+                with self._connected().begin() as connection:
+                    return [connection.execute(s).rowcount for s in statements]
+            except IntegrityError as error:
+                raise ConflictError(f"not stored: {error.orig}") from error
+
+        return await self._run(write)
+
+    def _connected(self) -> sa.Engine:
+        if self._engine is None:
+            raise StoreError("the store is not open")
+        return self._engine
+
+    def _open(self) -> None:
+        try:
+            self._engine = _connect(self.url)
+            with self._engine.begin() as connection:
+                _prepare_schema(connection)
+                _forget_old_replies(connection)
+        except (sa.exc.SQLAlchemyError, OSError) as error:
+            reason = getattr(error, "orig", None) or error
+            raise StoreError(f"cannot open the store {_shown(self.url)!r}: {reason}") from error
+
+    def _close(self) -> None:
+        if self._engine is not None:
+            self._engine.dispose()
+            self._engine = None
+
+
+def now_us() -> int:
+    """Wall-clock time [us] since 1970 UTC."""
+    return time.time_ns() // 1000
+
+
+def _shown(url: str) -> str:
+    """The URL without its password."""
+    try:
+        return make_url(url).render_as_string(hide_password=True)
+    except sa.exc.ArgumentError:
+        return "<no SQLAlchemy URL>"
+
+
+def _connect(url: str) -> sa.Engine:
+    parsed = make_url(url)
+    if parsed.get_backend_name() != "sqlite":
+        return sa.create_engine(parsed, pool_pre_ping=True)
+    if parsed.database and parsed.database != ":memory:":
+        Path(parsed.database).absolute().parent.mkdir(parents=True, exist_ok=True)
+    engine = sa.create_engine(parsed)
+    sa.event.listen(engine, "connect", _set_up_sqlite)
+    return engine
+
+
+def _set_up_sqlite(connection: Any, _record: object) -> None:
+    cursor = connection.cursor()
+    # NORMAL loses no committed transaction when the process dies, only when the machine does.
+    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.execute("PRAGMA busy_timeout=5000")
+    cursor.close()
+
+
+def _prepare_schema(connection: Connection) -> None:
+    t.schema_version.create(connection, checkfirst=True)
+    found = connection.execute(sa.select(sa.func.max(t.schema_version.c.version))).scalar()
+    if found is not None and found != t.SCHEMA_VERSION:
+        raise StoreError(
+            f"the store has schema version {found}, this worker reads {t.SCHEMA_VERSION}; "
+            "start a worker of that version, or give another REAL2SIM_STORE_URL"
+        )
+    t.metadata.create_all(connection)
+    if found is None:
+        connection.execute(_insert(t.schema_version, {"version": t.SCHEMA_VERSION}))
+
+
+def _forget_old_replies(connection: Connection) -> None:
+    table = t.idempotent_replies
+    old = table.c.created_us <= now_us() - REPLY_LIFETIME_US
+    connection.execute(sa.delete(table).where(old))
+
+
+def _insert(table: sa.Table, row: Mapping[str, Any]) -> sa.Insert:
+    return sa.insert(table).values(dict(row))
+
+
+def _keep(reply: StoredReply | None) -> list[sa.Executable]:
+    if reply is None:
+        return []
+    row = asdict(reply) | {"headers": json.dumps(dict(reply.headers)), "created_us": now_us()}
+    # An expired answer may still hold the key.
+    table = t.idempotent_replies
+    return [sa.delete(table).where(table.c.key == reply.key), _insert(table, row)]

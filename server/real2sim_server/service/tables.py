@@ -1,0 +1,93 @@
+"""Tables of the store. Portable types only: the same tables serve SQLite and PostgreSQL."""
+
+from __future__ import annotations
+
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+)
+
+SCHEMA_VERSION = 1
+
+metadata = MetaData()
+
+schema_version = Table("schema_version", metadata, Column("version", Integer, primary_key=True))
+
+scenarios = Table(
+    "scenarios",
+    metadata,
+    Column("scenario_id", String(80), primary_key=True),
+    Column("name", String(200), nullable=False),
+    Column("scene", String(80), nullable=False),
+    Column("scene_hash", String(64), nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+# Append-only. The primary key is what keeps two writers from making the same revision.
+scenario_log = Table(
+    "scenario_log",
+    metadata,
+    Column(
+        "scenario_id",
+        String(80),
+        ForeignKey("scenarios.scenario_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("revision", Integer, primary_key=True, autoincrement=False),
+    Column("kind", String(8), nullable=False),
+    Column("entry", Text, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+sessions = Table(
+    "sessions",
+    metadata,
+    Column("session_id", String(80), primary_key=True),
+    Column("worker_id", String(16), nullable=False),
+    Column("scene", String(80), nullable=False),
+    Column("scene_hash", String(64), nullable=False),
+    Column("scenario_id", String(80), nullable=True),
+    Column("scenario_revision", Integer, nullable=True),
+    Column("token", String(200), nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+    Column("closed_us", BigInteger, nullable=True),
+    Column("reason", Text, nullable=True),
+)
+Index("ix_sessions_open", sessions.c.worker_id, sessions.c.closed_us)
+
+# Append-only: resets, actions and edits of a session in the order in which they took effect.
+session_log = Table(
+    "session_log",
+    metadata,
+    Column(
+        "session_id",
+        String(80),
+        ForeignKey("sessions.session_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("seq", Integer, primary_key=True, autoincrement=False),
+    Column("kind", String(16), nullable=False),
+    Column("step", Integer, nullable=True),
+    Column("payload", LargeBinary, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+idempotent_replies = Table(
+    "idempotent_replies",
+    metadata,
+    Column("key", String(300), primary_key=True),
+    Column("fingerprint", String(64), nullable=False),
+    Column("status", Integer, nullable=False),
+    Column("headers", Text, nullable=False),
+    Column("body", LargeBinary, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+Index("ix_idempotent_replies_created", idempotent_replies.c.created_us)

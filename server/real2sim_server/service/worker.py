@@ -1,0 +1,191 @@
+"""Everything that makes up one worker, put together once."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Annotated
+
+import structlog
+from fastapi import Depends, Response
+from starlette.requests import HTTPConnection
+
+from real2sim_proto.scenes import DeviceInfo, Readiness
+
+from ..render import Backend, describe_backends, select_backend
+from ..settings import Settings
+from .engine import Engine
+from .idempotency import Idempotency
+from .library import Library
+from .metrics import Metrics
+from .pictures import Pictures
+from .residency import Residency
+from .scenarios import Scenarios
+from .store import Store
+
+LAG_PERIOD_S = 0.1
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass(eq=False)
+class Worker:
+    """One worker: what it is made of, and whether it takes work.
+
+    Attributes:
+        device: what draws, and why.
+        waiting_for: what has to happen before the worker is ready.
+        draining: whether the worker is on its way out.
+    """
+
+    settings: Settings
+    engine: Engine
+    metrics: Metrics
+    store: Store
+    residency: Residency
+    scenarios: Scenarios
+    idempotency: Idempotency
+    pictures: Pictures
+    backend: Backend
+    device: DeviceInfo
+    waiting_for: set[str] = field(default_factory=lambda: {"start"})
+    draining: bool = False
+
+    @classmethod
+    def build(cls, settings: Settings) -> Worker:
+        """Put a worker together; nothing runs yet.
+
+        Raises:
+            RenderError: the backend of the settings cannot be used here.
+        """
+        metrics = Metrics()
+        backend = select_backend(settings.backend)
+        engine = Engine(
+            queue_length=settings.queue_length,
+            threads=settings.threads,
+            on_job=metrics.observe_job,
+        )
+        residency = Residency(
+            Library(settings.scenes_path),
+            engine,
+            budget_bytes=settings.scene_memory_bytes,
+            device=_device_of(backend),
+            on_load=metrics.scene_loads.observe,
+        )
+        store = Store(settings.database_url)
+        worker = cls(
+            settings=settings,
+            engine=engine,
+            metrics=metrics,
+            store=store,
+            residency=residency,
+            scenarios=Scenarios(store, residency, metrics),
+            idempotency=Idempotency(store),
+            pictures=Pictures(engine, backend, metrics, max_pixels=settings.max_pixels_per_step),
+            backend=backend,
+            device=_device_info(backend, settings),
+        )
+        worker._connect_gauges()
+        return worker
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[Worker]:
+        """The worker at work: from the start of its engine to the end of its last job."""
+        self.engine.start()
+        await self.store.open()
+        await self.residency.refresh()
+        self.waiting_for = {"warming up kernels"}
+        background = [
+            asyncio.create_task(self._warm_up(), name="warm-up"),
+            asyncio.create_task(self._watch_loop(), name="loop-lag"),
+        ]
+        try:
+            yield self
+        finally:
+            self.draining = True
+            for task in background:
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await task
+            await asyncio.to_thread(self.engine.stop)
+            self.pictures.close()
+            self.residency.close()
+            await self.store.close()
+
+    def readiness(self) -> Readiness:
+        """Whether new work is welcome, and if not, why."""
+        reasons = sorted(self.waiting_for)
+        if self.draining:
+            reasons.append("draining: the worker is stopping")
+        if not self.engine.alive:
+            reasons.append(f"engine stopped: {self.engine.failure or 'its thread has ended'}")
+        if self.engine.queue_depth >= self.settings.queue_length:
+            reasons.append(f"{self.settings.queue_length} jobs wait for the engine")
+        return Readiness(ready=not reasons, reasons=reasons)
+
+    def replayed(self, answer: Response) -> Response:
+        """Count an answer that was given before."""
+        self.metrics.replays.inc()
+        return answer
+
+    async def _warm_up(self) -> None:
+        started = time.perf_counter()
+        try:
+            await self.pictures.warm_up()
+        except Exception as error:
+            log.exception("warm-up failed")
+            self.waiting_for = {f"warm-up failed: {error}"}
+            return
+        self.waiting_for = set()
+        seconds = round(time.perf_counter() - started, 2)
+        log.info("ready", backend=self.backend.name, warm_up_s=seconds)
+
+    async def _watch_loop(self) -> None:
+        while True:
+            due = time.perf_counter() + LAG_PERIOD_S
+            await asyncio.sleep(LAG_PERIOD_S)
+            self.metrics.loop_lag.observe(max(0.0, time.perf_counter() - due))
+
+    def _connect_gauges(self) -> None:
+        self.metrics.build.info(
+            {"version": version("real2sim"), "backend": self.backend.name},
+        )
+        self.metrics.watch(self.metrics.queue_depth, lambda: self.engine.queue_depth)
+        self.metrics.watch(self.metrics.scene_bytes, lambda: self.residency.resident_bytes)
+        for state, count in self.residency.counters().items():
+            self.metrics.watch(self.metrics.scenes.labels(state), count)
+
+
+def _device_of(backend: Backend) -> str:
+    return "cuda" if backend.name == "cuda" else "cpu"
+
+
+def _device_info(backend: Backend, settings: Settings) -> DeviceInfo:
+    import numba
+
+    reasons = {status.name: status.reason for status in describe_backends()}
+    reason = reasons.get(backend.name, "")
+    if backend.name == "cpu" and settings.backend == "auto":
+        reason = f"{reason}; not cuda: {reasons.get('cuda', 'unknown')}"
+    if settings.backend != "auto":
+        reason = f"asked for by REAL2SIM_BACKEND; {reason}"
+    return DeviceInfo(
+        backend=backend.name,
+        reason=reason,
+        device=_device_of(backend),
+        threads=settings.threads or numba.config.NUMBA_NUM_THREADS,
+    )
+
+
+def _worker_of(connection: HTTPConnection) -> Worker:
+    worker: Worker = connection.app.state.worker
+    return worker
+
+
+WorkerOf = Annotated[Worker, Depends(_worker_of)]
+"""The worker, as a parameter of routes and sockets."""

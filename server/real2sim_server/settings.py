@@ -1,0 +1,82 @@
+"""Settings of a worker: ``REAL2SIM_*`` in the environment, or arguments of ``real2sim serve``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, SecretStr
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+GIB = 1024**3
+MIB = 1024**2
+
+
+def _default_data_dir() -> Path:
+    state = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(state) / "real2sim"
+
+
+class Settings(BaseSettings):
+    """Everything about a worker that differs from one installation to the next.
+
+    Attributes:
+        host, port: where to listen; an address beyond loopback needs ``token``.
+        token: bearer token that every request but ``/livez`` and ``/readyz`` must carry.
+        worker_id: first part of session ids, so that a proxy can find the worker again.
+        data_dir: what the worker writes; the next three lie below it by default.
+        scenes_dir: folder of scene bundles.
+        import_root: the only folder that ``POST /v1/scenes`` may read from.
+        store_url: SQLAlchemy URL of scenarios and sessions.
+        backend: what draws: ``auto`` chooses by the hardware at hand.
+        threads: of numba and torch; 0 for one per core.
+        scene_memory_bytes: budget of resident scenes.
+        max_sessions: open sessions; more are refused at creation.
+        queue_length: jobs that may wait for the engine; more are refused.
+        max_request_bytes, max_upload_bytes: body of a request, and of an uploaded splat file.
+        max_pixels_per_step: pixels over all cameras of one observation or render.
+        stall_seconds: `/livez` fails when one job takes longer than this.
+        graceful_seconds: time that open requests get at shutdown.
+        metrics: whether `/metrics` is served.
+        log_level, log_format: ``auto`` is text on a terminal and JSON elsewhere.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="REAL2SIM_", frozen=True, extra="forbid")
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8600, ge=0, le=65535)
+    token: SecretStr | None = Field(default=None, min_length=8)
+    worker_id: str = Field(default="w0", pattern=r"^w[0-9]{1,6}$")
+    data_dir: Path = Field(default_factory=_default_data_dir)
+    scenes_dir: Path | None = None
+    import_root: Path | None = None
+    store_url: str | None = None
+    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+    threads: int = Field(default=0, ge=0, le=1024)
+    scene_memory_bytes: int = Field(default=8 * GIB, gt=0)
+    max_sessions: int = Field(default=32, ge=0)
+    queue_length: int = Field(default=64, ge=1)
+    max_request_bytes: int = Field(default=4 * MIB, ge=1024)
+    max_upload_bytes: int = Field(default=2 * GIB, ge=1024)
+    max_pixels_per_step: int = Field(default=64_000_000, ge=1)
+    stall_seconds: float = Field(default=120.0, gt=0)
+    graceful_seconds: float = Field(default=10.0, ge=0)
+    metrics: bool = True
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    log_format: Literal["auto", "json", "text"] = "auto"
+
+    @property
+    def scenes_path(self) -> Path:
+        """Folder of scene bundles."""
+        return self.scenes_dir or self.data_dir / "scenes"
+
+    @property
+    def import_path(self) -> Path:
+        """Folder that imports are read from."""
+        return self.import_root or self.data_dir / "import"
+
+    @property
+    def database_url(self) -> str:
+        """SQLAlchemy URL of the store."""
+        return self.store_url or f"sqlite:///{self.data_dir / 'real2sim.db'}"
