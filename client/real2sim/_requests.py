@@ -49,7 +49,6 @@ M = TypeVar("M", bound=BaseModel)
 
 MSGPACK = "application/msgpack"
 MEDIA_TYPES = {"raw": MSGPACK, "jpeg": "image/jpeg", "png": "image/png"}
-_DTYPES = {"rgb": "uint8", "depth": "float32", "instance": "uint16"}
 
 
 @dataclass(frozen=True)
@@ -61,6 +60,7 @@ class Request:
     params: dict[str, str] = field(default_factory=dict)
     headers: dict[str, str] = field(default_factory=dict)
     body: bytes | None = None
+    form: dict[str, str] = field(default_factory=dict)
     upload: Path | None = None
     idempotent: bool = True
     patient: bool = False
@@ -126,11 +126,14 @@ def import_scene(path: str, scene: str | None) -> Call[SceneInfo]:
 
 
 def upload_scene(path: Path, scene: str | None) -> Call[SceneInfo]:
-    params = {} if scene is None else {"scene": scene}
-    headers = {"Idempotency-Key": new_key()}
-    request = Request(
-        "POST", "/v1/scenes", params=params, headers=headers, upload=path, patient=True
-    )
+    key = new_key()
+    # The boundary follows from the key, so that every try sends the same bytes.
+    headers = {
+        "Idempotency-Key": key,
+        "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
+    }
+    form = {} if scene is None else {"scene": scene}
+    request = Request("POST", "/v1/scenes", headers=headers, form=form, upload=path, patient=True)
     return Call(request, _model(SceneInfo))
 
 
@@ -417,7 +420,8 @@ def _parse_image(reply: Reply, modality: str) -> Image:
     codec = codecs.get(reply.media_type)
     if codec is None:
         raise MalformedReplyError(f"the worker sent {reply.media_type!r} where an image was asked")
-    return Image(data=reply.content, codec=codec, modality=modality, dtype=_DTYPES[modality])
+    dtype = "uint8" if modality == "rgb" else "uint16"
+    return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype)
 
 
 def _parse_view(reply: Reply) -> View:

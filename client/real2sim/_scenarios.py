@@ -30,7 +30,8 @@ class Scenarios:
     def create(self, *, scene: str, name: str = "") -> Scenario:
         """A new scenario without edits on a scene."""
         info = self._transport.send(_requests.create_scenario(scene, name))
-        return Scenario(self._transport, info)
+        # The answer to a creation leaves trajectories out; a handle always has them.
+        return Scenario(self._transport, info).refresh()
 
     def get(self, scenario_id: str) -> Scenario:
         """A handle of an existing scenario."""

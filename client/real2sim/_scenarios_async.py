@@ -25,7 +25,7 @@ class AsyncScenarios:
     async def create(self, *, scene: str, name: str = "") -> AsyncScenario:
         """A new scenario without edits on a scene."""
         info = await self._transport.send(_requests.create_scenario(scene, name))
-        return AsyncScenario(self._transport, info)
+        return await AsyncScenario(self._transport, info).refresh()
 
     async def get(self, scenario_id: str) -> AsyncScenario:
         """A handle of an existing scenario."""

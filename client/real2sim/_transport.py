@@ -184,7 +184,7 @@ def _arguments(target: Target, request: Request) -> Iterator[dict[str, Any]]:
         yield arguments
         return
     with request.upload.open("rb") as file:
-        yield arguments | {"files": {"file": (request.upload.name, file)}}
+        yield arguments | {"data": request.form, "files": {"file": (request.upload.name, file)}}
 
 
 @contextlib.contextmanager

@@ -21,6 +21,8 @@ from .errors import ImageDecodeError, MalformedReplyError
 if TYPE_CHECKING:
     from real2sim_proto.drive import Frame as WireFrame
 
+DEPTH_PNG_UNIT = 1 / 256
+"""Metres of one level of depth sent as 16-bit png."""
 SUFFIX = {"jpeg": ".jpg", "png": ".png", "raw": ".npy"}
 
 
@@ -33,7 +35,7 @@ class Image:
         codec: ``raw``, ``jpeg`` or ``png``.
         modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` (float32 [H, W], metres along the camera z
             axis, 0 where nothing was hit) or ``instance`` (uint16 [H, W], 0 is background).
-        dtype: of the array.
+        dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``.
         shape: of the array; empty where only the image itself tells.
     """
 
@@ -56,6 +58,8 @@ class Image:
                 f"{self.codec} image holds {array.dtype} {array.shape} where "
                 f"{self.dtype} {self.shape or ''} was announced"
             )
+        if self.modality == "depth" and array.dtype == np.uint16:
+            return array * np.float32(DEPTH_PNG_UNIT)
         return array
 
     def save(self, path: str | os.PathLike[str]) -> Path:

@@ -1,0 +1,428 @@
+"""A worker without scenes: speaks the contract over a real socket, and misbehaves on request.
+
+The vehicle stands exactly where a plan says it should be; one camera shows a ramp of greys.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import simplejpeg
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
+from real2sim_proto.drive import CLIENT_MESSAGE, Action, Edit, Hello, Render, Reset, ResetSpec
+from real2sim_proto.operations import Delete, Duplicate
+from real2sim_proto.scenarios import OperationBatch
+
+ROUTE_LENGTH = 60.0
+IMAGE = np.tile(np.arange(64, dtype=np.uint8)[None, :, None] * 3, (48, 1, 3))
+CAMERA = {
+    "name": "front",
+    "width": 64,
+    "height": 48,
+    "K": [[50.0, 0, 32], [0, 50.0, 24], [0, 0, 1]],
+    "T_vehicle_camera": np.eye(4).tolist(),
+}
+OBJECT = {
+    "object_id": "car_3",
+    "category": "car",
+    "size": (4.5, 1.9, 1.6),
+    "instance_id": 1,
+    "gaussians": 100,
+    "start_us": 0,
+    "end_us": 10_000_000,
+}
+SCENE = {"scene": "street", "state": "resident", "cameras": [CAMERA], "objects": [OBJECT]}
+
+
+class FakeWorker:
+    """State of the worker. Set ``mischief`` to make it misbehave."""
+
+    def __init__(self) -> None:
+        self.url = ""
+        self.forget()
+        self.app = Starlette(
+            routes=[
+                Route("/readyz", self.ready),
+                Route("/v1/server", self.server),
+                Route("/v1/scenes", self.scenes),
+                Route("/v1/scenes/street/render", self.render),
+                Route("/v1/scenarios", self.create_scenario, methods=["POST"]),
+                Route("/v1/scenarios/{id}", self.scenario),
+                Route("/v1/scenarios/{id}/operations", self.edit, methods=["POST"]),
+                Route("/v1/sessions", self.create_session, methods=["POST"]),
+                Route("/v1/sessions/{id}", self.delete_session, methods=["DELETE"]),
+                WebSocketRoute("/v1/sessions/{id}/drive", self.drive),
+            ]
+        )
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self.mischief = ""
+        self.requests: list[tuple[str, str, dict[str, str]]] = []
+        self.messages: list[dict[str, Any]] = []
+        self.deleted: list[str] = []
+        self.objects: dict[str, dict[str, Any]] = {"car_3": OBJECT}
+        self.log: list[dict[str, Any]] = []
+
+    @contextmanager
+    def running(self) -> Iterator[FakeWorker]:
+        """Serve on a free port of this machine, in a thread."""
+        listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        config = uvicorn.Config(
+            self.app,
+            ws="websockets-sansio",
+            log_config=None,
+            ws_per_message_deflate=False,
+            timeout_graceful_shutdown=1,
+        )
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
+        thread.start()
+        while not server.started:
+            assert thread.is_alive()
+            time.sleep(0.005)
+        try:
+            yield self
+        finally:
+            server.should_exit = True
+            thread.join(10)
+            listener.close()
+
+    # --- REST -----------------------------------------------------------------------------
+
+    async def ready(self, request: Request) -> Response:
+        return JSONResponse({"ready": True})
+
+    async def server(self, request: Request) -> Response:
+        limits = dict.fromkeys(
+            (
+                "max_sessions",
+                "max_request_bytes",
+                "max_message_bytes",
+                "max_operations_per_request",
+                "max_cameras_per_step",
+                "max_pixels_per_step",
+                "max_steps_per_request",
+                "scene_memory_bytes",
+                "queue_length",
+            ),
+            8,
+        )
+        return JSONResponse(
+            {
+                "version": "0.1.0",
+                "protocol_version": 1,
+                "subprotocols": [DRIVE_SUBPROTOCOL],
+                "worker_id": "w0",
+                "device": {"backend": "fake", "reason": "test", "device": "cpu", "threads": 1},
+                "limits": limits,
+                "codecs": ["raw", "jpeg"],
+                "modalities": ["rgb"],
+                "conventions": {},
+            }
+        )
+
+    async def scenes(self, request: Request) -> Response:
+        self._note(request)
+        return JSONResponse({"scenes": [SCENE]})
+
+    async def render(self, request: Request) -> Response:
+        self._note(request)
+        if request.headers["accept"] == "image/jpeg":
+            return Response(simplejpeg.encode_jpeg(IMAGE), media_type="image/jpeg")
+        return Response(encode(frame("raw")), media_type="application/msgpack")
+
+    async def create_scenario(self, request: Request) -> Response:
+        self._note(request)
+        return JSONResponse(self._scenario_info(), 201)
+
+    async def scenario(self, request: Request) -> Response:
+        return JSONResponse(self._scenario_info())
+
+    async def edit(self, request: Request) -> Response:
+        self._note(request)
+        revision = len(self.log)
+        if request.headers["if-match"] != f'"r{revision}"':
+            return self._stale(request)
+        batch = OperationBatch.model_validate_json(await request.body())
+        created = []
+        for op in batch.operations:
+            if isinstance(op, Duplicate):
+                created.append(op.new_id or f"{op.object_id}_copy1")
+                self.objects[created[-1]] = OBJECT | {"object_id": created[-1]}
+            elif isinstance(op, Delete):
+                del self.objects[op.object_id]
+        self.record([op.model_dump(mode="json") for op in batch.operations])
+        answer = {"revision": revision + 1, "etag": f'"r{revision + 1}"', "created": created}
+        return JSONResponse(answer)
+
+    def record(self, operations: list[dict[str, Any]]) -> None:
+        """Append to the history, as if somebody had edited."""
+        self.log.append(
+            {
+                "revision": len(self.log) + 1,
+                "kind": "edit",
+                "operations": operations,
+                "created_at": "2026-01-01T00:00:00Z",
+            }
+        )
+
+    async def create_session(self, request: Request) -> Response:
+        self._note(request)
+        info = {
+            "session_id": "w0.abc",
+            "scene": "street",
+            "ws_url": "ws://unreachable.invalid/drive",
+            "token": "session-secret",
+            "created_at": "2026-01-01T00:00:00Z",
+            "reset": ResetSpec().model_dump(mode="json"),
+        }
+        return JSONResponse(info, 201)
+
+    async def delete_session(self, request: Request) -> Response:
+        self.deleted.append(request.path_params["id"])
+        return Response(status_code=204)
+
+    def _note(self, request: Request) -> None:
+        self.requests.append((request.method, request.url.path, dict(request.headers)))
+
+    def _scenario_info(self) -> dict[str, Any]:
+        return {
+            "scenario_id": "sc_1",
+            "name": "",
+            "scene": "street",
+            "scene_hash": "00",
+            "revision": len(self.log),
+            "etag": f'"r{len(self.log)}"',
+            "created_at": "2026-01-01T00:00:00Z",
+            "can_undo": bool(self.log),
+            "can_redo": False,
+            "objects": list(self.objects.values()),
+        }
+
+    def _stale(self, request: Request) -> Response:
+        seen = int(request.headers["if-match"].strip('"r'))
+        return JSONResponse(
+            {
+                "title": "Stale revision",
+                "status": 412,
+                "code": "STALE_REVISION",
+                "detail": f"the edit was made for revision {seen}",
+                "revision": len(self.log),
+                "missed": self.log[seen:],
+            },
+            412,
+            media_type="application/problem+json",
+        )
+
+    # --- drive socket ---------------------------------------------------------------------
+
+    async def drive(self, socket: WebSocket) -> None:
+        if self.mischief == "426 at the handshake":
+            problem = {
+                "status": 426,
+                "code": "UNSUPPORTED_PROTOCOL",
+                "detail": "the client offers real2sim.v1.msgpack; this worker speaks real2sim.v9",
+                "hint": "install a newer client",
+            }
+            await socket.send_denial_response(JSONResponse(problem, 426))
+            return
+        chosen = None if self.mischief == "no subprotocol" else DRIVE_SUBPROTOCOL
+        await socket.accept(subprotocol=chosen)
+        episode = Episode()
+        try:
+            while True:
+                await self._answer(socket, episode, decode(await socket.receive_bytes()))
+        except WebSocketDisconnect:
+            return
+
+    async def _answer(self, socket: WebSocket, episode: Episode, fields: dict[str, Any]) -> None:
+        self.messages.append(fields)
+        message = CLIENT_MESSAGE.validate_python(fields)
+        if isinstance(message, Hello):
+            answer = self._welcome()
+        elif isinstance(message, Reset):
+            answer = episode.reset(message.spec)
+        elif isinstance(message, Action):
+            if await self._misbehave(socket, message):
+                return
+            answer = episode.step(message)
+        elif isinstance(message, Edit):
+            episode.revision += 1
+            answer = {"type": "edited", "revision": episode.revision, "created": ["car_3_copy1"]}
+        elif isinstance(message, Render):
+            answer = {
+                "type": "view",
+                "t_us": episode.t_us,
+                "revision": episode.revision,
+                "frames": [frame(s.codec) for s in message.sensors],
+            }
+        else:
+            answer = {
+                "type": "result",
+                "steps": episode.count,
+                "t_us": episode.t_us,
+                "reason": "bye",
+                "metrics": {"progress": 1.0},
+            }
+        await socket.send_bytes(encode(answer | {"v": 1, "id": message.id}))
+
+    def _welcome(self) -> dict[str, Any]:
+        if self.mischief == "error after hello":
+            return {
+                "type": "error",
+                "code": "UNSUPPORTED_PROTOCOL",
+                "detail": "the client offers x; this worker speaks y",
+                "fatal": True,
+            }
+        return {
+            "type": "welcome",
+            "protocol": DRIVE_SUBPROTOCOL,
+            "session_id": "w0.abc",
+            "role": "controller",
+            "versions": {"server": "0.1.0"},
+            "limits": {},
+            "cameras": [CAMERA],
+            "objects": [OBJECT | {"size": list(OBJECT["size"])}],
+            "start_us": 0,
+            "end_us": 10_000_000,
+            "step": None,
+        }
+
+    async def _misbehave(self, socket: WebSocket, action: Action) -> bool:
+        """Whether the message has been answered, or is not going to be."""
+        mischief, self.mischief = self.mischief, ""
+        envelope = {"v": 1, "id": action.id}
+        match mischief:
+            case "hang":
+                return True
+            case "late":
+                # Two answers then: this one when nobody waits for it any more.
+                await asyncio.sleep(0.6)
+                return False
+            case "restart":
+                await socket.close(1012, "restarting")
+                raise WebSocketDisconnect
+            case "garbage":
+                await socket.send_bytes(b"\xc1\xff\x00")
+                return True
+            case "text":
+                await socket.send_text("{}")
+                return True
+            case "another type":
+                answer = {"type": "edited", "revision": 1}
+            case "missing fields":
+                answer = {"type": "obs", "step": 1}
+            case "version 2":
+                answer = {"type": "obs", "v": 2}
+            case "progress":
+                await socket.send_bytes(
+                    encode({"type": "progress", "phase": "compiling", "eta_s": 1.0} | envelope)
+                )
+                return False
+            case "":
+                return False
+            case code:
+                answer = {"type": "error", "code": code, "detail": "refused by the test", "step": 7}
+        await socket.send_bytes(encode(envelope | answer))
+        return True
+
+
+class Episode:
+    """A straight road along x; the vehicle is wherever its plan says."""
+
+    def __init__(self) -> None:
+        self.spec = ResetSpec()
+        self.revision = 0
+        self.count = 0
+        self.pose = (0.0, 0.0, 0.0)
+        self.speed = 0.0
+        self.cached: tuple[Any, dict[str, Any]] | None = None
+
+    @property
+    def t_us(self) -> int:
+        return self.count * self.spec.dt_us
+
+    def reset(self, spec: ResetSpec) -> dict[str, Any]:
+        self.spec, self.count, self.pose, self.speed = spec, 0, (0.0, 1.0, 0.0), 0.0
+        return self.obs()
+
+    def step(self, action: Action) -> dict[str, Any]:
+        if action.step == self.count - 1 and self.cached and self.cached[0] == action.plan:
+            return self.cached[1]
+        x, y, yaw = self.pose
+        self.count += 1
+        if action.plan.kind == "trajectory":
+            times = np.array([self.t_us - self.spec.dt_us, *action.plan.times_us], float)
+            poses = np.array([(0.0, 0.0, 0.0), *action.plan.poses])
+            dx, dy, dyaw = (np.interp(self.t_us, times, poses[:, k]) for k in range(3))
+            c, s = math.cos(yaw), math.sin(yaw)
+            self.pose = (x + c * dx - s * dy, y + s * dx + c * dy, yaw + dyaw)
+            self.speed = math.hypot(dx, dy) / (self.spec.dt_us * 1e-6)
+        elif action.plan.kind == "control":
+            dt = self.spec.dt_us * 1e-6
+            self.speed += action.plan.acceleration * dt
+            self.pose = (x + self.speed * dt, y, yaw)
+        self.cached = (action.plan, self.obs())
+        return self.cached[1]
+
+    def obs(self) -> dict[str, Any]:
+        x, y, yaw = (float(v) for v in self.pose)
+        along = np.arange(x, ROUTE_LENGTH + 0.5, 1.0)
+        c, s = math.cos(yaw), math.sin(yaw)
+        route = np.stack([along - x, np.full_like(along, -y)], axis=1) @ np.array([[c, -s], [s, c]])
+        done = x >= ROUTE_LENGTH - 2.0
+        return {
+            "type": "obs",
+            "step": self.count,
+            "t_us": self.t_us,
+            "revision": self.revision,
+            "ego": {
+                "position": [x, y, 0.0],
+                "quaternion": [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)],
+                "yaw": yaw,
+                "speed": float(self.speed),
+                "acceleration": 0.0,
+                "steering": 0.0,
+                "yaw_rate": 0.0,
+                "size": [4.6, 1.9, 1.6],
+            },
+            "command": "straight",
+            "route": route,
+            "frames": [frame(s.codec, t_us=self.t_us) for s in self.spec.sensors],
+            "truncated": done,
+            "reason": "horizon" if done else None,
+            "timing": {"render": 1.5, "total": 2.0},
+        }
+
+
+def frame(codec: str, *, t_us: int = 0) -> dict[str, Any]:
+    """The one picture there is, as a frame of the wire."""
+    data = IMAGE.tobytes() if codec == "raw" else simplejpeg.encode_jpeg(IMAGE, quality=95)
+    return {
+        "sensor": "front",
+        "modality": "rgb",
+        "t_us": t_us,
+        "T_world_sensor": np.eye(4),
+        "K": np.array(CAMERA["K"]),
+        "codec": codec,
+        "dtype": "uint8",
+        "shape": list(IMAGE.shape),
+        "data": data,
+    }

@@ -1,0 +1,360 @@
+"""Requests and answers without a network: what goes out, and what each answer becomes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+
+import httpx2
+import numpy as np
+import pytest
+
+import real2sim
+from real2sim import _transport
+from real2sim.errors import CapacityError
+from real2sim_proto import encode
+
+from .fake_worker import IMAGE, frame
+
+Handler = Callable[[httpx2.Request], httpx2.Response]
+SCENES = {"scenes": [{"scene": "street", "state": "resident"}]}
+
+
+class Script:
+    """Answers in order; the last one for ever."""
+
+    def __init__(self, *answers: httpx2.Response | Exception) -> None:
+        self.answers = list(answers)
+        self.requests: list[httpx2.Request] = []
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        request.read()
+        self.requests.append(request)
+        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def client_of(handler: Handler, **options: object) -> real2sim.Client:
+    transport = httpx2.MockTransport(handler)
+    return real2sim.connect("http://worker:8600", transport=transport, **options)
+
+
+def problem(status: int, code: str, **members: object) -> httpx2.Response:
+    body = {"status": status, "code": code, "title": code, "detail": f"about {code}"} | members
+    headers = {"content-type": "application/problem+json"}
+    return httpx2.Response(status, content=json.dumps(body).encode(), headers=headers)
+
+
+@pytest.fixture
+def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    delays: list[float] = []
+    monkeypatch.setattr(_transport.time, "sleep", delays.append)
+    return delays
+
+
+# --- errors -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "error"),
+    [
+        (401, "UNAUTHORIZED", real2sim.UnauthorizedError),
+        (404, "UNKNOWN_SCENE", real2sim.NotFoundError),
+        (409, "SCENE_IN_USE", real2sim.ConflictError),
+        (409, "CONTROLLER_TAKEN", real2sim.ControllerTakenError),
+        (410, "SESSION_CLOSED", real2sim.SessionClosedError),
+        (412, "STALE_REVISION", real2sim.StaleRevisionError),
+        (413, "PAYLOAD_TOO_LARGE", real2sim.InvalidRequestError),
+        (422, "INVALID_OPERATION", real2sim.InvalidOperationError),
+        (422, "TIME_OUT_OF_RANGE", real2sim.InvalidRequestError),
+        (426, "UNSUPPORTED_PROTOCOL", real2sim.ProtocolMismatchError),
+        (429, "OVER_CAPACITY", real2sim.CapacityError),
+        (500, "INTERNAL", real2sim.WorkerFailedError),
+        (507, "OUT_OF_MEMORY", real2sim.CapacityError),
+        (418, "CODE_OF_THE_FUTURE", real2sim.StatusError),
+    ],
+)
+def test_a_problem_becomes_the_error_of_its_code(status, code, error):
+    with (
+        client_of(Script(problem(status, code)), retries=0) as client,
+        pytest.raises(error, match=f"about {code}") as caught,
+    ):
+        client.scenes.get("street")
+    assert type(caught.value) is error
+
+
+def test_an_error_carries_everything_the_problem_says():
+    said = problem(
+        422,
+        "INVALID_REQUEST",
+        hint="see the limits",
+        request_id="r-17",
+        errors=[{"pointer": "/width", "message": "at most 8192"}],
+    )
+    with client_of(Script(said)) as client, pytest.raises(real2sim.StatusError) as caught:
+        client.scenes.get("street")
+    error = caught.value
+    assert (error.status, error.code, error.request_id) == (422, "INVALID_REQUEST", "r-17")
+    assert (error.hint, error.errors[0].pointer) == ("see the limits", "/width")
+    assert "/width: at most 8192" in str(error)
+
+
+def test_a_proxy_that_answers_with_html_is_still_one_sentence():
+    page = httpx2.Response(502, text="<html>bad gateway</html>")
+    with (
+        client_of(Script(page), retries=0) as client,
+        pytest.raises(real2sim.WorkerFailedError, match=r"status 502.*bad gateway"),
+    ):
+        client.scenes.list()
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"[]", b'{"scenes": 3}', b'{"scenes": [{}]}'])
+def test_an_answer_of_another_shape_is_malformed(content):
+    with (
+        client_of(Script(httpx2.Response(200, content=content))) as client,
+        pytest.raises(real2sim.MalformedReplyError, match="not a SceneList"),
+    ):
+        client.scenes.list()
+
+
+def test_members_of_a_newer_worker_are_ignored():
+    newer = {"scenes": [{"scene": "street", "state": "resident", "mood": "sunny"}], "more": 1}
+    with client_of(Script(httpx2.Response(200, json=newer))) as client:
+        assert [s.scene for s in client.scenes.list()] == ["street"]
+
+
+# --- retries ----------------------------------------------------------------------------------
+
+
+def test_a_busy_worker_is_asked_again_after_the_time_it_names(slept):
+    busy = problem(503, "QUEUE_FULL")
+    busy.headers["Retry-After"] = "3"
+    script = Script(busy, httpx2.Response(200, json=SCENES))
+    with client_of(script) as client:
+        assert len(client.scenes.list()) == 1
+    assert slept == [3.0]
+
+
+def test_a_worker_that_stays_busy_is_given_up_with_its_wish(slept):
+    busy = problem(429, "OVER_CAPACITY")
+    busy.headers["Retry-After"] = "5"
+    script = Script(busy)
+    with client_of(script, retries=2) as client, pytest.raises(CapacityError) as caught:
+        client.session(scene="street").open()
+    assert (len(script.requests), slept, caught.value.retry_after) == (3, [5.0, 5.0], 5.0)
+
+
+def test_all_tries_of_one_call_have_one_idempotency_key_and_calls_have_their_own(slept):
+    script = Script(problem(503, "DRAINING"))
+    with client_of(script, retries=2) as client:
+        for _ in range(2):
+            with pytest.raises(CapacityError):
+                client.scenarios.create(scene="street")
+    keys = [request.headers["idempotency-key"] for request in script.requests]
+    assert len(keys) == 6
+    assert len(set(keys[:3])) == len(set(keys[3:])) == 1
+    assert keys[0] != keys[3]
+
+
+def test_a_broken_connection_is_tried_again(slept):
+    script = Script(httpx2.ReadError("reset by peer"), httpx2.Response(200, json=SCENES))
+    with client_of(script) as client:
+        assert len(client.scenes.list()) == 1
+
+
+def test_steps_are_never_sent_twice(slept):
+    script = Script(httpx2.ReadError("reset by peer"))
+    with client_of(script) as client, pytest.raises(real2sim.UnreachableError):
+        client.sessions.step("w0.abc", n=3)
+    assert len(script.requests) == 1
+
+
+def test_what_will_not_get_better_is_not_tried_again(slept):
+    script = Script(problem(404, "UNKNOWN_SCENE"))
+    with client_of(script) as client, pytest.raises(real2sim.NotFoundError):
+        client.scenes.get("nowhere")
+    assert (len(script.requests), slept) == (1, [])
+
+
+def test_a_timeout_names_the_call_and_the_seconds(slept):
+    script = Script(httpx2.ReadTimeout("slow"))
+    with (
+        client_of(script, timeout=4.0, retries=0) as client,
+        pytest.raises(TimeoutError, match=r"no reply to GET /v1/scenes .* within 4 s"),
+    ):
+        client.scenes.list()
+
+
+def test_the_async_client_retries_alike(monkeypatch):
+    delays: list[float] = []
+
+    async def no_sleep(seconds: float) -> None:
+        delays.append(seconds)
+
+    monkeypatch.setattr(_transport.asyncio, "sleep", no_sleep)
+    busy = problem(503, "QUEUE_FULL")
+    busy.headers["Retry-After"] = "2"
+    script = Script(busy, httpx2.Response(200, json=SCENES))
+
+    async def run() -> None:
+        transport = httpx2.MockTransport(script)
+        async with real2sim.connect_async("http://worker:8600", transport=transport) as client:
+            assert len(await client.scenes.list()) == 1
+
+    asyncio.run(run())
+    assert delays == [2.0]
+
+
+# --- what goes out ----------------------------------------------------------------------------
+
+
+def test_the_token_is_sent_and_never_shown():
+    script = Script(httpx2.Response(200, json=SCENES))
+    with client_of(script, token="secret") as client:
+        client.scenes.list()
+        assert script.requests[0].headers["authorization"] == "Bearer secret"
+        assert "secret" not in repr(client)
+        assert "***" in repr(client)
+
+
+def test_names_cannot_leave_their_place_in_the_path():
+    script = Script(problem(404, "UNKNOWN_SCENE"))
+    with client_of(script) as client, pytest.raises(real2sim.NotFoundError):
+        client.scenes.get("../server?x=1")
+    assert script.requests[0].url.raw_path == b"/v1/scenes/..%2Fserver%3Fx%3D1"
+
+
+@pytest.mark.parametrize(
+    ("url", "codec", "accept"),
+    [
+        ("http://127.0.0.1:8600", "auto", "application/msgpack"),
+        ("http://[::1]:8600", "auto", "application/msgpack"),
+        ("http://worker.example:8600", "auto", "image/jpeg"),
+        ("http://127.0.0.1:8600", "png", "image/png"),
+    ],
+)
+def test_pictures_come_raw_on_this_machine_and_as_jpeg_over_a_network(url, codec, accept):
+    script = Script(problem(404, "UNKNOWN_CAMERA"))
+    transport = httpx2.MockTransport(script)
+    with (
+        real2sim.connect(url, transport=transport) as client,
+        pytest.raises(real2sim.NotFoundError),
+    ):
+        client.scenes.render("street", camera="front", codec=codec)
+    assert script.requests[0].headers["accept"] == accept
+
+
+def test_depth_is_asked_for_without_loss_everywhere():
+    script = Script(problem(404, "UNKNOWN_CAMERA"))
+    with client_of(script) as client, pytest.raises(real2sim.NotFoundError):
+        client.scenes.render("street", camera="front", modality="depth", t_us=5, width=320)
+    request = script.requests[0]
+    assert request.headers["accept"] == "application/msgpack"
+    assert dict(request.url.params) == {
+        "camera": "front",
+        "modality": "depth",
+        "t_us": "5",
+        "width": "320",
+    }
+
+
+def test_a_raw_picture_has_its_pose_and_intrinsics():
+    content = encode(frame("raw"))
+    headers = {"content-type": "application/msgpack"}
+    answer = httpx2.Response(200, content=content, headers=headers)
+    with client_of(Script(answer)) as client:
+        picture = client.scenes.render("street", camera="front", codec="raw")
+    assert isinstance(picture, real2sim.Frame)
+    np.testing.assert_array_equal(picture.array, IMAGE)
+    np.testing.assert_array_equal(picture.T_world_sensor, np.eye(4))
+
+
+def test_all_tries_of_an_upload_send_the_same_bytes(tmp_path, slept):
+    file = tmp_path / "street.ply"
+    file.write_bytes(b"ply\n...")
+    script = Script(problem(503, "QUEUE_FULL"))
+    with client_of(script, retries=1) as client, pytest.raises(CapacityError):
+        client.scenes.upload(file, scene="mine")
+    first, second = script.requests
+    assert first.content == second.content
+    assert b'name="file"; filename="street.ply"' in first.content
+    assert b"mine" in first.content
+
+
+@pytest.mark.parametrize("names", [{}, {"scene": "a", "scenario": "b"}])
+def test_a_session_runs_on_exactly_one_world(names):
+    script = Script(problem(500, "INTERNAL"))
+    with client_of(script) as client, pytest.raises(ValueError, match="name exactly one"):
+        client.session(**names).open()
+    assert script.requests == []
+
+
+@pytest.mark.parametrize(
+    ("url", "sentence"),
+    [
+        ("worker:8600", "is not an address"),
+        ("ftp://worker", "is not an address"),
+        ("http://", "is not an address"),
+        ("http://user:pw@worker", "holds credentials"),
+    ],
+)
+def test_addresses_that_cannot_be_a_worker_are_refused_at_once(url, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        real2sim.connect(url)
+
+
+def test_a_worker_of_another_protocol_version_is_named_with_both_versions():
+    info = {
+        "version": "9.0",
+        "protocol_version": 9,
+        "subprotocols": [],
+        "worker_id": "w0",
+        "device": {"backend": "x", "reason": "", "device": "cpu", "threads": 1},
+        "limits": dict.fromkeys(real2sim_limits(), 1),
+        "codecs": [],
+        "modalities": [],
+        "conventions": {},
+    }
+    with (
+        client_of(Script(httpx2.Response(200, json=info))) as client,
+        pytest.raises(real2sim.ProtocolMismatchError, match="protocol 9; this client speaks"),
+    ):
+        client.server()
+
+
+def real2sim_limits() -> list[str]:
+    from real2sim_proto.scenes import Limits
+
+    return list(Limits.model_fields)
+
+
+# --- waiting ----------------------------------------------------------------------------------
+
+
+def test_waiting_for_a_worker_ends_with_what_was_in_the_way(slept):
+    answer = httpx2.Response(503, json={"ready": False, "reasons": ["compiling kernels"]})
+    with (
+        client_of(Script(answer)) as client,
+        pytest.raises(real2sim.ReplyTimeoutError, match="ready worker") as caught,
+    ):
+        client.wait_ready(timeout=0.0)
+    assert caught.value.hint == "compiling kernels"
+
+
+def test_loading_waits_until_the_scene_is_there(slept):
+    loading = httpx2.Response(200, json={"scene": "street", "state": "loading"})
+    resident = httpx2.Response(200, json={"scene": "street", "state": "resident"})
+    script = Script(httpx2.Response(202, json={}), loading, loading, resident)
+    with client_of(script) as client:
+        assert client.scenes.load("street").state == "resident"
+    assert [r.method for r in script.requests] == ["PUT", "GET", "GET", "GET"]
+
+
+def test_a_broken_scene_is_not_waited_for(slept):
+    broken = {"scene": "street", "state": "broken", "reason": "truncated"}
+    script = Script(httpx2.Response(202, json={}), httpx2.Response(200, json=broken))
+    with client_of(script) as client, pytest.raises(real2sim.Real2SimError, match="truncated"):
+        client.scenes.load("street")

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import real2sim
+from real2sim import errors
+
+PACKAGE = Path(real2sim.__file__).parent
+PUBLIC = [
+    "AsyncClient",
+    "AsyncDriveSession",
+    "BadStepError",
+    "CapacityError",
+    "Client",
+    "ConflictError",
+    "ConnectionLostError",
+    "Control",
+    "ControllerTakenError",
+    "DriveSession",
+    "EpisodeOverError",
+    "Frame",
+    "Image",
+    "ImageDecodeError",
+    "InvalidActionError",
+    "InvalidOperationError",
+    "InvalidRequestError",
+    "MalformedReplyError",
+    "NotFoundError",
+    "NotOpenError",
+    "NotResetError",
+    "Observation",
+    "PoseCommand",
+    "ProtocolMismatchError",
+    "Real2SimError",
+    "ReplyTimeoutError",
+    "SensorSpec",
+    "SessionClosedError",
+    "StaleRevisionError",
+    "StaleStepError",
+    "StatusError",
+    "StepConflictError",
+    "TrajectoryPlan",
+    "UnauthorizedError",
+    "UnreachableError",
+    "View",
+    "WorkerFailedError",
+    "__version__",
+    "connect",
+    "connect_async",
+]
+HEAVY = ("torch", "numba", "cv2", "fastapi", "matplotlib", "scipy", "real2sim_server.render")
+
+
+def test_the_public_names_are_these_and_sorted():
+    assert real2sim.__all__ == sorted(PUBLIC) == dir(real2sim)
+
+
+def test_every_public_name_is_there():
+    for name in real2sim.__all__:
+        assert getattr(real2sim, name) is not None
+
+
+def test_other_names_are_not():
+    with pytest.raises(AttributeError, match="no attribute 'Cleint'"):
+        _ = real2sim.Cleint
+
+
+def test_every_error_is_public_and_drawn_in_the_tree():
+    classes = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and issubclass(value, errors.Real2SimError)
+    }
+    assert classes <= set(real2sim.__all__)
+    for name in classes:
+        assert f"{name} " in errors.__doc__, name
+
+
+def test_the_tree_that_is_drawn_is_the_tree_that_is():
+    lines = [line for line in errors.__doc__.splitlines() if "Error " in f"{line} "]
+    path: list[str] = []
+    for line in lines:
+        name = line.lstrip(" │├└─").split()[0]
+        if not name.endswith("Error"):
+            continue
+        depth = (len(line) - len(line.lstrip(" │├└─")) - 4) // 4
+        path[depth:] = [name]
+        if depth > 0:
+            assert issubclass(getattr(errors, name), getattr(errors, path[depth - 1])), name
+
+
+def imported_after(code: str) -> set[str]:
+    script = f"import sys\n{code}\nprint('\\n'.join(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.split())
+
+
+def test_importing_the_sdk_imports_almost_nothing():
+    loaded = imported_after("import real2sim")
+    assert not loaded & {"numpy", "pydantic", "httpx2", "websockets", *HEAVY}
+
+
+def test_using_the_sdk_needs_none_of_the_workers_libraries():
+    code = "import real2sim, real2sim.planners\nreal2sim.connect().close()"
+    assert not imported_after(code) & {*HEAVY, "real2sim_server"}
+
+
+def test_the_command_line_loads_nothing_heavy_before_a_command_runs():
+    loaded = imported_after("import real2sim.cli\nreal2sim.cli.build_app()")
+    assert not loaded & {"numpy", "pydantic", "httpx2", "websockets", *HEAVY}
+
+
+def test_help_comes_at_once():
+    command = [sys.executable, "-m", "real2sim.cli", "--help"]
+    fastest = min(seconds_of(command) for _ in range(3))
+    assert fastest < 2.0
+
+
+def seconds_of(command: list[str]) -> float:
+    started = time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True)
+    return time.perf_counter() - started
+
+
+ALLOWED = {
+    "real2sim",
+    "real2sim_proto",
+    "numpy",
+    "pydantic",
+    "msgpack",
+    "httpx2",
+    "websockets",
+    "simplejpeg",
+    "typer",
+    "rich",
+} | set(sys.stdlib_module_names)
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: p.stem)
+def test_the_client_imports_only_what_the_base_install_has(path):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [str(node.module)]
+        else:
+            continue
+        assert {name.partition(".")[0] for name in names} <= ALLOWED
