@@ -81,7 +81,7 @@ def _overlaps(
 def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
     """Visible objects whose path, as a box around it, comes near that of ``subject``."""
     tracks = state.tracks
-    radii = np.linalg.norm([o.scaled_size for o in tracks.objects], axis=1) / 2
+    radii = np.linalg.norm(tracks.sizes, axis=1) / 2
     reach = (radii + np.linalg.norm(subject.scaled_size) / 2)[:, None]
     at = own[:, :3, 3]
     apart = (tracks.lower - reach > at.max(axis=0)) | (tracks.upper + reach < at.min(axis=0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -14,13 +13,16 @@ from ..scene import Trajectory
 from ..scene.rotation import slerp, transform_from
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 class Tracked(Protocol):
-    """Anything with a trajectory."""
+    """Anything with a trajectory and a box."""
 
     @property
     def trajectory(self) -> Trajectory: ...  # noqa: D102
+    @property
+    def scaled_size(self) -> tuple[float, float, float]: ...  # noqa: D102
 
 
 T = TypeVar("T", bound=Tracked)
@@ -32,6 +34,7 @@ class Placed(Generic[T]):
 
     Attributes:
         objects: in the state's order.
+        sizes: [K, 3] float64, (length, width, height) of their boxes [m].
         positions: [K, 3] float64, box centres in the world [m].
         quaternions: [K, 4] float64, wxyz.
         velocities: [K, 3] float64, world [m/s].
@@ -39,6 +42,7 @@ class Placed(Generic[T]):
     """
 
     objects: tuple[T, ...]
+    sizes: Float
     positions: Float
     quaternions: Float
     velocities: Float
@@ -50,61 +54,60 @@ class PackedTracks(Generic[T]):
 
     Attributes:
         objects: in the given order, N of them.
+        sizes: [N, 3] float64, their boxes [m].
         lower, upper: [N, 3] float64, lowest and highest position of each trajectory [m].
     """
 
     def __init__(self, objects: tuple[T, ...]) -> None:
-        self.objects = objects
         trajectories = [o.trajectory for o in objects]
-        starts = np.cumsum([0, *(len(t.times_us) for t in trajectories)]).tolist()
-        self._clocks = [
-            (i, start, t.times_us.tolist())
-            for i, (start, t) in enumerate(zip(starts[:-1], trajectories, strict=True))
-        ]
+        counts = np.array([len(t.times_us) for t in trajectories], dtype=np.int64)
+        self.objects = objects
+        self.sizes = _stacked([np.array([o.scaled_size]) for o in objects], 3)
+        self.lower = _stacked([t.positions.min(axis=0)[None] for t in trajectories], 3)
+        self.upper = _stacked([t.positions.max(axis=0)[None] for t in trajectories], 3)
+        self._times = np.concatenate([np.zeros(0, np.int64), *(t.times_us for t in trajectories)])
+        self._ends = np.cumsum(counts)
+        self._starts = self._ends - counts
         self._positions = _stacked([t.positions for t in trajectories], 3)
         self._quaternions = _stacked([t.quaternions for t in trajectories], 4)
         self._velocities = _stacked([_knot_velocities(t) for t in trajectories], 3)
-        self.lower = _stacked([t.positions.min(axis=0)[None] for t in trajectories], 3)
-        self.upper = _stacked([t.positions.max(axis=0)[None] for t in trajectories], 3)
+        # Objects that stand or drive straight need no slerp; turning[k]: knot k to k + 1.
+        self._turning = np.zeros(len(self._times), dtype=bool)
+        self._turning[:-1] = (self._quaternions[1:] != self._quaternions[:-1]).any(axis=1)
+        # One sorted array of (object, rank of the time among all times) finds the knots of all
+        # objects in a single search; ranks, since times themselves could overflow the product.
+        self._clock, ranks = np.unique(self._times, return_inverse=True)
+        self._offsets = np.arange(len(objects)) * (len(self._clock) + 1)
+        self._keys = np.repeat(self._offsets, counts) + ranks
 
     def at(self, t_us: int) -> Placed[T]:
         """Objects whose trajectory covers ``t_us``; poses and velocities as Trajectory has them."""
-        known: list[int] = []
-        before: list[int] = []
-        after: list[int] = []
-        fractions: list[float] = []
-        for i, start, times in self._clocks:
-            if not times[0] <= t_us <= times[-1]:
-                continue
-            k = bisect_left(times, t_us)
-            known.append(i)
-            after.append(start + k)
-            if times[k] == t_us:
-                before.append(start + k)
-                fractions.append(0.0)
-            else:
-                before.append(start + k - 1)
-                fractions.append((t_us - times[k - 1]) / (times[k] - times[k - 1]))
-        return self._placed(known, np.array(before, int), np.array(after, int), np.array(fractions))
+        rank = np.searchsorted(self._clock, t_us)
+        after = np.searchsorted(self._keys, self._offsets + rank)
+        known = np.flatnonzero(after < self._ends)
+        known = known[self._times[self._starts[known]] <= t_us]
+        after = after[known]
+        exact = self._times[after] == t_us
+        before = np.where(exact, after, after - 1)
+        span = np.where(exact, 1, self._times[after] - self._times[before])
+        return self._placed(known, before, after, (t_us - self._times[before]) / span)
 
-    def _placed(
-        self, known: list[int], before: NDArray[np.int_], after: NDArray[np.int_], fraction: Float
-    ) -> Placed[T]:
+    def _placed(self, known: Index, before: Index, after: Index, fraction: Float) -> Placed[T]:
         share = fraction[:, None]
         positions = (1 - share) * self._positions[before] + share * self._positions[after]
         quaternions = self._quaternions[before]
-        between = np.flatnonzero(before != after)
-        # Most poses at a logged time stamp or of parked objects need no slerp.
-        if len(between):
-            a, b = quaternions[between], self._quaternions[after[between]]
-            quaternions[between] = slerp(a, b, fraction[between])
-        objects = self.objects
+        turning = np.flatnonzero(self._turning[before] & (fraction > 0))
+        if len(turning):
+            a, b = quaternions[turning], self._quaternions[after[turning]]
+            quaternions[turning] = slerp(a, b, fraction[turning])
+        everything = len(known) == len(self.objects)
         return Placed(
-            objects=objects if len(known) == len(objects) else tuple(objects[i] for i in known),
+            objects=self.objects if everything else tuple(self.objects[i] for i in known),
+            sizes=self.sizes if everything else self.sizes[known],
             positions=positions,
             quaternions=quaternions,
             velocities=self._velocities[before],
-            transforms=transform_from(positions, quaternions),
+            transforms=_transforms(positions, quaternions),
         )
 
 
@@ -123,6 +126,29 @@ def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, 
     p, q = trajectory.positions, trajectory.quaternions
     positions = (1 - share)[:, None] * p[before] + share[:, None] * p[after]
     return transform_from(positions, slerp(q[before], q[after], share)), covered
+
+
+ROTATION_OF_PRODUCTS = np.zeros((4, 4, 3, 3))
+"""[4, 4, 3, 3]: the rotation matrix of a unit quaternion q is the sum over i, j of q_i q_j times
+entry [i, j]; one product instead of thirty small operations."""
+for _i in range(3):
+    _j, _k = (_i + 1) % 3, (_i + 2) % 3
+    ROTATION_OF_PRODUCTS[0, 0, _i, _i] = 1
+    ROTATION_OF_PRODUCTS[_i + 1, _i + 1, _i, _i] = 1
+    ROTATION_OF_PRODUCTS[_i + 1, _i + 1, _j, _j] = -1
+    ROTATION_OF_PRODUCTS[_i + 1, _i + 1, _k, _k] = -1
+    ROTATION_OF_PRODUCTS[_i + 1, _j + 1, _i, _j] = ROTATION_OF_PRODUCTS[_i + 1, _j + 1, _j, _i] = 2
+    ROTATION_OF_PRODUCTS[0, _i + 1, _k, _j], ROTATION_OF_PRODUCTS[0, _i + 1, _j, _k] = 2, -2
+
+
+def _transforms(positions: Float, quaternions: Float) -> Float:
+    """``T_world_object`` [K, 4, 4] of positions [K, 3] and unit quaternions [K, 4]."""
+    products = (quaternions[:, :, None] * quaternions[:, None, :]).reshape(-1, 16)
+    matrices = np.zeros((len(positions), 4, 4))
+    matrices[:, :3, :3] = (products @ ROTATION_OF_PRODUCTS.reshape(16, 9)).reshape(-1, 3, 3)
+    matrices[:, :3, 3] = positions
+    matrices[:, 3, 3] = 1.0
+    return matrices
 
 
 def _stacked(parts: Sequence[Float], width: int) -> Float:

@@ -17,6 +17,7 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
         agents.positions.tolist(),
         agents.quaternions.tolist(),
         agents.velocities.tolist(),
+        agents.sizes.tolist(),
         strict=True,
     )
     return [
@@ -26,7 +27,7 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
             "position": position,
             "quaternion": quaternion,
             "velocity": velocity,
-            "size": subject.scaled_size,
+            "size": size,
         }
-        for subject, position, quaternion, velocity in poses
+        for subject, position, quaternion, velocity, size in poses
     ]

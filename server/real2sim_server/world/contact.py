@@ -40,7 +40,7 @@ def touching(T_world_box: Float, size: tuple[float, float, float], agents: Agent
     """Places in ``agents`` of the objects whose boxes overlap the ego box."""
     if not agents.objects:
         return []
-    sizes = np.array([o.scaled_size for o in agents.objects])
+    sizes = agents.sizes
     reach = np.sqrt(np.sum(sizes * sizes, axis=1)) / 2
     local = np.abs((agents.positions - T_world_box[:3, 3]) @ T_world_box[:3, :3])
     near = np.flatnonzero((local < np.array(size) / 2 + reach[:, None]).all(axis=1))

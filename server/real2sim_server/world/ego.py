@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ SLOW = 0.1
 """Below this speed the steering angle cannot be told from the motion [m/s]."""
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """Planar state of the vehicle.
 
     Attributes:
@@ -40,8 +39,7 @@ class Motion:
     yaw_rate: float = 0.0
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """What the driver asks for: acceleration [m/s^2] and road-wheel angle [rad]."""
 
     acceleration: float
@@ -65,9 +63,7 @@ def drive(motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int) -> Motion:
     for k in range(substeps):
         motion = _substep(motion, driver(motion, k * h), spec, h)
     acceleration = (motion.speed - start.speed) / (dt_us * 1e-6)
-    return Motion(
-        motion.x, motion.y, motion.yaw, motion.speed, acceleration, motion.steering, motion.yaw_rate
-    )
+    return motion._replace(acceleration=acceleration)
 
 
 def _substep(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ..scene.rotation import matrix_to_quaternion
 from .agents import Agents, agent_fields
 from .ego import Motion
 from .events import Event
@@ -51,7 +50,7 @@ class Observation:
         motion = self.motion
         return {
             "position": self.T_world_vehicle[:3, 3].tolist(),
-            "quaternion": matrix_to_quaternion(self.T_world_vehicle[:3, :3]).tolist(),
+            "quaternion": _quaternion(self.T_world_vehicle),
             "yaw": math.remainder(motion.yaw, math.tau),
             "speed": motion.speed,
             "acceleration": motion.acceleration,
@@ -76,3 +75,13 @@ class Observation:
             "truncated": self.truncated,
             "reason": self.reason,
         }
+
+
+def _quaternion(T_world_vehicle: Float) -> tuple[float, float, float, float]:
+    """wxyz, w >= 0, of a vehicle that stands upright: one case of four, and no arrays."""
+    (xx, xy, xz, _), (yx, yy, yz, _), (zx, zy, zz, _), _ = T_world_vehicle.tolist()
+    # With the z axis up, w^2 + z^2 is at least a half, so the larger of the two is a safe pivot.
+    w, z = 1 + xx + yy + zz, 1 - xx - yy + zz
+    q = (w, zy - yz, xz - zx, yx - xy) if w >= z else (yx - xy, xz + zx, yz + zy, z)
+    length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0])
+    return (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import assert_never
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Control, PoseCommand, ResetSpec, SensorSpec, TrajectoryPlan
@@ -26,8 +27,9 @@ from .events import Event
 from .ground import LoggedGround
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
+from .reference import Reference
 from .route import command_ahead, route_ahead
-from .tracker import Reference, to_world
+from .tracker import Tracker, to_world
 
 Plan = TrajectoryPlan | Control | PoseCommand
 
@@ -84,7 +86,7 @@ class World:
         self._near: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._standing()
         self.agents: Agents = state.tracks.at(self.t_us)
-        self._plan: Reference | Command | PoseCommand | None = None
+        self._plan: Tracker | Command | PoseCommand | None = None
         self._start_s = self._near.s
         self._distance = 0.0
         self._collisions = 0
@@ -206,7 +208,7 @@ class World:
         # A step replaces what it changes and never writes into it.
         return copy.copy(self)
 
-    def _accepted(self, plan: Plan | None) -> Reference | Command | PoseCommand:
+    def _accepted(self, plan: Plan | None) -> Tracker | Command | PoseCommand:
         if plan is None:
             return self._plan if self._plan is not None else self._follow_log()
         if plan.kind != self.spec.action:
@@ -218,7 +220,7 @@ class World:
             )
         match plan:
             case TrajectoryPlan():
-                return self._reference(plan)
+                return self._track(plan)
             case Control():
                 return Command(plan.acceleration, plan.steering)
             case PoseCommand():
@@ -226,7 +228,7 @@ class World:
             case _:
                 assert_never(plan)
 
-    def _reference(self, plan: TrajectoryPlan) -> Reference:
+    def _track(self, plan: TrajectoryPlan) -> Tracker:
         if plan.times_us[0] <= self.t_us:
             raise WorldError(
                 ErrorCode.INVALID_ACTION,
@@ -234,32 +236,26 @@ class World:
                 hint="times_us are absolute simulation times after t_us of the observation",
             )
         poses = plan.poses if plan.frame == "world" else to_world(plan.poses, self.motion)
-        return Reference(
-            motion=self.motion,
-            start_us=self.t_us,
-            times_us=plan.times_us,
-            poses=poses,
-            wheelbase=self.spec.ego.wheelbase,
-        )
+        return self._tracker(plan.times_us, poses)
 
-    def _follow_log(self) -> Reference:
+    def _follow_log(self) -> Tracker:
         ego = self.scene.ego
         rest = ego.times_us > self.t_us
         yaws = quaternion_yaw(ego.quaternions[rest])
-        return Reference(
-            motion=self.motion,
-            start_us=self.t_us,
-            times_us=ego.times_us[rest],
-            poses=np.column_stack([ego.positions[rest, :2], yaws]),
-            wheelbase=self.spec.ego.wheelbase,
-        )
+        return self._tracker(ego.times_us[rest], np.column_stack([ego.positions[rest, :2], yaws]))
 
-    def _move_ego(self, plan: Reference | Command | PoseCommand) -> None:
+    def _tracker(self, times_us: ArrayLike, poses: ArrayLike) -> Tracker:
+        reference = Reference(
+            self.motion, start_us=self.t_us, times_us=times_us, poses=poses, spec=self.spec.ego
+        )
+        return Tracker(reference, self.spec.ego.wheelbase)
+
+    def _move_ego(self, plan: Tracker | Command | PoseCommand) -> None:
         old, spec, dt_us = self.motion, self.spec.ego, self._clock.dt_us
         match plan:
-            case Reference():
-                since = (self.t_us - plan.start_us) * 1e-6
-                self.motion = drive(old, lambda m, t: plan.steer(m, since + t), spec, dt_us)
+            case Tracker():
+                since = (self.t_us - plan.reference.start_us) * 1e-6
+                self.motion = drive(old, lambda m, t: plan.command(m, since + t), spec, dt_us)
             case Command():
                 self.motion = drive(old, lambda _m, _t: plan, spec, dt_us)
             case PoseCommand():
