@@ -58,7 +58,7 @@ def _inspect_backends() -> tuple[list[dict[str, object]], list[str]]:
     rows: list[dict[str, object]] = [
         {"name": b.name, "usable": b.usable, "reason": b.reason} for b in described
     ]
-    return rows, [b.advice for b in described if not b.usable and b.advice]
+    return rows, [f"{b.name}: {b.remedy}" for b in described if b.remedy]
 
 
 def _warm_seconds() -> float:

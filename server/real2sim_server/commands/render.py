@@ -8,10 +8,13 @@ from pathlib import Path
 from ..edit.apply import apply_operations
 from ..edit.compose import instances_at
 from ..edit.state import ScenarioState
-from ..render import Frame, RasterOptions, render_cameras, write_frame
+from ..render import Frame, RasterOptions, encode_image, render_cameras
 from ..scene import Scene
 from ..scene.io import load_scene
+from ..scene.io.atomic import atomic_file
 from .console import CommandError, console, print_figures, write_json
+
+CODEC_BY_SUFFIX = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
 @dataclass(frozen=True)
@@ -38,10 +41,12 @@ def run(
     """Draw ``view`` of the bundle ``scene`` into ``out``; compare it with ``log`` where given."""
     if log is not None and (view.t_us is not None or delete):
         raise CommandError("--log compares whole recorded frames: use --frame, and no --delete")
+    if out.suffix.lower() not in CODEC_BY_SUFFIX:
+        raise CommandError(f"--out {out}: the name must end in {', '.join(CODEC_BY_SUFFIX)}")
     loaded = load_scene(scene)
     t_us = _time_of(view, loaded)
     picture = _draw(loaded, view, t_us, delete, backend)
-    write_frame(picture, out, modality=view.modality)
+    _write(picture, view.modality, out)
     figures: dict[str, object] = {
         "image": str(out),
         "camera": picture.camera,
@@ -85,6 +90,18 @@ def _draw(scene: Scene, view: View, t_us: int, delete: list[str], backend: str) 
         backend=backend,
     )
     return frame
+
+
+def _write(frame: Frame, modality: str, out: Path) -> None:
+    images = {"rgb": frame.rgb, "depth": frame.depth, "instance": frame.instance}
+    codec = CODEC_BY_SUFFIX[out.suffix.lower()]
+    if modality not in images:
+        raise CommandError(f"--modality {modality!r}; allowed are {', '.join(images)}")
+    image = images[modality]
+    if modality != "rgb" and codec != "png":
+        raise CommandError(f"{modality} images are written as .png, not {out.suffix}")
+    with atomic_file(out) as file:
+        file.write(encode_image(image, modality, codec).data)
 
 
 def _compare(scene: Scene, log_path: Path, view: View, camera: str) -> dict[str, float]:
