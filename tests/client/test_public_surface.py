@@ -121,7 +121,7 @@ def test_the_command_line_loads_nothing_heavy_before_a_command_runs():
 def test_help_comes_at_once():
     command = [sys.executable, "-m", "real2sim.cli", "--help"]
     fastest = min(seconds_of(command) for _ in range(3))
-    assert fastest < 2.0
+    assert fastest < 3.0
 
 
 def seconds_of(command: list[str]) -> float:

@@ -39,7 +39,7 @@ class Comfort:
     gap: float = 4.0
     headway: float = 1.0
     clearance: float = 0.4
-    recovery: float = 8.0
+    recovery: float = 5.0
 
 
 class FollowRoute:
@@ -137,12 +137,15 @@ class Path:
         direction = ahead - here
         moving = np.linalg.norm(direction, axis=1) > 1e-6
         yaw = np.where(moving, np.arctan2(direction[:, 1], direction[:, 0]), 0.0)
-        return np.concatenate([here, np.unwrap(yaw)[:, None]], axis=1)
+        # A vehicle that stands cannot turn; its heading meets the path's within a metre or two.
+        turned = np.unwrap(yaw) * (1.0 - np.exp(-travelled))
+        return np.concatenate([here, turned[:, None]], axis=1)
 
     def _at(self, travelled: Array, recovery: float) -> Array:
         inside = np.stack([np.interp(travelled, self.arc, self.points[:, k]) for k in (0, 1)], 1)
         beyond = np.maximum(travelled - self.arc[-1], 0.0)[:, None] * self._last_direction()
-        fade = np.exp(-travelled / recovery)[:, None]
+        # Its slope is 0 at the start: the way back begins along the route, not across it.
+        fade = ((1.0 + travelled / recovery) * np.exp(-travelled / recovery))[:, None]
         points: Array = inside + beyond + self.offset * fade
         return points
 
