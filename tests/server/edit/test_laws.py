@@ -1,0 +1,228 @@
+"""Laws that hold for any sequence of operations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from real2sim_proto.base import Pose, Track
+from real2sim_proto.operations import (
+    Delete,
+    Duplicate,
+    Operation,
+    Restore,
+    Rotate,
+    Scale,
+    SetPose,
+    SetTrajectory,
+    Translate,
+)
+from real2sim_server.edit import (
+    EditError,
+    ObjectState,
+    Scenario,
+    ScenarioState,
+    apply_operations,
+)
+
+IDS = st.sampled_from(["parked", "crossing", "turning", "late", "parked_copy1"])
+LENGTHS = st.floats(-300, 300)
+FACTORS = st.floats(0.2, 5.0)
+FRAMES = st.sampled_from(["world", "object"])
+VECTORS = st.tuples(LENGTHS, LENGTHS, LENGTHS)
+QUATERNIONS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.01)
+
+
+def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    norm = sum(v * v for v in quaternion) ** 0.5
+    return tuple(v / norm for v in quaternion)
+
+
+POSES = st.builds(Pose, position=VECTORS, quaternion=QUATERNIONS.map(_unit))
+TRACKS = st.lists(POSES, min_size=1, max_size=4).map(
+    lambda poses: Track(
+        times_us=[1_000_000 + 500_000 * i for i in range(len(poses))],
+        positions=[p.position for p in poses],
+        quaternions=[p.quaternion for p in poses],
+    )
+)
+AXES = VECTORS.filter(lambda v: sum(a * a for a in v) > 1e-6)
+SHIFTS = {"x": LENGTHS, "y": LENGTHS, "z": LENGTHS, "frame": FRAMES}
+
+OPERATIONS: st.SearchStrategy[Operation] = st.one_of(
+    st.builds(Translate, object_id=IDS, **SHIFTS),
+    st.builds(Rotate, object_id=IDS, angle=st.floats(-7, 7), axis=AXES, frame=FRAMES),
+    st.builds(
+        Scale,
+        object_id=IDS,
+        x=FACTORS,
+        y=FACTORS,
+        z=FACTORS,
+        anchor=st.sampled_from(["bottom", "centre"]),
+    ),
+    st.builds(SetPose, object_id=IDS, pose=POSES),
+    st.builds(SetTrajectory, object_id=IDS, trajectory=TRACKS),
+    st.builds(Duplicate, object_id=IDS, **SHIFTS),
+    st.builds(Delete, object_id=IDS),
+    st.builds(Restore, object_id=IDS),
+)
+
+
+def possible(state: ScenarioState, operations: list[Operation]) -> list[Operation]:
+    """The operations that apply one after the other; those that would be refused left out."""
+    kept: list[Operation] = []
+    for operation in operations:
+        try:
+            state = apply_operations(state, [operation]).state
+        except EditError:
+            continue
+        kept.append(operation)
+    return kept
+
+
+def same_bits(a: ScenarioState, b: ScenarioState) -> bool:
+    return (
+        list(a.objects) == list(b.objects)
+        and a.next_instance_id == b.next_instance_id
+        and all(
+            _identity(a.objects[i]) == _identity(b.objects[i])
+            and all(x.tobytes() == y.tobytes() for x, y in _arrays(a.objects[i], b.objects[i]))
+            for i in a.objects
+        )
+    )
+
+
+def assert_close(a: ObjectState, b: ObjectState, tolerance: float = 1e-9) -> None:
+    """Same object within ``tolerance``; a rotation q equals -q."""
+    assert (a.object_id, a.source_id, a.size, a.instance_id, a.deleted) == (
+        (b.object_id, b.source_id, b.size, b.instance_id, b.deleted)
+    )
+    np.testing.assert_allclose(a.scale, b.scale, rtol=tolerance)
+    np.testing.assert_array_equal(a.trajectory.times_us, b.trajectory.times_us)
+    np.testing.assert_allclose(a.trajectory.positions, b.trajectory.positions, atol=tolerance)
+    dots = np.abs(np.sum(a.trajectory.quaternions * b.trajectory.quaternions, axis=1))
+    np.testing.assert_allclose(dots, 1, atol=tolerance)
+
+
+def _identity(o: ObjectState) -> tuple[object, ...]:
+    return (o.object_id, o.source_id, o.category, o.size, o.scale, o.instance_id, o.deleted)
+
+
+def _arrays(a: ObjectState, b: ObjectState) -> list[tuple[np.ndarray, np.ndarray]]:
+    s, t = a.trajectory, b.trajectory
+    return [
+        (s.times_us, t.times_us),
+        (s.positions, t.positions),
+        (s.quaternions, t.quaternions),
+    ]
+
+
+ENOUGH = settings(max_examples=40, deadline=None)
+BATCHES = st.lists(OPERATIONS, min_size=1, max_size=8)
+
+
+@ENOUGH
+@given(operations=BATCHES)
+def test_inverse_operations_bring_every_object_back(
+    state: ScenarioState, operations: list[Operation]
+):
+    outcome = apply_operations(state, possible(state, operations))
+
+    restored = apply_operations(outcome.state, outcome.inverse).state
+
+    for object_id, before in state.objects.items():
+        assert_close(restored.objects[object_id], before)
+    assert all(restored.objects[i].deleted for i in outcome.created)
+
+
+@ENOUGH
+@given(batches=st.lists(BATCHES, min_size=1, max_size=5))
+def test_undoing_everything_restores_the_very_first_state(
+    state: ScenarioState, batches: list[list[Operation]]
+):
+    scenario = Scenario(state)
+    for batch in batches:
+        scenario.edit(possible(scenario.state, batch))
+
+    while scenario.can_undo:
+        scenario.undo()
+
+    assert same_bits(scenario.state, state)
+
+
+@ENOUGH
+@given(batches=st.lists(BATCHES, min_size=1, max_size=4), moves=st.lists(st.booleans(), max_size=8))
+def test_a_replayed_log_gives_the_same_bits(
+    state: ScenarioState, batches: list[list[Operation]], moves: list[bool]
+):
+    scenario = Scenario(state)
+    for batch in batches:
+        scenario.edit(possible(scenario.state, batch))
+    for undo in moves:
+        if undo and scenario.can_undo:
+            scenario.undo()
+        elif not undo and scenario.can_redo:
+            scenario.redo()
+
+    replayed = Scenario.replay(state, scenario.entries)
+
+    assert same_bits(replayed.state, scenario.state)
+    assert (replayed.revision, replayed.can_undo, replayed.can_redo) == (
+        (scenario.revision, scenario.can_undo, scenario.can_redo)
+    )
+
+
+@ENOUGH
+@given(operations=BATCHES)
+def test_undo_then_redo_gives_the_same_bits(state: ScenarioState, operations: list[Operation]):
+    scenario = Scenario(state)
+    edited = scenario.edit(possible(state, operations)).state
+
+    scenario.undo()
+    scenario.redo()
+
+    assert same_bits(scenario.state, edited)
+
+
+@ENOUGH
+@given(operations=BATCHES, place=st.integers(0, 8))
+def test_one_refused_operation_refuses_the_batch(
+    state: ScenarioState, operations: list[Operation], place: int
+):
+    scenario = Scenario(state)
+    batch = possible(state, operations)
+    place = min(place, len(batch))
+    batch.insert(place, Delete(object_id="nobody"))
+
+    with pytest.raises(EditError) as refused:
+        scenario.edit(batch)
+
+    assert refused.value.index == place
+    assert scenario.state is state
+    assert scenario.revision == 0
+
+
+@ENOUGH
+@given(operations=BATCHES)
+def test_objects_nobody_named_are_shared_not_copied(
+    state: ScenarioState, operations: list[Operation]
+):
+    batch = possible(state, operations)
+    after = apply_operations(state, batch).state
+
+    untouched = set(state.objects) - {o.object_id for o in batch}
+
+    assert all(after.objects[i] is state.objects[i] for i in untouched)
+
+
+@ENOUGH
+@given(operations=BATCHES)
+def test_instance_ids_stay_unique(state: ScenarioState, operations: list[Operation]):
+    after = apply_operations(state, possible(state, operations)).state
+    ids = [o.instance_id for o in after.objects.values()]
+
+    assert len(set(ids)) == len(ids)
+    assert all(after.objects[i].instance_id == o.instance_id for i, o in state.objects.items())
+    assert after.next_instance_id == max(ids) + 1

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import pytest
+
+from real2sim_proto.base import Pose
+from real2sim_proto.operations import Delete, Duplicate, Rotate, Scale, SetPose, Translate
+from real2sim_server.edit import apply_operations
+
+
+def warnings(state, *operations, ground=None):
+    outcome = apply_operations(state, operations, ground=ground)
+    return [(w.code, w.object_id) for w in outcome.warnings]
+
+
+def test_a_harmless_shift_warns_of_nothing(state):
+    assert warnings(state, Translate(object_id="parked", x=1)) == []
+
+
+def test_a_copy_in_its_original_overlaps(state):
+    assert warnings(state, Duplicate(object_id="parked", x=1)) == [("overlap", "parked_copy1")]
+
+
+def test_a_copy_beside_its_original_does_not_overlap(state):
+    assert warnings(state, Duplicate(object_id="parked", y=2.01)) == []
+
+
+def test_a_copy_in_a_deleted_original_does_not_overlap(state):
+    operations = [Duplicate(object_id="parked"), Delete(object_id="parked")]
+
+    assert warnings(state, *operations) == []
+
+
+def test_paths_that_cross_at_different_times_do_not_overlap(state):
+    # "crossing" passes (7.6, -27.6) after one second and is 24 m further at t = 4 s.
+    there = SetPose(object_id="parked", pose=Pose(position=(7.6, -27.6, 0.8)))
+    assert warnings(state, there) == [("overlap", "parked")]
+
+    late = Translate(object_id="late", x=7.6 - 60, y=-27.6 + 8)
+    assert warnings(state, late) == []
+
+
+def test_an_overlap_names_the_other_and_the_time(state):
+    outcome = apply_operations(state, [Translate(object_id="parked", x=20, y=6)])
+
+    assert [w.message for w in outcome.warnings] == ["'parked' overlaps 'turning' from t=0.00 s"]
+
+
+@pytest.mark.parametrize(("lift", "side"), [(0.4, "above"), (-0.4, "below")])
+def test_an_object_off_the_ground_is_reported_with_its_height(state, lift, side):
+    outcome = apply_operations(state, [Translate(object_id="parked", z=lift)])
+
+    assert [w.code for w in outcome.warnings] == ["off_ground"]
+    assert f"0.40 m {side}" in outcome.warnings[0].message
+
+
+@pytest.mark.parametrize(
+    "operation",
+    [
+        Translate(object_id="parked", z=0.25),
+        Scale(object_id="parked", z=3),
+        Rotate(object_id="parked", angle=1),
+    ],
+)
+def test_what_stays_on_the_ground_is_not_reported(state, operation):
+    assert warnings(state, operation) == []
+
+
+def test_a_tilted_object_digs_into_the_ground(state):
+    tilt = Rotate(object_id="parked", angle=0.5, axis=(0, 1, 0))
+
+    assert warnings(state, tilt) == [("off_ground", "parked")]
+
+
+def test_the_ground_is_asked_where_it_is_known(state):
+    def slope(points):
+        return 0.1 * points[:, 0]
+
+    up_the_hill = Translate(object_id="parked", x=10, z=1)
+
+    assert warnings(state, up_the_hill, ground=slope) == []
+    assert warnings(state, up_the_hill) == [("off_ground", "parked")]
+
+
+@pytest.mark.parametrize(("y", "expected"), [(90, []), (150, [("outside_map", "parked")])])
+def test_objects_far_from_everything_recorded_are_reported(state, y, expected):
+    assert warnings(state, Translate(object_id="parked", y=y)) == expected
