@@ -26,8 +26,8 @@ class Geometry(NamedTuple):
 
     Attributes:
         bounds: [N, 6] low x, y, z, high x, y, z of every node.
-        child: [N] int32, left child of an inner node (the right one follows it) or first triangle.
-        count: [N] int32, triangles of a leaf, 0 for an inner node.
+        child: [N] uint32, left child of an inner node (the right one follows it) or first triangle.
+        count: [N] uint32, triangles of a leaf, 0 for an inner node.
         edges: [T, 9] first corner and the two edges from it.
         uv: [T, 6] texture coordinates of the three corners.
         normals: [T, 9] unit normals of the three corners.
@@ -36,8 +36,8 @@ class Geometry(NamedTuple):
     """
 
     bounds: Float
-    child: NDArray[np.int32]
-    count: NDArray[np.int32]
+    child: NDArray[np.uint32]
+    count: NDArray[np.uint32]
     edges: Float
     uv: Float
     normals: Float
@@ -52,8 +52,8 @@ def build_geometry(meshes: list[Mesh]) -> tuple[Geometry, NDArray[np.int64]]:
     for mesh in meshes:
         low, high = mesh.corners.min(axis=1), mesh.corners.max(axis=1)
         bounds, child, count, order = _build(low, high)
-        child = np.where(count > 0, child + triangle_base, child + node_base).astype(np.int32)
-        parts.append((bounds, child, count, *_arrange(mesh, order)))
+        child = np.where(count > 0, child + triangle_base, child + node_base).astype(np.uint32)
+        parts.append((bounds, child, count.astype(np.uint32), *_arrange(mesh, order)))
         roots.append(node_base)
         node_base += len(child)
         triangle_base += len(order)

@@ -41,7 +41,7 @@ class Instances(NamedTuple):
 @njit(cache=True)
 def new_stack():
     """Scratch memory of one thread for the functions below."""
-    return np.empty(STACK_SIZE, np.int64), np.empty(STACK_SIZE)
+    return np.empty(STACK_SIZE, np.uint32), np.empty(STACK_SIZE)
 
 
 @njit(cache=True, error_model="numpy")
@@ -76,11 +76,12 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
     """
     nodes, entries = stack
     ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
-    best, best_triangle, best_u, best_v = limit, -1, 0.0, 0.0
-    if _enter(g.bounds, root, ox, oy, oz, ix, iy, iz, best) == np.inf:
+    best, best_triangle, best_u, best_v = limit, np.int64(-1), 0.0, 0.0
+    # Unsigned indices spare the test for negative ones at every access.
+    node = np.uint32(root)
+    if _enter(g.bounds, node, ox, oy, oz, ix, iy, iz, best) == np.inf:
         return best, best_triangle, best_u, best_v
     top = 0
-    node = root
     while True:
         count = g.count[node]
         child = g.child[node]
@@ -103,7 +104,7 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
                     continue
                 t = (e2x * qx + e2y * qy + e2z * qz) * inv
                 if 1e-6 < t < best:
-                    best, best_triangle, best_u, best_v = t, k, u, v
+                    best, best_triangle, best_u, best_v = t, np.int64(k), u, v
                     if any_hit:
                         return best, best_triangle, best_u, best_v
         else:
@@ -111,7 +112,7 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
             right = _enter(g.bounds, child + 1, ox, oy, oz, ix, iy, iz, best)
             if left <= right:
                 if right < np.inf:
-                    nodes[top], entries[top] = child + 1, right
+                    nodes[top], entries[top] = np.uint32(child + 1), right
                     top += 1
                 if left < np.inf:
                     node = child
@@ -120,7 +121,7 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
                 if left < np.inf:
                     nodes[top], entries[top] = child, left
                     top += 1
-                node = child + 1
+                node = np.uint32(child + 1)
                 continue
         while top > 0 and entries[top - 1] > best:
             top -= 1

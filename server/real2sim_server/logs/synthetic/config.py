@@ -44,7 +44,7 @@ class SyntheticConfig:
         hz: frames per second, and turns of the LiDAR per second.
         width, height: image size of every camera [px].
         cameras: the rig.
-        samples: rays per pixel along each image axis.
+        samples: rays per pixel along each image axis, where there are edges.
         moving_cars: vehicles that drive, ahead of the ego vehicle and towards it.
         parked_cars: vehicles at the kerbs; fewer where the street has no room for more.
         speed: mean speed of the ego vehicle [m/s].

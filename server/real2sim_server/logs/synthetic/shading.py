@@ -46,8 +46,8 @@ class World(NamedTuple):
     """
 
     bounds: Float
-    child: NDArray[np.int32]
-    count: NDArray[np.int32]
+    child: NDArray[np.uint32]
+    count: NDArray[np.uint32]
     edges: Float
     uv: Float
     normals: Float
@@ -96,7 +96,8 @@ def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     gx, gy, gz = _unit(gx, gy, gz)
     if gx * dx + gy * dy + gz * dz > 0.0:
         gx, gy, gz = -gx, -gy, -gz
-    if nx * gx + ny * gy + nz * gz < 0.0:
+    # Leaves are lit as the crown they belong to, whichever way each one is turned.
+    if nx * gx + ny * gy + nz * gz < 0.0 and g.material[k] != LEAVES:
         nx, ny, nz, bx, by, bz = -nx, -ny, -nz, -bx, -by, -bz
     f = t * spread
     material = g.material[k]
@@ -155,10 +156,15 @@ def _footprint(f, dx, dy, dz, gx, gy, gz):
 
 @njit(cache=True, error_model="numpy")
 def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
-    """Linear RGB of a ray whose nearest hit is known."""
+    """A ray whose nearest hit is known: linear (r, g, b), key, normal and plane offset.
+
+    The key names what was hit and whether the sun reaches it; equal keys, normals and offsets of
+    neighbouring pixels mean that one sample each will do. Negative keys ask for more anyway.
+    """
     t, k, _, _, instance = hit
     if k < 0:
-        return sky_colour(dx, dy, dz, world.seed)
+        r, g, b = sky_colour(dx, dy, dz, world.seed)
+        return r, g, b, 0, 0.0, 0.0, 0.0, 0.0
     r, g, b, gloss, nx, ny, nz, gx, gy, gz = surface_at(
         world, instances, hit, ox, oy, oz, dx, dy, dz, spread
     )
@@ -196,7 +202,9 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     if gloss > 0.0:
         mr, mg, mb = _reflection(world, gloss, open_, lit, dx, dy, dz, nx, ny, nz)
         r, g, b = r + mr, g + mg, b + mb
-    return _haze(t, r, g, b)
+    r, g, b = _haze(t, r, g, b)
+    key = 2 + 2 * (world.paint[k] + 100_000 * (instance + 1)) + int(lit)
+    return r, g, b, -1 if leaves else key, nx, ny, nz, px * gx + py * gy + pz * gz
 
 
 @njit(cache=True, error_model="numpy")

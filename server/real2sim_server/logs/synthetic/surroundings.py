@@ -55,8 +55,8 @@ def _add_house_row(
     builder: MeshBuilder, street: Street, side: float, rng: np.random.Generator
 ) -> None:
     s = street.start
-    while s < street.end:
-        width = rng.uniform(9, 17)
+    while s < street.end - 8:
+        width = min(rng.uniform(9, 17), street.end - s)
         setback = float(rng.choice([0.0, 0.0, 0.4, 0.8, 5.0], p=[0.4, 0.15, 0.15, 0.15, 0.15]))
         ends = street.point([s, s + width], side * (FACADE + setback))
         # The street must lie to the right of a front's direction.
@@ -130,7 +130,7 @@ def _add_foliage(
     builder: MeshBuilder, centre: Float, radius: float, paint: int, rng: np.random.Generator
 ) -> None:
     """A lump of leaves: a ball of loose quads, so that light and sky come through its rim."""
-    count = 150
+    count = 230
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     depth = rng.uniform(0.45, 1.05, (count, 1)) ** 0.5
@@ -140,7 +140,7 @@ def _add_foliage(
     first = np.cross(normal, rng.normal(size=(count, 3)))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(normal, first)
-    size = radius * rng.uniform(0.14, 0.3, (count, 1))
+    size = radius * rng.uniform(0.1, 0.22, (count, 1))
     corners = np.stack(
         [at - size * first, at + size * second, at + size * first, at - size * second], axis=1
     )
