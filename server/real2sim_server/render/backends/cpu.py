@@ -10,13 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..types import Instance, RenderOutput
-from .base import Placement, RasterRequest, place_instances
+from .base import CLAMP_MARGIN, Placement, RasterRequest, place_instances
 from .cpu_blend import blend_tiles
 from .cpu_project import project_cluster
 from .cpu_records import CHUNK, RECORD, TILE, Cluster, Images, Records, View
@@ -37,7 +38,7 @@ class CpuBackend:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._space: dict[str, NDArray[np.generic]] = {}
+        self._space: dict[str, NDArray[Any]] = {}
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw one camera after the other into shared output arrays."""
@@ -92,6 +93,7 @@ class CpuBackend:
         total = sum(regions)
         records = Records(
             self._array("values", (total * CHUNK, RECORD), np.float32),
+            self._array("boxes", (total * CHUNK,), np.int64),
             self._array("depths", (total * CHUNK,), np.float32),
             self._array("counts", (total,), np.int64),
         )
@@ -118,18 +120,19 @@ class CpuBackend:
         starts = self._array("starts", (tiles_x * tiles_y + 1,), np.int64)
         with _timed(timing, "tile"):
             cursors = self._array("cursors", (TILE_CHUNKS, tiles_x * tiles_y), np.int64)
-            count_tiles(records.values, order, tiles_x, tiles_y, cursors)
+            boxes = self._array("ordered_boxes", order.shape, np.int64)
+            count_tiles(records.values, records.boxes, order, tiles_x, boxes, cursors)
             bands = _bands(cursors.sum(0).reshape(tiles_y, tiles_x).sum(1))
         for first, last in bands:
             tiles = first * tiles_x, last * tiles_x
             with _timed(timing, "tile"):
                 tile_starts(cursors, *tiles, starts)
                 lists = self._array("lists", (int(starts[tiles[1]]),), np.int32)
-                scatter_tiles(records.values, order, tiles_x, first, last, cursors, lists)
+                scatter_tiles(records.values, boxes, order, tiles_x, first, last, cursors, lists)
             with _timed(timing, "blend"):
                 blend_tiles(records.values, lists, starts, tiles_x, *tiles, behind, images)
 
-    def _array(self, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[np.generic]:
+    def _array(self, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
         """Uninitialised work space that is kept from call to call."""
         size = int(np.prod(shape))
         held = self._space.get(name)
@@ -173,14 +176,29 @@ def _numpy(tensor: torch.Tensor) -> NDArray[np.float32]:
 
 
 def _view(request: RasterRequest, camera: int) -> View:
-    K, options = request.Ks[camera], request.options
-    antialiased = options.rasterize_mode == "antialiased"
-    return View(
-        *(np.float32(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])),
-        *(np.float32(value) for value in (request.width, request.height)),
-        *(np.float32(value) for value in (options.near_plane, options.far_plane)),
-        *(np.float32(value) for value in (options.eps2d, options.radius_clip, antialiased)),
-    )
+    options, width, height = request.options, request.width, request.height
+    K = request.Ks[camera].detach().cpu().numpy()
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = CLAMP_MARGIN * 0.5 * width / fx, CLAMP_MARGIN * 0.5 * height / fy
+    numbers = {
+        "fx": fx,
+        "fy": fy,
+        "cx": cx,
+        "cy": cy,
+        "width": width,
+        "height": height,
+        "left": -cx / fx - margin_x,
+        "right": (width - cx) / fx + margin_x,
+        "top": -cy / fy - margin_y,
+        "bottom": (height - cy) / fy + margin_y,
+        "near_plane": options.near_plane,
+        "far_plane": options.far_plane,
+        "eps2d": options.eps2d,
+        "radius_clip": options.radius_clip,
+        "antialiased": options.rasterize_mode == "antialiased",
+        "blur": options.eps2d**0.5,
+    }
+    return View(**{name: np.float32(value) for name, value in numbers.items()})
 
 
 def _direction_matrix(request: RasterRequest, camera: int) -> NDArray[np.float32]:

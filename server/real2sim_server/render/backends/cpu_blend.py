@@ -1,7 +1,7 @@
 """Front-to-back blending of the tiles.
 
 Tiles are dealt to tasks by a fixed pattern and share nothing, so any number of threads gives the
-same bits. Numba's disk cache follows the time stamp of this file only, not of cpu_simd.
+same bits.
 """
 
 # Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
@@ -37,6 +37,7 @@ from .cpu_simd import (
     blend_rgb_instance,
     prefetch,
 )
+from .kernel import kernel
 
 TASKS = 64
 """Tiles are dealt to this many tasks in turn, which spreads dense parts of an image."""
@@ -46,7 +47,7 @@ F32 = np.float32
 LIMIT, HALF, LAST_LANE = F32(EXPONENT_LIMIT), F32(0.5), F32(LANES - 1)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, background, images):
     """Blend tiles [first_tile, last_tile) into Images.
 
@@ -69,7 +70,7 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
             write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance)
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def open_tile(pixels, x0, y0, shape):
     """Clear the state; finish pixels outside the image. Returns a bit for each open half row."""
     pixels[:] = 0
@@ -107,7 +108,7 @@ def blend_tile(values, members, x0, y0, pixels, alive, extras):
             break
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def blend_half(pixels, half, record, start, rest, extras):
     """Blend one record over eight pixels; zero when all of them are finished."""
     sharpness, depth, instance = record[SHARPNESS], record[DEPTH], record[INSTANCE]
@@ -127,7 +128,7 @@ def blend_half(pixels, half, record, start, rest, extras):
     return blend_rgb(pixels, half, sharpness, start, rest, red, green, blue, depth, instance)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
     """Put the background behind the tile and write it to the"""
     height, width = alpha.shape

@@ -2,8 +2,6 @@
 
 Nothing of the cluster is copied: what may be seen becomes one record. Chunks of fixed size write
 to regions of their own, so that the result does not depend on the number of threads.
-
-Numba's disk cache follows the time stamp of this file only, not of the modules it imports.
 """
 
 # Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
@@ -16,13 +14,12 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .base import ALPHA_MIN, CLAMP_MARGIN
+from .base import ALPHA_MIN
 from .cpu_records import (
     BLUE,
     CHUNK,
     DEPTH,
     EXPONENT_UNIT,
-    EXTENT_X,
     EXTENT_Y,
     FALLOFF,
     GREEN,
@@ -33,20 +30,28 @@ from .cpu_records import (
     RED,
     SHARPNESS,
     SLOPE,
+    TILE,
     TIP_Y,
 )
+from .kernel import kernel
 
 F32 = np.float32
 ZERO, HALF, ONE, TWO = F32(0), F32(0.5), F32(1), F32(2)
 LEAST_ALPHA = F32(ALPHA_MIN)
 REACH_MAX = F32(math.sqrt(2 * math.log(255.0)))
-MARGIN = F32(0.5 * CLAMP_MARGIN)
+LOG_255 = F32(math.log(255.0))
+HALF_UNIT = F32(0.5 / EXPONENT_UNIT)
+PER_TILE = F32(1.0 / TILE)
+EDGE, SLACK = F32(0.5), F32(0.01)
+"""From the edge of a pixel to its centre, and how much boxes are widened against rounding [px]."""
+NOWHERE = np.int64(0)
+"""Box of what cannot be seen; no box has this value since x1 and y1 are at least 1."""
 COVARIANCE_MAX = F32(1e30)
 """Larger than any picture [px^2]; beyond it float32 gives out."""
 FASTMATH = {"contract", "nsz", "arcp"}
 
 
-@njit(parallel=True, cache=True, fastmath=FASTMATH, error_model="numpy")
+@kernel(parallel=True, fastmath=FASTMATH)
 def project_cluster(cluster, view, base, records):
     """Write records of the Gaussians of one Cluster that a View may see.
 
@@ -56,84 +61,101 @@ def project_cluster(cluster, view, base, records):
     """
     n = cluster.means.shape[0]
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
-    values, depths, counts = records.values, records.depths, records.counts
+    values, boxes = records.values, records.boxes
+    depths, counts = records.depths, records.counts
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         start = chunk * CHUNK
         slot = base + start
         for i in range(start, min(n, start + CHUNK)):
-            if project_gaussian(cluster, view, i, values[slot]):
+            box = project_gaussian(cluster, view, i, values[slot])
+            if box != NOWHERE:
+                boxes[slot] = box
                 depths[slot] = values[slot, DEPTH]
                 slot += 1
         counts[(base + start) // CHUNK] = slot - base - start
 
 
-@njit(fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def project_gaussian(cluster, view, i, out):  # noqa: PLR0911 - each test drops as early as it can
-    """Fill ``out`` with the record of Gaussian ``i``; False where it cannot be seen."""
+    """Fill ``out`` with the record of Gaussian ``i``; returns its box of tiles, see pack_box."""
     opacity = cluster.opacities[i]
     if not opacity >= LEAST_ALPHA:
-        return False
+        return NOWHERE
     x, y, z = to_camera(cluster, i)
     if not (z >= view.near_plane and z <= view.far_plane):
-        return False
+        return NOWHERE
     rz = ONE / z
     tx, ty = x * rz, y * rz
     mean_x, mean_y = view.fx * tx + view.cx, view.fy * ty + view.cy
-    margin_x, margin_y = MARGIN * view.width / view.fx, MARGIN * view.height / view.fy
-    tx = min(max(tx, -view.cx / view.fx - margin_x), (view.width - view.cx) / view.fx + margin_x)
-    ty = min(max(ty, -view.cy / view.fy - margin_y), (view.height - view.cy) / view.fy + margin_y)
+    tx = min(max(tx, view.left), view.right)
+    ty = min(max(ty, view.top), view.bottom)
     scale_x, scale_y = view.fx * rz, view.fy * rz
     sigma = largest_sigma(cluster, i)
-    reach_x = REACH_MAX * math.sqrt(scale_x * scale_x * (ONE + tx * tx) * sigma + view.eps2d)
-    reach_y = REACH_MAX * math.sqrt(scale_y * scale_y * (ONE + ty * ty) * sigma + view.eps2d)
-    if not (
-        mean_x + reach_x > ZERO
-        and mean_x - reach_x < view.width
-        and mean_y + reach_y > ZERO
-        and mean_y - reach_y < view.height
-    ):
-        return False
+    reach_x = REACH_MAX * (scale_x * (ONE + abs(tx)) * sigma + view.blur)
+    reach_y = REACH_MAX * (scale_y * (ONE + abs(ty)) * sigma + view.blur)
+    if not on_image(view, mean_x, mean_y, reach_x, reach_y):
+        return NOWHERE
 
     cxx, cxy, cyy, sharp = image_covariance(cluster, i, scale_x, scale_y, tx, ty)
     determinant = sharp + view.eps2d * (cxx + cyy) + view.eps2d * view.eps2d
     cxx += view.eps2d
     cyy += view.eps2d
     if not (determinant > ZERO and cxx < COVARIANCE_MAX and cyy < COVARIANCE_MAX):
-        return False
+        return NOWHERE
     if view.antialiased > ZERO:
         opacity *= F32(math.sqrt(max(sharp, 0.0) / determinant))
         if not opacity >= LEAST_ALPHA:
-            return False
+            return NOWHERE
     level = -math.log(opacity)
-    reach = math.sqrt(TWO * max(F32(math.log(255.0)) - level, ZERO))
-    reach_x = reach * F32(math.sqrt(cxx))
-    reach_y = reach * F32(math.sqrt(cyy))
-    if math.ceil(reach_x) <= view.radius_clip and math.ceil(reach_y) <= view.radius_clip:
-        return False
-    if not (
-        mean_x + reach_x > ZERO
-        and mean_x - reach_x < view.width
-        and mean_y + reach_y > ZERO
-        and mean_y - reach_y < view.height
-    ):
-        return False
+    reach = math.sqrt(TWO * max(LOG_255 - level, ZERO))
+    reach_x = reach * math.sqrt(F32(cxx))
+    reach_y = reach * math.sqrt(F32(cyy))
+    clip = view.radius_clip
+    if clip > ZERO and math.ceil(reach_x) <= clip and math.ceil(reach_y) <= clip:
+        return NOWHERE
+    if not on_image(view, mean_x, mean_y, reach_x, reach_y):
+        return NOWHERE
 
+    inverse = ONE / F32(cyy)
     out[MEAN_X] = mean_x
     out[MEAN_Y] = mean_y
-    out[SHARPNESS] = math.sqrt(cyy / determinant * (0.5 / EXPONENT_UNIT))
-    out[SLOPE] = cxy / cyy
-    out[FALLOFF] = (0.5 / EXPONENT_UNIT) / cyy
+    out[SHARPNESS] = math.sqrt(F32(cyy / determinant) * HALF_UNIT)
+    out[SLOPE] = F32(cxy) * inverse
+    out[FALLOFF] = HALF_UNIT * inverse
     out[LEVEL] = level * F32(1 / EXPONENT_UNIT)
     out[DEPTH] = z
     out[INSTANCE] = cluster.instance_id
-    out[EXTENT_X] = reach_x
     out[EXTENT_Y] = reach_y
-    out[TIP_Y] = reach_x * cxy / cxx
+    out[TIP_Y] = reach_x * F32(cxy) / F32(cxx)
     write_color(cluster, i, out)
-    return True
+    return pack_box(view, mean_x, mean_y, reach_x, reach_y)
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+def on_image(view, x, y, reach_x, reach_y):
+    """Whether a box about (x, y) meets the image; False for what is not finite."""
+    return (
+        x + reach_x > ZERO
+        and x - reach_x < view.width
+        and y + reach_y > ZERO
+        and y - reach_y < view.height
+    )
+
+
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+def pack_box(view, x, y, reach_x, reach_y):
+    """Tiles [x0, x1) x [y0, y1) whose pixel centres a box may hold; NOWHERE when none."""
+    reach_x, reach_y = reach_x + SLACK, reach_y + SLACK
+    x0 = math.floor(max(x - reach_x - EDGE, ZERO) * PER_TILE)
+    y0 = math.floor(max(y - reach_y - EDGE, ZERO) * PER_TILE)
+    x1 = math.floor(min(x + reach_x - EDGE, view.width - ONE) * PER_TILE) + 1
+    y1 = math.floor(min(y + reach_y - EDGE, view.height - ONE) * PER_TILE) + 1
+    if x1 <= x0 or y1 <= y0:
+        return NOWHERE
+    return np.int64(x0) | np.int64(x1) << 16 | np.int64(y0) << 32 | np.int64(y1) << 48
+
+
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def to_camera(cluster, i):
     """Centre in the camera frame; summed in float64 so that rounding cannot change the order."""
     x, y, z = (
@@ -149,19 +171,18 @@ def to_camera(cluster, i):
     )
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def largest_sigma(cluster, i):
-    """Upper bound of the variance along any direction of the world [m^2]."""
+    """Upper bound of the standard deviation along any direction of the world [m]."""
     largest = max(cluster.scale[0], cluster.scale[1], cluster.scale[2])
     if cluster.covars.shape[0] > 0:
         trace = cluster.covars[i, 0, 0] + cluster.covars[i, 1, 1] + cluster.covars[i, 2, 2]
-        return trace * largest * largest
+        return math.sqrt(trace) * largest
     s = cluster.scales[i]
-    largest *= max(s[0], s[1], s[2])
-    return largest * largest
+    return largest * max(s[0], s[1], s[2])
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def image_covariance(cluster, i, scale_x, scale_y, tx, ty):
     """Covariance (xx, xy, yy) [px^2] on the image before blur, and its determinant, float64."""
     m = cluster.linear
@@ -195,7 +216,7 @@ def image_covariance(cluster, i, scale_x, scale_y, tx, ty):
     )
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def transform_covariance(covar, ax, ay, az, bx, by, bz):
     """Like image_covariance, from rows a, b of the map and a covariance [3, 3]."""
     sxx, sxy, sxz = np.float64(covar[0, 0]), np.float64(covar[0, 1]), np.float64(covar[0, 2])
@@ -214,7 +235,7 @@ def transform_covariance(covar, ax, ay, az, bx, by, bz):
     return xx, xy, yy, xx * yy - xy * xy
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def write_color(cluster, i, out):
     """Evaluate the spherical harmonics of Gaussian ``i`` as seen by the camera (Sloan 2013)."""
     sh = cluster.sh[i]
@@ -245,7 +266,7 @@ def write_color(cluster, i, out):
     out[RED], out[GREEN], out[BLUE] = max(r, ZERO), max(g, ZERO), max(b, ZERO)
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def add_cubic(r, g, b, sh, x, y, z):
     """Add the seven functions of degree 3."""
     five, three = F32(5) * z * z - ONE, F32(3)
@@ -259,7 +280,7 @@ def add_cubic(r, g, b, sh, x, y, z):
     return add_band(r, g, b, sh, 15, c3 * x * (x * x - three * y * y))
 
 
-@njit(inline="always", fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
 def add_band(r, g, b, sh, k, basis):
     """Colour plus coefficient ``k`` times its basis function."""
     return r + basis * sh[k, 0], g + basis * sh[k, 1], b + basis * sh[k, 2]

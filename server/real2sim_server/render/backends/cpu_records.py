@@ -27,8 +27,8 @@ LEVEL = 5
 """-ln(opacity) in EXPONENT_UNIT."""
 RED, GREEN, BLUE, DEPTH, INSTANCE = 6, 7, 8, 9, 10
 """Colour, depth of the centre [m], instance id as a float."""
-EXTENT_X, EXTENT_Y, TIP_Y = 11, 12, 13
-"""Half-size of the bounding box of alpha >= 1/255 [px]; dy of its rightmost point [px]."""
+EXTENT_Y, TIP_Y = 11, 12
+"""Of the ellipse alpha >= 1/255: largest dy, and dy of its rightmost point [px]."""
 
 EXPONENT_UNIT = 16.0
 """Exponents are stored over this: exp(-s) = polynomial(s / 16)^16."""
@@ -53,7 +53,14 @@ class Cluster(NamedTuple):
 
 
 class View(NamedTuple):
-    """Camera and options as float32 numbers; see Camera and RasterOptions."""
+    """Camera and options as float32 numbers.
+
+    Attributes:
+        fx, fy, cx, cy, width, height: of the camera [px].
+        left, right, top, bottom: bounds of x/z and y/z in the projection's Jacobian.
+        near_plane, far_plane, eps2d, radius_clip, antialiased: see RasterOptions.
+        blur: square root of ``eps2d`` [px].
+    """
 
     fx: np.float32
     fy: np.float32
@@ -61,11 +68,16 @@ class View(NamedTuple):
     cy: np.float32
     width: np.float32
     height: np.float32
+    left: np.float32
+    right: np.float32
+    top: np.float32
+    bottom: np.float32
     near_plane: np.float32
     far_plane: np.float32
     eps2d: np.float32
     radius_clip: np.float32
     antialiased: np.float32
+    blur: np.float32
 
 
 class Records(NamedTuple):
@@ -73,11 +85,14 @@ class Records(NamedTuple):
 
     Attributes:
         values: [M, RECORD] float32.
+        boxes: [M] int64, tiles [x0, x1) x [y0, y1) that may be touched: four times 16 bits in the
+            order x0, x1, y0, y1 from the lowest; fits a cache where the records do not.
         depths: [M] float32, depth of the centres [m].
         counts: [M / CHUNK] int64, records in use of each region.
     """
 
     values: NDArray[np.float32]
+    boxes: NDArray[np.int64]
     depths: NDArray[np.float32]
     counts: NDArray[np.int64]
 

@@ -6,7 +6,7 @@ registers where those are all there is, and give the same bits in each case as l
 has fused multiply-add.
 
 State of eight pixels is PLANES vectors in a row: transmittance (negative once finished), red,
-green, blue, depth, instance. After editing, remove the cached kernels of cpu_blend.
+green, blue, depth, instance.
 """
 
 # Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
@@ -187,13 +187,14 @@ blend_rgb_depth_instance = _blend_intrinsic(3)
 
 @intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of ``array[index]`` (2-D float32) without waiting for it."""
+    """Ask for the cache line of ``array[index]`` (its first axis) without waiting for it."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         values = context.make_array(signature.args[0])(context, builder, arguments[0])
-        stride = cgutils.unpack_tuple(builder, values.shape)[1]
-        position = builder.mul(arguments[1], stride)
-        pointer = builder.gep(values.data, [position], source_etype=FLOAT)
+        stride = cgutils.unpack_tuple(builder, values.strides)[0]
+        start = builder.bitcast(values.data, ir.IntType(8).as_pointer())
+        offset = builder.mul(arguments[1], stride)
+        pointer = builder.gep(start, [offset], source_etype=ir.IntType(8))
         i32 = ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [pointer.type, i32, i32, i32])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")

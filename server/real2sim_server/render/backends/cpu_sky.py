@@ -7,13 +7,15 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from .kernel import kernel
+
 F32 = np.float32
 ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
 OPAQUE = F32(1 - 1e-5)
 """Nothing of the sky is seen through alpha at or above this."""
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def add_sky(faces, matrix, rgb, alpha):
     """Add ``(1 - alpha) * sky`` to ``rgb``.
 
@@ -37,7 +39,7 @@ def add_sky(faces, matrix, rgb, alpha):
                 add_sample(faces, direction, ONE - alpha[row, column], rgb[row, column])
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def add_sample(faces, direction, weight, color):
     """Add the bilinear sample along ``direction`` times ``weight`` to ``color`` [3]."""
     size = faces.shape[1]
@@ -54,7 +56,7 @@ def add_sample(faces, direction, weight, color):
         color[k] += weight * (top * (ONE - fr) + bottom * fr)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def face_coordinates(direction):
     """Face index and u, v in [-1, 1]; see scene.sky.face_coordinates."""
     x, y, z = direction

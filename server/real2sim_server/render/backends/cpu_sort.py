@@ -7,10 +7,11 @@ ties keep the order of instances and of Gaussians in them.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from .cpu_records import CHUNK, Records
+from .kernel import kernel
 
 DIGIT_BITS = 11
 SORT_CHUNKS = 8
@@ -40,7 +41,7 @@ def sort_records(records: Records, regions: int, pairs: Pairs, scratch: Pairs) -
     return pairs[:total]
 
 
-@njit(parallel=True, cache=True)
+@kernel(parallel=True)
 def gather_pairs(keys, counts, ends, pairs):
     """Pack (key - smallest key) and record index; return the smallest and largest key.
 
@@ -61,7 +62,7 @@ def gather_pairs(keys, counts, ends, pairs):
     return np.int64(low), np.int64(highs.max())
 
 
-@njit(parallel=True, cache=True)
+@kernel(parallel=True)
 def radix_pass(source, target, total, shift, width):
     """Stable counting sort of ``source[:total]`` by ``width`` bits from ``shift`` on."""
     size = 1 << width
