@@ -44,7 +44,8 @@ from real2sim_proto.drive import (
 )
 from real2sim_proto.operations import Operation
 
-from ._requests import checked, describe
+from ._replies import describe
+from ._requests import checked
 from .errors import (
     MalformedReplyError,
     NotResetError,

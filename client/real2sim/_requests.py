@@ -6,7 +6,6 @@ in who waits.
 
 from __future__ import annotations
 
-import json
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,13 +15,10 @@ from urllib.parse import quote
 
 from pydantic import BaseModel, ValidationError
 
-from real2sim_proto import CodecError, decode
-from real2sim_proto.drive import Frame as WireFrame
 from real2sim_proto.drive import SensorSpec
 from real2sim_proto.operations import Operation
 from real2sim_proto.scenarios import (
     History,
-    HistoryEntry,
     OperationBatch,
     OperationResult,
     ScenarioCreate,
@@ -39,16 +35,21 @@ from real2sim_proto.sessions import (
     StepRequest,
 )
 
-from ._retry import parse_retry_after
-from .errors import InvalidValue, MalformedReplyError, Real2SimError, Refusal, error_for
-from .images import Image, frame_from_wire
-from .observation import View, view_from_frames
+from ._replies import (
+    MEDIA_TYPES,
+    MSGPACK,
+    Reply,
+    describe,
+    model_of,
+    nothing,
+    parse_image,
+    parse_view,
+)
+from .images import Image
+from .observation import View
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
-
-MSGPACK = "application/msgpack"
-MEDIA_TYPES = {"raw": MSGPACK, "jpeg": "image/jpeg", "png": "image/png"}
 
 
 @dataclass(frozen=True)
@@ -71,19 +72,6 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Reply:
-    """What came back; header names in lower case."""
-
-    status: int
-    headers: Mapping[str, str]
-    content: bytes
-
-    @property
-    def media_type(self) -> str:
-        return self.headers.get("content-type", "").partition(";")[0].strip().lower()
-
-
-@dataclass(frozen=True)
 class Call(Generic[T]):
     """A request and how its reply is read."""
 
@@ -95,34 +83,34 @@ class Call(Generic[T]):
 
 
 def server_info() -> Call[ServerInfo]:
-    return Call(Request("GET", "/v1/server"), _model(ServerInfo))
+    return Call(Request("GET", "/v1/server"), model_of(ServerInfo))
 
 
 def readiness() -> Call[Readiness]:
     request = Request("GET", "/readyz", accepted=frozenset({503}))
-    return Call(request, _model(Readiness))
+    return Call(request, model_of(Readiness))
 
 
 def list_scenes() -> Call[SceneList]:
-    return Call(Request("GET", "/v1/scenes"), _model(SceneList))
+    return Call(Request("GET", "/v1/scenes"), model_of(SceneList))
 
 
 def get_scene(scene: str) -> Call[SceneInfo]:
-    return Call(Request("GET", f"/v1/scenes/{_segment(scene)}"), _model(SceneInfo))
+    return Call(Request("GET", f"/v1/scenes/{_segment(scene)}"), model_of(SceneInfo))
 
 
 def load_scene(scene: str) -> Call[None]:
     path = f"/v1/scenes/{_segment(scene)}/residency"
-    return Call(Request("PUT", path, patient=True), _nothing)
+    return Call(Request("PUT", path, patient=True), nothing)
 
 
 def unload_scene(scene: str) -> Call[None]:
-    return Call(Request("DELETE", f"/v1/scenes/{_segment(scene)}/residency"), _nothing)
+    return Call(Request("DELETE", f"/v1/scenes/{_segment(scene)}/residency"), nothing)
 
 
 def import_scene(path: str, scene: str | None) -> Call[SceneInfo]:
     body = checked(SceneImport, path=path, scene=scene)
-    return Call(_post("/v1/scenes", body, patient=True), _model(SceneInfo))
+    return Call(_post("/v1/scenes", body, patient=True), model_of(SceneInfo))
 
 
 def upload_scene(path: Path, scene: str | None) -> Call[SceneInfo]:
@@ -134,7 +122,7 @@ def upload_scene(path: Path, scene: str | None) -> Call[SceneInfo]:
     }
     form = {} if scene is None else {"scene": scene}
     request = Request("POST", "/v1/scenes", headers=headers, form=form, upload=path, patient=True)
-    return Call(request, _model(SceneInfo))
+    return Call(request, model_of(SceneInfo))
 
 
 def render_scene(scene: str, view: ViewRequest) -> Call[Image]:
@@ -157,19 +145,19 @@ class ViewRequest:
 
 def create_scenario(scene: str, name: str) -> Call[ScenarioInfo]:
     body = checked(ScenarioCreate, scene=scene, name=name)
-    return Call(_post("/v1/scenarios", body), _model(ScenarioInfo))
+    return Call(_post("/v1/scenarios", body), model_of(ScenarioInfo))
 
 
 def list_scenarios() -> Call[ScenarioList]:
-    return Call(Request("GET", "/v1/scenarios"), _model(ScenarioList))
+    return Call(Request("GET", "/v1/scenarios"), model_of(ScenarioList))
 
 
 def get_scenario(scenario_id: str) -> Call[ScenarioInfo]:
-    return Call(Request("GET", _scenario(scenario_id)), _model(ScenarioInfo))
+    return Call(Request("GET", _scenario(scenario_id)), model_of(ScenarioInfo))
 
 
 def delete_scenario(scenario_id: str) -> Call[None]:
-    return Call(Request("DELETE", _scenario(scenario_id)), _nothing)
+    return Call(Request("DELETE", _scenario(scenario_id)), nothing)
 
 
 def apply_operations(
@@ -177,23 +165,23 @@ def apply_operations(
 ) -> Call[OperationResult]:
     body = checked(OperationBatch, operations=list(operations), dry_run=dry_run)
     request = _post(f"{_scenario(scenario_id)}/operations", body, if_match=etag)
-    return Call(request, _model(OperationResult))
+    return Call(request, model_of(OperationResult))
 
 
 def undo(scenario_id: str, etag: str) -> Call[OperationResult]:
     request = _post(f"{_scenario(scenario_id)}/undo", None, if_match=etag)
-    return Call(request, _model(OperationResult))
+    return Call(request, model_of(OperationResult))
 
 
 def redo(scenario_id: str, etag: str) -> Call[OperationResult]:
     request = _post(f"{_scenario(scenario_id)}/redo", None, if_match=etag)
-    return Call(request, _model(OperationResult))
+    return Call(request, model_of(OperationResult))
 
 
 def history(scenario_id: str, after: int | None) -> Call[History]:
     params = {} if after is None else {"after": str(after)}
     request = Request("GET", f"{_scenario(scenario_id)}/operations", params=params)
-    return Call(request, _model(History))
+    return Call(request, model_of(History))
 
 
 def preview(scenario_id: str, view: ViewRequest) -> Call[Image]:
@@ -213,20 +201,20 @@ def create_session(
         )
     params = {"scene": scene} if scene is not None else {"scenario": str(scenario)}
     request = _post("/v1/sessions", body, params=params, patient=True)
-    return Call(request, _model(SessionInfo))
+    return Call(request, model_of(SessionInfo))
 
 
 def list_sessions() -> Call[SessionList]:
-    return Call(Request("GET", "/v1/sessions"), _model(SessionList))
+    return Call(Request("GET", "/v1/sessions"), model_of(SessionList))
 
 
 def get_session(session_id: str, token: str | None) -> Call[SessionInfo]:
     request = Request("GET", _session(session_id), headers=_bearer(token))
-    return Call(request, _model(SessionInfo))
+    return Call(request, model_of(SessionInfo))
 
 
 def delete_session(session_id: str, token: str | None) -> Call[None]:
-    return Call(Request("DELETE", _session(session_id), headers=_bearer(token)), _nothing)
+    return Call(Request("DELETE", _session(session_id), headers=_bearer(token)), nothing)
 
 
 def step_session(session_id: str, token: str | None, body: StepRequest) -> Call[SessionState]:
@@ -239,12 +227,12 @@ def step_session(session_id: str, token: str | None, body: StepRequest) -> Call[
         idempotent=False,
         patient=True,
     )
-    return Call(request, _model(SessionState))
+    return Call(request, model_of(SessionState))
 
 
 def session_state(session_id: str, token: str | None) -> Call[SessionState]:
     request = Request("GET", f"{_session(session_id)}/state", headers=_bearer(token))
-    return Call(request, _model(SessionState))
+    return Call(request, model_of(SessionState))
 
 
 def render_session(session_id: str, token: str | None, sensors: Sequence[SensorSpec]) -> Call[View]:
@@ -255,8 +243,9 @@ def render_session(session_id: str, token: str | None, sensors: Sequence[SensorS
         f"{_session(session_id)}/render",
         headers=_bearer(token) | {"Content-Type": "application/json", "Accept": MSGPACK},
         body=_json(body),
+        patient=True,
     )
-    return Call(request, _parse_view)
+    return Call(request, parse_view)
 
 
 # --- the way in -------------------------------------------------------------------------------
@@ -272,18 +261,6 @@ def checked(model: type[M], /, **fields: Any) -> M:
         return model(**fields)
     except ValidationError as error:
         raise ValueError(f"{model.__name__}: {describe(error)}") from error
-
-
-def describe(error: ValidationError) -> str:
-    """What is wrong, in one line: ``sensors/0/width: input should be ...``."""
-    problems = []
-    for problem in error.errors(include_url=False, include_context=False)[:4]:
-        place = "/".join(str(part) for part in problem["loc"])
-        given = repr(problem["input"])
-        given = given if len(given) <= 60 else f"{given[:57]}..."
-        problems.append(f"{place}: {problem['msg']}, not {given}")
-    more = error.error_count() - len(problems)
-    return "; ".join(problems) + (f"; and {more} more" if more > 0 else "")
 
 
 def new_key() -> str:
@@ -338,116 +315,5 @@ def _image(path: str, view: ViewRequest) -> Call[Image]:
     params |= {} if view.t_us is None else {"t_us": str(view.t_us)}
     params |= {} if view.width is None else {"width": str(view.width)}
     headers = {"Accept": MEDIA_TYPES[view.codec]}
-    request = Request("GET", path, params, headers)
-    return Call(request, lambda reply: _parse_image(reply, view.modality))
-
-
-# --- the way back -----------------------------------------------------------------------------
-
-
-def refusal_error(reply: Reply) -> Real2SimError:
-    """The exception for an answer of status 400 or above, problem document or not."""
-    try:
-        problem = json.loads(reply.content)
-    except ValueError:
-        problem = None
-    retry_after = parse_retry_after(reply.headers.get("retry-after"))
-    if not isinstance(problem, dict):
-        text = reply.content[:200].decode("utf-8", "replace").strip() or "empty body"
-        detail = f"the answer has status {reply.status} and is no problem document: {text!r}"
-        return error_for(Refusal(reply.status, "UNKNOWN", detail, retry_after=retry_after))
-    return error_for(
-        Refusal(
-            status=reply.status,
-            code=str(problem.get("code", "UNKNOWN")),
-            detail=str(problem.get("detail") or problem.get("title") or f"status {reply.status}"),
-            hint=_text(problem.get("hint")),
-            request_id=_text(problem.get("request_id")) or reply.headers.get("x-request-id"),
-            errors=tuple(_invalid_values(problem.get("errors"))),
-            retry_after=retry_after,
-            revision=problem["revision"] if isinstance(problem.get("revision"), int) else None,
-            missed=tuple(_missed(problem.get("missed"))),
-        )
-    )
-
-
-def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) and value else None
-
-
-def _invalid_values(values: Any) -> list[InvalidValue]:
-    if not isinstance(values, list):
-        return []
-    return [
-        InvalidValue(str(value.get("pointer", "")), str(value.get("message", "")))
-        for value in values
-        if isinstance(value, dict)
-    ]
-
-
-def _missed(values: Any) -> list[HistoryEntry]:
-    entries = []
-    for value in values if isinstance(values, list) else []:
-        try:
-            entries.append(HistoryEntry.model_validate(value))
-        except ValidationError:
-            # The refusal matters more than one entry that a newer worker writes differently.
-            continue
-    return entries
-
-
-def _nothing(_reply: Reply) -> None:
-    return None
-
-
-def _model(model: type[M]) -> Callable[[Reply], M]:
-    def parse(reply: Reply) -> M:
-        try:
-            return model.model_validate_json(reply.content)
-        except ValidationError as error:
-            raise MalformedReplyError(
-                f"the worker's answer is not a {model.__name__}: {describe(error)}",
-                hint="is this address a Real2Sim worker, of this protocol version?",
-            ) from error
-
-    return parse
-
-
-def _parse_image(reply: Reply, modality: str) -> Image:
-    if reply.media_type == MSGPACK:
-        return frame_from_wire(_wire_frame(_decoded(reply)))
-    codecs = {media_type: codec for codec, media_type in MEDIA_TYPES.items()}
-    codec = codecs.get(reply.media_type)
-    if codec is None:
-        raise MalformedReplyError(f"the worker sent {reply.media_type!r} where an image was asked")
-    dtype = "uint8" if modality == "rgb" else "uint16"
-    return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype)
-
-
-def _parse_view(reply: Reply) -> View:
-    message = _decoded(reply)
-    frames = message.get("frames")
-    if not isinstance(frames, list):
-        raise MalformedReplyError("the worker's answer to render has no list of frames")
-    wires = [_wire_frame(frame) for frame in frames]
-    return view_from_frames(
-        wires,
-        t_us=int(message.get("t_us", wires[0].t_us if wires else 0)),
-        revision=int(message.get("revision", 0)),
-        timing=message.get("timing", {}),
-    )
-
-
-def _decoded(reply: Reply) -> dict[str, Any]:
-    try:
-        return decode(reply.content)
-    except CodecError as error:
-        raise MalformedReplyError(f"the worker's answer cannot be read: {error}") from error
-
-
-def _wire_frame(value: Any) -> WireFrame:
-    known = {k: v for k, v in dict(value).items() if k in WireFrame.model_fields}
-    try:
-        return WireFrame.model_validate(known)
-    except ValidationError as error:
-        raise MalformedReplyError(f"the worker sent a broken frame: {describe(error)}") from error
+    request = Request("GET", path, params, headers, patient=True)
+    return Call(request, lambda reply: parse_image(reply, view.modality))

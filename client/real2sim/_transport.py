@@ -13,7 +13,8 @@ from urllib.parse import urlsplit
 
 import httpx2
 
-from ._requests import Call, Reply, Request, refusal_error
+from ._replies import Reply, refusal_error
+from ._requests import Call, Request
 from ._retry import RETRYABLE_STATUS, RetryPolicy
 from .errors import Real2SimError, ReplyTimeoutError, StatusError, UnreachableError
 
@@ -147,7 +148,9 @@ class Attempts:
             Real2SimError: the error itself, when there is no next try.
         """
         delay = None
-        if self._request.idempotent and _passing(error):
+        # Who has waited long already would only add work to a worker that is slow.
+        waited = self._request.patient and isinstance(error, ReplyTimeoutError)
+        if self._request.idempotent and not waited and _passing(error):
             retry_after = error.retry_after if isinstance(error, StatusError) else None
             delay = self._policy.delay(self._made, retry_after=retry_after)
         self._made += 1

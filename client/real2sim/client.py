@@ -40,7 +40,8 @@ def connect(
     Args:
         url: ``http://host:port`` or ``https://...``.
         token: bearer token of the worker.
-        timeout: seconds that a reply may take; calls that load a scene have at least 300.
+        timeout: seconds that a reply may take; calls that may load a scene or
+            compile kernels have at least 300.
         retries: more tries of requests that may safely be sent again.
         transport: replaces the network, for tests of programs that use the SDK.
 

@@ -7,31 +7,27 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 
-import websockets
 from websockets.asyncio.client import connect as connect_async
 from websockets.sync.client import connect
 
-from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.drive import Edited, Envelope, Plan, Result, Welcome
 from real2sim_proto.operations import Operation
 from real2sim_proto.sessions import SessionInfo
 
 from . import _requests
-from ._conversation import MAX_MESSAGE_BYTES, Conversation, Question
+from ._conversation import Conversation, Question
+from ._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from ._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
 from ._transport import AsyncTransport, Target, Transport
 from .errors import (
-    ConnectionLostError,
     NotOpenError,
-    ProtocolMismatchError,
     Real2SimError,
     ReplyTimeoutError,
-    UnreachableError,
 )
 from .observation import Observation, View, observation_from_wire, view_from_frames
 from .version import SDK
@@ -138,11 +134,11 @@ class DriveSession(SessionBase):
             session_id, token = info.session_id, info.token
             self._stack.callback(self._delete, info)
         try:
-            with _handshake_errors(self._target):
+            with handshake_errors(self._target):
                 self._socket = self._stack.enter_context(
-                    connect(**_socket_options(self._target, session_id))
+                    connect(**socket_options(self._target, session_id))
                 )
-            _check_subprotocol(self._socket.subprotocol)
+            check_subprotocol(self._socket.subprotocol)
             self._welcome = self._ask(self._hello(token))
         except BaseException:
             self._shut()
@@ -207,7 +203,7 @@ class DriveSession(SessionBase):
     def _ask(self, question: Question[A]) -> A:
         socket = self._open_socket()
         seconds = self._seconds(question)
-        with _lost_connection(self._target, question):
+        with lost_connection(self._target, question):
             socket.send(question.data)
             while True:
                 try:
@@ -253,11 +249,11 @@ class AsyncDriveSession(SessionBase):
             session_id, token = info.session_id, info.token
             self._stack.push_async_callback(self._delete, info)
         try:
-            with _handshake_errors(self._target):
+            with handshake_errors(self._target):
                 self._socket = await self._stack.enter_async_context(
-                    connect_async(**_socket_options(self._target, session_id))
+                    connect_async(**socket_options(self._target, session_id))
                 )
-            _check_subprotocol(self._socket.subprotocol)
+            check_subprotocol(self._socket.subprotocol)
             self._welcome = await self._ask(self._hello(token))
         except BaseException:
             await self._shut()
@@ -309,7 +305,7 @@ class AsyncDriveSession(SessionBase):
     async def _ask(self, question: Question[A]) -> A:
         socket = self._open_socket()
         seconds = self._seconds(question)
-        with _lost_connection(self._target, question):
+        with lost_connection(self._target, question):
             await socket.send(question.data)
             while True:
                 try:
@@ -336,65 +332,3 @@ class AsyncDriveSession(SessionBase):
             token = self._target.token or info.token
             with contextlib.suppress(Real2SimError):
                 await self._transport.send(_requests.delete_session(info.session_id, token))
-
-
-def _socket_options(target: Target, session_id: str) -> dict[str, Any]:
-    return {
-        "uri": target.drive_url(session_id),
-        "subprotocols": [DRIVE_SUBPROTOCOL],
-        "additional_headers": target.headers,
-        "compression": None,
-        "max_size": MAX_MESSAGE_BYTES,
-        "open_timeout": target.timeout,
-        "close_timeout": min(target.timeout, 5.0),
-        "proxy": None if target.loopback else True,
-    }
-
-
-def _check_subprotocol(chosen: str | None) -> None:
-    if chosen != DRIVE_SUBPROTOCOL:
-        raise ProtocolMismatchError(
-            f"the worker chose drive protocol {chosen or 'none'}; this client speaks "
-            f"{DRIVE_SUBPROTOCOL}",
-            hint="install a client and a worker of the same major version",
-        )
-
-
-@contextlib.contextmanager
-def _handshake_errors(target: Target) -> Iterator[None]:
-    try:
-        yield
-    except websockets.exceptions.InvalidStatus as error:
-        response = error.response
-        headers = {name.lower(): value for name, value in response.headers.raw_items()}
-        reply = _requests.Reply(response.status_code, headers, bytes(response.body or b""))
-        raise _requests.refusal_error(reply) from error
-    except TimeoutError as error:
-        raise ReplyTimeoutError(
-            f"answer to the drive socket's handshake from {target.url}", target.timeout
-        ) from error
-    except websockets.exceptions.NegotiationError as error:
-        raise ProtocolMismatchError(
-            f"the worker did not agree to drive protocol {DRIVE_SUBPROTOCOL}: {error}",
-            hint="install a client and a worker of the same major version",
-        ) from error
-    except (OSError, websockets.exceptions.WebSocketException) as error:
-        raise UnreachableError(
-            f"the drive socket at {target.url} did not open: {error}",
-            hint="is the worker up? see `real2sim status`",
-        ) from error
-
-
-@contextlib.contextmanager
-def _lost_connection(target: Target, question: Question[Any]) -> Iterator[None]:
-    try:
-        yield
-    except websockets.exceptions.ConnectionClosed as error:
-        close = error.rcvd
-        said = f"{close.code} {close.reason}".strip() if close else "no goodbye"
-        leaving = close is not None and close.code in {1001, 1012}
-        raise ConnectionLostError(
-            f"the worker at {target.url} closed the drive socket ({said}) while "
-            f"{question.awaited} was awaited",
-            hint="the worker is shutting down or restarting" if leaving else None,
-        ) from error

@@ -118,7 +118,9 @@ class StatusError(Real2SimError):
     """
 
     def __init__(self, refusal: Refusal) -> None:
-        places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in refusal.errors)
+        # Many workers say the first of the errors in the detail already.
+        told = [e for e in refusal.errors if e.message not in refusal.detail]
+        places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in told)
         message = f"{refusal.detail} ({places})" if places else refusal.detail
         super().__init__(f"{message} [{refusal.code}]", hint=refusal.hint)
         self.status = refusal.status

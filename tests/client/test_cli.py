@@ -17,7 +17,8 @@ import typer
 
 from real2sim import cli
 
-from .fake_worker import IMAGE, FakeWorker
+from .fake_episode import IMAGE
+from .fake_worker import FakeWorker
 
 
 @dataclass

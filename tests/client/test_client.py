@@ -15,7 +15,7 @@ from real2sim import _transport
 from real2sim.errors import CapacityError
 from real2sim_proto import encode
 
-from .fake_worker import IMAGE, frame
+from .fake_episode import IMAGE, frame
 
 Handler = Callable[[httpx2.Request], httpx2.Response]
 SCENES = {"scenes": [{"scene": "street", "state": "resident"}]}
@@ -102,6 +102,15 @@ def test_an_error_carries_everything_the_problem_says():
     assert "/width: at most 8192" in str(error)
 
 
+def test_what_the_detail_says_is_not_said_twice():
+    said = problem(
+        422, "INVALID_REQUEST", errors=[{"pointer": "/x", "message": "about INVALID_REQUEST"}]
+    )
+    with client_of(Script(said)) as client, pytest.raises(real2sim.StatusError) as caught:
+        client.scenes.get("street")
+    assert str(caught.value) == "about INVALID_REQUEST [INVALID_REQUEST]"
+
+
 def test_a_proxy_that_answers_with_html_is_still_one_sentence():
     page = httpx2.Response(502, text="<html>bad gateway</html>")
     with (
@@ -186,6 +195,13 @@ def test_a_timeout_names_the_call_and_the_seconds(slept):
         pytest.raises(TimeoutError, match=r"no reply to GET /v1/scenes .* within 4 s"),
     ):
         client.scenes.list()
+
+
+def test_a_slow_render_is_not_asked_for_again(slept):
+    script = Script(httpx2.ReadTimeout("slow"))
+    with client_of(script) as client, pytest.raises(real2sim.ReplyTimeoutError, match="300 s"):
+        client.scenes.render("street", camera="front")
+    assert len(script.requests) == 1
 
 
 def test_the_async_client_retries_alike(monkeypatch):

@@ -10,7 +10,8 @@ import pytest
 import real2sim
 from real2sim.errors import CapacityError
 
-from .fake_worker import IMAGE, FakeWorker
+from .fake_episode import IMAGE
+from .fake_worker import FakeWorker
 
 pytestmark = pytest.mark.network
 

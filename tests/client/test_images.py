@@ -10,7 +10,7 @@ from real2sim.errors import ImageDecodeError, MalformedReplyError
 from real2sim.images import Image, frame_from_wire, write_atomically
 from real2sim_proto.drive import Frame as WireFrame
 
-from .fake_worker import IMAGE, frame
+from .fake_episode import IMAGE, frame
 
 
 def raw_image(array: np.ndarray, modality: str, dtype: str) -> Image:

@@ -9,7 +9,8 @@ import real2sim
 from real2sim import planners
 from real2sim.planners import FollowRoute, StageTimes, load_planner, run_episode
 
-from ..fake_worker import ROUTE_LENGTH, FakeWorker
+from ..fake_episode import ROUTE_LENGTH
+from ..fake_worker import FakeWorker
 
 
 @pytest.mark.network
