@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,6 +54,7 @@ class Reference:
         self._times: list[float] = [0.0, *seconds.tolist()]
         self._x: list[float] = [motion.x, *given[:, 0].tolist()]
         self._y: list[float] = [motion.y, *given[:, 1].tolist()]
+        self._yaws: list[float] = [motion.yaw, *given[:, 2].tolist()]
         self._vx: list[float] = [own[0], *tangents[:, 0].tolist()]
         self._vy: list[float] = [own[1], *tangents[:, 1].tolist()]
         last_speed = math.hypot(self._vx[-1], self._vy[-1])
@@ -69,6 +70,10 @@ class Reference:
         x, vx = _hermite((self._x[i], self._vx[i]), (self._x[j], self._vx[j]), h, since)
         y, vy = _hermite((self._y[i], self._vy[i]), (self._y[j], self._vy[j]), h, since)
         return x, y, vx, vy
+
+    def heading(self, t: float) -> float:
+        """Planned heading [rad] at the first pose not before ``t``, or at the last one."""
+        return self._yaws[min(bisect_left(self._times, t), len(self._yaws) - 1)]
 
     def _beyond(self, since: float) -> tuple[float, float, float, float]:
         vx, vy = self._vx[-1], self._vy[-1]

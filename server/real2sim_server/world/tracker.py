@@ -42,7 +42,8 @@ class Tracker:
     def command(self, motion: Motion, t: float) -> Command:
         """What to do in ``motion``, ``t`` seconds after the plan's start."""
         if t >= self.reference.end:
-            return Command(-GENTLE_BRAKING, self._steering(motion, *self._aim_after_end(motion)))
+            aim = _straight_on(motion, *self.reference.last_pose)
+            return Command(-GENTLE_BRAKING, self._steering(motion, *aim))
         x, y, vx, vy = self.reference.at(t + LOOKAHEAD)
         acceleration = _acceleration(motion, (x - motion.x, y - motion.y), (vx, vy))
         if math.hypot(x - motion.x, y - motion.y) < MIN_AIM:
@@ -56,23 +57,24 @@ class Tracker:
         return math.atan(self.wheelbase * 2 * left / (dx * dx + dy * dy))
 
     def _farther_aim(self, motion: Motion, t: float) -> tuple[float, float]:
-        """The first place of the plan after ``t`` that is far enough, or one beyond its end."""
+        """The first place of the plan after ``t`` that is far enough.
+
+        Where the plan stops before that, a place on the line straight on from where it stands.
+        """
         for _ in range(AIM_TRIES):
-            t += LOOKAHEAD
-            if t >= self.reference.end:
-                break
+            t = min(t + LOOKAHEAD, self.reference.end)
             x, y, _, _ = self.reference.at(t)
             if math.hypot(x - motion.x, y - motion.y) >= MIN_AIM:
                 return x, y
-        return self._aim_after_end(motion)
+        return _straight_on(motion, x, y, self.reference.heading(t))
 
-    def _aim_after_end(self, motion: Motion) -> tuple[float, float]:
-        """A place ahead on the straight line that leaves the last pose along its heading."""
-        x, y, yaw = self.reference.last_pose
-        dx, dy = math.cos(yaw), math.sin(yaw)
-        along = max((motion.x - x) * dx + (motion.y - y) * dy, 0.0)
-        reach = along + max(MIN_AIM, motion.speed * LOOKAHEAD)
-        return x + reach * dx, y + reach * dy
+
+def _straight_on(motion: Motion, x: float, y: float, yaw: float) -> tuple[float, float]:
+    """A place to aim at, on the line from (x, y) along ``yaw``."""
+    dx, dy = math.cos(yaw), math.sin(yaw)
+    along = max((motion.x - x) * dx + (motion.y - y) * dy, 0.0)
+    reach = along + max(MIN_AIM, motion.speed * LOOKAHEAD)
+    return x + reach * dx, y + reach * dy
 
 
 def _acceleration(

@@ -15,9 +15,9 @@ from real2sim_proto.drive import Control, PoseCommand, ResetSpec, SensorSpec, Tr
 from real2sim_proto.operations import Operation
 
 from ..edit import EditError, EditOutcome, ScenarioState, apply_operations, compose
+from ..edit.tracks import sample
 from ..render.types import Instance
 from ..scene import Scene
-from ..scene.rotation import quaternion_yaw
 from .agents import Agents
 from .contact import begun, ego_box, touching
 from .ego import Command, drive, logged_motion, placed
@@ -40,6 +40,9 @@ METRICS = {
     "collisions": "contacts begun since the start",
 }
 """Metrics of every observation, and what they say."""
+
+LOG_SPACING_US = 100_000
+"""Where there is no plan, the log is followed by poses this far apart at most [us]."""
 
 LEFT_LOG = 10.0
 """Beyond this distance from the recorded path an event says so [m]; images get poor there."""
@@ -239,10 +242,12 @@ class World:
         return self._tracker(plan.times_us, poses)
 
     def _follow_log(self) -> Tracker:
-        ego = self.scene.ego
-        rest = ego.times_us > self.t_us
-        yaws = quaternion_yaw(ego.quaternions[rest])
-        return self._tracker(ego.times_us[rest], np.column_stack([ego.positions[rest, :2], yaws]))
+        # Even spacing: some logs have poses milliseconds apart, whose differences are noise.
+        count = -(-(self.scene.end_us - self.t_us) // LOG_SPACING_US)
+        times = np.linspace(self.t_us, self.scene.end_us, count + 1).astype(np.int64)[1:]
+        transforms, _ = sample(self.scene.ego, times)
+        yaws = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
+        return self._tracker(times, np.column_stack([transforms[:, :2, 3], yaws]))
 
     def _tracker(self, times_us: ArrayLike, poses: ArrayLike) -> Tracker:
         reference = Reference(

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from real2sim_server.scene import Trajectory
+from real2sim_server.scene.rotation import multiply_quaternions, yaw_quaternion
+from real2sim_server.world import LoggedGround, LoggedPath
+from real2sim_server.world.route import command_ahead, route_ahead
+
+
+def along(xyz: list[tuple[float, float, float]], quaternions: np.ndarray) -> Trajectory:
+    return Trajectory(np.arange(len(xyz)) * 100_000, np.array(xyz), quaternions)
+
+
+def circle(radius: float, angle: float) -> Trajectory:
+    yaw = np.linspace(0, angle, 400)
+    side = np.sign(radius)
+    x, y = abs(radius) * np.sin(yaw), radius * (1 - np.cos(yaw))
+    return along(np.stack([x, y, 0 * x], axis=1), yaw_quaternion(side * yaw))
+
+
+def slope(*, pitch: float, roll: float) -> Trajectory:
+    """East along a plane that rises to the east by ``pitch`` and to the south by ``roll``."""
+    nose_up = np.array([math.cos(pitch / 2), 0, -math.sin(pitch / 2), 0])
+    banked = np.array([math.cos(roll / 2), math.sin(roll / 2), 0, 0])
+    attitude = multiply_quaternions(nose_up, banked)
+    way = np.arange(30.0)
+    positions = np.stack([way * math.cos(pitch), 0 * way, way * math.sin(pitch)], axis=1)
+    return along(positions, np.tile(attitude, (30, 1)))
+
+
+@given(s=st.floats(0.5, 28), offset=st.floats(-8, 8))
+def test_nearest_finds_distance_and_side(s, offset):
+    path = LoggedPath(circle(20.0, 1.5))
+    angle = s / 20
+    x, y = (20 - offset) * math.sin(angle), 20 - (20 - offset) * math.cos(angle)
+    found = path.nearest(x, y)
+
+    assert found.s == pytest.approx(s, abs=0.05)
+    assert found.offset == pytest.approx(offset, abs=0.01)
+    assert found.yaw == pytest.approx(angle, abs=0.01)
+
+
+def test_a_path_that_crosses_itself_is_followed_in_order():
+    eight = np.linspace(0, 2 * np.pi, 400)
+    x, y = 40 * np.sin(eight), 40 * np.sin(eight) * np.cos(eight)
+    yaw = np.arctan2(np.gradient(y), np.gradient(x))
+    path = LoggedPath(along(np.stack([x, y, 0 * x], axis=1), yaw_quaternion(yaw)))
+    half = path.length / 2
+
+    assert path.nearest(0.1, 0.0, near_s=half - 5).s == pytest.approx(half, abs=1)
+    assert path.nearest(0.1, 0.0, near_s=2.0).s == pytest.approx(0, abs=1)
+
+
+def test_a_vehicle_put_elsewhere_is_found_again():
+    path = LoggedPath(circle(100.0, 3.0))
+
+    assert path.nearest(100.0, 100.0, near_s=0.0).s == pytest.approx(50 * np.pi, abs=0.1)
+
+
+def test_a_vehicle_that_never_moved_has_a_path_along_its_heading():
+    path = LoggedPath(along([(1, 2, 3)] * 5, yaw_quaternion(np.full(5, np.pi / 2))))
+
+    assert path.length == pytest.approx(1.0)
+    assert path.nearest(0.5, 2.5).offset == pytest.approx(0.5)
+
+
+def test_noise_of_a_standing_vehicle_adds_no_way():
+    noise = np.random.default_rng(0).normal(scale=0.005, size=(100, 3))
+    path = LoggedPath(along(noise, np.tile([1.0, 0, 0, 0], (100, 1))))
+
+    assert path.length == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("x", "y"), [(10.0, 0.0), (5.0, 4.0), (20.0, -6.0)])
+def test_the_ground_is_the_plane_the_recorder_stood_on(x, y):
+    trajectory = slope(pitch=0.1, roll=0.05)
+    path = LoggedPath(trajectory)
+    normal = trajectory.transform(0)[:3, 2]
+    expected = -(normal[0] * x + normal[1] * y) / normal[2]
+
+    assert LoggedGround(path)(np.array([[x, y]]))[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_far_from_the_path_the_plane_is_not_extended():
+    ground = LoggedGround(LoggedPath(slope(pitch=0.0, roll=0.1)))
+    near, far = ground(np.array([[10.0, 10.0], [10.0, 50.0]]))
+
+    assert far == pytest.approx(near)
+
+
+@given(yaw=st.floats(-3.1, 3.1))
+def test_a_vehicle_stands_upright_on_the_slope_with_its_heading(yaw):
+    trajectory = slope(pitch=0.15, roll=-0.1)
+    path = LoggedPath(trajectory)
+    T = LoggedGround(path).stand(12.0, 3.0, yaw, path.nearest(12.0, 3.0))
+
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    np.testing.assert_allclose(T[:3, 2], trajectory.transform(0)[:3, 2], atol=1e-12)
+    assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw)
+
+
+def test_on_the_path_the_vehicle_stands_as_recorded():
+    trajectory = slope(pitch=0.15, roll=-0.1)
+    path = LoggedPath(trajectory)
+    recorded = trajectory.transform(1_000_000)
+    x, y = recorded[:2, 3]
+    yaw = math.atan2(recorded[1, 0], recorded[0, 0])
+
+    stood = LoggedGround(path).stand(x, y, yaw, path.nearest(x, y))
+    np.testing.assert_allclose(stood, recorded, atol=1e-9)
+
+
+def test_the_route_lies_on_the_recorded_path():
+    path = LoggedPath(circle(30.0, 2.5))
+    s, yaw = 15.0, 0.5
+    x, y = 30 * math.sin(yaw), 30 * (1 - math.cos(yaw))
+    route = route_ahead(path, s, x, y, yaw)
+
+    assert route.shape == (20, 2)
+    turns = 2.0 * np.arange(1, 21) / 30
+    expected = np.stack([30 * np.sin(turns), 30 * (1 - np.cos(turns))], axis=1)
+    np.testing.assert_allclose(route, expected, atol=0.02)
+
+
+def test_beyond_the_recording_the_route_goes_straight_on():
+    path = LoggedPath(circle(30.0, np.pi / 2))
+    route = route_ahead(path, path.length, 30.0, 30.0, np.pi / 2)
+
+    np.testing.assert_allclose(route[:, 0], 2.0 * np.arange(1, 21), atol=1e-6)
+    np.testing.assert_allclose(route[:, 1], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("radius", "command"), [(20, "left"), (-20, "right"), (200, "straight")])
+def test_the_command_says_which_way_the_path_turns(radius, command):
+    assert command_ahead(LoggedPath(circle(float(radius), 1.5)), 2.0) == command
+
+
+def test_headings_that_wrap_are_no_turn():
+    yaw = np.pi - 0.05 + np.linspace(0, 0.1, 200)
+    x = -np.arange(200.0)
+    path = LoggedPath(along(np.stack([x, 0 * x, 0 * x], axis=1), yaw_quaternion(yaw)))
+
+    assert command_ahead(path, 90.0) == "straight"
