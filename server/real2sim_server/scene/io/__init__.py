@@ -1,7 +1,7 @@
 """Scenes, assets and splats on disk."""
 
 from .bundle import load_asset, load_scene, save_asset, save_scene
-from .splats import import_splats, read_splats, write_ply
+from .splats import import_splats, read_splats, write_ply, write_splats
 from .summary import ObjectSummary, SceneSummary, read_scene_summary
 
 __all__ = [
@@ -15,4 +15,5 @@ __all__ = [
     "save_asset",
     "save_scene",
     "write_ply",
+    "write_splats",
 ]

@@ -46,8 +46,31 @@ def read_splats(path: str | PathLike[str]) -> GaussianCloud:
     for splat_format in FORMATS:
         if splat_format.recognises(head):
             return splat_format.read(file)
+    for splat_format in FORMATS:
+        if not splat_format.has_signature and file.name.lower().endswith(splat_format.suffix):
+            return splat_format.read(file)
     known = ", ".join(f.name for f in FORMATS)
     raise BundleError(f"{file}: not a ply nor any other known splat format; known are: {known}")
+
+
+def write_splats(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
+    """Write ``cloud`` in the format that the name ends with, atomically, in its own frame.
+
+    ``.compressed.ply``, ``.ply``, ``.spz`` (version 3) or ``.splat``; what each format rounds is
+    said at its class in :mod:`.formats`.
+
+    Raises:
+        SceneError: another ending, values that are not finite or out of range, or values the
+            format cannot hold.
+        OSError: the file cannot be written.
+    """
+    file = Path(path)
+    splat_format = next((f for f in FORMATS if file.name.lower().endswith(f.suffix)), None)
+    if splat_format is None:
+        endings = ", ".join(f.suffix for f in FORMATS)
+        raise SceneError(f"{file}: no splat format ends so; allowed are {endings}")
+    cloud.check_values(f"cloud for {file}")
+    splat_format.write(cloud, file)
 
 
 def write_ply(cloud: GaussianCloud, path: str | PathLike[str]) -> None:

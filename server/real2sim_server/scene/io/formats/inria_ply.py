@@ -30,6 +30,8 @@ class InriaPly:
     """
 
     name = "INRIA ply"
+    suffix = ".ply"
+    has_signature = True
 
     def recognises(self, head: bytes) -> bool:
         """Whether ``head`` is that of a PLY file; the compressed kind is asked before."""
@@ -53,6 +55,10 @@ class InriaPly:
             opacities=opacities,
             sh=_harmonics(path, vertex),
         )
+
+    def write(self, cloud: GaussianCloud, path: Path) -> None:
+        """Write ``cloud``; see :func:`write_ply`."""
+        write_ply(cloud, path)
 
 
 def write_ply(cloud: GaussianCloud, path: Path) -> None:

@@ -10,14 +10,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
 from ...harmonics import SH_C0
 from ...rotation import Float
+from ..atomic import atomic_file
 from ..ply import read_ply_elements
-from .types import build_cloud, columns, require_properties
+from .morton import morton_order
+from .types import build_cloud, columns, host_array, require_properties
 
 CHUNK_SIZE = 256
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -29,10 +32,26 @@ LOW_COLOUR, HIGH_COLOUR = ("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b
 Words = NDArray[np.uint32]
 
 
+CHUNK_FIELDS = LOW_POSITION + HIGH_POSITION + LOW_SCALE + HIGH_SCALE + LOW_COLOUR + HIGH_COLOUR
+
+LARGEST_LOG_SCALE = 20.0
+"""Log scales are clamped to plus or minus this, as in the format's own writer."""
+
+
 class PlayCanvasPly:
-    """Elements ``chunk`` (12 or 18 floats), ``vertex`` (4 uint32) and, for degree > 0, ``sh``."""
+    """Elements ``chunk`` (12 or 18 floats), ``vertex`` (4 uint32) and, for degree > 0, ``sh``.
+
+    Axes: those of the splats it was made of, mostly y down. Both ways keep the coordinates.
+
+    Quantisation: within a chunk of 256, positions and log scales are cut into 2047 (x, z) and
+    1023 (y) steps of the chunk's extent, colours of the first harmonic into 255; opacities are
+    multiples of 1/255; the three small parts of a quaternion are multiples of sqrt(2)/1023;
+    further harmonics are clamped to [-4, 4] and cut into 256 bins.
+    """
 
     name = "PlayCanvas compressed ply"
+    suffix = ".compressed.ply"
+    has_signature = True
 
     def recognises(self, head: bytes) -> bool:
         """Whether ``head`` is that of a PLY file with packed positions."""
@@ -61,6 +80,26 @@ class PlayCanvasPly:
             opacities=rgba[:, 3],
             sh=np.concatenate([first, _rest(path, elements.get("sh"), len(vertex))], axis=1),
         )
+
+    def write(self, cloud: GaussianCloud, path: Path) -> None:
+        """Write ``cloud`` in Z-curve order, so that chunks are small; the order is not kept.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        cloud = cloud.select(torch.from_numpy(morton_order(host_array(cloud.means))))
+        chunks, words = _packed(cloud)
+        sh = _packed_rest(host_array(cloud.sh[:, 1:]))
+        lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
+        lines += [f"property float {name}" for name in CHUNK_FIELDS]
+        lines += [f"element vertex {len(cloud)}", *(f"property uint {name}" for name in PACKED)]
+        if sh.shape[1]:
+            lines.append(f"element sh {len(cloud)}")
+            lines += [f"property uchar f_rest_{i}" for i in range(sh.shape[1])]
+        with atomic_file(path) as file:
+            file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
+            for part in (chunks.astype("<f4"), words.astype("<u4"), sh):
+                file.write(part.tobytes())
 
     def _checked(
         self, path: Path, elements: dict[str, NDArray[np.void]]
@@ -131,4 +170,63 @@ def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> Float:
     codes = columns(path, sh, names)
     # The writer cuts 256 equal bins; their middles come back, and the ends where it clamped.
     fraction = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
-    return ((fraction - 0.5) * 8).reshape(count, 3, -1).transpose(0, 2, 1)
+    return ((fraction - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+
+
+def _packed(cloud: GaussianCloud) -> tuple[Float, Words]:
+    """Bounds [C, 18] of all chunks in the order of ``CHUNK_FIELDS``, and words [N, 4]."""
+    log_scales = np.log(host_array(cloud.scales))
+    position, low_position, high_position = _fractions(host_array(cloud.means))
+    scale, low_scale, high_scale = _fractions(
+        np.clip(log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
+    )
+    colour, low_colour, high_colour = _fractions(0.5 + SH_C0 * host_array(cloud.sh[:, 0]))
+    rgba = np.concatenate([colour, host_array(cloud.opacities)[:, None]], axis=1)
+    words = [
+        _pack(position, (11, 10, 11)),
+        _pack_rotation(host_array(cloud.quats)),
+        _pack(scale, (11, 10, 11)),
+        _pack(rgba, (8, 8, 8, 8)),
+    ]
+    bounds = [low_position, high_position, low_scale, high_scale, low_colour, high_colour]
+    return np.concatenate(bounds, axis=1), np.stack(words, axis=1)
+
+
+def _fractions(values: Float) -> tuple[Float, Float, Float]:
+    """Values [N, 3] as fractions between the bounds [C, 3] of their chunks, and these bounds."""
+    starts = np.arange(0, len(values), CHUNK_SIZE)
+    if not len(starts):
+        return values, np.empty((0, 3)), np.empty((0, 3))
+    # The file holds bounds as float32, so fractions refer to what will be read back.
+    low = np.minimum.reduceat(values, starts).astype(np.float32).astype(np.float64)
+    high = np.maximum.reduceat(values, starts).astype(np.float32).astype(np.float64)
+    chunk_of = np.arange(len(values)) // CHUNK_SIZE
+    span = (high - low)[chunk_of]
+    fractions = (values - low[chunk_of]) / np.where(span > 0, span, 1.0)
+    return np.clip(fractions, 0.0, 1.0), low, high
+
+
+def _pack(fractions: Float, bits: tuple[int, ...]) -> Words:
+    """One word of each row of fractions; the first component goes to the highest bits."""
+    words = np.zeros(len(fractions), dtype=np.uint32)
+    for column, width in enumerate(bits):
+        codes = np.rint(fractions[:, column] * (2**width - 1)).astype(np.uint32)
+        words = words << np.uint32(width) | codes
+    return words
+
+
+def _pack_rotation(quats: Float) -> Words:
+    """Inverse of :func:`_unpack_rotation`."""
+    place = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    positive = np.where(quats[rows, place] < 0, -1.0, 1.0)[:, None] * quats
+    others = np.array([[k for k in range(4) if k != p] for p in range(4)])[place]
+    small = np.take_along_axis(positive, others, axis=1) / np.sqrt(2) + 0.5
+    words: Words = place.astype(np.uint32) << np.uint32(30)
+    return words | _pack(np.clip(small, 0, 1), (10, 10, 10))
+
+
+def _packed_rest(rest: Float) -> NDArray[np.uint8]:
+    """Bytes [N, 3 (K - 1)] of harmonics [N, K - 1, 3], channel by channel."""
+    codes = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(codes.transpose(0, 2, 1).reshape(len(rest), 3 * rest.shape[1]))

@@ -24,14 +24,33 @@ class SplatFormat(Protocol):
     def name(self) -> str:
         """What the format is called in messages."""
 
+    @property
+    def suffix(self) -> str:
+        """End of its file names, lower case, with the dot; chooses the format to write."""
+
+    @property
+    def has_signature(self) -> bool:
+        """Whether the content tells the format; the others are told by ``suffix``."""
+
     def recognises(self, head: bytes) -> bool:
-        """Whether a file that starts with ``head`` (up to 64 KiB) is of this format."""
+        """Whether a file that starts with ``head`` (up to 64 KiB) is of this format.
+
+        Always false where there is no signature.
+        """
 
     def read(self, path: Path) -> GaussianCloud:
         """The Gaussians of a file, in the file's own frame and units.
 
         Raises:
             BundleError: naming the file and the reason.
+        """
+
+    def write(self, cloud: GaussianCloud, path: Path) -> None:
+        """Write Gaussians of checked values, atomically, in the frame they are in.
+
+        Raises:
+            SceneError: for values the format cannot hold.
+            OSError: the file cannot be written.
         """
 
 
@@ -71,6 +90,11 @@ def columns(path: Path, records: NDArray[np.void], names: tuple[str, ...]) -> Fl
     for index, name in enumerate(names):
         values[:, index] = column(path, records, name)
     return values
+
+
+def host_array(tensor: torch.Tensor) -> Float:
+    """Values of a tensor as float64 on the host."""
+    return tensor.detach().cpu().numpy().astype(np.float64)
 
 
 def build_cloud(
