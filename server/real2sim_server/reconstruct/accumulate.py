@@ -16,6 +16,11 @@ from .options import InitialiseOptions
 from .points import PointSet, path_distance, thin, voxel_levels
 
 HALF_TURN_US = 50_000
+EGO_MARGIN = 0.45
+"""Returns this close beside the recording vehicle are its own mirrors [m]."""
+SHELL = 0.3
+"""Above the road, what is this close to a box is dropped: boxes are not exact, and what sticks
+out of a moving vehicle would leave a smear [m]."""
 THIN_EVERY = 6_000_000
 """Points that may pile up before they are thinned, so that memory does not follow the drive."""
 
@@ -41,7 +46,8 @@ def accumulate(
     A point belongs to a tracked object when, at the moment it was measured, it lay inside the
     box enlarged by ``box_margin`` and above ``ground_clearance`` over the box bottom. Below that,
     what is level with the bottom is road; the rest, tyres and underbody, is dropped, and so are
-    returns from the recording vehicle itself. Everything else is background.
+    other points within SHELL of a box and returns from the recording vehicle itself. Everything
+    else is background.
     """
     path = drive_path(log)
     background: list[PointSet] = []
@@ -107,7 +113,7 @@ def _usable(
     on_vehicle = (
         (points[:, 0] > -0.3 * length)
         & (points[:, 0] < 0.85 * length)
-        & (np.abs(points[:, 1]) < width / 2 + 0.15)
+        & (np.abs(points[:, 1]) < width / 2 + EGO_MARGIN)
         & (points[:, 2] > 0.1)
         & (points[:, 2] < height + 0.6)
     )
@@ -124,6 +130,7 @@ def _assign(
     in_world: Float, offset_us: Float, log: DrivingLog, frame: int, options: InitialiseOptions
 ) -> tuple[NDArray[np.int64], Float]:
     """Index of the track each point belongs to, or _BACKGROUND, and its position in that box."""
+    in_world = np.asfortranarray(in_world)
     owner = np.full(len(in_world), _BACKGROUND)
     local = np.zeros_like(in_world)
     nearest = np.full(len(in_world), np.inf)
@@ -131,13 +138,13 @@ def _assign(
     for index, track in enumerate(log.tracks):
         if not track.trajectory.covers(t_us):
             continue
-        chosen, in_box = _near_box(in_world, offset_us, track, t_us, options.box_margin)
+        chosen, in_box = _near_box(in_world, offset_us, track, t_us)
         half = np.array(track.size) / 2
         outside = (np.abs(in_box) - half).max(axis=1)
         height = in_box[:, 2] + half[2]
         inside = outside <= options.box_margin
-        under = inside & (height > ROAD_BAND) & (height <= options.ground_clearance)
-        owner[chosen[under & (owner[chosen] == _BACKGROUND)]] = _DROPPED
+        stray = (outside <= SHELL) & (height > ROAD_BAND) & (owner[chosen] == _BACKGROUND)
+        owner[chosen[stray]] = _DROPPED
         mine = inside & (height > options.ground_clearance) & (outside < nearest[chosen])
         owner[chosen[mine]] = index
         local[chosen[mine]] = in_box[mine]
@@ -146,14 +153,14 @@ def _assign(
 
 
 def _near_box(
-    in_world: Float, offset_us: Float, track: ObjectTrack, t_us: int, margin: float
+    in_world: Float, offset_us: Float, track: ObjectTrack, t_us: int
 ) -> tuple[NDArray[np.int64], Float]:
     """Indices of points near the box and their coordinates in it when they were measured."""
     centre = track.trajectory.pose(t_us)[0]
     velocity = track.trajectory.velocity(t_us)
-    reach = np.linalg.norm(track.size) / 2 + margin + np.linalg.norm(velocity) * 0.1
-    offset = in_world - centre
-    chosen = np.flatnonzero((offset**2).sum(axis=1) < reach**2)
+    reach = np.linalg.norm(track.size) / 2 + SHELL + np.linalg.norm(velocity) * 0.1
+    chosen = np.flatnonzero(np.abs(in_world[:, 0] - centre[0]) < reach)
+    chosen = chosen[np.abs(in_world[chosen, 1] - centre[1]) < reach]
     early, late = (
         invert_transform(pose_around(track.trajectory, t_us + sign * HALF_TURN_US))
         for sign in (-1, 1)

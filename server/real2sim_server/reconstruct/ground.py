@@ -62,35 +62,51 @@ class GroundSurface:
         return inside & self.is_ground[index[:, 0], index[:, 1]]
 
 
-def fit_ground(
-    points: NDArray[np.float32],
-    T_world_vehicle: Float,
-    footprints: Float,
-) -> GroundSurface:
+def fit_ground(points: Float, T_world_vehicle: Float, boxes: BoxBottoms) -> GroundSurface:
     """Fit the ground, coarse to fine, starting from where the vehicle drove.
 
     On each level a cell takes a low quantile of those of its points that agree with the level
-    before; cells without any are filled from their neighbours.
+    before. Cells without any take the bottom of a box that stood there, or are filled from their
+    neighbours.
 
     Args:
         points: [N, 3], background in the world [m].
         T_world_vehicle: [P, 4, 4] poses of the vehicle, whose origin moves on the ground.
-        footprints: [M, 4, 2] corners of boxes that stand on the ground and hide it [m].
+        boxes: what stands on the ground and hides it.
     """
     path = T_world_vehicle[:, :2, 3]
     coarsest = LEVELS[0][0]
     low = np.floor((path.min(axis=0) - REACH) / coarsest) * coarsest
     size = np.ceil((path.max(axis=0) + REACH - low) / coarsest).astype(int) * coarsest
-    within = ((points[:, :2] >= low) & (points[:, :2] < low + size)).all(axis=1)
-    points = points[within].astype(np.float64)
-    distance, expected = _driven_plane(points, T_world_vehicle)
+    points, bottoms = (_within(p, low, size) for p in (points, boxes.points))
     surface = None
     for cell, tolerance, growth in LEVELS:
-        if surface is not None:
-            expected = surface.height_at(points[:, :2])
-        agrees = np.abs(points[:, 2] - expected) < tolerance + growth * distance
-        surface = _fit_level(points[agrees], low, size, cell, path)
-    return _close(surface, path, footprints)
+        agreeing = [
+            p[_agrees(p, surface, T_world_vehicle, tolerance, growth)] for p in (points, bottoms)
+        ]
+        surface = _fit_level(*agreeing, _Grid(low, size, cell), path)
+    assert surface is not None
+    return _close(surface, boxes.footprints)
+
+
+def _within(points: Float, low: Float, size: Float) -> Float:
+    inside = ((points[:, :2] >= low) & (points[:, :2] < low + size)).all(axis=1)
+    return points[inside].astype(np.float64)
+
+
+def _agrees(
+    points: Float,
+    surface: GroundSurface | None,
+    T_world_vehicle: Float,
+    tolerance: float,
+    growth: float,
+) -> NDArray[np.bool_]:
+    """Which points [N] lie near the surface of the level before, or near the driven plane."""
+    if surface is not None:
+        expected = surface.height_at(points[:, :2])
+        return np.abs(points[:, 2] - expected) < tolerance
+    distance, expected = _driven_plane(points, T_world_vehicle)
+    return np.abs(points[:, 2] - expected) < tolerance + growth * distance
 
 
 def _driven_plane(points: Float, T_world_vehicle: Float) -> tuple[Float, Float]:
@@ -104,24 +120,41 @@ def _driven_plane(points: Float, T_world_vehicle: Float) -> tuple[Float, Float]:
     return distance, origin[:, 2] - offset / normal[:, 2]
 
 
-def _fit_level(points: Float, low: Float, size: Float, cell: float, path: Float) -> GroundSurface:
-    shape = np.round(size / cell).astype(int)
-    index = np.floor((points[:, :2] - low) / cell).astype(np.int64)
-    flat = index[:, 0] * shape[1] + index[:, 1]
-    residual = np.zeros(shape[0] * shape[1], dtype=np.float32)
-    counts = np.zeros(len(residual))
-    if len(flat):
-        order = np.lexsort((points[:, 2], flat))
-        cells, starts, sizes = np.unique(flat[order], return_index=True, return_counts=True)
-        # Low, because what stands on the ground is never below it; not lowest, because of noise.
-        residual[cells] = points[order][starts + (sizes * 0.35).astype(np.int64), 2]
-        counts[cells] = sizes
-    measured = (counts > 0).reshape(shape)
-    weights = np.minimum(counts / 3, 1).astype(np.float32).reshape(shape)
-    heights = pull_push(residual.reshape(*shape, 1), weights)[..., 0]
-    centres = low + (np.indices(shape).reshape(2, -1).T + 0.5) * cell
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    low: Float
+    size: Float
+    cell: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        x, y = np.round(self.size / self.cell).astype(int)
+        return int(x), int(y)
+
+    def cells(self, xy: Float) -> NDArray[np.int64]:
+        index = np.floor((xy - self.low) / self.cell).astype(np.int64)
+        return index[:, 0] * self.shape[1] + index[:, 1]
+
+
+def _fit_level(points: Float, bottoms: Float, grid: _Grid, path: Float) -> GroundSurface:
+    shape = grid.shape
+    heights = np.zeros(shape[0] * shape[1], dtype=np.float32)
+    weights = np.zeros(len(heights), dtype=np.float32)
+    under = grid.cells(bottoms[:, :2])
+    heights[under] = bottoms[:, 2]
+    weights[under] = 1
+    cell = grid.cells(points[:, :2])
+    order = np.lexsort((points[:, 2], cell))
+    cells, starts, sizes = np.unique(cell[order], return_index=True, return_counts=True)
+    # Low, because what stands on the ground is never below it; not lowest, because of noise.
+    heights[cells] = points[order][starts + (sizes * 0.35).astype(np.int64), 2]
+    weights[cells] = np.minimum(sizes / 3, 1)
+    filled = pull_push(heights.reshape(*shape, 1), weights.reshape(shape))[..., 0]
+    centres = grid.low + (np.indices(shape).reshape(2, -1).T + 0.5) * grid.cell
     distance = _path_distance(centres, path).reshape(shape)
-    return GroundSurface(low, cell, heights, measured, distance)
+    measured = np.zeros(len(heights), dtype=np.bool_)
+    measured[cells] = True
+    return GroundSurface(grid.low, grid.cell, filled, measured.reshape(shape), distance)
 
 
 def _path_distance(xy: Float, path: Float) -> NDArray[np.float32]:
@@ -131,7 +164,7 @@ def _path_distance(xy: Float, path: Float) -> NDArray[np.float32]:
     return np.asarray(distance, dtype=np.float32)
 
 
-def _close(surface: GroundSurface, path: Float, footprints: Float) -> GroundSurface:
+def _close(surface: GroundSurface, footprints: Float) -> GroundSurface:
     """Add gaps between rings, what boxes hide, and what is under the vehicle itself."""
     import cv2
 
@@ -157,20 +190,45 @@ def _close(surface: GroundSurface, path: Float, footprints: Float) -> GroundSurf
     )
 
 
-def box_footprints(
+@dataclass(frozen=True, eq=False)
+class BoxBottoms:
+    """Where tracked boxes stand on the ground, over all times.
+
+    Attributes:
+        points: [N, 3] float64, spread over the bottoms, world [m].
+        footprints: [M, 4, 2] float64, corners of the bottoms, enlarged [m].
+    """
+
+    points: Float
+    footprints: Float
+
+
+def box_bottoms(
     tracks: tuple[ObjectTrack, ...], times_us: NDArray[np.int64], *, margin: float = 0.4
-) -> Float:
-    """Corners [M, 4, 2] [m] of all boxes at all times at which they exist, enlarged."""
-    footprints = []
+) -> BoxBottoms:
+    """Bottoms of all boxes at all times at which they exist."""
+    points, footprints = [np.zeros((0, 3))], [np.zeros((0, 4, 2))]
     for track in tracks:
-        half_x, half_y = track.size[0] / 2 + margin, track.size[1] / 2 + margin
-        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [half_x, half_y]
-        corners = np.concatenate([signs, np.zeros((4, 1))], axis=1)
-        for t_us in times_us:
-            if track.trajectory.covers(int(t_us)):
-                pose = track.trajectory.transform(int(t_us))
-                footprints.append(apply_transform(pose, corners)[:, :2])
-    return np.array(footprints).reshape(-1, 4, 2)
+        times = [int(t) for t in times_us if track.trajectory.covers(int(t))]
+        for pose in (track.trajectory.transform(t) for t in times):
+            points.append(apply_transform(pose, _bottom_grid(track.size)))
+            corners = _bottom_corners(track.size, margin)
+            footprints.append(apply_transform(pose, corners)[None, :, :2])
+    return BoxBottoms(np.concatenate(points), np.concatenate(footprints))
+
+
+def _bottom_corners(size: tuple[float, float, float], margin: float) -> Float:
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
+    corners = np.zeros((4, 3))
+    corners[:, :2] = signs * (np.array(size[:2]) / 2 + margin)
+    return corners
+
+
+def _bottom_grid(size: tuple[float, float, float]) -> Float:
+    step = LEVELS[-1][0]
+    x, y = (np.arange(-s / 2 + step / 2, s / 2, step) for s in size[:2])
+    grid = np.stack([g.ravel() for g in np.meshgrid(x, y, indexing="ij")], axis=1)
+    return np.concatenate([grid, np.full((len(grid), 1), -size[2] / 2)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from ..logs import DrivingLog, ObjectTrack
 from ..scene import GaussianCloud, Scene, SceneObject, Sky
 from ..scene.harmonics import SH_C0
 from .accumulate import Accumulation, accumulate, drive_path
-from .ground import GroundSurface, box_footprints, fit_ground, spread_ground
-from .object_shape import add_box_surface
+from .ground import GroundSurface, box_bottoms, fit_ground, spread_ground
+from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .options import InitialiseOptions, ReconstructError
 from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
 from .sky_map import SkySamples
@@ -31,6 +31,7 @@ from .views import Placed, View, chosen_frames, gather_views
 OPACITY = 0.95
 ABOVE_GROUND = 0.1
 """Points this close to the ground surface are replaced by it [m]."""
+UNDERSIDE_COLOUR = 0.06
 SKY_FRAMES = 15
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
@@ -43,6 +44,7 @@ class _Parts:
     surfels: Surfels
     intensity: NDArray[np.float32]
     instance: NDArray[np.uint16]
+    is_underside: NDArray[np.bool_]
     ground_count: int
 
 
@@ -95,8 +97,8 @@ def initialise_scene(
 
 def _fit_ground(log: DrivingLog, background: PointSet) -> GroundSurface:
     poses = np.array([log.ego.transform(int(t)) for t in log.frame_times_us])
-    footprints = box_footprints(log.tracks, log.frame_times_us)
-    return fit_ground(background.points, poses, footprints)
+    boxes = box_bottoms(log.tracks, log.frame_times_us)
+    return fit_ground(background.points.astype(np.float64), poses, boxes)
 
 
 def _shape(
@@ -116,13 +118,21 @@ def _shape(
     surfels = [ground, fit_surfels(above.points, largest=largest)]
     intensity = [np.zeros(len(ground), np.float32), above.intensity]
     instance = [np.zeros(len(ground) + len(above), np.uint16)]
+    is_underside = [np.zeros(len(ground) + len(above), np.bool_)]
     for index, track in enumerate(log.tracks):
         points = _object_points(measured.objects[track.object_id], track, options)
-        surfels.append(fit_surfels(points.points, largest=0.1, smallest=0.004))
-        intensity.append(points.intensity)
-        instance.append(np.full(len(points), index + 1, np.uint16))
+        body = fit_surfels(points.points, largest=0.1, smallest=0.004)
+        plate = underside(track.size)
+        surfels += [body, plate]
+        intensity += [points.intensity, np.zeros(len(plate), np.float32)]
+        instance.append(np.full(len(body) + len(plate), index + 1, np.uint16))
+        is_underside.append(np.repeat([False, True], [len(body), len(plate)]))
     return _Parts(
-        Surfels.join(surfels), np.concatenate(intensity), np.concatenate(instance), len(ground)
+        Surfels.join(surfels),
+        np.concatenate(intensity),
+        np.concatenate(instance),
+        np.concatenate(is_underside),
+        len(ground),
     )
 
 
@@ -143,10 +153,12 @@ def _above_ground(background: PointSet, surface: GroundSurface) -> PointSet:
 
 
 def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOptions) -> PointSet:
-    thinned = thin_to(points, options.object_voxel, options.max_object)
-    if len(thinned) < options.min_object_points:
-        return add_box_surface(thinned, track.size)
-    return thinned
+    """Thinned points of an object, its unseen parts completed."""
+    thinned = thin_to(points, options.object_voxel, options.max_object // 2)
+    if track.size[0] >= VEHICLE_LENGTH:
+        thinned = mirrored(thinned, voxel=options.object_voxel)
+    completed = complete_body(thinned, track.size, track.category)
+    return thin_to(completed, options.object_voxel, options.max_object)
 
 
 def _look(
@@ -198,7 +210,9 @@ def _fill_unseen(
 def _fill_objects(
     log: DrivingLog, parts: _Parts, colours: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    members = [np.flatnonzero(parts.instance == i + 1) for i in range(len(log.tracks))]
+    """Fill each object's body from itself, then its underside, in place."""
+    bodies = ~parts.is_underside
+    members = [np.flatnonzero((parts.instance == i + 1) & bodies) for i in range(len(log.tracks))]
     if not members:
         return colours
     relative = np.zeros(len(colours), dtype=np.float32)
@@ -213,6 +227,7 @@ def _fill_objects(
         mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
         likely = prior.colour(relative[mine], parts.intensity[mine])
         colours[mine] = fill_from_neighbours(points, mirrored, now_known, likely)
+    colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
     return colours
 
 

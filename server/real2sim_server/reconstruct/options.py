@@ -23,7 +23,6 @@ class InitialiseOptions:
         max_range: LiDAR points farther from the sensor are dropped [m].
         box_margin: how far outside its box a point still belongs to an object [m] (mirrors).
         ground_clearance: height above the box bottom below which points are road, not object [m].
-        min_object_points: objects with fewer points get a coarse box surface besides.
         max_colour_frames: at most so many frames, evenly spread, give colours.
         samples: best views that are averaged for the colour of a Gaussian.
         sky_resolution: edge of a face of the sky's cube map [px].
@@ -33,7 +32,7 @@ class InitialiseOptions:
     """
 
     max_background: int = 600_000
-    max_object: int = 40_000
+    max_object: int = 60_000
     voxel: float = 0.05
     voxel_per_metre: float = 0.004
     object_voxel: float = 0.025
@@ -41,13 +40,12 @@ class InitialiseOptions:
     max_range: float = 120.0
     box_margin: float = 0.12
     ground_clearance: float = 0.12
-    min_object_points: int = 60
     max_colour_frames: int = 60
     samples: int = 8
     sky_resolution: int = 512
 
     def __post_init__(self) -> None:
-        may_be_zero = {"voxel_per_metre", "box_margin", "ground_clearance", "min_object_points"}
+        may_be_zero = {"voxel_per_metre", "box_margin", "ground_clearance"}
         for name, value in asdict(self).items():
             if not (value > 0 or (value == 0 and name in may_be_zero)) or value == float("inf"):
                 raise ReconstructError(f"{name}={value!r} of InitialiseOptions must be positive")

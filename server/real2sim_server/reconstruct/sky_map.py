@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 
 from ..scene import Sky
 from ..scene.sky import face_directions
-from .pull_push import pull_push
 from .views import SHRINK, View
 
 SLOTS = 15
 """Samples of which the median is taken for a direction."""
 PANORAMA = (256, 512)
-GROUND_ELEVATION = -0.15
+ZENITH = np.array([0.75, 0.82, 0.9])
+"""Colour of a sky that was never seen."""
+FADE = 1 / 24
+"""Share of a turn over which a seen colour loses its say."""
+GROUND_ELEVATION = -0.03
 """Below this elevation [rad] directions are given the colour of the ground."""
 
 
@@ -99,21 +102,43 @@ def _panorama(
     known: NDArray[np.bool_],
     ground_colour: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Elevation x azimuth image [H, W, 3] filled from the known texels and the ground below."""
+    """Elevation x azimuth image [H, W, 3] that extends the known texels all around."""
     height, width = PANORAMA
     row, column = _panorama_place(directions[known])
     flat = row.astype(np.int64) * width + column.astype(np.int64)
-    counts = np.bincount(flat, minlength=height * width)
+    counts = np.bincount(flat, minlength=height * width).reshape(height, width)
     sums = np.stack([np.bincount(flat, texels[known, c], height * width) for c in range(3)], -1)
-    values = (sums / np.maximum(counts, 1)[:, None]).reshape(height, width, 3)
-    weights = (counts > 0).astype(np.float32).reshape(height, width)
+    values = sums.reshape(height, width, 3) / np.maximum(counts, 1)[..., None]
     elevation = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
-    below = elevation < GROUND_ELEVATION
-    values[below] = np.where(weights[below][..., None] > 0, values[below], ground_colour)
-    weights[below] = 1
-    # Three turns side by side, so that the fill knows no seam at the back.
-    tripled = pull_push(np.tile(values.astype(np.float32), (1, 3, 1)), np.tile(weights, (1, 3)))
-    return tripled[:, width : 2 * width]
+    seen = np.flatnonzero((counts > 0).any(axis=1) & (elevation > 0))
+    panorama = np.empty((height, width, 3))
+    for r in range(height):
+        if elevation[r] < GROUND_ELEVATION or len(seen) == 0:
+            panorama[r] = ground_colour if elevation[r] < 0 else ZENITH
+        else:
+            # What was never seen looks like what was seen at the same elevation.
+            nearest = int(seen[np.abs(seen - r).argmin()])
+            panorama[r] = _around(values[nearest], counts[nearest] > 0)
+    return _softened(panorama)
+
+
+def _around(row: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """A closed ring of colours [W, 3]: from the nearest known ones, fading to their mean."""
+    width = len(row)
+    place = np.flatnonzero(known)
+    gap = np.abs(np.arange(width)[:, None] - place)
+    gap = np.minimum(gap, width - gap)
+    trust = np.exp(-gap.min(axis=1) / (FADE * width))[:, None]
+    return trust * row[place[gap.argmin(axis=1)]] + (1 - trust) * row[place].mean(axis=0)
+
+
+def _softened(panorama: NDArray[np.float64]) -> NDArray[np.float32]:
+    import cv2
+
+    width = panorama.shape[1]
+    # Three turns side by side, so that there is no seam at the back.
+    blurred = cv2.GaussianBlur(np.tile(panorama, (1, 3, 1)).astype(np.float32), (0, 0), 2)
+    return blurred[:, width : 2 * width]
 
 
 def _panorama_place(directions: NDArray[np.float32]) -> tuple[NDArray, NDArray]:

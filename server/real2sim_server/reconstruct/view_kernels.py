@@ -1,7 +1,8 @@
 """Compiled loops over Gaussians in one camera image: projection, depth, visibility, samples.
 
-Every loop writes only to its own Gaussian or runs on one thread, so results do not depend on the
-number of threads.
+Loops run over a range of Gaussians and write only to those, so ranges can be spread over threads
+and the result does not depend on how many there are. The kernels release the GIL; Numba's own
+``parallel`` would take several times longer to compile.
 """
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -10,14 +11,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
 """Half-width of the largest footprint in the depth image [px]."""
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def to_camera(means, normals, instance, transforms, present, in_camera, turned):
     """Write positions and normals in the camera frame; z = 0 for instances that are absent.
 
@@ -28,7 +29,7 @@ def to_camera(means, normals, instance, transforms, present, in_camera, turned):
         present: [I] bool.
         in_camera, turned: [N, 3] float32, written.
     """
-    for i in prange(means.shape[0]):
+    for i in range(means.shape[0]):
         k = instance[i]
         if not present[k]:
             in_camera[i, 2] = np.float32(0.0)
@@ -115,7 +116,7 @@ def enter_boxes(T_box_camera, half, boxes, K, first, first_box, second):
                     second[py, px] = enter
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True)
 def visible_weight(x, y, z, nx, ny, nz, px, py, K, depth):
     """0 where the disk through (x, y, z) is hidden, 0.15 at its own silhouette, else 1."""
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -145,7 +146,7 @@ def visible_weight(x, y, z, nx, ny, nz, px, py, K, depth):
     return weight
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def gather_samples(
     in_camera,
     turned,
@@ -174,7 +175,7 @@ def gather_samples(
     """
     height, width = levels[0].shape[0], levels[0].shape[1]
     small = K / np.float32(shrink)
-    for i in prange(in_camera.shape[0]):
+    for i in range(in_camera.shape[0]):
         x, y, z = in_camera[i, 0], in_camera[i, 1], in_camera[i, 2]
         if z < NEAR:
             continue
@@ -193,7 +194,7 @@ def gather_samples(
             continue
         cosine = abs(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
         size = K[0] * footprints[i] / z
-        weight *= (np.float32(0.1) + cosine) * min(size, np.float32(4.0))
+        weight *= (np.float32(0.05) + cosine) * size * size
         worst = 0
         for s in range(1, weights.shape[1]):
             if weights[i, s] < weights[i, worst]:
@@ -210,7 +211,7 @@ def gather_samples(
             colours[i, worst, c] = sample(levels[level], u * scale, v * scale, c)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True)
 def sample(image, u, v, channel):
     """Bilinear value of one channel at (u, v) [px], rounded; pixel centres lie at +0.5."""
     height, width = image.shape[0], image.shape[1]
@@ -224,7 +225,7 @@ def sample(image, u, v, channel):
     return np.uint8(top * (1 - fy) + bottom * fy + 0.5)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def robust_mean(colours, weights, result, known):
     """Weighted mean of the samples that agree with their weighted median, channel by channel.
 
@@ -234,7 +235,7 @@ def robust_mean(colours, weights, result, known):
         known: [N] bool, written.
     """
     slots = weights.shape[1]
-    for i in prange(weights.shape[0]):
+    for i in range(weights.shape[0]):
         total = np.float32(0.0)
         for s in range(slots):
             total += weights[i, s]
@@ -248,10 +249,11 @@ def robust_mean(colours, weights, result, known):
                 if abs(np.float32(colours[i, s, c]) - median) <= 24:
                     value += weights[i, s] * np.float32(colours[i, s, c])
                     share += weights[i, s]
+            # share is never 0: the median itself is among the samples.
             result[i, c] = value / (share * np.float32(255.0))
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True)
 def weighted_median(values, weights, total):
     """The value below and above which lies half of the weight."""
     best = np.float32(0.0)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,9 @@ SHRINK = 2
 PYRAMID = 4
 BOX_MARGIN = 0.15
 """Boxes hide what is behind them with this margin to the sides and the top [m]."""
+
+_Result = TypeVar("_Result")
+_BoxDepths = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +92,12 @@ class ColourSamples:
             [np.eye(4) if pose is None else T_camera_world @ pose for pose in poses]
         )
         present = np.array([pose is not None for pose in poses])
-        kernels.to_camera(
-            self._means, self._normals, self._placed.instance,
-            transforms[:, :3].astype(np.float32), present, self._in_camera, self._turned,
-        )  # fmt: skip
+        self._project(transforms, present)
         k = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]], np.float32)
         shape = (-(-camera.height // SHRINK), -(-camera.width // SHRINK))
-        depth = np.full(shape, np.inf, dtype=np.float32)
-        kernels.splat_depth(self._in_camera, self._turned, self._radii, k / SHRINK, depth)
+        depth = self._depth(k / np.float32(SHRINK), shape)
         boxes = _box_depths(log, transforms, present, k / np.float32(SHRINK), shape)
-        kernels.gather_samples(
-            self._in_camera, self._turned, self._footprints, self._placed.instance, k, SHRINK,
-            depth, *boxes, _pyramid(image), self._colours, self._weights,
-        )  # fmt: skip
+        self._gather(k, depth, boxes, _pyramid(image))
         return View(camera, frame, T_camera_world, image, depth, np.isfinite(boxes[0]))
 
     def mean(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -108,6 +106,63 @@ class ColourSamples:
         colours, known = np.zeros((n, 3), dtype=np.float32), np.zeros(n, dtype=np.bool_)
         kernels.robust_mean(self._colours, self._weights, colours, known)
         return colours, known
+
+    def _project(self, transforms: Float, present: NDArray[np.bool_]) -> None:
+        matrices = np.ascontiguousarray(transforms[:, :3], dtype=np.float32)
+
+        def work(part: slice) -> None:
+            kernels.to_camera(
+                self._means[part],
+                self._normals[part],
+                self._placed.instance[part],
+                matrices,
+                present,
+                self._in_camera[part],
+                self._turned[part],
+            )
+
+        self._on_all_cores(work)
+
+    def _depth(self, k: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+        def work(part: slice) -> NDArray[np.float32]:
+            depth = np.full(shape, np.inf, dtype=np.float32)
+            kernels.splat_depth(
+                self._in_camera[part], self._turned[part], self._radii[part], k, depth
+            )
+            return depth
+
+        return np.asarray(np.minimum.reduce(self._on_all_cores(work)))
+
+    def _gather(
+        self,
+        k: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        boxes: _BoxDepths,
+        pyramid: tuple[NDArray[np.uint8], ...],
+    ) -> None:
+        def work(part: slice) -> None:
+            kernels.gather_samples(
+                self._in_camera[part],
+                self._turned[part],
+                self._footprints[part],
+                self._placed.instance[part],
+                k,
+                SHRINK,
+                depth,
+                *boxes,
+                pyramid,
+                self._colours[part],
+                self._weights[part],
+            )
+
+        self._on_all_cores(work)
+
+    def _on_all_cores(self, work: Callable[[slice], _Result]) -> list[_Result]:
+        """Run ``work`` on ranges of Gaussians that together are all of them."""
+        count = os.cpu_count() or 1
+        bounds = [len(self._means) * i // count for i in range(count + 1)]
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(work, map(slice, bounds[:-1], bounds[1:])))
 
 
 def gather_views(
@@ -162,7 +217,7 @@ def _box_depths(
     present: NDArray[np.bool_],
     k: NDArray[np.float32],
     shape: tuple[int, int],
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
+) -> _BoxDepths:
     """Depth of the first box in each pixel, its instance, and depth of the second."""
     boxes = np.array([i for i in range(1, len(present)) if present[i]], dtype=np.int64)
     half = np.array([log.tracks[i - 1].size for i in boxes], np.float32).reshape(-1, 3) / 2

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from real2sim_server.logs import open_log, write_native_log
+from real2sim_server.reconstruct import (
+    InitialiseOptions,
+    ReconstructError,
+    evaluate_views,
+    initialise_scene,
+    reconstruct,
+)
+from real2sim_server.reconstruct.evaluate import lidar_mask, psnr, render_logged_view
+from real2sim_server.scene import Trajectory
+from real2sim_server.scene.io import load_scene
+
+from .conftest import painted_log
+
+SMALL = InitialiseOptions(
+    max_background=60_000, max_object=4_000, ground_spacing=0.12, sky_resolution=64
+)
+
+
+def test_a_log_on_disk_becomes_a_bundle_with_a_preview(tmp_path):
+    write_native_log(painted_log(frames=3), tmp_path / "log")
+    report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", options=SMALL)
+    scene = load_scene(tmp_path / "out.r2s")
+    assert scene.gaussian_count == report.gaussians
+    assert list(scene.objects) == ["other_1"]
+    assert report.gaussians_by_object == {"other_1": len(scene.object("other_1").cloud)}
+    assert report.psnr_lidar_db > 20
+    assert (tmp_path / "out.r2s.preview.png").stat().st_size > 1000
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "out.r2s", "out.r2s.preview.png"]
+
+
+def test_training_is_refused_until_there_is_a_trainer(tmp_path):
+    with pytest.raises(ReconstructError, match=r"iterations=100.*training does not exist yet"):
+        reconstruct(tmp_path, tmp_path / "out.r2s", iterations=100)
+
+
+def test_psnr_of_a_constant_error_is_the_textbook_value():
+    black = np.zeros((4, 5, 3), np.uint8)
+    assert psnr(black + np.uint8(51), black) == pytest.approx(20 * np.log10(5))
+    assert psnr(black, black) == float("inf")
+    assert np.isnan(psnr(black, black, np.zeros((4, 5), bool)))
+
+
+def test_lidar_mask_covers_what_points_project_to_and_nothing_in_the_sky():
+    log = painted_log(frames=2)
+    mask = lidar_mask(log, log.rig["front"], 0)
+    assert not mask[:20].any()
+    assert mask[60:].mean() > 0.6
+
+
+def test_evaluation_needs_a_frame():
+    log = painted_log(frames=2)
+    scene = initialise_scene(log, options=SMALL)
+    with pytest.raises(ReconstructError, match="at least one"):
+        evaluate_views(scene, log, frames=[])
+
+
+def shortened(log, frames: int):
+    """The first ``frames`` of a log."""
+    times = log.frame_times_us[:frames]
+    ego = Trajectory.from_transforms(times, [log.ego.transform(int(t)) for t in times])
+    return replace(log, frame_times_us=times, ego=ego)
+
+
+@pytest.fixture(scope="module")
+def jam(test_data):
+    folder = test_data / "kitti_jam"
+    if not folder.is_dir():
+        pytest.skip(f"no real log at {folder}")
+    log = shortened(open_log(folder), 6)
+    options = InitialiseOptions(max_background=200_000, max_object=15_000, sky_resolution=256)
+    return log, initialise_scene(log, options=options)
+
+
+def test_a_real_street_is_recognisable_where_lidar_saw_it(jam):
+    log, scene = jam
+    report = evaluate_views(scene, log, frames=[0, 3, 5])
+    assert report.psnr_lidar >= 15
+
+
+def test_lead_car_truck_and_tanker_are_objects(jam):
+    _, scene = jam
+    assert {"car_0", "truck_2", "truck_3"} <= set(scene.objects)
+    assert all(len(scene.object(k).cloud) > 3000 for k in ("car_0", "truck_2", "truck_3"))
+
+
+def test_without_the_lead_car_its_place_looks_like_the_road_beside_it(jam):
+    log, scene = jam
+    camera, t_us = log.rig["image_02"], int(log.frame_times_us[3])
+    others = {k: o for k, o in scene.objects.items() if k != "car_0"}
+    empty = render_logged_view(replace(scene, objects=others), camera, t_us).astype(float)
+    with_car = render_logged_view(scene, camera, t_us).astype(float)
+    # Low on the lead car's rear: bumper and number plate where the car stands, else road.
+    rear = (slice(230, 290), slice(590, 680))
+    lane = np.median(empty[230:290, 480:540].reshape(-1, 3), axis=0)
+    assert np.abs(with_car[rear] - empty[rear]).mean() > 25
+    assert np.abs(np.median(empty[rear].reshape(-1, 3), axis=0) - lane).max() < 60
+    # Road is grey: no red of the lamps, no blue of the plate.
+    assert np.ptp(empty[rear], axis=-1).mean() < 25
