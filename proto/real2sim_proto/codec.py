@@ -100,16 +100,22 @@ def _unpack_array(code: int, payload: bytes) -> np.ndarray:
     return np.frombuffer(data, dtype=dtype).reshape(shape)
 
 
+_LEAVES = frozenset({str, bytes, int, float, bool, np.ndarray, type(None)})
+
+
 def _check_values(value: Any, depth: int) -> None:
     if depth < 0:
         raise CodecError(f"message is nested deeper than {MAX_DEPTH} levels")
-    if isinstance(value, dict):
+    kind = type(value)
+    if kind is dict:
         for key, item in value.items():
-            if not isinstance(key, str):
+            if type(key) is not str:
                 raise CodecError(f"map keys must be strings, not {key!r}")
-            _check_values(item, depth - 1)
-    elif isinstance(value, list):
+            if type(item) not in _LEAVES:
+                _check_values(item, depth - 1)
+    elif kind is list:
         for item in value:
-            _check_values(item, depth - 1)
-    elif not isinstance(value, str | bytes | int | float | bool | np.ndarray | None):
-        raise CodecError(f"values of type {type(value).__name__} are not allowed")
+            if type(item) not in _LEAVES:
+                _check_values(item, depth - 1)
+    else:
+        raise CodecError(f"values of type {kind.__name__} are not allowed")

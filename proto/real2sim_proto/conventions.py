@@ -14,5 +14,6 @@ CONVENTIONS: dict[str, str] = {
     "box_size": "(length, width, height) along the object's x, y, z, metres",
     "rgb": "uint8 [H, W, 3]",
     "depth": "float32 [H, W], metres along the camera z axis, 0 where nothing was hit",
+    "depth_png": "16 bit, steps of 1/256 m, 0 where nothing was hit, 65535 from 255.99 m on",
     "instance": "uint16 [H, W], 0 is background",
 }

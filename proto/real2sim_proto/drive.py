@@ -9,7 +9,14 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter, WithJsonSchema, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    WithJsonSchema,
+    model_validator,
+)
 
 from .base import Codec, Identifier, Metres, Microseconds, Modality, Model, Quaternion, Vector3
 from .operations import Operation
@@ -46,6 +53,16 @@ class Envelope(Model):
 
     v: Literal[1] = 1
     id: int = Field(default=0, ge=0, le=2**53)
+
+
+class Told(Model):
+    """Base of what a worker says. Readers ignore unknown members: newer workers may add some."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class Answer(Envelope, Told):
+    """What every message from the worker has."""
 
 
 # --- shared by socket and REST sessions -------------------------------------------------------
@@ -150,7 +167,7 @@ Plan = Annotated[TrajectoryPlan | Control | PoseCommand, Field(discriminator="ki
 PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
 
 
-class EgoState(Model):
+class EgoState(Told):
     """The controlled vehicle at one instant; frames as in `conventions`."""
 
     position: Vector3
@@ -163,7 +180,7 @@ class EgoState(Model):
     size: Vector3 = Field(description="box length, width, height [m]")
 
 
-class AgentState(Model):
+class AgentState(Told):
     """Another road user at one instant."""
 
     object_id: str
@@ -174,7 +191,7 @@ class AgentState(Model):
     size: Vector3
 
 
-class Event(Model):
+class Event(Told):
     """Something that happened in this step."""
 
     type: Literal["collision", "left_log", "horizon", "edited"]
@@ -239,7 +256,7 @@ CLIENT_MESSAGE: TypeAdapter[ClientMessage] = TypeAdapter(ClientMessage)
 # --- server to client -------------------------------------------------------------------------
 
 
-class Frame(Model):
+class Frame(Told):
     """One image of one sensor."""
 
     sensor: str
@@ -253,7 +270,7 @@ class Frame(Model):
     data: bytes
 
 
-class Welcome(Envelope):
+class Welcome(Answer):
     """Answer to hello. Loading, compilation and the first render are over by now."""
 
     type: Literal["welcome"] = "welcome"
@@ -269,7 +286,7 @@ class Welcome(Envelope):
     step: int | None = Field(description="of the running episode; None before reset")
 
 
-class Obs(Envelope):
+class Obs(Answer):
     """What the vehicle perceives at one committed instant."""
 
     type: Literal["obs"] = "obs"
@@ -289,7 +306,7 @@ class Obs(Envelope):
     timing: dict[str, float] = Field(default_factory=dict, description="milliseconds by stage")
 
 
-class Edited(Envelope):
+class Edited(Answer):
     """Answer to edit."""
 
     type: Literal["edited"] = "edited"
@@ -298,7 +315,7 @@ class Edited(Envelope):
     warnings: list[EditWarning] = Field(default_factory=list)
 
 
-class View(Envelope):
+class View(Answer):
     """Answer to render."""
 
     type: Literal["view"] = "view"
@@ -308,7 +325,7 @@ class View(Envelope):
     timing: dict[str, float] = Field(default_factory=dict)
 
 
-class Progress(Envelope):
+class Progress(Answer):
     """Long work before welcome or obs is under way."""
 
     type: Literal["progress"] = "progress"
@@ -316,7 +333,7 @@ class Progress(Envelope):
     eta_s: float | None = None
 
 
-class Error(Envelope):
+class Error(Answer):
     """A message was refused. The session goes on unless `fatal`."""
 
     type: Literal["error"] = "error"
@@ -328,7 +345,7 @@ class Error(Envelope):
     step: int | None = Field(default=None, description="step the session is at")
 
 
-class Result(Envelope):
+class Result(Answer):
     """The session is over."""
 
     type: Literal["result"] = "result"

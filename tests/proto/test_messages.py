@@ -118,3 +118,10 @@ def test_a_problem_keeps_members_it_does_not_know():
 def test_a_sensor_cannot_name_a_modality_twice():
     with pytest.raises(ValidationError, match="repeat"):
         drive.SensorSpec(camera="front", modalities=["rgb", "rgb"])
+
+
+def test_members_that_a_newer_worker_adds_are_ignored_and_those_of_a_client_refused():
+    answer = {"v": 1, "type": "edited", "id": 1, "revision": 2, "mood": "good"}
+    assert drive.SERVER_MESSAGE.validate_python(answer).revision == 2
+    with pytest.raises(ValidationError, match="mood"):
+        CLIENT_MESSAGE.validate_python({"v": 1, "type": "bye", "id": 1, "mood": "good"})
