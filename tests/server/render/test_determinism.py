@@ -1,0 +1,100 @@
+"""The same picture, bit for bit, from any number of threads and in any process."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import torch
+
+from real2sim_server.render import Instance, RenderOutput, rasterize
+from real2sim_server.render.backends.cpu import CpuBackend
+from real2sim_server.scene import GaussianCloud, Sky
+
+K = np.array([[[200.0, 0, 100], [0, 200, 75], [0, 0, 1]]])
+
+
+def scene() -> list[Instance]:
+    generator = np.random.default_rng(5)
+    n = 30_000
+    parts = (
+        generator.uniform((-5, -4, 0.5), (5, 4, 12), (n, 3)),
+        generator.normal(size=(n, 4)),
+        np.exp(generator.uniform(-5, -2, (n, 3))),
+        generator.uniform(0, 1, n),
+        generator.normal(0, 0.3, (n, 4, 3)),
+    )
+    cloud = GaussianCloud(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
+    return [Instance(cloud), Instance(cloud.select(torch.arange(5000)), np.eye(4), 3)]
+
+
+def draw(instances: list[Instance]) -> RenderOutput:
+    sky = Sky(torch.linspace(0, 1, 6 * 4 * 4 * 3).reshape(6, 4, 4, 3))
+    return rasterize(instances, np.eye(4)[None], K, 200, 150, sky=sky, backend="cpu")
+
+
+def digest(output: RenderOutput) -> str:
+    assert output.depth is not None
+    assert output.instance is not None
+    images = (output.rgb, output.alpha, output.depth, output.instance)
+    return hashlib.sha256(b"".join(image.numpy().tobytes() for image in images)).hexdigest()
+
+
+def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+    instances = scene()
+    digests = set()
+    threads = numba.get_num_threads()
+    try:
+        for count in range(1, threads + 1):
+            numba.set_num_threads(count)
+            digests.add(digest(draw(instances)))
+    finally:
+        numba.set_num_threads(threads)
+    assert len(digests) == 1
+
+
+def test_bits_do_not_depend_on_what_was_drawn_before() -> None:
+    instances = scene()
+    first = digest(draw(instances))
+    draw(instances[1:])
+    rasterize(instances, np.eye(4)[None], K * [[[2.0], [2], [1]]], 400, 300, backend="cpu")
+    assert digest(draw(instances)) == first
+
+
+def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
+    program = (
+        "import importlib.util, sys\n"
+        f"spec = importlib.util.spec_from_file_location('t', {__file__!r})\n"
+        "module = importlib.util.module_from_spec(spec); spec.loader.exec_module(module)\n"
+        "print(module.digest(module.draw(module.scene())))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={"NUMBA_NUM_THREADS": "1", "PATH": ""},
+    )
+    assert result.stdout.strip() == digest(draw(scene()))
+
+
+def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    instances = scene()
+    whole = digest(draw(instances))
+    monkeypatch.setattr("real2sim_server.render.backends.cpu.LIST_BUDGET", 2000)
+    assert digest(draw(instances)) == whole
+
+
+def test_clouds_are_read_where_they_lie() -> None:
+    instances = scene()
+    backend = CpuBackend()
+    request = {"width": 200, "height": 150, "backend": backend}
+    rasterize(instances, np.eye(4)[None], K, **request)
+    behind = np.diag([-1.0, 1, -1, 1])[None]
+    before = {name: array.copy() for name, array in backend._space.items()}
+    rasterize(instances, behind, K, **request)
+    # Nothing is seen, so nothing was written but counts and empty lists.
+    assert np.array_equal(before["values"], backend._space["values"])
