@@ -15,50 +15,51 @@ PAINT_GLOSS = 0.55
 
 
 @njit(cache=True, error_model="numpy")
-def body_surface(shape, roof, paint, number, x, y, z, nx, ny, f):
+def body_surface(shape, roof, i, paint, p, number, x, y, z, nx, ny, f):
     """(r, g, b, gloss) of a body at a point in its own frame.
 
     Args:
-        shape: row of measures, see ``vehicles.shape_row``.
-        roof: heights of the roof line at even steps from rear to front [m].
-        paint: row of the paint table, the body's colour.
+        shape: table of measures, see ``vehicles.shape_row``.
+        roof: table of roof lines, heights at even steps from rear to front [m].
+        i: row of both.
+        paint, p: paint table and the row of the body's colour.
         number: of the vehicle, for its plates.
         x, y, z: the point; z from the ground [m].
         nx, ny: of the surface normal.
         f: size of a pixel there [m].
     """
-    length, height, belt = shape[0], shape[2], shape[3]
-    r, g, b, gloss = paint[0], paint[1], paint[2], PAINT_GLOSS
-    clearance = shape[13]
+    length, height, belt = shape[i, 0], shape[i, 2], shape[i, 3]
+    r, g, b, gloss = paint[p, 0], paint[p, 1], paint[p, 2], PAINT_GLOSS
+    clearance = shape[i, 13]
     trim = band(z, -1.0, clearance + 0.1, f)
     r, g, b = blend(r, 0.025, trim), blend(g, 0.025, trim), blend(b, 0.027, trim)
     if abs(ny) > 0.4:
-        r, g, b, gloss = _side(shape, roof, r, g, b, gloss, x, z, f)
+        r, g, b, gloss = _side(shape, roof, i, r, g, b, gloss, x, z, f)
     elif z > belt:
-        r, g, b, gloss = _screens(shape, r, g, b, gloss, x, y, z, nx, f)
+        r, g, b, gloss = _screens(shape, i, r, g, b, gloss, x, y, z, nx, f)
     if nx > 0.35 and x > length / 2 - 0.6 and z < belt:
-        r, g, b, gloss = _nose(shape, number, r, g, b, gloss, y, z, f)
+        r, g, b, gloss = _nose(shape, i, number, r, g, b, gloss, y, z, f)
     elif nx < -0.35 and x < 0.4 - length / 2 and z < max(belt, 0.7 * height):
-        r, g, b, gloss = _tail(shape, number, r, g, b, gloss, y, z, f)
+        r, g, b, gloss = _tail(shape, i, number, r, g, b, gloss, y, z, f)
     return r, g, b, gloss
 
 
 @njit(cache=True, error_model="numpy")
-def _roof_at(roof, length, x):
-    at = (x / length + 0.5) * (len(roof) - 1)
-    at = min(max(at, 0.0), len(roof) - 1.001)
-    i = int(at)
-    return blend(roof[i], roof[i + 1], at - i)
+def _roof_at(roof, i, length, x):
+    at = (x / length + 0.5) * (roof.shape[1] - 1)
+    at = min(max(at, 0.0), roof.shape[1] - 1.001)
+    j = int(at)
+    return blend(roof[i, j], roof[i, j + 1], at - j)
 
 
 @njit(cache=True, error_model="numpy")
-def _side(shape, roof, r, g, b, gloss, x, z, f):
-    length, height, belt = shape[0], shape[2], shape[3]
-    rear, front, pillars = shape[4], shape[5], int(shape[14])
-    top = _roof_at(roof, length, x)
-    wheel, clearance = shape[12], shape[13]
+def _side(shape, roof, i, r, g, b, gloss, x, z, f):
+    length, height, belt = shape[i, 0], shape[i, 2], shape[i, 3]
+    rear, front, pillars = shape[i, 4], shape[i, 5], int(shape[i, 14])
+    top = _roof_at(roof, i, length, x)
+    wheel, clearance = shape[i, 12], shape[i, 13]
     for k in range(10, 12):
-        distance = math.hypot(x - shape[k], z - wheel)
+        distance = math.hypot(x - shape[i, k], z - wheel)
         arch = band(distance, -1.0, wheel + 0.055, f)
         if arch > 0.0:
             r, g, b, gloss = (
@@ -93,17 +94,17 @@ def _side(shape, roof, r, g, b, gloss, x, z, f):
 
 
 @njit(cache=True, error_model="numpy")
-def _screens(shape, r, g, b, gloss, x, y, z, nx, f):
-    width, height, belt = shape[1], shape[2], shape[3]
+def _screens(shape, i, r, g, b, gloss, x, y, z, nx, f):
+    width, height, belt = shape[i, 1], shape[i, 2], shape[i, 3]
     side = abs(y)
     half = 0.5 * width * (0.86 - 0.16 * (z - belt) / (height - belt))
     if height > 2.0:
         half = 0.5 * width * 0.9
     glass = 0.0
     if nx > 0.2:
-        glass = band(x, shape[7], shape[6], f)
-    elif nx < -0.2 and shape[9] > shape[8]:
-        glass = band(x, shape[8], shape[9], f)
+        glass = band(x, shape[i, 7], shape[i, 6], f)
+    elif nx < -0.2 and shape[i, 9] > shape[i, 8]:
+        glass = band(x, shape[i, 8], shape[i, 9], f)
     glass *= band(side, -1.0, half - 0.07, f) * band(z, belt - 0.02, height - 0.05, f)
     return (
         blend(r, 0.018, glass),
@@ -114,15 +115,15 @@ def _screens(shape, r, g, b, gloss, x, y, z, nx, f):
 
 
 @njit(cache=True, error_model="numpy")
-def _nose(shape, number, r, g, b, gloss, y, z, f):
-    width, height = shape[1], shape[2]
+def _nose(shape, i, number, r, g, b, gloss, y, z, f):
+    width, height = shape[i, 1], shape[i, 2]
     big = height > 2.0
-    lamp_z = 0.47 * shape[3] + 0.2 if not big else 0.78
+    lamp_z = 0.47 * shape[i, 3] + 0.2 if not big else 0.78
     side = abs(y)
     grille = band(side, -1.0, 0.42, f) * band(z, lamp_z - 0.1, lamp_z + 0.06, f)
     bars = 0.02 + 0.1 * band(z - math.floor(z / 0.04) * 0.04, 0.0, 0.014, f)
     r, g, b = blend(r, bars, grille), blend(g, bars, grille), blend(b, bars, grille)
-    intake = band(side, -1.0, 0.3 * width, f) * band(z, shape[13] + 0.08, shape[13] + 0.2, f)
+    intake = band(side, -1.0, 0.3 * width, f) * band(z, shape[i, 13] + 0.08, shape[i, 13] + 0.2, f)
     r, g, b = blend(r, 0.02, intake), blend(g, 0.02, intake), blend(b, 0.02, intake)
     lamp = band(side, width / 2 - 0.52, width / 2 - 0.1, f) * band(
         z, lamp_z - 0.08, lamp_z + 0.08, f
@@ -134,8 +135,8 @@ def _nose(shape, number, r, g, b, gloss, y, z, f):
 
 
 @njit(cache=True, error_model="numpy")
-def _tail(shape, number, r, g, b, gloss, y, z, f):
-    width, height, belt = shape[1], shape[2], shape[3]
+def _tail(shape, i, number, r, g, b, gloss, y, z, f):
+    width, height, belt = shape[i, 1], shape[i, 2], shape[i, 3]
     side = abs(y)
     low, high = belt - 0.33, belt - 0.12
     inner = width / 2 - 0.42

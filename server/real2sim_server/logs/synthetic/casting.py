@@ -67,7 +67,7 @@ def _inverse(x):
 
 @njit(cache=True, error_model="numpy")
 def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per node
-    g, root, ox, oy, oz, dx, dy, dz, limit, any_hit, stack
+    bounds, children, counts, edges, root, ox, oy, oz, dx, dy, dz, limit, any_hit, stack
 ):
     """Nearest hit below ``root``: (distance, triangle, u, v), triangle -1 where there is none.
 
@@ -79,22 +79,22 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
     best, best_triangle, best_u, best_v = limit, np.int64(-1), 0.0, 0.0
     # Unsigned indices spare the test for negative ones at every access.
     node = np.uint32(root)
-    if _enter(g.bounds, node, ox, oy, oz, ix, iy, iz, best) == np.inf:
+    if _enter(bounds, node, ox, oy, oz, ix, iy, iz, best) == np.inf:
         return best, best_triangle, best_u, best_v
     top = 0
     while True:
-        count = g.count[node]
-        child = g.child[node]
+        count = counts[node]
+        child = children[node]
         if count > 0:
             for k in range(child, child + count):
-                e1x, e1y, e1z = g.edges[k, 3], g.edges[k, 4], g.edges[k, 5]
-                e2x, e2y, e2z = g.edges[k, 6], g.edges[k, 7], g.edges[k, 8]
+                e1x, e1y, e1z = edges[k, 3], edges[k, 4], edges[k, 5]
+                e2x, e2y, e2z = edges[k, 6], edges[k, 7], edges[k, 8]
                 px, py, pz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
                 det = e1x * px + e1y * py + e1z * pz
                 if abs(det) < 1e-14:
                     continue
                 inv = 1.0 / det
-                tx, ty, tz = ox - g.edges[k, 0], oy - g.edges[k, 1], oz - g.edges[k, 2]
+                tx, ty, tz = ox - edges[k, 0], oy - edges[k, 1], oz - edges[k, 2]
                 u = (tx * px + ty * py + tz * pz) * inv
                 if u < -EPSILON or u > 1.0 + EPSILON:
                     continue
@@ -108,8 +108,8 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
                     if any_hit:
                         return best, best_triangle, best_u, best_v
         else:
-            left = _enter(g.bounds, child, ox, oy, oz, ix, iy, iz, best)
-            right = _enter(g.bounds, child + 1, ox, oy, oz, ix, iy, iz, best)
+            left = _enter(bounds, child, ox, oy, oz, ix, iy, iz, best)
+            right = _enter(bounds, child + 1, ox, oy, oz, ix, iy, iz, best)
             if left <= right:
                 if right < np.inf:
                     nodes[top], entries[top] = np.uint32(child + 1), right
@@ -131,7 +131,7 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
         node = nodes[top]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _near_instance(instances, i, ox, oy, oz, dx, dy, dz, limit):
     """Whether a ray comes close enough to instance i for its mesh to be looked at."""
     cx = instances.to_world[i, 0, 3] - ox
@@ -145,7 +145,7 @@ def _near_instance(instances, i, ox, oy, oz, dx, dy, dz, limit):
     return 0.0 < along < limit + instances.radius[i] and distance - along * along < square
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def rotate(m, i, x, y, z):
     """Rotation of transform ``m[i]`` applied to a vector."""
     return (
@@ -155,10 +155,12 @@ def rotate(m, i, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     """Nearest hit in the world: (distance, triangle, u, v, instance), instance -1 for static."""
-    best, triangle, u, v = cast_mesh(g, 0, ox, oy, oz, dx, dy, dz, limit, False, stack)
+    best, triangle, u, v = cast_mesh(
+        g.bounds, g.child, g.count, g.edges, 0, ox, oy, oz, dx, dy, dz, limit, False, stack
+    )
     instance = -1
     for i in range(len(instances.radius)):
         if not _near_instance(instances, i, ox, oy, oz, dx, dy, dz, best):
@@ -167,7 +169,10 @@ def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
         px, py, pz = rotate(m, i, ox, oy, oz)
         qx, qy, qz = rotate(m, i, dx, dy, dz)
         t, k, a, b = cast_mesh(
-            g,
+            g.bounds,
+            g.child,
+            g.count,
+            g.edges,
             instances.root[i],
             px + m[i, 0, 3],
             py + m[i, 1, 3],
@@ -184,7 +189,7 @@ def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     return best, triangle, u, v, instance
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     """Whether anything lies on a ray within ``limit``."""
     for i in range(len(instances.radius)):
@@ -194,7 +199,10 @@ def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
         px, py, pz = rotate(m, i, ox, oy, oz)
         qx, qy, qz = rotate(m, i, dx, dy, dz)
         hit = cast_mesh(
-            g,
+            g.bounds,
+            g.child,
+            g.count,
+            g.edges,
             instances.root[i],
             px + m[i, 0, 3],
             py + m[i, 1, 3],
@@ -208,4 +216,9 @@ def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
         )
         if hit[1] >= 0:
             return True
-    return cast_mesh(g, 0, ox, oy, oz, dx, dy, dz, limit, True, stack)[1] >= 0
+    return (
+        cast_mesh(
+            g.bounds, g.child, g.count, g.edges, 0, ox, oy, oz, dx, dy, dz, limit, True, stack
+        )[1]
+        >= 0
+    )

@@ -18,7 +18,7 @@ from ..native_writer import write_native_log
 from .bvh import build_geometry
 from .casting import Instances
 from .config import SyntheticConfig
-from .sensors import shoot_depth, shoot_image, shoot_lidar
+from .sensors import shoot_image, shoot_lidar
 from .shading import World
 from .street import lay_street
 from .surroundings import build_surroundings
@@ -80,25 +80,21 @@ class SyntheticSource:
         lens = self.rig[camera]
         t_us = int(self.frame_times_us[frame])
         pose = self.ego.transform(t_us) @ lens.T_vehicle_camera
-        return self._shoot(pose, lens.K, lens.width, lens.height, self.instances(t_us))
+        return self.render(pose, lens.K, lens.width, lens.height, t_us)[0]
 
     def render(
         self, T_world_camera: Float, k: Float, width: int, height: int, t_us: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
         """See :meth:`SyntheticLog.render`."""
-        instances = self.instances(t_us)
-        pose = np.ascontiguousarray(T_world_camera, dtype=np.float64)
-        k = np.ascontiguousarray(k, dtype=np.float64)
-        image = self._shoot(pose, k, width, height, instances)
-        return image, *shoot_depth(self.world, instances, pose, k, width, height)
-
-    def _shoot(
-        self, pose: Float, k: Float, width: int, height: int, instances: Instances
-    ) -> NDArray[np.uint8]:
-        image: NDArray[np.uint8] = shoot_image(
-            self.world, instances, pose, k, width, height, self.config.samples
+        return shoot_image(
+            self.world,
+            self.instances(t_us),
+            np.ascontiguousarray(T_world_camera, dtype=np.float64),
+            np.ascontiguousarray(k, dtype=np.float64),
+            width,
+            height,
+            self.config.samples,
         )
-        return image
 
     def instances(self, t_us: int) -> Instances:
         """Where all vehicles are at ``t_us``."""

@@ -24,45 +24,45 @@ PARKING_BAY = 6.5
 
 @njit(cache=True, error_model="numpy")
 def static_surface(  # noqa: PLR0911 - one return per material
-    material, paint, u, v, fu, fv, seed
+    material, paint, p, u, v, fu, fv, seed
 ):
     """(r, g, b, gloss) of any material but bodies and wheels of vehicles.
 
-    ``u, v`` are texture coordinates [m], ``fu, fv`` a pixel's size along them [m], ``paint`` a
-    row of the paint table.
+    ``u, v`` are texture coordinates [m], ``fu, fv`` a pixel's size along them [m], ``p`` a
+    row of the paint table. Rows are not sliced off: that counts references, across all threads.
     """
     f = math.sqrt(fu * fv)
     if material == ROAD:
-        return _road(paint, u, v, fu, fv, f, seed)
+        return _road(paint, p, u, v, fu, fv, f, seed)
     if material == KERB_STONE:
-        return _kerb(paint, u, fu, f, v, seed)
+        return _kerb(paint, p, u, fu, f, v, seed)
     if material == PAVING:
-        return _paving(paint, u, v, fu, fv, f, seed)
+        return _paving(paint, p, u, v, fu, fv, f, seed)
     if material == EARTH:
         k = 1.0 + 0.6 * layered_noise(u * 1.5, v * 1.5, 4, f * 1.5, seed + 40)
-        return paint[0] * k, paint[1] * k, paint[2] * k, 0.0
+        return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
     if material == WALL:
-        return _wall(paint, u, v, fu, fv, f)
+        return _wall(paint, p, u, v, fu, fv, f)
     if material == WINDOW:
-        return _window(paint, u, v, f)
+        return _window(paint, p, u, v, f)
     if material == DOOR:
-        return _door(paint, u, v, f)
+        return _door(paint, p, u, v, f)
     if material == ROOF:
-        return _tiles(paint, u, v, fu, fv, seed)
+        return _tiles(paint, p, u, v, fu, fv, seed)
     if material == BARK:
         k = 1.0 + 0.7 * layered_noise(u * 14, v * 3, 3, f * 14, seed + 50)
-        return paint[0] * k, paint[1] * k, paint[2] * k, 0.0
+        return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
     if material == LEAVES:
         k = 1.0 + 0.75 * layered_noise(u * 4.0, v * 4.0, 3, f * 4.0, seed + 60)
-        return paint[0] * k, paint[1] * k, paint[2] * k, 0.0
+        return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
     if material == SIGN:
-        return _sign(paint, u, v, f)
-    return paint[0], paint[1], paint[2], 0.0
+        return _sign(paint, p, u, v, f)
+    return paint[p, 0], paint[p, 1], paint[p, 2], 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def _road(paint, s, d, fs, fd, f, seed):
-    crossing, lane, kerb = paint[3], paint[4], paint[5]
+def _road(paint, p, s, d, fs, fd, f, seed):
+    crossing, lane, kerb = paint[p, 3], paint[p, 4], paint[p, 5]
     k = 1.0 + 0.22 * layered_noise(s * 0.3, d * 0.5, 3, f * 0.5, seed)
     k += 0.5 * layered_noise(s * 11.0, d * 11.0, 4, f * 11.0, seed + 5)
     side = abs(d)
@@ -74,7 +74,7 @@ def _road(paint, s, d, fs, fd, f, seed):
     else:
         k *= 1.18
     k *= _repairs(s, d, fs, fd, seed)
-    r, g, b = paint[0] * k, paint[1] * k, paint[2] * k
+    r, g, b = paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k
     gutter = band(side, kerb - 0.3, kerb, fd)
     if gutter > 0.0:
         stone = 0.2 * (1.0 + 0.5 * layered_noise(s * 3.0, d * 3.0, 3, f * 3.0, seed + 9))
@@ -143,7 +143,7 @@ def _markings(s, side, d, fs, fd, crossing, lane, kerb):
 
 
 @njit(cache=True, error_model="numpy")
-def _kerb(paint, s, fs, f, v, seed):
+def _kerb(paint, p, s, fs, f, v, seed):
     stone = math.floor(s)
     k = (
         0.85
@@ -151,11 +151,11 @@ def _kerb(paint, s, fs, f, v, seed):
         + 0.3 * layered_noise(s * 6, v * 6, 3, f * 6, seed + 71)
     )
     k *= 1.0 - 0.55 * band(s - stone, 0.0, 0.02, fs)
-    return paint[0] * k, paint[1] * k, paint[2] * k, 0.0
+    return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def _paving(paint, s, d, fs, fd, f, seed):
+def _paving(paint, p, s, d, fs, fd, f, seed):
     row = math.floor(d / 0.5)
     shift = 0.5 * (row - 2.0 * math.floor(row / 2.0))
     a = s / 0.75 + shift
@@ -166,15 +166,15 @@ def _paving(paint, s, d, fs, fd, f, seed):
     k += 0.2 * layered_noise(s * 0.4, d * 0.4, 2, f * 0.4, seed + 85)
     joint = max(band((a - slab) * 0.75, 0.0, 0.02, fs), band(d - row * 0.5, 0.0, 0.02, fd))
     k *= 1.0 - 0.45 * joint
-    return paint[0] * k, paint[1] * k, paint[2] * k, 0.0
+    return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def _wall(paint, u, z, fu, fv, f):
-    seed = int(paint[4])
-    r, g, b = paint[0], paint[1], paint[2]
+def _wall(paint, p, u, z, fu, fv, f):
+    seed = int(paint[p, 4])
+    r, g, b = paint[p, 0], paint[p, 1], paint[p, 2]
     k = 1.0 + 0.16 * layered_noise(u * 0.35, z * 0.35, 3, f * 0.35, seed)
-    if paint[3] > 0.5:
+    if paint[p, 3] > 0.5:
         row = math.floor(z / 0.09)
         shift = 0.5 * (row - 2.0 * math.floor(row / 2.0))
         a = u / 0.27 + shift
@@ -200,10 +200,10 @@ def _wall(paint, u, z, fu, fv, f):
 
 
 @njit(cache=True, error_model="numpy")
-def _window(paint, u, v, f):
+def _window(paint, p, u, v, f):
     number = math.floor(u / 10.0)
     u -= number * 10.0
-    w, h, shop = paint[3], paint[4], paint[5]
+    w, h, shop = paint[p, 3], paint[p, 4], paint[p, 5]
     border = 0.07
     glass = band(u, border, w - border, f) * band(v, border, h - border, f)
     if shop < 0.5:
@@ -231,46 +231,46 @@ def _window(paint, u, v, f):
         g = blend(g, 0.25 * hash01(number * 16 + column, 3, 6), share)
         b = blend(b, 0.25 * hash01(number * 16 + column, 4, 6), share)
     return (
-        blend(paint[0], r, glass),
-        blend(paint[1], g, glass),
-        blend(paint[2], b, glass),
+        blend(paint[p, 0], r, glass),
+        blend(paint[p, 1], g, glass),
+        blend(paint[p, 2], b, glass),
         glass * 0.8,
     )
 
 
 @njit(cache=True, error_model="numpy")
-def _door(paint, u, v, f):
-    w, h = paint[3], paint[4]
+def _door(paint, p, u, v, f):
+    w, h = paint[p, 3], paint[p, 4]
     k = 0.9
     panel = band(u, 0.16, w - 0.16, f) * (band(v, 0.2, 0.95, f) + band(v, 1.1, h - 0.55, f))
     inner = band(u, 0.2, w - 0.2, f) * (band(v, 0.24, 0.91, f) + band(v, 1.14, h - 0.59, f))
     k *= 1.0 - 0.45 * (panel - inner)
     light = band(u, 0.12, w - 0.12, f) * band(v, h - 0.42, h - 0.08, f)
     knob = band(u, w - 0.14, w - 0.08, f) * band(v, 1.0, 1.12, f)
-    r, g, b = paint[0] * k, paint[1] * k, paint[2] * k
+    r, g, b = paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k
     r, g, b = blend(r, 0.04, light), blend(g, 0.04, light), blend(b, 0.045, light)
     return blend(r, 0.5, knob), blend(g, 0.42, knob), blend(b, 0.2, knob), light * 0.7
 
 
 @njit(cache=True, error_model="numpy")
-def _tiles(paint, u, v, fu, fv, seed):
+def _tiles(paint, p, u, v, fu, fv, seed):
     row, column = math.floor(v / 0.34), math.floor(u / 0.24)
     fade = ramp(0.4 - math.sqrt(fu * fv), 0.0, 0.3)
     k = 1.0 + (hash01(column, row, seed + 90) - 0.5) * 0.45 * fade
     k += 0.25 * layered_noise(u * 0.5, v * 0.5, 3, fu * 0.5, seed + 91)
     k *= 1.0 - 0.5 * band(v - row * 0.34, 0.0, 0.05, fv)
     k *= 1.0 - 0.25 * band(u - column * 0.24, 0.0, 0.03, fu)
-    return paint[0] * k, paint[1] * k, paint[2] * k, 0.0
+    return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def _sign(paint, u, v, f):
+def _sign(paint, p, u, v, f):
     rim = 1.0 - band(max(abs(u), abs(v)), -1.0, 0.9, f * 3.0)
     bar = band(abs(u), -1.0, 0.5 - 0.35 * v, f * 3.0) * band(v, -0.6, 0.55, f * 3.0)
     white = max(rim, bar)
     return (
-        blend(paint[0], 0.7, white),
-        blend(paint[1], 0.7, white),
-        blend(paint[2], 0.7, white),
+        blend(paint[p, 0], 0.7, white),
+        blend(paint[p, 1], 0.7, white),
+        blend(paint[p, 2], 0.7, white),
         0.05,
     )

@@ -5,64 +5,129 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
+from numpy.typing import NDArray
 
+from ...scene.rotation import Float
 from .casting import Instances, cast, new_stack
 from .light import tone
-from .shading import ray_colour, surface_at
+from .shading import World, ray_colour, surface_at
 
 FAR = 1e6
+CHUNK = 256
+
+
+class Samples(NamedTuple):
+    """What camera rays see.
+
+    Attributes:
+        colours: [N, 3] float32, display values in [0, 1].
+        depth: [N] float32, along the camera's z [m], 0 in the sky.
+        instance: [N] uint16, 0 for the static world, else 1 + the vehicle's index.
+        keys, planes: [N] int64 and [N, 4] float32, surface and its plane, see
+            :func:`.shading.ray_colour`.
+    """
+
+    colours: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    instance: NDArray[np.uint16]
+    keys: NDArray[np.int64]
+    planes: NDArray[np.float32]
+
+
+def shoot_image(
+    world: World,
+    instances: Instances,
+    T_world_camera: Float,
+    k: Float,
+    width: int,
+    height: int,
+    samples: int,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
+    """RGB uint8 [height, width, 3], depth float32 and instance uint16 [height, width].
+
+    One ray through every pixel's centre, which gives depth and instance; then ``samples``^2 rays
+    where the surface, its direction or its shadow changes between neighbours. Textures are
+    band-limited and need no more than one.
+    """
+    row, column = np.divmod(np.arange(width * height), width)
+    centres = np.stack([column + 0.5, row + 0.5], axis=1)
+    first = Samples(*_shoot(world, instances, T_world_camera, k, centres, 1.0))
+    colours = first.colours
+    if samples > 1:
+        keys, planes = first.keys.reshape(height, width), first.planes.reshape(height, width, 4)
+        edges = np.flatnonzero(_find_edges(keys, planes))
+        inside = np.repeat(centres[edges], samples * samples, axis=0)
+        inside += np.tile(_sheared_grid(samples), (len(edges), 1))
+        again = Samples(*_shoot(world, instances, T_world_camera, k, inside, 1.0 / samples))
+        colours[edges] = again.colours.reshape(len(edges), -1, 3).mean(axis=1)
+    image = (colours * 255 + 0.5).astype(np.uint8)
+    return (
+        image.reshape(height, width, 3),
+        first.depth.reshape(height, width),
+        first.instance.reshape(height, width),
+    )
+
+
+def _sheared_grid(samples: int) -> Float:
+    """Sample positions [samples^2, 2] relative to a pixel's centre.
+
+    No two share a row or a column, which smooths level and upright edges best; and being the same
+    in every pixel they add no grain.
+    """
+    j, i = np.divmod(np.arange(samples * samples), samples)
+    x = (i + (j + 0.5) / samples) / samples
+    y = (j + (samples - i - 0.5) / samples) / samples
+    return np.stack([x, y], axis=1) - 0.5
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def shoot_image(world, instances, T_world_camera, k, width, height, samples):
-    """RGB uint8 [height, width, 3].
+def _shoot(world, instances, m, k, positions, size):
+    """Fields of :class:`Samples` for rays through image positions [N, 2].
 
-    One ray through every pixel's centre; then ``samples``^2 rays where the surface, its direction
-    or its shadow changes between neighbours. Textures are band-limited and need no more than one.
+    ``m`` is the camera's pose in the world, ``size`` the share of a pixel that a ray stands for.
     """
-    colours = np.empty((height, width, 3), np.float32)
-    keys = np.empty((height, width), np.int64)
-    planes = np.empty((height, width, 4), np.float32)
-    for row in prange(height):
+    n = len(positions)
+    colours, planes = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
+    depth, instance = np.empty(n, np.float32), np.empty(n, np.uint16)
+    keys = np.empty(n, np.int64)
+    ox, oy, oz = m[0, 3], m[1, 3], m[2, 3]
+    spread = size / k[0, 0]
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
         stack = new_stack()
-        for column in range(width):
-            r, g, b, keys[row, column], nx, ny, nz, offset = _sample(
-                world, instances, T_world_camera, k, column + 0.5, row + 0.5, 1, stack
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, n)):
+            x = (positions[i, 0] - k[0, 2]) / k[0, 0]
+            y = (positions[i, 1] - k[1, 2]) / k[1, 1]
+            s = 1.0 / math.sqrt(x * x + y * y + 1.0)
+            dx = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * s
+            dy = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * s
+            dz = (m[2, 0] * x + m[2, 1] * y + m[2, 2]) * s
+            hit = cast(world, instances, ox, oy, oz, dx, dy, dz, FAR, stack)
+            r, g, b, keys[i], nx, ny, nz, offset = ray_colour(
+                world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack
             )
-            pixel, plane = colours[row, column], planes[row, column]
-            pixel[0], pixel[1], pixel[2] = tone(r), tone(g), tone(b)
-            plane[0], plane[1], plane[2], plane[3] = nx, ny, nz, offset
-    image = np.empty((height, width, 3), np.uint8)
-    for row in prange(height):
-        stack = new_stack()
-        for column in range(width):
-            r, g, b = colours[row, column, 0], colours[row, column, 1], colours[row, column, 2]
-            if samples > 1 and _is_edge(keys, planes, row, column):
-                r, g, b = _supersample(
-                    world, instances, T_world_camera, k, column, row, samples, stack
-                )
-            image[row, column, 0] = int(255.0 * r + 0.5)
-            image[row, column, 1] = int(255.0 * g + 0.5)
-            image[row, column, 2] = int(255.0 * b + 0.5)
-    return image
+            colours[i, 0], colours[i, 1], colours[i, 2] = tone(r), tone(g), tone(b)
+            planes[i, 0], planes[i, 1], planes[i, 2], planes[i, 3] = nx, ny, nz, offset
+            depth[i] = hit[0] * s if hit[1] >= 0 else 0.0
+            instance[i] = hit[4] + 1
+    return colours, depth, instance, keys, planes
 
 
 @njit(cache=True, error_model="numpy")
-def _sample(world, instances, m, k, px, py, samples, stack):
-    """What the camera sees at image coordinates px, py, see :func:`.shading.ray_colour`."""
-    ox, oy, oz = m[0, 3], m[1, 3], m[2, 3]
-    dx, dy, dz = _direction(m, (px - k[0, 2]) / k[0, 0], (py - k[1, 2]) / k[1, 1])
-    hit = cast(world, instances, ox, oy, oz, dx, dy, dz, FAR, stack)
-    spread = 1.0 / (k[0, 0] * samples)
-    return ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack)
+def _find_edges(keys, planes):
+    """Which pixels [H, W] show another surface than one of their eight neighbours."""
+    edges = np.zeros(keys.shape, np.bool_)
+    for row in range(keys.shape[0]):
+        for column in range(keys.shape[1]):
+            edges[row, column] = _is_edge(keys, planes, row, column)
+    return edges
 
 
 @njit(cache=True, error_model="numpy")
 def _is_edge(keys, planes, row, column):
-    """Whether a pixel shows another surface than one of its eight neighbours."""
     key = keys[row, column]
     if key < 0:
         return True
@@ -79,56 +144,6 @@ def _is_edge(keys, planes, row, column):
             if abs(planes[row, column, 3] - planes[y, x, 3]) > 0.08 and turned < 1e-5:
                 return True
     return False
-
-
-@njit(cache=True, error_model="numpy")
-def _supersample(world, instances, m, k, column, row, samples, stack):
-    """Mean display values (r, g, b) of ``samples``^2 rays through a pixel.
-
-    The rays lie on a sheared grid: no two share a row or a column, which smooths level and upright
-    edges best, and being the same in every pixel it adds no grain.
-    """
-    red = green = blue = 0.0
-    for j in range(samples):
-        for i in range(samples):
-            px = column + (i + (j + 0.5) / samples) / samples
-            py = row + (j + (samples - i - 0.5) / samples) / samples
-            s = _sample(world, instances, m, k, px, py, samples, stack)
-            red, green, blue = red + tone(s[0]), green + tone(s[1]), blue + tone(s[2])
-    share = 1.0 / (samples * samples)
-    return red * share, green * share, blue * share
-
-
-@njit(cache=True, error_model="numpy")
-def _direction(m, x, y):
-    """Unit direction in the world of the camera ray (x, y, 1)."""
-    s = 1.0 / math.sqrt(x * x + y * y + 1.0)
-    return (
-        (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * s,
-        (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * s,
-        (m[2, 0] * x + m[2, 1] * y + m[2, 2]) * s,
-    )
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def shoot_depth(world, instances, T_world_camera, k, width, height):
-    """Depth float32 [height, width] along z and instance uint16, through pixel centres.
-
-    Depth is 0 in the sky; instance is 0 for the static world, else 1 + the vehicle's index.
-    """
-    depth = np.zeros((height, width), np.float32)
-    index = np.zeros((height, width), np.uint16)
-    for row in prange(height):
-        stack = new_stack()
-        m = T_world_camera
-        for column in range(width):
-            x, y = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
-            dx, dy, dz = _direction(m, x, y)
-            hit = cast(world, instances, m[0, 3], m[1, 3], m[2, 3], dx, dy, dz, FAR, stack)
-            if hit[1] >= 0:
-                depth[row, column] = hit[0] / math.sqrt(x * x + y * y + 1.0)
-                index[row, column] = hit[4] + 1
-    return depth, index
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -66,7 +66,7 @@ def _mix3(values, row, offset, u, v):
     return a * (1.0 - u - v) + b * u + c * v
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     """Material and normal at a hit: (r, g, b, gloss, nx, ny, nz, gx, gy, gz).
 
@@ -102,16 +102,18 @@ def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     f = t * spread
     material = g.material[k]
     if material == BODY:
-        shape = world.shapes[instances.shape[instance]]
+        shape = instances.shape[instance]
         bx, by, bz = _unit(bx, by, bz)
         r, gr, b, gloss = body_surface(
+            world.shapes,
+            world.roofs,
             shape,
-            world.roofs[instances.shape[instance]],
-            world.paints[instances.paint[instance]],
+            world.paints,
+            instances.paint[instance],
             instance,
             lx,
             ly,
-            lz + 0.5 * shape[2],
+            lz + 0.5 * world.shapes[shape, 2],
             bx,
             by,
             f,
@@ -125,7 +127,7 @@ def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     else:
         fu, fv = _footprint(f, dx, dy, dz, gx, gy, gz)
         r, gr, b, gloss = static_surface(
-            material, world.paints[g.paint[k]], a, c, fu, fv, world.seed
+            material, world.paints, g.paint[k], a, c, fu, fv, world.seed
         )
     return r, gr, b, gloss, nx, ny, nz, gx, gy, gz
 
@@ -154,7 +156,7 @@ def _footprint(f, dx, dy, dz, gx, gy, gz):
     return f * slant, f
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     """A ray whose nearest hit is known: linear (r, g, b), key, normal and plane offset.
 
@@ -207,7 +209,7 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     return r, g, b, -1 if leaves else key, nx, ny, nz, px * gx + py * gy + pz * gz
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _openness(instances, instance, x, y, z, nz):
     """Share of the sky's light that reaches a point: less beside and under vehicles."""
     share = 1.0
@@ -232,7 +234,7 @@ def _openness(instances, instance, x, y, z, nz):
     return share
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _reflection(world, gloss, open_, lit, dx, dy, dz, nx, ny, nz):
     cos = max(-(dx * nx + dy * ny + dz * nz), 0.0)
     fresnel = gloss * (0.045 + 0.75 * (1.0 - cos) ** 5)
