@@ -166,6 +166,8 @@ class Scenario:
             EditError: STALE_REVISION when another entry was committed since it was planned.
         """
         self._append(planned.entry)
+        # Kept for undo, but nobody is likely to look into it soon.
+        self.state.forget_tracks()
         self.state = planned.outcome.state
         self._keep(len(self._done), self.state)
         return planned.outcome

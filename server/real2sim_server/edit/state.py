@@ -133,6 +133,10 @@ class ScenarioState:
         """Trajectories of the visible objects, packed once for look-ups at one instant."""
         return PackedTracks(tuple(o for o in self.objects.values() if not o.deleted))
 
+    def forget_tracks(self) -> None:
+        """Free the packed tracks, about 100 bytes a pose; they are packed anew when asked for."""
+        self.__dict__.pop("tracks", None)
+
 
 def _trajectories(scene: SceneSource, sources: list[ObjectSource]) -> list[Trajectory]:
     return [scene.ego, *(o.trajectory for o in sources)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +65,14 @@ class LoggedPath:
             ahead = STUB * np.array([np.cos(yaw), np.sin(yaw), 0.0])
             self.positions = np.stack([self.positions[0], self.positions[0] + ahead])
             self.yaws, self.ups = np.repeat(self.yaws, 2), np.repeat(self.ups, 2, axis=0)
-        self._starts = np.ascontiguousarray(self.positions[:-1, :2])
-        self._steps = np.diff(self.positions[:, :2], axis=0)
-        lengths = np.hypot(self._steps[:, 0], self._steps[:, 1])
+        # As complex numbers x + iy: (p - start) * turn has the share of the segment that lies
+        # before p's foot as its real part, and p's distance to the left as its imaginary part,
+        # both in lengths of the segment.
+        plane = self.positions[:, 0] + 1j * self.positions[:, 1]
+        steps = np.diff(plane)
+        lengths = np.abs(steps)
+        self._starts = plane[:-1]
+        self._turns = steps.conj() / lengths**2
         self._squares = lengths**2
         self.s: Float = np.concatenate([[0.0], np.cumsum(lengths)])
 
@@ -93,15 +99,13 @@ class LoggedPath:
         return self._nearest(x, y, 0, len(self._starts))
 
     def _nearest(self, x: float, y: float, first: int, last: int) -> PathPoint:
-        starts, steps = self._starts[first:last], self._steps[first:last]
-        dx, dy = x - starts[:, 0], y - starts[:, 1]
-        share = (dx * steps[:, 0] + dy * steps[:, 1]) / self._squares[first:last]
-        share = np.minimum(np.maximum(share, 0.0), 1.0)
-        gap_x, gap_y = dx - share * steps[:, 0], dy - share * steps[:, 1]
-        k = int(np.argmin(gap_x * gap_x + gap_y * gap_y))
-        distance = float(np.hypot(gap_x[k], gap_y[k]))
-        side = steps[k, 0] * gap_y[k] - steps[k, 1] * gap_x[k]
-        return self._point(first + k, float(share[k]), float(np.copysign(distance, side)))
+        local = (complex(x, y) - self._starts[first:last]) * self._turns[first:last]
+        foot = np.minimum(np.maximum(local.real, 0.0), 1.0)
+        beyond = local.real - foot
+        squares = (beyond * beyond + local.imag * local.imag) * self._squares[first:last]
+        k = int(squares.argmin())
+        offset = math.copysign(math.sqrt(squares[k]), local.imag[k])
+        return self._point(first + k, float(foot[k]), offset)
 
     def _point(self, k: int, share: float, offset: float) -> PathPoint:
         rest = 1.0 - share

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .ego import Command, Motion
-from .reference import Reference
+from .reference import Pose, Reference
 
 LOOKAHEAD = 0.4
 """The controller aims at where the plan is this much later [s]."""
@@ -24,7 +25,7 @@ GENTLE_BRAKING = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Tracker:
-    """Follows a reference; holds no state, so that a copied world goes on alike.
+    """Follows a reference; knows nothing of the past, so that a copied world goes on alike.
 
     Steering is pure pursuit (Coulter 1992, CMU-RI-TR-92-01): the arc that ends at the aim. The
     aim lies on the plan, so the arc carries the plan's curvature. Acceleration is what brings the
@@ -99,9 +100,7 @@ def _arc_length(ahead: float, left: float) -> float:
     return math.hypot(ahead, left) * stretch
 
 
-def to_world(
-    poses: list[tuple[float, float, float]], motion: Motion
-) -> list[tuple[float, float, float]]:
+def to_world(poses: Sequence[Pose], motion: Motion) -> list[Pose]:
     """Poses x, y, yaw of the vehicle frame in the world."""
     cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
     return [

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import assert_never
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Control, PoseCommand, ResetSpec, SensorSpec, TrajectoryPlan
@@ -27,7 +26,7 @@ from .events import Event
 from .ground import LoggedGround
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
-from .reference import Reference
+from .reference import Pose, Reference
 from .route import command_ahead, route_ahead
 from .tracker import Tracker, to_world
 
@@ -247,9 +246,10 @@ class World:
         times = np.linspace(self.t_us, self.scene.end_us, count + 1).astype(np.int64)[1:]
         transforms, _ = sample(self.scene.ego, times)
         yaws = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
-        return self._tracker(times, np.column_stack([transforms[:, :2, 3], yaws]))
+        poses = np.column_stack([transforms[:, :2, 3], yaws])
+        return self._tracker(times.tolist(), [(x, y, yaw) for x, y, yaw in poses.tolist()])
 
-    def _tracker(self, times_us: ArrayLike, poses: ArrayLike) -> Tracker:
+    def _tracker(self, times_us: Sequence[int], poses: Sequence[Pose]) -> Tracker:
         reference = Reference(
             self.motion, start_us=self.t_us, times_us=times_us, poses=poses, spec=self.spec.ego
         )

@@ -118,6 +118,16 @@ def test_undo_reaches_beyond_the_states_kept_in_memory(state):
         assert positions.tobytes() == expected.objects["parked"].trajectory.positions.tobytes()
 
 
+def test_states_kept_for_undo_take_little_memory(state):
+    scenario = Scenario(state)
+    first = scenario.edit(SHIFT).state
+    assert first.tracks.objects
+    scenario.edit(SHIFT)
+
+    assert "tracks" not in vars(first)
+    assert first.tracks.at(0).objects
+
+
 def test_edits_undone_and_replaced_leave_no_trace_in_the_state(state):
     scenario = Scenario(state)
     scenario.edit(SHIFT)
