@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import asyncio
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fastapi import Response
@@ -63,6 +64,36 @@ def info_response(
         media_type="application/json",
         headers=dict(headers or {}),
     )
+
+
+async def large_response(
+    build: Callable[[], BaseModel],
+    *,
+    status: int = 200,
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """The answer for a model with many objects, built and written on another thread.
+
+    It is written in pieces: one call for all of a scene's trajectories would keep every thread
+    waiting for the interpreter for tens of milliseconds, the event loop too.
+    """
+    content = await asyncio.to_thread(lambda: json_in_pieces(build()))
+    return Response(content, status, dict(headers or {}), "application/json")
+
+
+def json_in_pieces(model: BaseModel) -> str:
+    """The same JSON value as ``model_dump_json``, one call for each model in a list."""
+    lists = {
+        name: value
+        for name, value in model
+        if isinstance(value, list) and value and isinstance(value[0], BaseModel)
+    }
+    text = model.model_dump_json(exclude=set(lists))
+    for name, items in lists.items():
+        separator = "" if text == "{}" else ","
+        joined = ",".join(map(json_in_pieces, items))
+        text = f'{text[:-1]}{separator}"{name}":[{joined}]}}'
+    return text
 
 
 def frame_response(pictured: Pictured, media_type: str, *, revision: int | None = None) -> Response:

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
+from typing import Any
 
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
@@ -39,8 +40,7 @@ def create_app(settings: Settings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         async with worker.running():
-            # Made on demand it would keep the event loop busy for a tenth of a second.
-            await asyncio.to_thread(app.openapi)
+            app.openapi_schema = await asyncio.to_thread(_openapi, app)
             yield
 
     app = FastAPI(
@@ -60,6 +60,19 @@ def create_app(settings: Settings) -> FastAPI:
     for router in PROTECTED:
         app.include_router(router, dependencies=[Depends(require_token)])
     return app
+
+
+_published: dict[str, Any] = {}
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document, made once a process: it is the same for all settings.
+
+    Made on demand it would keep the event loop busy for tenths of a second.
+    """
+    if not _published:
+        _published.update(app.openapi())
+    return _published
 
 
 def operation_id(route: APIRoute) -> str:

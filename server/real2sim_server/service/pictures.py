@@ -179,18 +179,19 @@ def encode(image: Image) -> Frame:
     encoded = encode_image(
         image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality
     )
+    values: dict[str, Any] = {
+        "sensor": image.sensor.camera,
+        "modality": image.modality,
+        "t_us": image.t_us,
+        "T_world_sensor": image.T_world_sensor,
+        "K": image.K,
+        "codec": encoded.codec,
+        "dtype": encoded.dtype,
+        "shape": list(encoded.shape),
+        "data": encoded.data,
+    }
     # Every value is ours; validating a megabyte of pixels again would cost more than sending it.
-    return Frame.model_construct(
-        sensor=image.sensor.camera,
-        modality=image.modality,
-        t_us=image.t_us,
-        T_world_sensor=image.T_world_sensor,
-        K=image.K,
-        codec=encoded.codec,
-        dtype=encoded.dtype,
-        shape=list(encoded.shape),
-        data=encoded.data,
-    )
+    return Frame.model_construct(**values)
 
 
 def check_sensors(

@@ -23,6 +23,7 @@ from real2sim_proto.errors import ProblemDetail, title_of
 from ..edit import EditError
 from ..render import RenderError
 from ..scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
+from .disconnects import ClientGoneError
 from .engine import DeviceLostError, EngineStoppedError, QueueFullError
 
 MAX_DETAILS = 50
@@ -136,6 +137,12 @@ def problem_response(error: ServiceError, *, path: str, request_id: str | None) 
 def install_problem_handlers(app: FastAPI) -> None:
     """Answer every error of ``app`` with a problem document."""
 
+    async def leave(_request: Request, _error: Exception) -> Response:
+        # Never sent; the number is what proxies log for it.
+        return Response(status_code=499)
+
+    app.add_exception_handler(ClientGoneError, leave)
+
     async def refuse(request: Request, error: Exception) -> Response:
         return problem_response(
             _of_framework(request, error),
@@ -194,8 +201,8 @@ def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
         if isinstance(body, dict) and (part in body or is_last):
             body = body.get(part)
             yield part
-        elif isinstance(body, list) and isinstance(part, int) and part < len(body):
-            body = body[part]
+        elif isinstance(body, list) and isinstance(part, int) and (part < len(body) or is_last):
+            body = body[part] if part < len(body) else None
             yield part
 
 

@@ -48,13 +48,25 @@ class _Held:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScenarioView:
-    """A scenario at one revision, for previews and new sessions."""
+    """A scenario at one revision: for answers, previews and new sessions. Never changes."""
 
     row: ScenarioRow
-    revision: int
+    summary: SceneSummary
     state: ScenarioState
+    revision: int
+    can_undo: bool
+    can_redo: bool
+
+    def info(self, *, tracks: bool = True) -> ScenarioInfo:
+        """What the wire says about it; takes milliseconds where there are many trajectories."""
+        return ScenarioInfo(
+            **_head(self.row, self.revision),
+            can_undo=self.can_undo,
+            can_redo=self.can_redo,
+            objects=edited_objects(self.state.visible, self.summary, tracks=tracks),
+        )
 
 
 class Scenarios:
@@ -81,7 +93,7 @@ class Scenarios:
         )
         scenario = await asyncio.to_thread(_replay, row, summary, [])
         held = _Held(row, scenario, summary)
-        info = _info(held, tracks=False)
+        info = _view(held).info(tracks=False)
         reply = once.reply(info, status=201, headers=created_headers(info))
         await self._store.create_scenario(row, reply=reply)
         self._keep(held)
@@ -101,15 +113,9 @@ class Scenarios:
         rows = await self._store.scenarios()
         return [_listed(row, kinds.get(row.scenario_id, [])) for row in rows]
 
-    async def info(self, scenario_id: str) -> ScenarioInfo:
-        """One scenario with its objects and their trajectories."""
-        held = await self._hold(scenario_id)
-        return await asyncio.to_thread(_info, held, tracks=True)
-
     async def view(self, scenario_id: str) -> ScenarioView:
-        """The scenario as it is now."""
-        held = await self._hold(scenario_id)
-        return ScenarioView(held.row, held.scenario.revision, held.scenario.state)
+        """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
+        return _view(await self._hold(scenario_id))
 
     async def history(self, scenario_id: str, *, after: int = 0) -> History:
         """Revisions behind ``after``, oldest first."""
@@ -315,13 +321,15 @@ def _stale(scenario: Scenario, expected: int) -> ServiceError:
     )
 
 
-def _info(held: _Held, *, tracks: bool) -> ScenarioInfo:
+def _view(held: _Held) -> ScenarioView:
     scenario = held.scenario
-    return ScenarioInfo(
-        **_head(held.row, scenario.revision),
+    return ScenarioView(
+        row=held.row,
+        summary=held.summary,
+        state=scenario.state,
+        revision=scenario.revision,
         can_undo=scenario.can_undo,
         can_redo=scenario.can_redo,
-        objects=edited_objects(scenario.state.visible, held.summary, tracks=tracks),
     )
 
 

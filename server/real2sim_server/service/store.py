@@ -290,7 +290,7 @@ class Store:
             self._engine = _connect(self.url)
             with self._engine.begin() as connection:
                 _prepare_schema(connection)
-                _forget_old_replies(connection)
+                connection.execute(_delete_old_replies())
         except (sa.exc.SQLAlchemyError, OSError) as error:
             reason = getattr(error, "orig", None) or error
             raise StoreError(f"cannot open the store {_shown(self.url)!r}: {reason}") from error
@@ -347,10 +347,9 @@ def _prepare_schema(connection: Connection) -> None:
         connection.execute(_insert(t.schema_version, {"version": t.SCHEMA_VERSION}))
 
 
-def _forget_old_replies(connection: Connection) -> None:
+def _delete_old_replies() -> sa.Delete:
     table = t.idempotent_replies
-    old = table.c.created_us <= now_us() - REPLY_LIFETIME_US
-    connection.execute(sa.delete(table).where(old))
+    return sa.delete(table).where(table.c.created_us <= now_us() - REPLY_LIFETIME_US)
 
 
 def _insert(table: sa.Table, row: Mapping[str, Any]) -> sa.Insert:
@@ -361,6 +360,4 @@ def _keep(reply: StoredReply | None) -> list[sa.Executable]:
     if reply is None:
         return []
     row = asdict(reply) | {"headers": json.dumps(dict(reply.headers)), "created_us": now_us()}
-    # An expired answer may still hold the key.
-    table = t.idempotent_replies
-    return [sa.delete(table).where(table.c.key == reply.key), _insert(table, row)]
+    return [_delete_old_replies(), _insert(t.idempotent_replies, row)]

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Annotated
@@ -95,27 +95,24 @@ class Worker:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Worker]:
-        """The worker at work: from the start of its engine to the end of its last job."""
-        self.engine.start()
-        await self.store.open()
-        await self.residency.refresh()
-        self.waiting_for = {"warming up kernels"}
-        background = [
-            asyncio.create_task(self._warm_up(), name="warm-up"),
-            asyncio.create_task(self._watch_loop(), name="loop-lag"),
-        ]
-        try:
+        """The worker at work: from the start of its engine to the end of its last job.
+
+        Raises:
+            StoreError: the store cannot be opened.
+        """
+        async with AsyncExitStack() as at_exit:
+            self.engine.start()
+            at_exit.push_async_callback(asyncio.to_thread, self.engine.stop)
+            at_exit.callback(self.pictures.close)
+            at_exit.callback(self.residency.close)
+            at_exit.push_async_callback(self.store.close)
+            await self.store.open()
+            await self.residency.refresh()
+            self.waiting_for = {"warming up kernels"}
+            at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
+            at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
+            at_exit.callback(self._drain)
             yield self
-        finally:
-            self.draining = True
-            for task in background:
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
-            await asyncio.to_thread(self.engine.stop)
-            self.pictures.close()
-            self.residency.close()
-            await self.store.close()
 
     def readiness(self) -> Readiness:
         """Whether new work is welcome, and if not, why."""
@@ -132,6 +129,9 @@ class Worker:
         """Count an answer that was given before."""
         self.metrics.replays.inc()
         return answer
+
+    def _drain(self) -> None:
+        self.draining = True
 
     async def _warm_up(self) -> None:
         started = time.perf_counter()
@@ -161,6 +161,12 @@ class Worker:
             self.metrics.watch(self.metrics.scenes.labels(state), count)
 
 
+async def _cancel(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
 def _device_of(backend: Backend) -> str:
     return "cuda" if backend.name == "cuda" else "cpu"
 
@@ -178,7 +184,7 @@ def _device_info(backend: Backend, settings: Settings) -> DeviceInfo:
         backend=backend.name,
         reason=reason,
         device=_device_of(backend),
-        threads=settings.threads or numba.config.NUMBA_NUM_THREADS,
+        threads=settings.threads or numba.get_num_threads(),
     )
 
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 import structlog
@@ -34,12 +35,20 @@ def make_settings(tmp_path: Path, scenes_dir: Path) -> Callable[..., Settings]:
 
 
 @pytest.fixture
-def start_worker(make_settings) -> Iterator[Callable[..., TestClient]]:
+def run_worker(make_settings) -> Callable[..., TestClient]:
+    """Makes workers that run for the length of a ``with`` block; keywords override settings."""
+    return lambda **overrides: TestClient(
+        create_app(make_settings(**overrides)), base_url="http://127.0.0.1"
+    )
+
+
+@pytest.fixture
+def start_worker(run_worker) -> Iterator[Callable[..., TestClient]]:
     """Starts workers that stop with the test; keywords override settings."""
     with ExitStack() as stack:
 
         def start(**overrides) -> TestClient:
-            return stack.enter_context(running_client(make_settings(**overrides)))
+            return stack.enter_context(run_worker(**overrides))
 
         yield start
 
@@ -49,11 +58,19 @@ def client(start_worker) -> TestClient:
     return start_worker()
 
 
-def running_client(settings: Settings) -> TestClient:
-    """A client to be entered; the worker runs inside the ``with`` block."""
-    return TestClient(create_app(settings), base_url="http://127.0.0.1")
-
-
 @pytest.fixture(autouse=True, scope="session")
 def quiet_log() -> None:
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    _log_from(logging.CRITICAL)
+
+
+@pytest.fixture
+def logged() -> Iterator[list[dict[str, Any]]]:
+    """All log entries of the test, oldest first."""
+    _log_from(logging.DEBUG)
+    with structlog.testing.capture_logs() as entries:
+        yield entries
+    _log_from(logging.CRITICAL)
+
+
+def _log_from(level: int) -> None:
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(level))

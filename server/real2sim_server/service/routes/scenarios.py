@@ -19,10 +19,12 @@ from real2sim_proto.scenarios import (
     ScenarioList,
 )
 
-from ..answers import FRAME_RESPONSES, frame_response, info_response
+from ..answers import FRAME_RESPONSES, frame_response, info_response, large_response
+from ..disconnects import unless_gone
 from ..idempotency import IdempotencyKey, Once
 from ..problems import ServiceError
 from ..scenarios import created_headers, tag
+from ..views import etag
 from ..worker import Worker, WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -81,8 +83,8 @@ async def list_scenarios(worker: WorkerOf) -> ScenarioList:
 @router.get("/{scenario_id}", response_model=ScenarioInfo)
 async def describe(worker: WorkerOf, scenario_id: str) -> Response:
     """One scenario with all its objects as they are now."""
-    info = await worker.scenarios.info(scenario_id)
-    return info_response(info, headers={"ETag": info.etag})
+    view = await worker.scenarios.view(scenario_id)
+    return await large_response(view.info, headers={"ETag": etag(view.revision)})
 
 
 @router.delete("/{scenario_id}", status_code=204, response_class=Response)
@@ -146,12 +148,15 @@ async def redo(
 
 
 @router.get("/{scenario_id}/preview", responses=FRAME_RESPONSES, response_class=Response)
-async def preview(worker: WorkerOf, scenario_id: str, asked: FrameQueryOf) -> Response:
+async def preview(
+    worker: WorkerOf, scenario_id: str, asked: FrameQueryOf, request: Request
+) -> Response:
     """One frame of the scenario as it is now, from where the recording vehicle was at ``t_us``."""
     media_type = asked.media_type()
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.residency.get(view.row.scene)
-    pictured = await worker.pictures.take(asked.shot(scene, view.state, media_type))
+    shot = asked.shot(scene, view.state, media_type)
+    pictured = await unless_gone(request, worker.pictures.take(shot))
     return frame_response(pictured, media_type, revision=view.revision)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 
 from real2sim_proto.base import Identifier
 from real2sim_proto.scenes import SceneInfo, SceneList
 
 from ...edit import ScenarioState
-from ..answers import FRAME_RESPONSES, frame_response, info_response
+from ..answers import FRAME_RESPONSES, frame_response, large_response
+from ..disconnects import unless_gone
 from ..views import scene_info
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
@@ -16,16 +17,17 @@ from .frame_query import FrameQueryOf
 router = APIRouter(prefix="/v1", tags=["scenes"])
 
 
-@router.get("/scenes")
-async def list_scenes(worker: WorkerOf) -> SceneList:
+@router.get("/scenes", response_model=SceneList)
+async def list_scenes(worker: WorkerOf) -> Response:
     """Every scene below the worker's scene folder, resident or not, broken ones with the reason."""
     residency = worker.residency
-    return SceneList(
-        scenes=[
-            scene_info(item, residency.state(name), summary=item.summary, tracks=False)
-            for name, item in (await residency.refresh()).items()
-        ]
-    )
+    listed = [(item, residency.state(name)) for name, item in (await residency.refresh()).items()]
+
+    def build() -> SceneList:
+        infos = [scene_info(i, state, summary=i.summary, tracks=False) for i, state in listed]
+        return SceneList(scenes=infos)
+
+    return await large_response(build)
 
 
 @router.get("/scenes/{scene}", response_model=SceneInfo)
@@ -49,12 +51,15 @@ async def unload(worker: WorkerOf, scene: Identifier) -> Response:
 
 
 @router.get("/scenes/{scene}/render", responses=FRAME_RESPONSES, response_class=Response)
-async def render(worker: WorkerOf, scene: Identifier, asked: FrameQueryOf) -> Response:
+async def render(
+    worker: WorkerOf, scene: Identifier, asked: FrameQueryOf, request: Request
+) -> Response:
     """One frame of the unedited scene, from where the recording vehicle was at ``t_us``."""
     media_type = asked.media_type()
     resident = await worker.residency.get(scene)
     shot = asked.shot(resident, ScenarioState.of(resident), media_type)
-    return frame_response(await worker.pictures.take(shot), media_type)
+    pictured = await unless_gone(request, worker.pictures.take(shot))
+    return frame_response(pictured, media_type)
 
 
 async def scene_response(
@@ -64,5 +69,8 @@ async def scene_response(
     listing = await worker.residency.listing(scene)
     state = worker.residency.state(scene)
     summary = await worker.residency.summary(scene) if listing.summary else None
-    info = scene_info(listing, state, summary=summary, tracks=True)
-    return info_response(info, status=status, headers=headers)
+    return await large_response(
+        lambda: scene_info(listing, state, summary=summary, tracks=True),
+        status=status,
+        headers=headers,
+    )

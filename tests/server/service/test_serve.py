@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import socket
+import threading
+
+import httpx2
+import pytest
+
+from real2sim_server.service.auth import OpenBindError
+from real2sim_server.service.serve import run, running_worker, server_config
+
+pytestmark = pytest.mark.network
+
+
+def test_a_running_worker_is_ready_and_stops_with_the_block(make_settings):
+    with running_worker(make_settings()) as running:
+        assert httpx2.get(f"{running.url}/readyz").status_code == 200
+        assert httpx2.get(f"{running.url}/v1/scenes/tiny/render?camera=front").status_code == 200
+        url, engine = running.url, running.worker.engine
+    assert not engine.alive
+    with pytest.raises(httpx2.ConnectError):
+        httpx2.get(f"{url}/livez")
+
+
+def test_it_stops_although_the_block_raises(make_settings):
+    with pytest.raises(KeyError), running_worker(make_settings()) as running:
+        raise KeyError
+    assert not running.worker.engine.alive
+
+
+def test_two_workers_take_two_ports(make_settings, tmp_path):
+    with (
+        running_worker(make_settings()) as first,
+        running_worker(make_settings(data_dir=tmp_path / "other", worker_id="w1")) as second,
+    ):
+        names = [httpx2.get(f"{w.url}/v1/server").json()["worker_id"] for w in (first, second)]
+    assert names == ["w0", "w1"]
+
+
+def test_the_token_is_handed_on(make_settings):
+    with running_worker(make_settings(token="correct horse")) as running:
+        headers = {"Authorization": f"Bearer {running.token}"}
+        assert httpx2.get(f"{running.url}/v1/server").status_code == 401
+        assert httpx2.get(f"{running.url}/v1/server", headers=headers).status_code == 200
+
+
+def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
+    warm = threading.Event()
+    monkeypatch.setattr("real2sim_server.service.pictures.warm_up", lambda _: warm.wait(5))
+    with (
+        pytest.raises(RuntimeError, match="warming up kernels"),
+        running_worker(make_settings(), timeout_s=0.5),
+    ):
+        pass
+    warm.set()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_worker_that_cannot_start_says_so_at_once(make_settings, tmp_path):
+    (tmp_path / "data").write_text("in the way")
+    with (
+        pytest.raises(RuntimeError, match="ended while it started"),
+        running_worker(make_settings()),
+    ):
+        pass
+
+
+def test_an_open_address_without_a_token_is_refused_before_anything_starts(make_settings):
+    settings = make_settings(host="0.0.0.0")
+    with pytest.raises(OpenBindError):
+        run(settings)
+    with pytest.raises(OpenBindError), running_worker(settings):
+        pass
+
+
+def test_a_port_that_is_taken_is_refused(make_settings):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with (
+            pytest.raises(OSError, match="in use"),
+            running_worker(make_settings(port=taken.getsockname()[1])),
+        ):
+            pass
+
+
+def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
+    from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
+    from real2sim_server.service.app import create_app
+
+    config = server_config(create_app(make_settings()), make_settings())
+    assert config.ws == "websockets-sansio"
+    assert config.ws_per_message_deflate is False
+    assert config.ws_max_size == MAX_CLIENT_MESSAGE_BYTES
+
+
+def test_a_render_of_a_client_that_left_is_not_drawn(make_settings):
+    with running_worker(make_settings()) as running:
+        engine, go_on = running.worker.engine, threading.Event()
+        httpx2.put(f"{running.url}/v1/scenes/tiny/residency")
+        blocker = threading.Thread(target=engine.call_sync, args=(go_on.wait,))
+        blocker.start()
+        with pytest.raises(httpx2.ReadTimeout):
+            httpx2.get(f"{running.url}/v1/scenes/tiny/render?camera=front", timeout=0.5)
+        waited = threading.Event()
+        for _ in range(200):
+            if engine.queue_depth == 0:
+                break
+            waited.wait(0.01)
+        depth = engine.queue_depth
+        go_on.set()
+        blocker.join()
+    assert depth == 0

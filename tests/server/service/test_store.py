@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+from dataclasses import replace
+
+import pytest
+
+from real2sim_server.service.store import (
+    ConflictError,
+    ScenarioRow,
+    SessionEntry,
+    SessionRow,
+    Store,
+    StoredReply,
+    StoreError,
+    now_us,
+)
+
+SCENARIO = ScenarioRow("sc_1", "first", "tiny", "0" * 64, 1)
+SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "secret", 1)
+REPLY = StoredReply("key", "f" * 64, 201, {"ETag": '"r1"'}, b'{"a": 1}')
+
+
+@pytest.fixture
+def url(tmp_path) -> str:
+    return f"sqlite:///{tmp_path / 'deep' / 'store.db'}"
+
+
+def run(url: str, work):
+    """Run ``work(store)`` on a store opened for it."""
+
+    async def inside():
+        store = Store(url)
+        await store.open()
+        try:
+            return await work(store)
+        finally:
+            await store.close()
+
+    return asyncio.run(inside())
+
+
+def entry(text: str) -> dict:
+    return {"kind": "edit", "text": text}
+
+
+def test_a_scenario_and_its_log_survive_closing(url):
+    async def write(store):
+        await store.create_scenario(SCENARIO)
+        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
+        await store.append_scenario_entry("sc_1", 2, entry("b"), created_us=2)
+
+    async def read(store):
+        return await store.scenario("sc_1"), await store.scenario_entries("sc_1")
+
+    run(url, write)
+    assert run(url, read) == (SCENARIO, [entry("a"), entry("b")])
+
+
+def test_a_revision_can_be_written_only_once(url):
+    async def write(store):
+        await store.create_scenario(SCENARIO)
+        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
+        with pytest.raises(ConflictError):
+            await store.append_scenario_entry("sc_1", 1, entry("b"), created_us=1)
+        return await store.scenario_entries("sc_1")
+
+    assert run(url, write) == [entry("a")]
+
+
+def test_an_entry_without_its_scenario_is_refused(url):
+    async def write(store):
+        with pytest.raises(ConflictError):
+            await store.append_scenario_entry("sc_9", 1, entry("a"), created_us=1)
+
+    run(url, write)
+
+
+def test_deleting_a_scenario_takes_its_log_along(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
+        assert await store.delete_scenario("sc_1") is True
+        assert await store.delete_scenario("sc_1") is False
+        return await store.scenarios(), await store.scenario_kinds()
+
+    assert run(url, work) == ([], {})
+
+
+def test_scenarios_are_listed_oldest_first(url):
+    async def work(store):
+        await store.create_scenario(replace(SCENARIO, scenario_id="late", created_us=9))
+        await store.create_scenario(replace(SCENARIO, scenario_id="early", created_us=3))
+        return [row.scenario_id for row in await store.scenarios()]
+
+    assert run(url, work) == ["early", "late"]
+
+
+def test_a_reply_is_stored_with_its_effect_or_not_at_all(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1, reply=REPLY)
+        other = replace(REPLY, key="other")
+        with pytest.raises(ConflictError):
+            await store.append_scenario_entry("sc_1", 1, entry("b"), created_us=1, reply=other)
+        return await store.reply("key"), await store.reply("other")
+
+    assert run(url, work) == (REPLY, None)
+
+
+def test_a_reply_is_forgotten_after_a_day(url, monkeypatch):
+    async def work(store):
+        await store.create_scenario(SCENARIO, reply=REPLY)
+        day_us = 24 * 3600 * 1_000_000
+        monkeypatch.setattr("real2sim_server.service.store.now_us", lambda: now_us() + day_us)
+        gone = await store.reply("key")
+        await store.create_scenario(replace(SCENARIO, scenario_id="sc_2"), reply=REPLY)
+        return gone, await store.reply("key")
+
+    assert run(url, work) == (None, REPLY)
+
+
+def test_a_session_log_is_appended_all_or_nothing(url):
+    first, second = (SessionEntry(i, "action", i, b"\x80", 1) for i in range(2))
+
+    async def work(store):
+        await store.create_session(SESSION)
+        await store.append_session_entries("w0.1", [first])
+        with pytest.raises(ConflictError):
+            await store.append_session_entries("w0.1", [second, first])
+        kept = await store.session_entries("w0.1")
+        await store.append_session_entries("w0.1", [second])
+        return kept, await store.session_entries("w0.1", after=0)
+
+    assert run(url, work) == ([first], [second])
+
+
+def test_open_sessions_are_those_of_the_worker_that_were_not_closed(url):
+    async def work(store):
+        for session_id, worker_id in (("w0.1", "w0"), ("w0.2", "w0"), ("w1.1", "w1")):
+            row = replace(SESSION, session_id=session_id, worker_id=worker_id)
+            await store.create_session(row)
+        await store.close_session("w0.1", reason="done")
+        await store.close_session("w0.1", reason="again")
+        return await store.open_sessions("w0"), await store.session("w0.1")
+
+    still_open, closed = run(url, work)
+    assert [row.session_id for row in still_open] == ["w0.2"]
+    assert closed.reason == "done"
+    assert closed.closed_us is not None
+
+
+def test_a_write_ahead_log_is_used(url, tmp_path):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        return (tmp_path / "deep" / "store.db-wal").exists()
+
+    assert run(url, work)
+
+
+def test_a_newer_store_is_refused_with_both_versions(url, tmp_path):
+    async def nothing(store):
+        pass
+
+    run(url, nothing)
+    connection = sqlite3.connect(tmp_path / "deep" / "store.db")
+    connection.execute("UPDATE schema_version SET version = 99")
+    connection.commit()
+    connection.close()
+    with pytest.raises(StoreError, match="schema version 99, this worker reads 1"):
+        run(url, nothing)
+
+
+def test_a_file_that_is_no_database_is_refused(url, tmp_path):
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "store.db").write_bytes(b"not a database at all" * 100)
+
+    async def nothing(store):
+        pass
+
+    with pytest.raises(StoreError, match="cannot open the store"):
+        run(url, nothing)
+
+
+def test_a_password_in_the_url_is_not_shown():
+    async def nothing(store):
+        pass
+
+    with pytest.raises(StoreError) as caught:
+        run("nosuchdb://user:hunter2@host/db", nothing)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_what_was_handed_over_is_written_although_the_caller_was_cancelled(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        append = store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
+        task = asyncio.create_task(append)
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        return await store.scenario_entries("sc_1")
+
+    assert run(url, work) == [entry("a")]
+
+
+def test_a_store_in_memory_works_too():
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        return await store.scenario("sc_1")
+
+    assert run("sqlite://", work) == SCENARIO
