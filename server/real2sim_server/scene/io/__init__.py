@@ -1,12 +1,14 @@
 """Scenes, assets and splats on disk."""
 
 from .bundle import load_asset, load_scene, save_asset, save_scene
+from .export import export_scene
 from .splats import import_splats, read_splats, write_ply, write_splats
 from .summary import ObjectSummary, SceneSummary, read_scene_summary
 
 __all__ = [
     "ObjectSummary",
     "SceneSummary",
+    "export_scene",
     "import_splats",
     "load_asset",
     "load_scene",

@@ -16,7 +16,7 @@ from ..errors import BundleError, SceneError
 from ..rotation import Float, quaternion_to_matrix, yaw_quaternion
 from ..scene import Scene
 from ..trajectory import Trajectory
-from .formats import FORMATS, inria_ply
+from .formats import FORMATS, SplatFormat, inria_ply
 
 HEAD_BYTES = 1 << 16
 
@@ -65,12 +65,22 @@ def write_splats(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
         OSError: the file cannot be written.
     """
     file = Path(path)
-    splat_format = next((f for f in FORMATS if file.name.lower().endswith(f.suffix)), None)
-    if splat_format is None:
-        endings = ", ".join(f.suffix for f in FORMATS)
-        raise SceneError(f"{file}: no splat format ends so; allowed are {endings}")
+    splat_format = format_to_write(file)
     cloud.check_values(f"cloud for {file}")
     splat_format.write(cloud, file)
+
+
+def format_to_write(path: Path) -> SplatFormat:
+    """The format that the name of ``path`` ends with.
+
+    Raises:
+        SceneError: where it ends with none.
+    """
+    for splat_format in FORMATS:
+        if path.name.lower().endswith(splat_format.suffix):
+            return splat_format
+    endings = ", ".join(f.suffix for f in FORMATS)
+    raise SceneError(f"{path}: no splat format ends so; allowed are {endings}")
 
 
 def write_ply(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
@@ -138,7 +148,7 @@ def import_splats(
     cloud = read_splats(file)
     if not len(cloud):
         raise BundleError(f"{file}: holds no splats; nothing to import")
-    placed = cloud.moved(_upright(up_axis, yaw), scale=scale)
+    placed = cloud.moved(upright(up_axis, yaw), scale=scale)
     provenance = {
         "source": "splat file",
         "file": file.name,
@@ -208,7 +218,12 @@ def _head(file: Path) -> bytes:
         raise BundleError(f"{file}: cannot be read: {error.strerror}") from error
 
 
-def _upright(up_axis: str, yaw: float) -> Float:
+def upright(up_axis: str, yaw: float) -> Float:
+    """Turn ``T_scene_file`` [4, 4] for files whose ``up_axis`` points up, then by ``yaw`` [rad].
+
+    Raises:
+        SceneError: for an unknown axis or a yaw that is not finite.
+    """
     if up_axis not in _ROTATIONS:
         raise SceneError(f"up_axis {up_axis!r}; allowed are {list(_ROTATIONS)}")
     if not np.isfinite(yaw):

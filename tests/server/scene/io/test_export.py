@@ -1,0 +1,154 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.scene import GaussianCloud, SceneError, Trajectory, UnknownObjectError
+from real2sim_server.scene.io import export_scene, import_splats, read_splats
+from real2sim_server.scene.io.export import bake
+from real2sim_server.scene.rotation import apply_transform
+
+SPLATS = ["ply", "compressed.ply", "spz", "splat"]
+
+
+@pytest.fixture
+def t_us(scene):
+    return scene.start_us + 130_000
+
+
+def extent(cloud):
+    return cloud.means.amin(0).tolist() + cloud.means.amax(0).tolist()
+
+
+@pytest.mark.parametrize("name", SPLATS)
+def test_a_baked_scene_holds_everything_where_it_was(scene, t_us, tmp_path, name):
+    (file,) = export_scene(scene, tmp_path / f"a.{name}", format=name, t_us=t_us)
+    back = import_splats(file, name="a", up_axis="y" if name == "spz" else "z").background
+    expected = [scene.background.means.numpy()]
+    for scene_object in scene.objects.values():
+        pose = scene_object.trajectory.transform(t_us)
+        expected.append(apply_transform(pose, scene_object.cloud.means.numpy()))
+    expected = np.concatenate(expected)
+    assert len(back) == len(expected) == scene.gaussian_count
+    given = back.means.numpy()
+    # Some formats reorder: each point has its own in the other.
+    distances = np.linalg.norm(given[:, None] - expected[None], axis=2)
+    # A chunk spans about 60 m, which compressed ply cuts into 1023 steps across and more along.
+    assert distances.min(axis=0).max() < (0.06 if name == "compressed.ply" else 4e-4)
+    assert distances.min(axis=1).max() < (0.06 if name == "compressed.ply" else 4e-4)
+
+
+def test_a_baked_ply_equals_the_clouds_moved_to_the_world(scene, t_us, tmp_path):
+    export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us)
+    back, expected = read_splats(tmp_path / "a.ply"), bake(scene, t_us)
+    assert torch.equal(back.means, expected.means)
+    assert torch.equal(back.sh, expected.sh)
+    placed = scene.objects["car_7"].cloud.moved(scene.objects["car_7"].trajectory.transform(t_us))
+    n = len(scene.background)
+    assert torch.equal(back.means[n : n + len(placed)], placed.means)
+
+
+def test_objects_that_do_not_exist_then_are_left_out(scene, tmp_path):
+    late = scene.end_us
+    gone = scene.objects["car_3"]
+    first = gone.trajectory
+    short = Trajectory(first.times_us[:2], first.positions[:2], first.quaternions[:2])
+    object.__setattr__(gone, "trajectory", short)
+    export_scene(scene, tmp_path / "a.ply", format="ply", t_us=late)
+    assert len(read_splats(tmp_path / "a.ply")) == scene.gaussian_count - len(gone.cloud)
+
+
+def test_only_the_objects_asked_for_are_baked(scene, t_us, tmp_path):
+    export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us, objects=["car_3"])
+    expected = len(scene.background) + len(scene.objects["car_3"].cloud)
+    assert len(read_splats(tmp_path / "a.ply")) == expected
+    export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us, objects=[])
+    assert len(read_splats(tmp_path / "a.ply")) == len(scene.background)
+
+
+@pytest.mark.parametrize(("up_axis", "file_up"), [("z", 2), ("y", 1)])
+def test_the_axis_asked_for_points_up(scene, t_us, tmp_path, up_axis, file_up):
+    scene.background.means[:, 2] += 1000
+    export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us, up_axis=up_axis)
+    assert read_splats(tmp_path / "a.ply").means[:100].mean(0)[file_up] > 900
+    back = import_splats(tmp_path / "a.ply", name="a", up_axis=up_axis).background
+    np.testing.assert_allclose(back.means, bake(scene, t_us).means, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SPLATS)
+def test_objects_become_files_in_their_own_frame(scene, tmp_path, name):
+    files = export_scene(scene, tmp_path / "out", format=name)
+    assert sorted(f.name for f in files) == sorted(p.name for p in (tmp_path / "out").iterdir())
+    index = json.loads((tmp_path / "out" / "objects.json").read_bytes())
+    assert index["background"] == f"background.{name}"
+    assert [o["object_id"] for o in index["objects"]] == list(scene.objects)
+    for entry in index["objects"]:
+        expected = scene.objects[entry["object_id"]]
+        cloud = read_splats(tmp_path / "out" / entry["file"])
+        turned = cloud.moved(np.linalg.inv(index["T_file_scene"]))
+        np.testing.assert_allclose(extent(turned), extent(expected.cloud), atol=4e-4)
+        track = Trajectory(entry["times_us"], entry["positions"], entry["quaternions_wxyz"])
+        assert track.times_us.tolist() == expected.trajectory.times_us.tolist()
+        assert (track.positions == expected.trajectory.positions).all()
+        assert (entry["category"], tuple(entry["size"])) == (expected.category, expected.size)
+
+
+def test_ids_cannot_lead_out_of_the_folder(scene, tmp_path):
+    files = export_scene(scene, tmp_path / "out", format="ply")
+    assert all(f.parent == tmp_path / "out" for f in files)
+    assert "003_______etc_passwd.ply" in {f.name for f in files}
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_an_export_replaces_an_export_and_nothing_else(scene, tmp_path):
+    export_scene(scene, tmp_path / "out", format="ply")
+    export_scene(scene, tmp_path / "out", format="spz")
+    assert all(not p.name.endswith(".ply") for p in (tmp_path / "out").iterdir())
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    with pytest.raises(SceneError, match="holds something else than an export"):
+        export_scene(scene, tmp_path / "out", format="ply")
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"background": 1, "objects": [3]}'])
+def test_a_folder_with_an_index_of_somebody_else_is_kept(scene, tmp_path, text):
+    (tmp_path / "objects.json").write_text(text)
+    with pytest.raises(SceneError, match="holds something else"):
+        export_scene(scene, tmp_path, format="ply")
+
+
+def test_a_failing_export_leaves_nothing(scene, tmp_path):
+    scene.objects["car_3"].cloud.scales[0] = 0
+    with pytest.raises(SceneError, match="scales not positive"):
+        export_scene(scene, tmp_path / "out", format="ply")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"format": "obj"}, "export format 'obj'; allowed are ply, compressed.ply, spz"),
+        ({"t_us": 10**9}, "t_us=1000000000 is outside scene 'street'; allowed are 7 to 400007"),
+        ({"objects": "car_3"}, "must be a list of ids, not the text 'car_3'"),
+        ({"objects": ["car_9"]}, "no object 'car_9'"),
+        ({"up_axis": "x"}, "up_axis 'x'"),
+        ({"format": "spz", "t_us": 7}, r"must end with \.spz"),
+        ({"format": "gltf"}, r"must end with \.glb"),
+        ({"format": "gltf", "up_axis": "z"}, "glTF is always y up"),
+    ],
+)
+def test_bad_requests_are_refused(scene, tmp_path, options, reason):
+    with pytest.raises((SceneError, UnknownObjectError), match=reason):
+        export_scene(scene, tmp_path / "a.ply", **{"format": "ply"} | options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_ply_does_not_silently_become_a_compressed_one(scene, tmp_path):
+    with pytest.raises(SceneError, match="this ending means PlayCanvas compressed ply, not ply"):
+        export_scene(scene, tmp_path / "a.compressed.ply", format="ply", t_us=7)
+
+
+def test_a_scene_without_objects_bakes_to_its_background(scene, tmp_path):
+    assert len(bake(scene, scene.start_us, objects={})) == len(scene.background)
+    assert isinstance(bake(scene, scene.start_us), GaussianCloud)
