@@ -94,3 +94,17 @@ def place_instances(instances: Sequence[Instance], viewmats: Tensor) -> Placemen
     rotation, offset = T_camera_object[..., :3, :3], T_camera_object[..., :3, 3]
     camera_position = -(rotation.mT @ offset[..., None])[..., 0]
     return Placement(rotation * scale[None, :, None, :], offset, camera_position, scale)
+
+
+def direction_matrix(request: RasterRequest, camera: int) -> Tensor:
+    """``R_world_camera K^-1`` [3, 3] float32: maps (x, y, 1) [px] to a world direction."""
+    rotation = request.viewmats[camera, :3, :3].detach()
+    return (rotation.mT @ torch.linalg.inv(request.Ks[camera])).float()
+
+
+def pixel_directions(request: RasterRequest, camera: int) -> Tensor:
+    """World directions [H, W, 3] float32 of pixel centres, on the device of ``viewmats``."""
+    matrix = direction_matrix(request, camera)
+    x = torch.arange(request.width, device=matrix.device) + 0.5
+    y = torch.arange(request.height, device=matrix.device) + 0.5
+    return (x[None, :, None] * matrix[:, 0] + y[:, None, None] * matrix[:, 1]) + matrix[:, 2]

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..types import Instance, RenderOutput
-from .base import CLAMP_MARGIN, Placement, RasterRequest, place_instances
+from .base import CLAMP_MARGIN, Placement, RasterRequest, direction_matrix, place_instances
 from .cpu_blend import blend_tiles
 from .cpu_project import project_cluster
 from .cpu_records import CHUNK, RECORD, TILE, Cluster, Images, Records, View
@@ -84,7 +84,8 @@ class CpuBackend:
         if request.sky is not None:
             with _timed(timing, "sky"):
                 faces = np.ascontiguousarray(request.sky.faces.detach().cpu().numpy())
-                add_sky(faces, _direction_matrix(request, camera), images.rgb, images.alpha)
+                matrix = direction_matrix(request, camera).cpu().contiguous().numpy()
+                add_sky(faces, matrix, images.rgb, images.alpha)
 
     def _project(
         self, request: RasterRequest, placement: Placement, camera: int
@@ -199,13 +200,6 @@ def _view(request: RasterRequest, camera: int) -> View:
         "blur": options.eps2d**0.5,
     }
     return View(**{name: np.float32(value) for name, value in numbers.items()})
-
-
-def _direction_matrix(request: RasterRequest, camera: int) -> NDArray[np.float32]:
-    """``R_world_camera K^-1`` [3, 3] float32."""
-    rotation = request.viewmats[camera, :3, :3].detach().cpu()
-    matrix = (rotation.mT @ torch.linalg.inv(request.Ks[camera].cpu())).float()
-    return np.ascontiguousarray(matrix.numpy())
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from .base import (
     TRANSMITTANCE_MIN,
     Placement,
     RasterRequest,
+    pixel_directions,
     place_instances,
 )
 from .spherical_harmonics import evaluate_sh
@@ -243,14 +244,3 @@ def _behind(request: RasterRequest, camera: int, dtype: torch.dtype) -> Tensor:
     if request.sky is None:
         return torch.tensor(request.options.background, dtype=dtype)
     return request.sky.sample(pixel_directions(request, camera)).to(dtype)
-
-
-def pixel_directions(request: RasterRequest, camera: int) -> Tensor:
-    """World directions [H, W, 3] float32 of pixel centres: ``R_world_camera K^-1 (x, y, 1)``."""
-    rotation = request.viewmats[camera, :3, :3].detach()
-    matrix = (rotation.mT @ torch.linalg.inv(request.Ks[camera])).float()
-    x = torch.arange(request.width, dtype=torch.float32) + 0.5
-    y = torch.arange(request.height, dtype=torch.float32) + 0.5
-    along_x = x[None, :, None] * matrix[:, 0]
-    along_y = y[:, None, None] * matrix[:, 1]
-    return (along_x + along_y) + matrix[:, 2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import logging
+import shutil
 from dataclasses import dataclass
 
 import torch
@@ -95,5 +96,16 @@ def _cuda_status() -> BackendStatus:
     if importlib.util.find_spec("gsplat") is None:
         return BackendStatus(
             "cuda", False, "gsplat is not installed", "pip install 'real2sim[server,cuda]'"
+        )
+    if importlib.util.find_spec("numba.cuda") is None:
+        return BackendStatus(
+            "cuda", False, "numba-cuda is not installed", "pip install 'real2sim[server,cuda]'"
+        )
+    if importlib.util.find_spec("gsplat.csrc") is None and shutil.which("nvcc") is None:
+        return BackendStatus(
+            "cuda",
+            False,
+            "gsplat is not compiled and there is no nvcc to compile it",
+            "install the CUDA toolkit, or a gsplat wheel built for this torch",
         )
     return BackendStatus("cuda", True, f"gsplat on {torch.cuda.get_device_name()}")
