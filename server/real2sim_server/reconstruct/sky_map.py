@@ -32,7 +32,7 @@ class SkySamples:
         self._counts = np.zeros(n, dtype=np.uint8)
 
     def add(self, view: View) -> None:
-        """Take the pixels of ``view`` that show neither a Gaussian nor a tracked box."""
+        """Take the pixels of ``view`` that show neither a Gaussian nor a tracked object."""
         texels, u, v = self._texels_in(view)
         row, column = (v / SHRINK).astype(np.int64), (u / SHRINK).astype(np.int64)
         free = uncovered(view)[row, column] & (self._counts[texels] < SLOTS)
@@ -77,10 +77,10 @@ class SkySamples:
 
 
 def uncovered(view: View) -> NDArray[np.bool_]:
-    """[H / 2, W / 2] bool: no Gaussian and no box there nor next to there; pinholes closed."""
+    """[H / 2, W / 2] bool: no Gaussian and no object there; pinholes closed."""
     import cv2
 
-    covered = (np.isfinite(view.depth) | view.in_box).astype(np.uint8)
+    covered = (np.isfinite(view.depth) | view.on_object).astype(np.uint8)
     closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     return np.asarray(closed == 0)
 

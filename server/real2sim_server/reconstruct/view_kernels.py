@@ -78,45 +78,6 @@ def splat_depth(in_camera, turned, radii, K, depth):
 
 
 @njit(cache=True, nogil=True)
-def enter_boxes(T_box_camera, half, boxes, K, first, first_box, second):
-    """Where the ray of each pixel first enters a box, and where it enters a second one.
-
-    Args:
-        T_box_camera: [B, 3, 4] float32.
-        half: [B, 3] float32, half sizes [m].
-        boxes: [B] int64, instance of each box.
-        K: [4] float32.
-        first, second: [H, W] float32 depths [m], written; inf where there is none.
-        first_box: [H, W] int32, instance of the first, written; -1 where there is none.
-    """
-    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    height, width = first.shape
-    for b in range(len(boxes)):
-        t = T_box_camera[b]
-        for py in range(height):
-            ry = (py + np.float32(0.5) - cy) / fy
-            for px in range(width):
-                rx = (px + np.float32(0.5) - cx) / fx
-                enter, leave = np.float32(0.0), np.float32(np.inf)
-                for a in range(3):
-                    direction = t[a, 0] * rx + t[a, 1] * ry + t[a, 2]
-                    if abs(direction) < 1e-9:
-                        direction = np.float32(1e-9)
-                    near = (-half[b, a] - t[a, 3]) / direction
-                    far = (half[b, a] - t[a, 3]) / direction
-                    enter = max(enter, min(near, far))
-                    leave = min(leave, max(near, far))
-                if enter >= leave:
-                    continue
-                if enter < first[py, px]:
-                    second[py, px] = first[py, px]
-                    first[py, px] = enter
-                    first_box[py, px] = boxes[b]
-                elif enter < second[py, px]:
-                    second[py, px] = enter
-
-
-@njit(cache=True, nogil=True)
 def visible_weight(x, y, z, nx, ny, nz, px, py, K, depth):
     """0 where the disk through (x, y, z) is hidden, 0.15 at its own silhouette, else 1."""
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -156,7 +117,7 @@ def gather_samples(
     shrink,
     depth,
     first,
-    first_box,
+    first_object,
     second,
     levels,
     colours,
@@ -169,7 +130,10 @@ def gather_samples(
         footprints: [N] float32, tangent size of the Gaussians [m].
         instance: [N] uint16.
         K: [4] float32 of the image; the depth image is ``shrink`` times smaller.
-        depth, first, first_box, second: from the other kernels.
+        depth: from :func:`splat_depth`.
+        first, second: [H, W] float32, depths of the nearest two objects, each drawn somewhat
+            larger than it is [m]; inf where there is none.
+        first_object: [H, W] int32, instance of the first; -1 where there is none.
         levels: tuple of [H, W, 3] uint8 images, each half the size of the one before.
         colours: [N, S, 3] uint8 and weights: [N, S] float32, updated.
     """
@@ -185,8 +149,8 @@ def gather_samples(
         px, py = int(u / shrink), int(v / shrink)
         if px >= depth.shape[1] or py >= depth.shape[0]:
             continue
-        box = first[py, px] if first_box[py, px] != instance[i] else second[py, px]
-        if box < z - np.float32(0.1):
+        other = first[py, px] if first_object[py, px] != instance[i] else second[py, px]
+        if other < z - np.float32(0.1):
             continue
         nx, ny, nz = turned[i, 0], turned[i, 1], turned[i, 2]
         weight = visible_weight(x, y, z, nx, ny, nz, px, py, small, depth)

@@ -6,25 +6,26 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..logs import DrivingLog
 from ..scene import Camera
-from ..scene.rotation import Float, invert_transform
+from ..scene.rotation import Float
 from . import view_kernels as kernels
 from .surfels import Surfels
 
 SHRINK = 2
 """The depth image is this much smaller than the camera image."""
 PYRAMID = 4
-BOX_MARGIN = 0.15
-"""Boxes hide what is behind them with this margin to the sides and the top [m]."""
+OBJECT_MARGIN = 0.12
+"""Objects hide what is behind them with this margin around them [m]."""
+MAX_REACH = 15
+"""Bound of that margin [px of the depth image]."""
 
-_Result = TypeVar("_Result")
-_BoxDepths = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
+_NearestObjects = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +34,7 @@ class Placed:
 
     Attributes:
         surfels: in the frame of their instance.
-        instance: [N] uint16, 0 for the background, else 1 + index of the track.
+        instance: [N] uint16, 0 for the background, else 1 + index of the track; increasing.
     """
 
     surfels: Surfels
@@ -50,7 +51,7 @@ class View:
         T_camera_world: [4, 4].
         image: [H, W, 3] uint8.
         depth: [H / 2, W / 2] float32 [m], nearest Gaussian, inf where there is none.
-        in_box: [H / 2, W / 2] bool, pixels whose ray passes through a tracked box.
+        on_object: [H / 2, W / 2] bool, pixels on a tracked object or next to one.
     """
 
     camera: Camera
@@ -58,7 +59,7 @@ class View:
     T_camera_world: Float
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
-    in_box: NDArray[np.bool_]
+    on_object: NDArray[np.bool_]
 
 
 def chosen_frames(log: DrivingLog, limit: int) -> list[int]:
@@ -78,6 +79,8 @@ class ColourSamples:
         tangents = placed.surfels.scales[:, :2]
         self._radii = (1.4 * tangents.max(axis=1)).astype(np.float32)
         self._footprints = np.sqrt(tangents[:, 0] * tangents[:, 1]).astype(np.float32)
+        self._cores = os.cpu_count() or 1
+        self._parts = self._split_by_instance()
         self._in_camera = np.zeros((n, 3), dtype=np.float32)
         self._turned = np.zeros((n, 3), dtype=np.float32)
         self._colours = np.zeros((n, slots, 3), dtype=np.uint8)
@@ -95,10 +98,10 @@ class ColourSamples:
         self._project(transforms, present)
         k = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]], np.float32)
         shape = (-(-camera.height // SHRINK), -(-camera.width // SHRINK))
-        depth = self._depth(k / np.float32(SHRINK), shape)
-        boxes = _box_depths(log, transforms, present, k / np.float32(SHRINK), shape)
-        self._gather(k, depth, boxes, _pyramid(image))
-        return View(camera, frame, T_camera_world, image, depth, np.isfinite(boxes[0]))
+        depth, objects = self._depths(k / np.float32(SHRINK), shape)
+        nearest = _nearest_objects(objects, float(k[0]) / SHRINK, shape)
+        self._gather(k, depth, nearest, _pyramid(image))
+        return View(camera, frame, T_camera_world, image, depth, np.isfinite(nearest[0]))
 
     def mean(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Colours [N, 3] float32 in [0, 1], and which are known [N] bool; the others are 0."""
@@ -123,7 +126,11 @@ class ColourSamples:
 
         self._on_all_cores(work)
 
-    def _depth(self, k: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+    def _depths(
+        self, k: NDArray[np.float32], shape: tuple[int, int]
+    ) -> tuple[NDArray[np.float32], dict[int, NDArray[np.float32]]]:
+        """Depth image of everything, and one of each object in view."""
+
         def work(part: slice) -> NDArray[np.float32]:
             depth = np.full(shape, np.inf, dtype=np.float32)
             kernels.splat_depth(
@@ -131,13 +138,20 @@ class ColourSamples:
             )
             return depth
 
-        return np.asarray(np.minimum.reduce(self._on_all_cores(work)))
+        with ThreadPoolExecutor(self._cores) as pool:
+            images = list(pool.map(work, [part for _, part in self._parts]))
+        objects = {
+            instance: image
+            for (instance, _), image in zip(self._parts, images, strict=True)
+            if instance > 0 and np.isfinite(image).any()
+        }
+        return np.asarray(np.minimum.reduce(images)), objects
 
     def _gather(
         self,
         k: NDArray[np.float32],
         depth: NDArray[np.float32],
-        boxes: _BoxDepths,
+        nearest: _NearestObjects,
         pyramid: tuple[NDArray[np.uint8], ...],
     ) -> None:
         def work(part: slice) -> None:
@@ -149,7 +163,7 @@ class ColourSamples:
                 k,
                 SHRINK,
                 depth,
-                *boxes,
+                *nearest,
                 pyramid,
                 self._colours[part],
                 self._weights[part],
@@ -157,12 +171,26 @@ class ColourSamples:
 
         self._on_all_cores(work)
 
-    def _on_all_cores(self, work: Callable[[slice], _Result]) -> list[_Result]:
+    def _on_all_cores(self, work: Callable[[slice], None]) -> None:
         """Run ``work`` on ranges of Gaussians that together are all of them."""
-        count = os.cpu_count() or 1
-        bounds = [len(self._means) * i // count for i in range(count + 1)]
-        with ThreadPoolExecutor(count) as pool:
-            return list(pool.map(work, map(slice, bounds[:-1], bounds[1:])))
+        with ThreadPoolExecutor(self._cores) as pool:
+            list(pool.map(work, _ranges(0, len(self._means), self._cores)))
+
+    def _split_by_instance(self) -> list[tuple[int, slice]]:
+        """Ranges of Gaussians of one instance each; the background in one range per core."""
+        bounds = np.flatnonzero(np.diff(self._placed.instance)) + 1
+        edges = [0, *bounds.tolist(), len(self._means)]
+        parts: list[tuple[int, slice]] = []
+        for start, stop in pairwise(edges):
+            instance = int(self._placed.instance[start])
+            count = self._cores if instance == 0 else 1
+            parts += [(instance, part) for part in _ranges(start, stop, count)]
+        return parts
+
+
+def _ranges(start: int, stop: int, count: int) -> list[slice]:
+    bounds = [start + (stop - start) * i // count for i in range(count + 1)]
+    return [slice(a, b) for a, b in pairwise(bounds)]
 
 
 def gather_views(
@@ -176,9 +204,8 @@ def gather_views(
     """Colour all Gaussians from all cameras at ``frames``, occlusion respected.
 
     A view counts for a Gaussian when nothing lies before it in a depth image of all Gaussians,
-    and the ray to it passes through no other object's box: car windows give no LiDAR returns,
-    so depth alone would paint windows on the road behind. Of the ``slots`` nearest, most frontal
-    views, those that agree with their median are averaged.
+    and no other object lies before it that is drawn somewhat larger than it is. Of the ``slots``
+    nearest, most frontal views, those that agree with their median are averaged.
 
     Args:
         on_view: called with each view after it was looked at.
@@ -211,24 +238,29 @@ def _instance_poses(log: DrivingLog, t_us: int) -> list[Float | None]:
     return [np.eye(4), *tracks]
 
 
-def _box_depths(
-    log: DrivingLog,
-    transforms: Float,
-    present: NDArray[np.bool_],
-    k: NDArray[np.float32],
-    shape: tuple[int, int],
-) -> _BoxDepths:
-    """Depth of the first box in each pixel, its instance, and depth of the second."""
-    boxes = np.array([i for i in range(1, len(present)) if present[i]], dtype=np.int64)
-    half = np.array([log.tracks[i - 1].size for i in boxes], np.float32).reshape(-1, 3) / 2
-    half += np.array([BOX_MARGIN, BOX_MARGIN, BOX_MARGIN / 2], dtype=np.float32)
-    T_box_camera = invert_transform(transforms[boxes])[:, :3].astype(np.float32)
-    T_box_camera[:, 2, 3] -= BOX_MARGIN / 2
+def _nearest_objects(
+    objects: dict[int, NDArray[np.float32]], focal: float, shape: tuple[int, int]
+) -> _NearestObjects:
+    """Depth of the nearest object in each pixel, its instance, and depth of the second nearest.
+
+    Objects are drawn larger by OBJECT_MARGIN, as boxes and poses are not exact.
+    """
+    import cv2
+
     first = np.full(shape, np.inf, dtype=np.float32)
     second = first.copy()
-    first_box = np.full(shape, -1, dtype=np.int32)
-    kernels.enter_boxes(T_box_camera, half, boxes, k, first, first_box, second)
-    return first, first_box, second
+    first_object = np.full(shape, -1, dtype=np.int32)
+    for instance, depth in objects.items():
+        distance = float(np.quantile(depth[np.isfinite(depth)], 0.3))
+        reach = min(max(1, round(OBJECT_MARGIN * focal / distance)), MAX_REACH)
+        disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        # The default border is the largest finite number, not infinity.
+        enlarged = cv2.erode(depth, disk, borderType=cv2.BORDER_REPLICATE)
+        nearer = enlarged < first
+        second = np.where(nearer, first, np.minimum(second, enlarged))
+        first_object[nearer] = instance
+        first = np.minimum(first, enlarged)
+    return first, first_object, second
 
 
 def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:

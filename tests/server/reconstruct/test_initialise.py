@@ -17,7 +17,7 @@ from real2sim_server.scene import CameraRig, Scene
 from real2sim_server.scene.harmonics import SH_C0
 from real2sim_server.scene.rotation import apply_transform, invert_transform
 
-from .conftest import BOX_COLOUR, BOX_SIZE, WALL_COLOUR, WALL_X, painted_log
+from .conftest import BOX_COLOUR, BOX_SIZE, SKY_COLOUR, WALL_COLOUR, WALL_X, painted_log
 
 SMALL = InitialiseOptions(
     max_background=80_000, max_object=6_000, ground_spacing=0.12, sky_resolution=64
@@ -132,7 +132,16 @@ def test_taking_the_box_away_shows_the_wall(painted_scene):
 def test_the_sky_is_taken_from_pixels_that_nothing_covers(painted_scene):
     up = torch.tensor([[1.0, 0.0, 0.38]])
     colour = painted_scene.sky.sample(up)[0].numpy() * 255
-    np.testing.assert_allclose(colour, (150, 190, 240), atol=12)
+    np.testing.assert_allclose(colour, SKY_COLOUR, atol=12)
+
+
+def test_the_sky_is_known_up_to_the_border_of_the_image(painted_scene):
+    from real2sim_server.reconstruct.evaluate import render_logged_view
+
+    log = painted_log()
+    image = render_logged_view(painted_scene, log.rig["front"], int(log.frame_times_us[4]))
+    top = image[2:12, 2:-2].astype(int)
+    assert np.abs(top - SKY_COLOUR).max() < 25
 
 
 def test_a_log_without_boxes_becomes_a_scene_without_objects():
