@@ -15,8 +15,6 @@ from numba import njit, prange
 from .cpu_records import (
     BLUE,
     DEPTH,
-    EXPONENT_LIMIT,
-    EXTENT_Y,
     FALLOFF,
     GREEN,
     INSTANCE,
@@ -35,7 +33,9 @@ from .cpu_simd import (
     blend_rgb_depth,
     blend_rgb_depth_instance,
     blend_rgb_instance,
+    lowest_bit,
     prefetch,
+    touched_halves,
 )
 from .kernel import kernel
 
@@ -44,7 +44,7 @@ TASKS = 64
 LOOK_AHEAD = 6
 HALVES = TILE // LANES
 F32 = np.float32
-LIMIT, HALF, LAST_LANE = F32(EXPONENT_LIMIT), F32(0.5), F32(LANES - 1)
+HALF = F32(0.5)
 
 
 @kernel(parallel=True)
@@ -72,12 +72,16 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
 
 @njit(forceinline=True)
 def open_tile(pixels, x0, y0, shape):
-    """Clear the state; finish pixels outside the image. Returns a bit for each open half row."""
+    """Clear the state and finish pixels outside the image.
+
+    Half rows of eight pixels are numbered down the left half of the tile, then down the right one.
+    Returns a bit for each that has something to draw.
+    """
     pixels[:] = 0
     alive = np.int64(0)
     for row in range(min(TILE, shape[0] - y0)):
         for column in range(min(TILE, shape[1] - x0)):
-            half = row * HALVES + column // LANES
+            half = column // LANES * TILE + row
             pixels[half * PLANES * LANES + column % LANES] = 1
             alive |= np.int64(1) << half
     return alive
@@ -89,21 +93,18 @@ def blend_tile(values, members, x0, y0, pixels, alive, extras):
     for position in range(members.shape[0]):
         prefetch(values, np.int64(members[min(position + LOOK_AHEAD, members.shape[0] - 1)]))
         record = values[members[position]]
-        top = record[MEAN_Y] - record[EXTENT_Y] - y0
-        bottom = record[MEAN_Y] + record[EXTENT_Y] - y0
-        first = np.int64(max(top + HALF, F32(0)))
-        last = np.int64(min(bottom + HALF, F32(TILE)))
-        for row in range(first, last):
-            dy = F32(row) + HALF + y0 - record[MEAN_Y]
-            rest = record[FALLOFF] * dy * dy + record[LEVEL]
-            offset = x0 + HALF - record[MEAN_X] - record[SLOPE] * dy
-            for side in range(HALVES):
-                half = row * HALVES + side
-                start = offset + F32(side * LANES)
-                gap = max(start, -start - LAST_LANE, F32(0)) * record[SHARPNESS]
-                if (alive >> half) & 1 and gap * gap + rest <= LIMIT:
-                    going = blend_half(pixels, half, record, start, rest, extras)
-                    alive &= ~(np.int64(going == 0) << half)
+        x, y = x0 + HALF - record[MEAN_X], y0 + HALF - record[MEAN_Y]
+        sharpness, slope = record[SHARPNESS], record[SLOPE]
+        falloff, level = record[FALLOFF], record[LEVEL]
+        touched = touched_halves(x, y, sharpness, slope, falloff, level) & alive
+        while touched != 0:
+            half = lowest_bit(touched)
+            touched &= touched - 1
+            dy = y + F32(half % TILE)
+            start = x - slope * dy + F32(half // TILE * LANES)
+            rest = falloff * dy * dy + level
+            going = blend_half(pixels, half, record, start, rest, extras)
+            alive &= ~(np.int64(going == 0) << half)
         if alive == 0:
             break
 
@@ -134,7 +135,7 @@ def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
         for column in range(min(TILE, width - x0)):
-            p = (row * HALVES + column // LANES) * PLANES * LANES + column % LANES
+            p = (column // LANES * TILE + row) * PLANES * LANES + column % LANES
             y, x = y0 + row, x0 + column
             left = abs(pixels[p])
             alpha[y, x] = F32(1) - left

@@ -186,6 +186,48 @@ blend_rgb_depth_instance = _blend_intrinsic(3)
 
 
 @intrinsic
+def touched_halves(  # type: ignore[no-untyped-def]
+    typingctx, x, y, sharpness, slope, falloff, level
+):
+    """Bits of the half rows of a 16x16 tile that one record may touch: 16 left ones, 16 right.
+
+    ``x``, ``y`` is the first pixel centre of the tile as seen from the record's centre [px].
+    """
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        x, y, sharpness, slope, falloff, level = (_splat(builder, value) for value in arguments)
+        numbers = _Lanes(builder, ir.Constant(VECTOR, [float(i) for i in range(LANES)]))
+        i64 = ir.IntType(64)
+        touched = i64(0)
+        for first_row in (0, LANES):
+            dy = numbers + y + float(first_row)
+            rest = (dy * dy).fused(falloff, level)
+            left = x - slope * dy
+            for side in (0, 1):
+                start = left + float(side * LANES)
+                beyond = -start - float(LANES - 1)
+                gap = start.where(start.compare(">", beyond), beyond)
+                gap = gap.where(gap.compare(">", 0.0), 0.0) * sharpness
+                mask = gap.fused(gap, rest).compare("<=", EXPONENT_LIMIT)
+                bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), i64)
+                shift = i64(side * 2 * LANES + first_row)
+                touched = builder.or_(touched, builder.shl(bits, shift))
+        return touched
+
+    return types.int64(*(types.float32,) * 6), generate
+
+
+@intrinsic
+def lowest_bit(typingctx, mask):  # type: ignore[no-untyped-def]
+    """Position of the lowest bit that is set; ``mask`` int64, not 0."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.cttz(arguments[0], ir.IntType(1)(1))
+
+    return types.int64(types.int64), generate
+
+
+@intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of ``array[index]`` (its first axis) without waiting for it."""
 
