@@ -33,6 +33,7 @@ class Settings(BaseSettings):
         threads: of numba and torch; 0 for one per core.
         scene_memory_bytes: budget of resident scenes.
         max_sessions: open sessions; more are refused at creation.
+        session_idle_seconds: sessions that nobody uses or is connected to end after this time.
         queue_length: jobs that may wait for the engine; more are refused.
         max_request_bytes, max_upload_bytes: body of a request, and of an uploaded splat file.
         max_pixels_per_step: pixels over all cameras of one observation or render.
@@ -56,6 +57,7 @@ class Settings(BaseSettings):
     threads: int = Field(default=0, ge=0, le=1024)
     scene_memory_bytes: int = Field(default=8 * GIB, gt=0)
     max_sessions: int = Field(default=32, ge=0)
+    session_idle_seconds: float = Field(default=1800.0, gt=0)
     queue_length: int = Field(default=64, ge=1)
     max_request_bytes: int = Field(default=4 * MIB, ge=1024)
     max_upload_bytes: int = Field(default=2 * GIB, ge=1024)

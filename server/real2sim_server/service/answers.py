@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from fastapi import Response
@@ -43,12 +43,21 @@ def choose_media_type(accept: str | None, modality: Modality) -> str:
         ServiceError: NOT_ACCEPTABLE when there is none; depth and instance are never jpeg.
     """
     offered = [m for m in CODEC_OF if m != "image/jpeg" or modality == "rgb"]
+    return choose_among(offered, accept, of=f"modality {modality!r}")
+
+
+def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
+    """The one of ``offered``, best first, that the client likes best.
+
+    Raises:
+        ServiceError: NOT_ACCEPTABLE when it likes none; ``of`` says of what.
+    """
     ranked = [(_quality(accept or "*/*", media_type), media_type) for media_type in offered]
     best = max(quality for quality, _ in ranked)
     if best <= 0:
         raise ServiceError(
             ErrorCode.NOT_ACCEPTABLE,
-            f"Accept {accept!r} allows none of {', '.join(offered)} for modality {modality!r}",
+            f"Accept {accept!r} allows none of {', '.join(offered)} for {of}",
             hint="leave Accept out for " + offered[0],
         )
     return next(media_type for quality, media_type in ranked if quality == best)

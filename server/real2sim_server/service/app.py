@@ -17,7 +17,7 @@ from ..settings import Settings
 from .auth import require_token
 from .problems import install_problem_handlers
 from .requests import BodyLimit, RequestContext
-from .routes import health, scenarios, scene_imports, scenes, server
+from .routes import drive, health, scenarios, scene_imports, scenes, server, sessions
 from .worker import Worker
 
 PROTECTED: tuple[APIRouter, ...] = (
@@ -27,6 +27,9 @@ PROTECTED: tuple[APIRouter, ...] = (
     scenarios.router,
 )
 """Routers behind the worker's token."""
+
+OPEN: tuple[APIRouter, ...] = (health.router, sessions.router, drive.router)
+"""Routers that ask for a token themselves, where they want one."""
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -56,7 +59,8 @@ def create_app(settings: Settings) -> FastAPI:
     install_problem_handlers(app)
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
     app.add_middleware(RequestContext, metrics=worker.metrics)
-    app.include_router(health.router)
+    for router in OPEN:
+        app.include_router(router)
     for router in PROTECTED:
         app.include_router(router, dependencies=[Depends(require_token)])
     return app

@@ -24,6 +24,7 @@ from ..edit import EditError
 from ..render import RenderError
 from ..scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from .disconnects import ClientGoneError
+from ..world import WorldError
 from .engine import DeviceLostError, EngineStoppedError, QueueFullError
 
 MAX_DETAILS = 50
@@ -88,6 +89,8 @@ def service_error(error: Exception) -> ServiceError:
         return error
     if isinstance(error, EditError):
         return _of_edit(error)
+    if isinstance(error, WorldError):
+        return ServiceError(error.code, str(error), hint=error.hint)
     for kind, code, hint in _KINDS:
         if isinstance(error, kind):
             return ServiceError(code, str(error), hint=hint)

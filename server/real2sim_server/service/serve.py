@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import ipaddress
+import signal
 import socket
 import sys
 import threading
@@ -66,7 +68,10 @@ def run(settings: Settings) -> int:
     server = uvicorn.Server(server_config(app, settings))
     # A lost device poisons the process: it ends, so that whoever supervises it starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
-    server.run(sockets=[listener])
+    # The server stops gracefully at a signal and then raises it once more for us.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt):
+        server.run(sockets=[listener])
     return 0 if worker.engine.failure is None and server.started else 1
 
 
@@ -152,7 +157,8 @@ def _wait_until_ready(address: tuple[str, int], thread: threading.Thread, timeou
     while time.monotonic() < deadline:
         if not thread.is_alive():
             raise RuntimeError("the worker ended while it started; see its log")
-        ready, answer = _ask_readiness(address, timeout_s=min(5.0, timeout_s))
+        # Short, because a worker that has died leaves the connection open and silent.
+        ready, answer = _ask_readiness(address, timeout_s=0.5)
         if ready:
             return
         time.sleep(POLL_S)

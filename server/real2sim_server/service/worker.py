@@ -26,6 +26,8 @@ from .metrics import Metrics
 from .pictures import Pictures
 from .residency import Residency
 from .scenarios import Scenarios
+from .sessions import SessionLimits, Sessions
+from .sessions.show import Show
 from .store import Store
 
 LAG_PERIOD_S = 0.1
@@ -51,6 +53,7 @@ class Worker:
     scenarios: Scenarios
     idempotency: Idempotency
     pictures: Pictures
+    sessions: Sessions
     backend: Backend
     device: DeviceInfo
     waiting_for: set[str] = field(default_factory=lambda: {"start"})
@@ -78,15 +81,27 @@ class Worker:
             on_load=metrics.scene_loads.observe,
         )
         store = Store(settings.database_url)
+        scenarios = Scenarios(store, residency, metrics)
+        pictures = Pictures(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(
             settings=settings,
             engine=engine,
             metrics=metrics,
             store=store,
             residency=residency,
-            scenarios=Scenarios(store, residency, metrics),
+            scenarios=scenarios,
             idempotency=Idempotency(store),
-            pictures=Pictures(engine, backend, metrics, max_pixels=settings.max_pixels_per_step),
+            pictures=pictures,
+            sessions=Sessions(
+                SessionLimits(
+                    settings.worker_id, settings.max_sessions, settings.session_idle_seconds
+                ),
+                Show(engine, pictures, metrics, max_pixels=settings.max_pixels_per_step),
+                store,
+                residency,
+                scenarios,
+                metrics,
+            ),
             backend=backend,
             device=_device_info(backend, settings),
         )
@@ -111,6 +126,7 @@ class Worker:
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
+            await at_exit.enter_async_context(self.sessions.running())
             at_exit.callback(self._drain)
             yield self
 
@@ -121,6 +137,8 @@ class Worker:
             reasons.append("draining: the worker is stopping")
         if not self.engine.alive:
             reasons.append(f"engine stopped: {self.engine.failure or 'its thread has ended'}")
+        if self.sessions.full:
+            reasons.append(f"all {self.settings.max_sessions} sessions are taken")
         if self.engine.queue_depth >= self.settings.queue_length:
             reasons.append(f"{self.settings.queue_length} jobs wait for the engine")
         return Readiness(ready=not reasons, reasons=reasons)

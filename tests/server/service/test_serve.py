@@ -1,6 +1,12 @@
 from __future__ import annotations
 
+import json
+import os
+import re
+import signal
 import socket
+import subprocess
+import sys
 import threading
 
 import httpx2
@@ -46,7 +52,7 @@ def test_the_token_is_handed_on(make_settings):
 
 def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
     warm = threading.Event()
-    monkeypatch.setattr("real2sim_server.service.pictures.warm_up", lambda _: warm.wait(5))
+    monkeypatch.setattr("real2sim_server.service.pictures.warm_up", lambda _: warm.wait(1))
     with (
         pytest.raises(RuntimeError, match="warming up kernels"),
         running_worker(make_settings(), timeout_s=0.5),
@@ -111,3 +117,31 @@ def test_a_render_of_a_client_that_left_is_not_drawn(make_settings):
         go_on.set()
         blocker.join()
     assert depth == 0
+
+
+def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(make_settings):
+    settings = make_settings(log_level="info")
+    environment = {
+        f"REAL2SIM_{name.upper()}": str(value)
+        for name, value in settings.model_dump(exclude_none=True).items()
+    }
+    code = (
+        "import sys; from real2sim_server.settings import Settings; "
+        "from real2sim_server.service.serve import run; sys.exit(run(Settings()))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=os.environ | environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        first = process.stderr.readline()
+        url = re.search(r"http://127\.0\.0\.1:\d+", first).group()
+        answer = httpx2.get(f"{url}/v1/server", timeout=30)
+        process.send_signal(signal.SIGTERM)
+        lines = process.stderr.read().splitlines()
+    assert process.returncode == 0
+    requests = [entry for line in lines if (entry := json.loads(line))["event"] == "request"]
+    assert [(r["path"], r["status"]) for r in requests] == [("/v1/server", 200)]
+    assert requests[0]["request_id"] == answer.headers["X-Request-Id"]

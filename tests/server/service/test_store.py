@@ -212,3 +212,12 @@ def test_a_store_in_memory_works_too():
         return await store.scenario("sc_1")
 
     assert run("sqlite://", work) == SCENARIO
+
+
+def test_appending_nothing_is_allowed(url):
+    async def work(store):
+        await store.create_session(SESSION)
+        await store.append_session_entries("w0.1", [])
+        return await store.session_entries("w0.1")
+
+    assert run(url, work) == []
