@@ -112,22 +112,21 @@ def _choose_sequence(root: Path, sequence: str | None) -> str:
 
 
 def _image_files(root: Path, sequence: str) -> dict[str, list[Path]]:
-    images = {}
-    for i in range(4):
-        folder = root / f"image_{i:02d}" / sequence
+    """Files of every camera; as many for each as the camera with the most images has."""
+    folders, suffixes, frame_count = {}, {}, 0
+    for folder in (root / f"image_{i:02d}" / sequence for i in range(4)):
         if folder.is_dir():
-            suffix = ".jpg" if (folder / "000000.jpg").exists() else ".png"
-            count = sum(p.suffix == suffix for p in folder.iterdir())
-            images[folder.parent.name] = [folder / f"{f:06d}{suffix}" for f in range(count)]
-    expected = len(images["image_02"])
-    if expected == 0:
+            name = folder.parent.name
+            folders[name] = folder
+            suffixes[name] = ".jpg" if (folder / "000000.jpg").exists() else ".png"
+            count = sum(p.suffix == suffixes[name] for p in folder.iterdir())
+            frame_count = max(frame_count, count)
+    if frame_count == 0:
         raise LogError(f"{root / 'image_02' / sequence}: holds no images %06d.png")
-    for name, files in images.items():
-        if len(files) != expected:
-            raise LogError(
-                f"{root / name / sequence}: holds {len(files)} images, image_02 holds {expected}"
-            )
-    return images
+    return {
+        name: [folder / f"{f:06d}{suffixes[name]}" for f in range(frame_count)]
+        for name, folder in folders.items()
+    }
 
 
 def _read_rig(

@@ -227,7 +227,7 @@ def _read_sweep(path: Path) -> LidarSweep:
     import zipfile
 
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             points, intensity, offset_us, origin = (
                 arrays[key] for key in ("points", "intensity", "offset_us", "origin")
             )

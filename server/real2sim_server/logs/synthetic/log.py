@@ -25,7 +25,7 @@ from .surroundings import build_surroundings
 from .traffic import Vehicle, drive_distance, drive_ego, place_vehicles, poses_at
 from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
 
-LIDAR_POSITION = (0.9, 0.0, 1.85)
+LIDAR_POSITION = (0.9, 0.0, 1.73)
 LIDAR_ELEVATION = (np.radians(-25.0), np.radians(3.0))
 
 

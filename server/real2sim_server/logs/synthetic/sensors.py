@@ -63,7 +63,7 @@ def shoot_image(
         inside = np.repeat(centres[edges], samples * samples, axis=0)
         inside += np.tile(_sheared_grid(samples), (len(edges), 1))
         again = Samples(*_shoot(world, instances, T_world_camera, k, inside, 1.0 / samples))
-        colours[edges] = again.colours.reshape(len(edges), -1, 3).mean(axis=1)
+        colours[edges] = again.colours.reshape(len(edges), samples * samples, 3).mean(axis=1)
     image = (colours * 255 + 0.5).astype(np.uint8)
     return (
         image.reshape(height, width, 3),

@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from real2sim_server.logs import LogError, open_log, write_native_log
+from real2sim_server.logs.images import write_image
+from real2sim_server.logs.synthetic import SyntheticLog
+
+
+def test_round_trip_keeps_every_bit(tiny_log: SyntheticLog, written_native: Path) -> None:
+    back = open_log(written_native)
+    assert back.name == tiny_log.name
+    assert (back.frame_times_us == tiny_log.frame_times_us).all()
+    for frame in range(tiny_log.frame_count):
+        for camera in tiny_log.rig.names:
+            assert (back.image(camera, frame) == tiny_log.image(camera, frame)).all()
+        for field in ("points", "intensity", "offset_us", "origin"):
+            given, read = (getattr(log.lidar(frame), field) for log in (tiny_log, back))
+            assert given.dtype == read.dtype
+            assert (given == read).all()
+
+
+def test_round_trip_keeps_cameras_and_tracks(tiny_log: SyntheticLog, written_native: Path) -> None:
+    back = open_log(written_native)
+    for camera in tiny_log.rig:
+        assert (back.rig[camera.name].K == camera.K).all()
+        assert (back.rig[camera.name].T_vehicle_camera == camera.T_vehicle_camera).all()
+    for one, two in zip(tiny_log.tracks, back.tracks, strict=True):
+        assert (one.object_id, one.category, one.size) == (two.object_id, two.category, two.size)
+        assert (one.trajectory.positions == two.trajectory.positions).all()
+        np.testing.assert_allclose(
+            one.trajectory.quaternions, two.trajectory.quaternions, atol=1e-15
+        )
+
+
+def test_progress_counts_up_to_the_total(tiny_log: SyntheticLog, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    write_native_log(tiny_log, tmp_path / "log", on_progress=lambda *at: seen.append(at))
+    total = tiny_log.frame_count * (len(tiny_log.rig) + 1)
+    assert seen == [(i + 1, total) for i in range(total)]
+
+
+def test_failed_writing_leaves_nothing_behind(tiny_log: SyntheticLog, tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_native_log(tiny_log, tmp_path / "log", on_progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_log_is_not_overwritten(tiny_log: SyntheticLog, native_folder: Path) -> None:
+    with pytest.raises(LogError, match="is there already"):
+        write_native_log(tiny_log, native_folder)
+
+
+def test_log_without_lidar_gives_empty_sweeps(native_folder: Path) -> None:
+    _edit(native_folder, lambda content: content.update(lidar=False))
+    assert open_log(native_folder).lidar(0).points.shape == (0, 3)
+
+
+def _edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads((folder / "log.json").read_text())
+    change(content)
+    (folder / "log.json").write_text(json.dumps(content))
+
+
+BAD_MANIFESTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "newer version": (lambda c: c.update(version=2), "is version 2; this program reads 1"),
+    "other format": (lambda c: c.update(format="x"), "real2sim-log"),
+    "no frames": (lambda c: c.update(frame_times_us=[]), "at least one frame"),
+    "unsorted times": (lambda c: c["frame_times_us"].reverse(), "frame times must increase"),
+    "fractional times": (lambda c: c.update(frame_times_us=[0.5]), "whole numbers"),
+    "NaN pose": (lambda c: c["ego"]["positions"][1].__setitem__(0, float("nan")), "not finite"),
+    "short ego": (
+        lambda c: [c["ego"][key].pop() for key in ("times_us", "positions", "quaternions")],
+        "ego poses cover",
+    ),
+    "long quaternion": (lambda c: c["ego"]["quaternions"].__setitem__(0, [2, 0, 0, 0]), "unit"),
+    "ragged positions": (lambda c: c["ego"]["positions"][0].pop(), "'positions' must be"),
+    "no cameras": (lambda c: c.update(cameras=[]), "at least one camera"),
+    "no rotation": (
+        lambda c: c["cameras"][0]["T_vehicle_camera"][0].__setitem__(2, 3.0), "rigid transform"
+    ),
+    "camera name with a slash": (lambda c: c["cameras"][0].update(name="a/b"), "folder name"),
+    "camera twice": (lambda c: c["cameras"].append(c["cameras"][0]), "unique"),
+    "zero size": (lambda c: c["tracks"][1].update(size=[4, 0, 1]), r"tracks\[1\].*positive"),
+    "track twice": (lambda c: c["tracks"].append(c["tracks"][0]), "used twice"),
+    "no tracks key": (lambda c: c.pop("tracks"), "'tracks' must be list, found nothing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_MANIFESTS)
+def test_bad_manifest_is_refused_by_name(native_folder: Path, case: str) -> None:
+    change, message = BAD_MANIFESTS[case]
+    _edit(native_folder, change)
+    with pytest.raises(LogError, match=message) as refusal:
+        open_log(native_folder)
+    assert "log.json" in str(refusal.value)
+
+
+def test_broken_json_is_refused(native_folder: Path) -> None:
+    (native_folder / "log.json").write_text('{"format": ')
+    with pytest.raises(LogError, match=r"log\.json: is no JSON file"):
+        open_log(native_folder)
+
+
+def test_missing_image_is_refused_on_opening(native_folder: Path) -> None:
+    (native_folder / "images/front/000001.png").unlink()
+    with pytest.raises(LogError, match=r"front/000001\.png"):
+        open_log(native_folder)
+
+
+def test_missing_camera_folder_is_refused(native_folder: Path) -> None:
+    (native_folder / "images/front_left").rename(native_folder / "images/other")
+    with pytest.raises(LogError, match="front_left: no such folder"):
+        open_log(native_folder)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_image_of_another_size_is_refused_on_opening(native_folder: Path, suffix: str) -> None:
+    path = native_folder / "images/front/000001.png"
+    write_image(path.with_suffix(suffix), np.zeros((10, 12, 3), np.uint8))
+    path.with_suffix(suffix).rename(path)
+    with pytest.raises(LogError, match=r"000001\.png: is 12x10, but camera 'front' is 120x80"):
+        open_log(native_folder)
+
+
+def test_cut_image_is_refused_when_asked_for(native_folder: Path) -> None:
+    path = native_folder / "images/front/000001.png"
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(LogError, match=r"000001\.png: is no readable"):
+        open_log(native_folder).image("front", 1)
+
+
+def test_text_in_place_of_an_image_is_refused(native_folder: Path) -> None:
+    (native_folder / "images/front/000001.png").write_text("no image")
+    with pytest.raises(LogError, match="expected a PNG or JPEG"):
+        open_log(native_folder)
+
+
+def test_missing_sweep_is_refused_on_opening(native_folder: Path) -> None:
+    (native_folder / "lidar/000002.npz").unlink()
+    with pytest.raises(LogError, match=r"000002\.npz: no such file"):
+        open_log(native_folder)
+
+
+def test_cut_sweep_is_refused_when_asked_for(native_folder: Path) -> None:
+    path = native_folder / "lidar/000000.npz"
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(LogError, match=r"000000\.npz: expected an \.npz"):
+        open_log(native_folder).lidar(0)
+
+
+def test_sweep_with_arrays_that_do_not_fit_is_refused(native_folder: Path) -> None:
+    np.savez(
+        native_folder / "lidar/000000.npz",
+        points=np.zeros((4, 3), np.float32),
+        intensity=np.zeros(3, np.float32),
+        offset_us=np.zeros(4, np.int32),
+        origin=np.zeros(3, np.float32),
+    )
+    with pytest.raises(LogError, match="intensity must be"):
+        open_log(native_folder).lidar(0)
+
+
+def test_sweep_with_pickled_objects_is_not_loaded(native_folder: Path) -> None:
+    np.savez(native_folder / "lidar/000000.npz", points=np.array([{}], dtype=object))
+    with pytest.raises(LogError, match=r"000000\.npz"):
+        open_log(native_folder).lidar(0)
+
+
+def test_documented_example_is_a_log(tmp_path: Path) -> None:
+    page = Path(__file__).resolve().parents[3] / "docs" / "log_format.md"
+    example = page.read_text().split("```json")[1].split("```")[0]
+    (tmp_path / "log.json").write_text(example)
+    for folder in ("images/front", "lidar"):
+        (tmp_path / folder).mkdir(parents=True)
+    for frame in range(2):
+        write_image(tmp_path / f"images/front/{frame:06d}.png", np.zeros((400, 640, 3), np.uint8))
+        np.savez(
+            tmp_path / f"lidar/{frame:06d}.npz",
+            points=np.zeros((1, 3)),
+            intensity=np.zeros(1),
+            offset_us=np.zeros(1),
+            origin=np.zeros(3),
+        )
+    log = open_log(tmp_path)
+    assert log.rig.names == ("front",)
+    assert log.tracks[0].object_id == "car_0"
