@@ -23,8 +23,8 @@ from real2sim_proto.errors import ProblemDetail, title_of
 from ..edit import EditError
 from ..render import RenderError
 from ..scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
-from .disconnects import ClientGoneError
 from ..world import WorldError
+from .disconnects import ClientGoneError
 from .engine import DeviceLostError, EngineStoppedError, QueueFullError
 
 MAX_DETAILS = 50

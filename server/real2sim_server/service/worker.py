@@ -96,11 +96,11 @@ class Worker:
                 SessionLimits(
                     settings.worker_id, settings.max_sessions, settings.session_idle_seconds
                 ),
-                Show(engine, pictures, metrics, max_pixels=settings.max_pixels_per_step),
-                store,
-                residency,
-                scenarios,
-                metrics,
+                show=Show(engine, pictures, metrics, max_pixels=settings.max_pixels_per_step),
+                store=store,
+                residency=residency,
+                scenarios=scenarios,
+                metrics=metrics,
             ),
             backend=backend,
             device=_device_info(backend, settings),

@@ -1,0 +1,163 @@
+"""Sessions by plain requests: the same world as the drive socket, for scripts."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.base import Identifier
+from real2sim_proto.drive import ResetSpec
+from real2sim_proto.sessions import (
+    SessionCreate,
+    SessionInfo,
+    SessionList,
+    SessionRender,
+    SessionState,
+    StepRequest,
+)
+
+from ..answers import info_response, large_response
+from ..auth import opens, require_token, unauthorized
+from ..idempotency import IdempotencyKey
+from ..problems import ServiceError
+from ..sessions.describe import session_info, session_state
+from ..sessions.registry import created_headers
+from ..sessions.session import Session
+from ..sessions.views import view_response
+from ..worker import WorkerOf
+
+router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+
+_bearer = HTTPBearer(auto_error=False, description="the session's token, or the worker's")
+
+
+async def _session_of(
+    worker: WorkerOf,
+    session_id: str,
+    credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
+) -> Session:
+    """The session, for whoever has its token or the worker's.
+
+    Raises:
+        ServiceError: UNKNOWN_SESSION, SESSION_CLOSED or UNAUTHORIZED.
+    """
+    session = await worker.sessions.find(session_id)
+    given = credentials.credentials if credentials else None
+    secret = worker.settings.token
+    if not opens(given, session.row.token, secret.get_secret_value() if secret else None):
+        error = unauthorized("this call wants the session's token or the worker's")
+        error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
+        raise error
+    session.touch()
+    return session
+
+
+SessionOf = Annotated[Session, Depends(_session_of)]
+
+
+@router.post("", status_code=201, response_model=SessionInfo, dependencies=[Depends(require_token)])
+async def create(  # noqa: PLR0917, one parameter for each part of the request
+    worker: WorkerOf,
+    request: Request,
+    body: SessionCreate | None = None,
+    scene: Annotated[Identifier | None, Query()] = None,
+    scenario: Annotated[Identifier | None, Query()] = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A new session on a scene or a scenario; with a body its first episode begins at once."""
+    async with worker.idempotency.once(request, idempotency_key) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        info = await worker.sessions.create(
+            scene=scene,
+            scenario=scenario,
+            spec=body.reset if body else None,
+            once=once,
+            ws_base=_ws_base(request),
+        )
+        return info_response(info, status=201, headers=created_headers(info))
+
+
+@router.get("", dependencies=[Depends(require_token)])
+async def list_sessions(worker: WorkerOf, request: Request) -> SessionList:
+    """All open sessions; their tokens are not told."""
+    ws_base = _ws_base(request)
+    return SessionList(sessions=[session_info(s, ws_base=ws_base) for s in worker.sessions])
+
+
+@router.get("/{session_id}")
+async def describe(session: SessionOf, request: Request) -> SessionInfo:
+    """One session."""
+    return session_info(session, ws_base=_ws_base(request))
+
+
+@router.delete("/{session_id}", status_code=204, response_class=Response)
+async def delete(worker: WorkerOf, session: SessionOf) -> Response:
+    """End a session; connections to it are closed."""
+    await worker.sessions.close(session, reason="deleted")
+    return Response(status_code=204)
+
+
+@router.post("/{session_id}/reset", response_model=SessionState)
+async def reset(worker: WorkerOf, session: SessionOf, body: ResetSpec | None = None) -> Response:
+    """Begin an episode anew, from what the session was made of; refused beside a controller."""
+    async with session.lock:
+        session.check_open()
+        session.check_no_controller()
+        await worker.sessions.stepper.restart(session, body or ResetSpec())
+        world = session.running_world()
+    return await large_response(lambda: session_state(session.session_id, world, ()))
+
+
+@router.post("/{session_id}/step", response_model=SessionState)
+async def step(worker: WorkerOf, session: SessionOf, body: StepRequest) -> Response:
+    """Move the clock; ends early with the episode. Refused beside a controller."""
+    async with session.lock:
+        session.check_open()
+        session.check_no_controller()
+        if body.dt_us not in {None, session.running_world().spec.dt_us}:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"dt_us {body.dt_us} is not that of the episode, {session.spec.dt_us}",
+                hint="leave dt_us out, or reset the session with another one",
+            )
+        await worker.sessions.stepper.step(session, body.n, body.plan)
+        world, events = session.running_world(), session.take_events()
+    return await large_response(lambda: session_state(session.session_id, world, events))
+
+
+@router.get("/{session_id}/state", response_model=SessionState)
+async def state(session: SessionOf) -> Response:
+    """Where everything is now."""
+    world, events = session.running_world(), tuple(session.events)
+    return await large_response(lambda: session_state(session.session_id, world, events))
+
+
+@router.post(
+    "/{session_id}/render",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "application/msgpack with all frames; or one frame as image file",
+            "content": {
+                media_type: {"schema": {"type": "string", "format": "binary"}}
+                for media_type in ("application/msgpack", "image/jpeg", "image/png")
+            },
+        }
+    },
+)
+async def render(
+    worker: WorkerOf,
+    session: SessionOf,
+    body: SessionRender,
+    accept: Annotated[str | None, Header()] = None,
+) -> Response:
+    """Images of the current instant; never moves time."""
+    return await view_response(worker.sessions.show, session.running_world(), body.sensors, accept)
+
+
+def _ws_base(request: Request) -> str:
+    return str(request.base_url).rstrip("/").replace("http", "ws", 1)

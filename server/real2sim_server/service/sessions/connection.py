@@ -1,0 +1,306 @@
+"""One drive socket: greeted, then served in lock step or as an observer."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Iterator
+from typing import Any, assert_never
+
+import structlog
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
+from real2sim_proto.drive import Action, Bye, Edit, Hello, Render, Reset
+
+from ..auth import opens, unauthorized
+from ..problems import ServiceError, service_error
+from .describe import welcome_fields
+from .messages import BadMessageError, Incoming, bad_message, read_message, unsupported_protocol
+from .observers import Mailbox
+from .registry import Sessions
+from .session import Session, controller_taken
+from .wire import pack_message
+
+GREETING_S = 10.0
+PROGRESS_S = 1.0
+FAREWELL_S = 2.0
+SMALL_BYTES = 16_384
+"""Messages up to this size are read on the event loop: that takes less than handing them over."""
+
+POLICY_VIOLATION = 1008
+NORMAL_CLOSURE = 1000
+
+log = structlog.get_logger(__name__)
+
+
+class FatalError(Exception):
+    """Ends the connection after telling the client why."""
+
+    def __init__(self, refusal: ServiceError, *, message_id: int = 0) -> None:
+        super().__init__(refusal.detail)
+        self.refusal = refusal
+        self.message_id = message_id
+
+
+class Connection:
+    """An accepted drive socket of a session.
+
+    Args:
+        socket: accepted with our subprotocol.
+        session: that it belongs to.
+        sessions: the session's registry.
+        authorised: whether the handshake carried the worker's token.
+        worker_token: opens every session; None where the worker has none.
+    """
+
+    def __init__(
+        self,
+        socket: WebSocket,
+        session: Session,
+        sessions: Sessions,
+        *,
+        authorised: bool,
+        worker_token: str | None,
+    ) -> None:
+        self._socket = socket
+        self._session = session
+        self._sessions = sessions
+        self._authorised = authorised
+        self._worker_token = worker_token
+        self._sending = asyncio.Lock()
+
+    async def serve(self) -> None:
+        """Talk until one of both leaves. A client that vanishes disturbs nobody."""
+        session = self._session
+        try:
+            hello = await self._greeting()
+            session.check_open()
+            session.hangups.add(self._hang_up)
+            if hello.role == "controller":
+                with self._as_controller(hello):
+                    await self._welcome(hello)
+                    await self._converse(hello.role)
+            else:
+                await self._welcome(hello)
+                async with self._as_observer():
+                    await self._converse(hello.role)
+        except WebSocketDisconnect:
+            pass
+        except (FatalError, ServiceError) as error:
+            refusal = error.refusal if isinstance(error, FatalError) else error
+            message_id = error.message_id if isinstance(error, FatalError) else 0
+            await self._hang_up(refusal, message_id=message_id)
+        finally:
+            session.hangups.discard(self._hang_up)
+            session.touch()
+
+    # --- greeting ---------------------------------------------------------------------------
+
+    async def _greeting(self) -> Hello:
+        """The client's hello. Raises FatalError when there is no talking to it."""
+        session = self._session
+        try:
+            async with asyncio.timeout(GREETING_S):
+                message = (await self._receive()).message
+        except TimeoutError as error:
+            refusal = ServiceError(ErrorCode.TIMEOUT, f"no hello within {GREETING_S:g} s")
+            raise FatalError(refusal) from error
+        except BadMessageError as error:
+            raise FatalError(error.refusal, message_id=error.message_id) from error
+        if not isinstance(message, Hello):
+            refusal = bad_message(f"the first message must be hello, not {message.type}")
+            raise FatalError(refusal, message_id=message.id)
+        if not set(message.protocols) & set(SUPPORTED_SUBPROTOCOLS):
+            raise FatalError(unsupported_protocol(message.protocols), message_id=message.id)
+        if not (self._authorised or opens(message.token, session.row.token, self._worker_token)):
+            refusal = unauthorized("hello carries neither the session's token nor the worker's")
+            refusal.hint = "the answer to POST /v1/sessions has the session's token"
+            raise FatalError(refusal, message_id=message.id)
+        return message
+
+    async def _welcome(self, hello: Hello) -> None:
+        """Have everything warm, saying so meanwhile, and tell the client what there is."""
+        warming = asyncio.create_task(self._sessions.warm_up(self._session))
+        # Read the outcome even when the client has left meanwhile.
+        warming.add_done_callback(lambda task: task.cancelled() or task.exception())
+        while not (await asyncio.wait({warming}, timeout=PROGRESS_S))[0]:
+            fields = {"phase": "warming up: kernels and first render", "eta_s": None}
+            await self._send(pack_message("progress", fields).with_id(hello.id))
+        try:
+            await warming
+        except Exception as error:
+            raise FatalError(_told(error), message_id=hello.id) from error
+        fields = await asyncio.to_thread(welcome_fields, self._session, hello.role)
+        await self._send(pack_message("welcome", fields).with_id(hello.id))
+
+    @contextlib.contextmanager
+    def _as_controller(self, hello: Hello) -> Iterator[None]:
+        session = self._session
+        if session.controller is not None:
+            raise FatalError(controller_taken(session.session_id), message_id=hello.id)
+        session.controller = self
+        try:
+            yield
+        finally:
+            session.controller = None
+
+    @contextlib.asynccontextmanager
+    async def _as_observer(self) -> AsyncIterator[None]:
+        mailbox = Mailbox()
+        self._session.observers.add(mailbox)
+        forwarding = asyncio.create_task(self._forward(mailbox))
+        try:
+            yield
+        finally:
+            self._session.observers.discard(mailbox)
+            forwarding.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await forwarding
+
+    async def _forward(self, mailbox: Mailbox) -> None:
+        # A client that left is noticed by whoever receives from it.
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                message = await mailbox.take()
+                await self._send(await self._sessions.show.on_world_thread(message.with_id, 0))
+
+    # --- conversation -----------------------------------------------------------------------
+
+    async def _converse(self, role: str) -> None:
+        """Answer every message with one message, in order, until bye."""
+        while True:
+            try:
+                incoming = await self._receive()
+                await self._send(await self._answer(incoming, role))
+            except BadMessageError as error:
+                if error.fatal:
+                    raise FatalError(error.refusal, message_id=error.message_id) from error
+                await self._send(self._error(error.refusal, error.message_id))
+            else:
+                if isinstance(incoming.message, Bye):
+                    await self._socket.close(NORMAL_CLOSURE)
+                    return
+
+    async def _answer(self, incoming: Incoming, role: str) -> bytes:
+        message = incoming.message
+        if role == "observer" and isinstance(message, Reset | Action | Edit):
+            refusal = ServiceError(
+                ErrorCode.NOT_CONTROLLER,
+                f"an observer sent {message.type}; observers may send render and bye",
+                hint="connect with role 'controller' to drive",
+            )
+            return self._error(refusal, message.id)
+        try:
+            return await self._obey(incoming, role)
+        except Exception as error:
+            return self._error(_told(error), message.id)
+
+    async def _obey(self, incoming: Incoming, role: str) -> bytes:
+        message, session, stepper = incoming.message, self._session, self._sessions.stepper
+        match message:
+            case Action():
+                return await self._act(message, incoming.content)
+            case Reset():
+                async with session.lock:
+                    session.check_open()
+                    return await stepper.reset(session, message.spec, reply_to=message.id)
+            case Edit():
+                return await self._edit(message)
+            case Render():
+                session.check_open()
+                show = self._sessions.show
+                world = session.running_world()
+                return (await show.view(world, message.sensors, reply_to=message.id)).wire
+            case Bye():
+                return await self._leave(message, role)
+            case Hello():
+                raise bad_message("hello has been said already")
+            case _:
+                assert_never(message)
+
+    async def _act(self, action: Action, content: bytes) -> bytes:
+        session = self._session
+        async with session.lock:
+            session.check_open()
+            cached = session.lockstep.cached_answer(action.step, content)
+            if cached is None:
+                stepper = self._sessions.stepper
+                return await stepper.act(session, action.plan, content, reply_to=action.id)
+        return await self._sessions.show.on_world_thread(cached.with_id, action.id)
+
+    async def _edit(self, edit: Edit) -> bytes:
+        session = self._session
+        async with session.lock:
+            session.check_open()
+            outcome = await self._sessions.stepper.edit(
+                session, edit.operations, base_rev=edit.base_rev
+            )
+            revision = session.running_world().revision
+        fields = {
+            "revision": revision,
+            "created": list(outcome.created),
+            "warnings": [w.model_dump(mode="json", exclude_none=True) for w in outcome.warnings],
+        }
+        return pack_message("edited", fields).with_id(edit.id)
+
+    async def _leave(self, bye: Bye, role: str) -> bytes:
+        """The result; a controller that says bye ends the session."""
+        session = self._session
+        if role == "controller":
+            session.hangups.discard(self._hang_up)
+            await self._sessions.close(session, reason="its controller said bye")
+        world = session.world
+        fields = {
+            "steps": world.steps if world else 0,
+            "t_us": world.t_us if world else None,
+            "reason": world.reason if world else None,
+            "metrics": world.metrics() if world else {},
+        }
+        return pack_message("result", fields).with_id(bye.id)
+
+    # --- bytes ------------------------------------------------------------------------------
+
+    async def _receive(self) -> Incoming:
+        event = await self._socket.receive()
+        if event["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(event.get("code", 1005))
+        self._session.touch()
+        data = event.get("bytes")
+        if data is None:
+            raise BadMessageError(bad_message("text was sent where messages are binary"))
+        if len(data) <= SMALL_BYTES:
+            return read_message(data)
+        return await asyncio.to_thread(read_message, data)
+
+    async def _send(self, data: bytes) -> None:
+        # Whoever ends the session may send too.
+        async with self._sending:
+            if self._socket.application_state is WebSocketState.DISCONNECTED:
+                raise WebSocketDisconnect
+            await self._socket.send_bytes(data)
+
+    async def _hang_up(self, refusal: ServiceError, *, message_id: int = 0) -> None:
+        """Tell the client why this is over and close; one that does not listen is left alone."""
+        with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
+            async with asyncio.timeout(FAREWELL_S):
+                await self._send(self._error(refusal, message_id, fatal=True))
+                await self._socket.close(POLICY_VIOLATION, refusal.code.value)
+
+    def _error(self, refusal: ServiceError, message_id: int, *, fatal: bool = False) -> bytes:
+        fields: dict[str, Any] = {
+            "code": refusal.code.value,
+            "detail": refusal.detail,
+            "hint": refusal.hint,
+            "retryable": refusal.code in RETRYABLE,
+            "fatal": fatal,
+            "step": self._session.lockstep.step,
+        }
+        return pack_message("error", fields).with_id(message_id)
+
+
+def _told(error: Exception) -> ServiceError:
+    refusal = service_error(error)
+    if refusal.code is ErrorCode.INTERNAL:
+        log.error("unexpected error", exc_info=error)
+    return refusal

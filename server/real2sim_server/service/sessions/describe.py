@@ -1,0 +1,79 @@
+"""What the wire says about a session."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Any
+
+from real2sim_proto import DRIVE_SUBPROTOCOL
+from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
+from real2sim_proto.drive import MAX_SENSORS
+from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
+from real2sim_proto.sessions import SessionInfo, SessionState
+
+from ...world import Event, World, agent_fields
+from ..views import camera_infos, edited_objects
+from .session import Session
+
+
+def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionInfo:
+    """A session; the token is told to its maker only."""
+    world, row = session.world, session.row
+    created = datetime.fromtimestamp(row.created_us / 1e6, UTC)
+    return SessionInfo(
+        session_id=row.session_id,
+        scene=row.scene,
+        scenario_id=row.scenario_id,
+        ws_url=f"{ws_base}/v1/sessions/{row.session_id}/drive",
+        token=token,
+        created_at=created.isoformat(timespec="milliseconds"),
+        step=world.steps if world else None,
+        t_us=world.t_us if world else None,
+        controller=session.controller is not None,
+        reset=session.spec,
+    )
+
+
+def session_state(session_id: str, world: World, events: Iterable[Event]) -> SessionState:
+    """Where everything is at an instant, and what happened before it."""
+    seen = world.observe()
+    return SessionState.model_validate(
+        {
+            "session_id": session_id,
+            "step": world.steps,
+            "t_us": world.t_us,
+            "revision": world.revision,
+            "ego": seen.ego_fields(),
+            "agents": agent_fields(world.agents),
+            "events": [event.fields() for event in events],
+            "metrics": seen.metrics,
+            "terminated": world.terminated,
+            "truncated": world.truncated,
+            "reason": world.reason,
+        }
+    )
+
+
+def welcome_fields(session: Session, role: str) -> dict[str, Any]:
+    """Of the wire's Welcome, without envelope."""
+    start, world = session.start, session.world
+    objects = (world.state if world else start.state).visible
+    infos = edited_objects(objects, start.summary, tracks=False)
+    return {
+        "protocol": DRIVE_SUBPROTOCOL,
+        "session_id": session.session_id,
+        "role": role,
+        "versions": {"server": version("real2sim"), "scene_hash": session.row.scene_hash},
+        "limits": {
+            "max_message_bytes": MAX_CLIENT_MESSAGE_BYTES,
+            "max_operations_per_request": MAX_OPERATIONS_PER_REQUEST,
+            "max_cameras_per_step": MAX_SENSORS,
+        },
+        "cameras": [c.model_dump(mode="json") for c in camera_infos(tuple(start.scene.rig))],
+        "objects": [o.model_dump(mode="json", exclude_none=True) for o in infos],
+        "start_us": start.scene.start_us,
+        "end_us": start.scene.end_us,
+        "step": world.steps if world else None,
+    }

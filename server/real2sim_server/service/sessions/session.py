@@ -1,0 +1,133 @@
+"""One closed-loop session: what differs from the scene, and who is connected."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.drive import ResetSpec
+
+from ...edit import ScenarioState
+from ...scene import Camera, Scene
+from ...scene.io import SceneSummary
+from ...world import Event, World
+from ..problems import ServiceError
+from ..store import SessionRow
+from .lockstep import LockStep, not_reset
+from .observers import Mailbox
+from .wire import Message
+
+Hangup = Callable[[ServiceError], Awaitable[None]]
+"""Tells a connection that its session is over, and ends it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What a session begins from, at its creation and at every reset.
+
+    Attributes:
+        scene: pinned in memory, shared with other sessions.
+        summary: of its bundle.
+        state: objects of the scenario as it was then, or of the bare scene.
+    """
+
+    scene: Scene
+    summary: SceneSummary
+    state: ScenarioState
+
+
+@dataclass(eq=False)
+class Session:
+    """A light view onto a scene. Belongs to the event loop; its worlds are computed elsewhere.
+
+    Attributes:
+        row: as it is in the store; holds id and token.
+        start: scene and objects at step 0.
+        lock: held by whoever changes the session.
+        world: the committed instant; never changed in place, so readers need no lock.
+        cameras: of the episode's sensors at the sizes asked for, by name.
+        lockstep: which action is due.
+        events: since the last answer to a REST step.
+        next_seq: of the session's log.
+        controller: the connection that drives, if there is one.
+        observers: what the connections that look on still have to be sent.
+        hangups: one for each open connection.
+        closed: why the session is over; None while it is not.
+    """
+
+    row: SessionRow
+    start: Start
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    world: World | None = None
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    lockstep: LockStep[Message] = field(default_factory=LockStep)
+    events: list[Event] = field(default_factory=list)
+    next_seq: int = 0
+    controller: object | None = None
+    observers: set[Mailbox] = field(default_factory=set)
+    hangups: set[Hangup] = field(default_factory=set)
+    closed: ServiceError | None = None
+    used_at: float = field(default_factory=time.monotonic)
+
+    @property
+    def session_id(self) -> str:
+        """Names its worker: ``<worker>.<random>``."""
+        return self.row.session_id
+
+    @property
+    def connected(self) -> bool:
+        """Whether anybody is connected by socket."""
+        return bool(self.hangups)
+
+    def touch(self) -> None:
+        """Somebody uses the session."""
+        self.used_at = time.monotonic()
+
+    def running_world(self) -> World:
+        """The committed instant. Raises ServiceError: NOT_RESET before the first reset."""
+        if self.world is None:
+            raise not_reset()
+        return self.world
+
+    @property
+    def spec(self) -> ResetSpec:
+        """Of the running episode; the defaults before the first one."""
+        return self.world.spec if self.world else ResetSpec()
+
+    def begin(self, world: World, cameras: dict[str, Camera]) -> None:
+        """An episode begins."""
+        self.world, self.cameras = world, cameras
+        self.lockstep.reset()
+        self.events = []
+
+    def take_events(self) -> list[Event]:
+        """Events since this was called last."""
+        taken, self.events = self.events, []
+        return taken
+
+    def check_open(self) -> None:
+        """Raises ServiceError: SESSION_CLOSED once the session is over."""
+        if self.closed is not None:
+            raise self.closed
+
+    def check_no_controller(self) -> None:
+        """Raises ServiceError: CONTROLLER_TAKEN while somebody drives by socket."""
+        if self.controller is not None:
+            raise controller_taken(self.session_id)
+
+    def publish(self, message: Message) -> None:
+        """Give an observation to all observers; never waits."""
+        for mailbox in self.observers:
+            mailbox.put(message)
+
+
+def controller_taken(session_id: str) -> ServiceError:
+    """CONTROLLER_TAKEN."""
+    return ServiceError(
+        ErrorCode.CONTROLLER_TAKEN,
+        f"session {session_id!r} has a controller on its drive socket",
+        hint="connect as an observer, or make a session of your own",
+    )

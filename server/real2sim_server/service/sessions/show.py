@@ -1,0 +1,200 @@
+"""Instants of worlds as messages: computed, drawn, encoded and packed off the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from real2sim_proto.drive import SensorSpec
+
+from ...edit import ScenarioState, instances_at
+from ...scene import Camera, Scene
+from ...world import World
+from ..engine import Engine
+from ..metrics import Metrics
+from ..pictures import Image, Pictures, Shot, check_sensors
+from .wire import EncodedFrame, Message, Stopwatch, encode_frame, pack_with_frames
+
+T = TypeVar("T")
+
+WARM_UP_WIDTH = 320
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """An instant on its way into a message.
+
+    Attributes:
+        world: at that instant.
+        images: in the order of sensors and modalities.
+        kind, fields: of the message, without frames and timing.
+        reply_to: id of the message that it answers.
+        watch: runs on.
+    """
+
+    world: World
+    images: Sequence[Image]
+    kind: str
+    fields: Mapping[str, Any]
+    reply_to: int
+    watch: Stopwatch
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """An instant as a message.
+
+    Attributes:
+        world: at that instant; it has not taken effect by being shown.
+        frames: the images of the message.
+        message: for whoever else gets it.
+        wire: bytes of the answer.
+        timing_ms: by stage.
+    """
+
+    world: World
+    frames: Sequence[EncodedFrame]
+    message: Message
+    wire: bytes
+    timing_ms: Mapping[str, float]
+
+
+class Show:
+    """Makes messages of instants.
+
+    A world without sensors moves on a thread of its own: it needs no device, and its planner
+    should not wait while other sessions are drawn. All else is one job of the engine. Raw images
+    are packed there at once; others are encoded beside it.
+
+    Args:
+        engine: runs what is drawn.
+        pictures: draws and encodes.
+        metrics: gets durations by stage.
+        max_pixels: over all images of one instant.
+    """
+
+    def __init__(
+        self, engine: Engine, pictures: Pictures, metrics: Metrics, *, max_pixels: int
+    ) -> None:
+        self._engine = engine
+        self._pictures = pictures
+        self._metrics = metrics
+        self._max_pixels = max_pixels
+        self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
+
+    def close(self) -> None:
+        """End the thread of the worlds."""
+        self._worlds.shutdown(cancel_futures=True)
+
+    def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
+        """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
+        cameras = check_sensors(scene.rig, sensors, max_pixels=self._max_pixels)
+        return {s.camera: c for s, c in zip(sensors, cameras, strict=True)}
+
+    async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
+        """``fn(*args)`` on the thread that moves worlds without sensors."""
+        return await asyncio.get_running_loop().run_in_executor(self._worlds, fn, *args)
+
+    async def observe(
+        self, change: Callable[[], World], cameras: Mapping[str, Camera], *, reply_to: int
+    ) -> Shown:
+        """The world that ``change`` makes, and the observation of it.
+
+        Args:
+            change: makes the new world; runs on another thread and leaves the present one alone.
+            cameras: of the world's sensors, by name, at the sizes asked for.
+            reply_to: id of the message that is answered.
+
+        Raises:
+            QueueFullError: too much waits for the engine.
+        """
+        watch = Stopwatch()
+
+        def work() -> Drawn | Shown:
+            watch.stage("queue")
+            world = change()
+            fields = world.observe().obs_fields()
+            watch.stage("world")
+            sensors = world.due_sensors()
+            images = self._images(world, sensors, [cameras[s.camera] for s in sensors])
+            watch.stage("render")
+            drawn = Drawn(world, images, "obs", fields, reply_to, watch)
+            return _packed(drawn, list(map(encode_frame, images))) if _is_raw(images) else drawn
+
+        if cameras:
+            made = await self._engine.call(work, label="drive")
+        else:
+            made = await self.on_world_thread(work)
+        return await self._finish(made)
+
+    async def view(
+        self, world: World, sensors: Sequence[SensorSpec], *, reply_to: int = 0
+    ) -> Shown:
+        """Images of a committed instant, from cameras of the vehicle; time does not move.
+
+        Raises:
+            ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
+            QueueFullError: too much waits for the engine.
+        """
+        cameras = check_sensors(world.scene.rig, sensors, max_pixels=self._max_pixels)
+        watch = Stopwatch()
+
+        def work() -> Drawn:
+            watch.stage("queue")
+            images = self._images(world, sensors, cameras)
+            watch.stage("render")
+            fields = {"t_us": world.t_us, "revision": world.revision}
+            return Drawn(world, images, "view", fields, reply_to, watch)
+
+        return await self._finish(await self._engine.call(work, label="view"))
+
+    async def first_render(self, scene: Scene, state: ScenarioState) -> None:
+        """Draw a scene from its first camera, to have everything compiled and in memory."""
+        shot = Shot(
+            scene=scene,
+            instances=instances_at(scene, state, scene.start_us),
+            T_world_vehicle=scene.ego.transform(scene.start_us),
+            t_us=scene.start_us,
+            sensors=(SensorSpec(camera=scene.rig.names[0], width=WARM_UP_WIDTH),),
+        )
+        await self._pictures.take(shot, stream="warm-up")
+
+    def _images(
+        self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]
+    ) -> Sequence[Image]:
+        if not sensors:
+            return ()
+        shot = Shot(
+            scene=world.scene,
+            instances=world.instances(),
+            T_world_vehicle=world.T_world_vehicle,
+            t_us=world.t_us,
+            sensors=sensors,
+        )
+        images, _ = self._pictures.draw(shot, cameras)
+        return images
+
+    async def _finish(self, made: Drawn | Shown) -> Shown:
+        if isinstance(made, Drawn):
+            frames = await self._pictures.on_encoders(encode_frame, made.images)
+            (made,) = await self._pictures.on_encoders(lambda d: _packed(d, frames), [made])
+        for stage, ms in made.timing_ms.items():
+            self._metrics.stages.labels(stage).observe(ms / 1e3)
+        for frame in made.frames:
+            self._metrics.frames.labels("drive", frame.codec).inc()
+        return made
+
+
+def _is_raw(images: Sequence[Image]) -> bool:
+    return all(image.sensor.codec == "raw" for image in images)
+
+
+def _packed(drawn: Drawn, frames: Sequence[EncodedFrame]) -> Shown:
+    watch = drawn.watch
+    watch.stage("encode")
+    message = pack_with_frames(drawn.kind, drawn.fields, frames, watch)
+    wire = message.with_id(drawn.reply_to)
+    return Shown(drawn.world, frames, message, wire, watch.timing_ms)

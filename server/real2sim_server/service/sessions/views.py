@@ -1,0 +1,45 @@
+"""Images of a session by plain request."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fastapi import Response
+
+from real2sim_proto.drive import SensorSpec
+
+from ...world import World
+from ..answers import CODEC_OF, choose_among, choose_media_type
+from ..views import etag
+from .show import Show
+
+MSGPACK = "application/msgpack"
+
+
+async def view_response(
+    show: Show, world: World, sensors: Sequence[SensorSpec], accept: str | None
+) -> Response:
+    """All frames as msgpack; a single one also as an image file, if ``accept`` likes that best.
+
+    In msgpack each frame has the codec its sensor names.
+
+    Raises:
+        ServiceError: NOT_ACCEPTABLE, or as Show.view().
+    """
+    single = len(sensors) == 1 and len(sensors[0].modalities) == 1
+    if single:
+        media_type = choose_media_type(accept, sensors[0].modalities[0])
+    else:
+        media_type = choose_among([MSGPACK], accept, of="more than one image")
+    if media_type != MSGPACK:
+        sensors = [sensors[0].model_copy(update={"codec": CODEC_OF[media_type]})]
+    shown = await show.view(world, sensors)
+    timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in shown.timing_ms.items())
+    headers = {
+        "Server-Timing": timing,
+        "Vary": "Accept",
+        "Cache-Control": "no-store",
+        "X-Real2Sim-Revision": etag(world.revision),
+    }
+    content = shown.wire if media_type == MSGPACK else bytes(shown.frames[0].data)
+    return Response(content, media_type=media_type, headers=headers)
