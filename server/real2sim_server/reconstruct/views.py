@@ -99,7 +99,7 @@ class ColourSamples:
         k = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]], np.float32)
         shape = (-(-camera.height // SHRINK), -(-camera.width // SHRINK))
         depth, objects = self._depths(k / np.float32(SHRINK), shape)
-        nearest = _nearest_objects(objects, float(k[0]) / SHRINK, shape)
+        nearest = nearest_objects(objects, float(k[0]) / SHRINK, shape)
         self._gather(k, depth, nearest, _pyramid(image))
         return View(camera, frame, T_camera_world, image, depth, np.isfinite(nearest[0]))
 
@@ -238,7 +238,7 @@ def _instance_poses(log: DrivingLog, t_us: int) -> list[Float | None]:
     return [np.eye(4), *tracks]
 
 
-def _nearest_objects(
+def nearest_objects(
     objects: dict[int, NDArray[np.float32]], focal: float, shape: tuple[int, int]
 ) -> _NearestObjects:
     """Depth of the nearest object in each pixel, its instance, and depth of the second nearest.

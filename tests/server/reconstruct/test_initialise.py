@@ -135,15 +135,6 @@ def test_the_sky_is_taken_from_pixels_that_nothing_covers(painted_scene):
     np.testing.assert_allclose(colour, SKY_COLOUR, atol=12)
 
 
-def test_the_sky_is_known_up_to_the_border_of_the_image(painted_scene):
-    from real2sim_server.reconstruct.evaluate import render_logged_view
-
-    log = painted_log()
-    image = render_logged_view(painted_scene, log.rig["front"], int(log.frame_times_us[4]))
-    top = image[2:12, 2:-2].astype(int)
-    assert np.abs(top - SKY_COLOUR).max() < 25
-
-
 def test_a_log_without_boxes_becomes_a_scene_without_objects():
     scene = initialise_scene(painted_log(boxes=False), options=SMALL)
     assert not scene.objects
