@@ -10,7 +10,7 @@ same bits.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from .cpu_records import (
     BLUE,
@@ -37,7 +37,7 @@ from .cpu_simd import (
     prefetch,
     touched_halves,
 )
-from .kernel import kernel
+from .kernel import inlined, kernel
 
 TASKS = 64
 """Tiles are dealt to this many tasks in turn, which spreads dense parts of an image."""
@@ -65,12 +65,12 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
         for tile in range(first_tile + task, last_tile, TASKS):
             x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
             going = open_tile(pixels, x0, y0, alpha.shape)
-            members = lists[starts[tile] : starts[tile + 1]]
-            blend_tile(values, members, F32(x0), F32(y0), pixels, going, extras)
+            first, last = starts[tile], starts[tile + 1]
+            blend_tile(values, lists, first, last, F32(x0), F32(y0), pixels, going, extras)
             write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance)
 
 
-@njit(forceinline=True)
+@inlined()
 def open_tile(pixels, x0, y0, shape):
     """Clear the state and finish pixels outside the image.
 
@@ -87,12 +87,12 @@ def open_tile(pixels, x0, y0, shape):
     return alive
 
 
-@njit(error_model="numpy")
-def blend_tile(values, members, x0, y0, pixels, alive, extras):
-    """Blend records near to far until the list ends or every pixel is finished."""
-    for position in range(members.shape[0]):
-        prefetch(values, np.int64(members[min(position + LOOK_AHEAD, members.shape[0] - 1)]))
-        record = values[members[position]]
+@inlined()
+def blend_tile(values, lists, first, last, x0, y0, pixels, alive, extras):
+    """Blend lists[first:last], near to far, until it ends or every pixel is finished."""
+    for position in range(first, last):
+        prefetch(values, np.int64(lists[min(position + LOOK_AHEAD, last - 1)]))
+        record = values[lists[position]]
         x, y = x0 + HALF - record[MEAN_X], y0 + HALF - record[MEAN_Y]
         sharpness, slope = record[SHARPNESS], record[SLOPE]
         falloff, level = record[FALLOFF], record[LEVEL]
@@ -109,7 +109,7 @@ def blend_tile(values, members, x0, y0, pixels, alive, extras):
             break
 
 
-@njit(forceinline=True)
+@inlined()
 def blend_half(pixels, half, record, start, rest, extras):
     """Blend one record over eight pixels; zero when all of them are finished."""
     sharpness, depth, instance = record[SHARPNESS], record[DEPTH], record[INSTANCE]
@@ -129,7 +129,7 @@ def blend_half(pixels, half, record, start, rest, extras):
     return blend_rgb(pixels, half, sharpness, start, rest, red, green, blue, depth, instance)
 
 
-@njit(forceinline=True, error_model="numpy")
+@inlined()
 def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
     """Put the background behind the tile and write it to the"""
     height, width = alpha.shape

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from .base import ALPHA_MIN
 from .cpu_records import (
@@ -33,7 +33,7 @@ from .cpu_records import (
     TILE,
     TIP_Y,
 )
-from .kernel import kernel
+from .kernel import inlined, kernel
 
 F32 = np.float32
 ZERO, HALF, ONE, TWO = F32(0), F32(0.5), F32(1), F32(2)
@@ -67,7 +67,7 @@ def project_cluster(cluster, view, base, records):
         start = chunk * CHUNK
         slot = base + start
         for i in range(start, min(n, start + CHUNK)):
-            box = project_gaussian(cluster, view, i, values[slot])
+            box = project_gaussian(cluster, view, i, values, slot)
             if box != NOWHERE:
                 boxes[slot] = box
                 depths[slot] = values[slot, DEPTH]
@@ -75,9 +75,10 @@ def project_cluster(cluster, view, base, records):
         counts[(base + start) // CHUNK] = slot - base - start
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
-def project_gaussian(cluster, view, i, out):  # noqa: PLR0911 - each test drops as early as it can
-    """Fill ``out`` with the record of Gaussian ``i``; returns its box of tiles, see pack_box."""
+@inlined(fastmath=FASTMATH)
+def project_gaussian(cluster, view, i, values, slot):  # noqa: PLR0911 - each test drops as early as it can
+    """Write the record of Gaussian ``i`` to ``slot``; returns its box of tiles, see pack_box."""
+    out = values[slot]
     opacity = cluster.opacities[i]
     if not opacity >= LEAST_ALPHA:
         return NOWHERE
@@ -131,7 +132,7 @@ def project_gaussian(cluster, view, i, out):  # noqa: PLR0911 - each test drops 
     return pack_box(view, mean_x, mean_y, reach_x, reach_y)
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def on_image(view, x, y, reach_x, reach_y):
     """Whether a box about (x, y) meets the image; False for what is not finite."""
     return (
@@ -142,7 +143,7 @@ def on_image(view, x, y, reach_x, reach_y):
     )
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def pack_box(view, x, y, reach_x, reach_y):
     """Tiles [x0, x1) x [y0, y1) whose pixel centres a box may hold; NOWHERE when none."""
     reach_x, reach_y = reach_x + SLACK, reach_y + SLACK
@@ -155,7 +156,7 @@ def pack_box(view, x, y, reach_x, reach_y):
     return np.int64(x0) | np.int64(x1) << 16 | np.int64(y0) << 32 | np.int64(y1) << 48
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def to_camera(cluster, i):
     """Centre in the camera frame; summed in float64 so that rounding cannot change the order."""
     x, y, z = (
@@ -171,7 +172,7 @@ def to_camera(cluster, i):
     )
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def largest_sigma(cluster, i):
     """Upper bound of the standard deviation along any direction of the world [m]."""
     largest = max(cluster.scale[0], cluster.scale[1], cluster.scale[2])
@@ -182,7 +183,7 @@ def largest_sigma(cluster, i):
     return largest * max(s[0], s[1], s[2])
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def image_covariance(cluster, i, scale_x, scale_y, tx, ty):
     """Covariance (xx, xy, yy) [px^2] on the image before blur, and its determinant, float64."""
     m = cluster.linear
@@ -216,7 +217,7 @@ def image_covariance(cluster, i, scale_x, scale_y, tx, ty):
     )
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def transform_covariance(covar, ax, ay, az, bx, by, bz):
     """Like image_covariance, from rows a, b of the map and a covariance [3, 3]."""
     sxx, sxy, sxz = np.float64(covar[0, 0]), np.float64(covar[0, 1]), np.float64(covar[0, 2])
@@ -235,7 +236,7 @@ def transform_covariance(covar, ax, ay, az, bx, by, bz):
     return xx, xy, yy, xx * yy - xy * xy
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def write_color(cluster, i, out):
     """Evaluate the spherical harmonics of Gaussian ``i`` as seen by the camera (Sloan 2013)."""
     sh = cluster.sh[i]
@@ -266,7 +267,7 @@ def write_color(cluster, i, out):
     out[RED], out[GREEN], out[BLUE] = max(r, ZERO), max(g, ZERO), max(b, ZERO)
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def add_cubic(r, g, b, sh, x, y, z):
     """Add the seven functions of degree 3."""
     five, three = F32(5) * z * z - ONE, F32(3)
@@ -280,7 +281,7 @@ def add_cubic(r, g, b, sh, x, y, z):
     return add_band(r, g, b, sh, 15, c3 * x * (x * x - three * y * y))
 
 
-@njit(forceinline=True, fastmath=FASTMATH, error_model="numpy")
+@inlined(fastmath=FASTMATH)
 def add_band(r, g, b, sh, k, basis):
     """Colour plus coefficient ``k`` times its basis function."""
     return r + basis * sh[k, 0], g + basis * sh[k, 1], b + basis * sh[k, 2]

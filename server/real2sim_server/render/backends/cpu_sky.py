@@ -1,13 +1,16 @@
 """The sky behind the picture: the twin of Sky.sample in Numba."""
 
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-from .kernel import kernel
+from .kernel import inlined, kernel
 
 F32 = np.float32
 ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
@@ -36,12 +39,13 @@ def add_sky(faces, matrix, rgb, alpha):
                     x * matrix[1, 0] + y * matrix[1, 1] + matrix[1, 2],
                     x * matrix[2, 0] + y * matrix[2, 1] + matrix[2, 2],
                 )
-                add_sample(faces, direction, ONE - alpha[row, column], rgb[row, column])
+                add_sample(faces, direction, rgb, alpha, row, column)
 
 
-@njit(forceinline=True, error_model="numpy")
-def add_sample(faces, direction, weight, color):
-    """Add the bilinear sample along ``direction`` times ``weight`` to ``color`` [3]."""
+@inlined()
+def add_sample(faces, direction, rgb, alpha, y, x):
+    """Add the bilinear sample along ``direction`` behind one pixel."""
+    weight = ONE - alpha[y, x]
     size = faces.shape[1]
     face, u, v = face_coordinates(direction)
     limit = F32(size - 1)
@@ -53,10 +57,10 @@ def add_sample(faces, direction, weight, color):
     for k in range(3):
         top = faces[face, r0, c0, k] * (ONE - fc) + faces[face, r0, c1, k] * fc
         bottom = faces[face, r1, c0, k] * (ONE - fc) + faces[face, r1, c1, k] * fc
-        color[k] += weight * (top * (ONE - fr) + bottom * fr)
+        rgb[y, x, k] += weight * (top * (ONE - fr) + bottom * fr)
 
 
-@njit(forceinline=True, error_model="numpy")
+@inlined()
 def face_coordinates(direction):
     """Face index and u, v in [-1, 1]; see scene.sky.face_coordinates."""
     x, y, z = direction

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from .cpu_records import (
     EXPONENT_LIMIT,
@@ -27,7 +27,7 @@ from .cpu_records import (
     TIP_Y,
 )
 from .cpu_simd import prefetch
-from .kernel import kernel
+from .kernel import inlined, kernel
 
 TILE_CHUNKS = 8
 LOOK_AHEAD = 24
@@ -96,13 +96,13 @@ def scatter_tiles(values, ordered_boxes, order, tiles_x, first_row, last_row, cu
                     cursors[chunk, tile] += 1
 
 
-@njit(forceinline=True)
+@inlined()
 def tile_rows(box):
     """Range of tile rows of a box."""
     return (box >> 32) & 0xFFFF, (box >> 48) & 0xFFFF
 
 
-@njit(forceinline=True, error_model="numpy")
+@inlined()
 def tile_columns(values, box, index, row):
     """Range of tile columns where the ellipse meets the pixel centres of a tile row.
 
@@ -122,7 +122,7 @@ def tile_columns(values, box, index, row):
     return first, min(last, np.int64(math.floor(min(right, F32(last)))) + 1)
 
 
-@njit(forceinline=True, error_model="numpy")
+@inlined()
 def side_reach(record, y0, y1, tip, side):
     """Outermost dx of the ellipse on one side (``side`` = ±1) for dy in [y0, y1]."""
     dy = min(max(tip, y0), y1)

@@ -28,6 +28,15 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
+def inlined(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.njit`` for what kernels call for each Gaussian; may not allocate.
+
+    Without ``_nrt=False`` each array that is passed or sliced is counted up and down by atomic
+    instructions, which take several times as long as the work itself.
+    """
+    return numba.njit(forceinline=True, error_model="numpy", _nrt=False, **options)
+
+
 @functools.cache
 def source_fingerprint() -> str:
     """Eight hexadecimal digits that change with any source a kernel is made of."""
