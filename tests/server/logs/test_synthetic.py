@@ -17,6 +17,8 @@ from real2sim_server.logs.synthetic import (
     generate_log,
     synthesize,
 )
+from real2sim_server.logs.synthetic.traffic import Drive, plan_drive
+from real2sim_server.logs.synthetic.vehicles import SHAPES
 from real2sim_server.scene import Camera
 from real2sim_server.scene.rotation import Float, apply_transform, invert_transform
 
@@ -128,7 +130,7 @@ def _inside(local: Float, track: ObjectTrack, *, margin: float) -> NDArray[np.bo
     return inside
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_vehicles_fill_their_boxes(seed: int) -> None:
     """Seen from all around, a vehicle reaches every face of its box."""
     log = generate_log(replace(SMALL, seed=seed, frames=1, moving_cars=1, parked_cars=0))
@@ -166,7 +168,7 @@ def test_lidar_measures_what_cameras_see(exact_log: SyntheticLog) -> None:
     aim = beams - sweep.origin
     distance = np.linalg.norm(aim, axis=1)
     checked = 0
-    for point, reach, ray in zip(beams[::23], distance[::23], aim[::23], strict=True):
+    for point, reach, ray in zip(beams[::47], distance[::47], aim[::47], strict=True):
         # A camera at the sensor, one pixel wide, looking along the beam.
         T_vehicle_probe = _facing_origin(-ray)
         T_vehicle_probe[:3, 3] = sweep.origin
@@ -176,7 +178,7 @@ def test_lidar_measures_what_cameras_see(exact_log: SyntheticLog) -> None:
         if instance[0, 0] == 0:
             assert depth[0, 0] == pytest.approx(reach, abs=0.02), point
             checked += 1
-    assert checked > 60
+    assert checked > 30
 
 
 def test_lidar_noise_has_the_asked_spread(log: SyntheticLog) -> None:
@@ -203,22 +205,21 @@ def test_points_of_parked_vehicles_stay_in_their_boxes_in_all_sweeps(
     exact_log: SyntheticLog,
 ) -> None:
     log, found = exact_log, 0
-    for track in (t for t in log.tracks if not _moves(t)):
-        for frame in (0, 1, 3):
-            points = log.lidar(frame).points.astype(np.float64)
+    for frame in (0, 3):
+        points = log.lidar(frame).points.astype(np.float64)
+        for track in (t for t in log.tracks if not _moves(t)):
             local = _points_near(log, track, points, int(log.frame_times_us[frame]))
             assert _outside(local, track) <= 0.01 * len(local)
             found += len(local)
-    assert found > 3000
+    assert found > 2000
 
 
 def test_points_of_moving_vehicles_move_with_their_boxes(exact_log: SyntheticLog) -> None:
     log, found = exact_log, 0
     movers = [t for t in log.tracks if _moves(t)]
-    for track in movers:
-        for frame in (1, 2):
-            t_us = int(log.frame_times_us[frame])
-            sweep = log.lidar(frame)
+    for frame in (1, 2):
+        t_us, sweep = int(log.frame_times_us[frame]), log.lidar(frame)
+        for track in movers:
             still = _points_near(log, track, sweep.points.astype(np.float64), t_us)
             velocity = log.ego.transform(t_us)[:3, :3].T @ track.trajectory.velocity(t_us)
             shift = velocity * (sweep.offset_us * 1e-6)[:, None]
@@ -241,18 +242,19 @@ def _outside(local: Float, track: ObjectTrack) -> int:
 
 
 def test_vehicles_keep_clear_of_each_other() -> None:
-    for seed in range(4):
-        log = generate_log(replace(SMALL, seed=seed, frames=40, moving_cars=6, parked_cars=20))
-        for t_us in log.frame_times_us[::6]:
-            _assert_clear(log, int(t_us))
+    for seed in range(12):
+        config = replace(SMALL, seed=seed, frames=60, moving_cars=6, parked_cars=20)
+        drive = plan_drive(config)
+        for t_us in drive.frame_times_us[::8]:
+            _assert_clear(drive, int(t_us))
 
 
-def _assert_clear(log: DrivingLog, t_us: int) -> None:
-    ego = log.ego.transform(t_us)
-    boxes = [(ego[:2, 3] + 1.4 * ego[:2, 0], ego, log.ego_size)]
-    for track in log.tracks:
-        pose = track.trajectory.transform(t_us)
-        boxes.append((pose[:2, 3], pose, track.size))
+def _assert_clear(drive: Drive, t_us: int) -> None:
+    ego = drive.ego.transform(t_us)
+    boxes = [(ego[:2, 3] + 1.4 * ego[:2, 0], ego, DrivingLog.ego_size)]
+    for vehicle in drive.vehicles:
+        pose = vehicle.trajectory.transform(t_us)
+        boxes.append((pose[:2, 3], pose, SHAPES[vehicle.shape].size))
     for i, (centre, pose, size) in enumerate(boxes):
         for other, _, other_size in boxes[i + 1 :]:
             along, across = pose[:2, :2].T @ (other - centre)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike
 from ...scene.rotation import Float
 from .materials import DOOR, PLAIN, ROOF, WALL, WINDOW
 from .mesh import MeshBuilder
+
+Corners = Float | Sequence[Sequence[float]]
 
 UV_PERIOD = 10.0
 """Window textures count windows in multiples of this, so that each can differ."""
@@ -105,7 +108,8 @@ class Facade:
     def world(self, local: ArrayLike) -> Float:
         """World points of (u, w, z) [..., 3]."""
         points: Float = np.asarray(local, dtype=np.float64) @ self.axes
-        return points + np.array([*self.start, 0.0])
+        points += np.array([*self.start, 0.0])
+        return points
 
     def panel(
         self,
@@ -115,7 +119,7 @@ class Facade:
         paint: int,
         *,
         w: float = 0.0,
-        uv: ArrayLike | None = None,
+        uv: Corners | None = None,
     ) -> None:
         """A rectangle parallel to the front."""
         corners = [[u[0], w, z[0]], [u[1], w, z[0]], [u[1], w, z[1]], [u[0], w, z[1]]]
@@ -128,7 +132,7 @@ class Facade:
             self.axes, [*self.start, 0.0], low, high, material=material, paint=paint
         )
 
-    def wall(self, corners: ArrayLike, material: int, paint: int, uv: ArrayLike) -> None:
+    def wall(self, corners: ArrayLike, material: int, paint: int, uv: Corners) -> None:
         """Any quad in (u, w, z)."""
         self.builder.quad(self.world(corners), material, paint, uv)
 
@@ -233,7 +237,8 @@ def _add_door(facade: Facade, house: House, u: tuple[float, float], z: tuple[flo
     _opening(facade, house, (u, z), (left, left + width), (0.15, high))
     colour = facade.builder.paints[house.front][:3]
     paint = facade.builder.mix(*colour, width, high - 0.15)
-    uv = [[0, 0], [width, 0], [width, high - 0.15], [0, high - 0.15]]
+    top = high - 0.15
+    uv = [[0.0, 0.0], [width, 0.0], [width, top], [0.0, top]]
     facade.panel((left, left + width), (0.15, high), DOOR, paint, w=-house.recess, uv=uv)
 
 

@@ -26,8 +26,8 @@ class Geometry(NamedTuple):
 
     Attributes:
         bounds: [N, 6] low x, y, z, high x, y, z of every node.
-        child: [N] uint32, left child of an inner node (the right one follows it) or first triangle.
-        count: [N] uint32, triangles of a leaf, 0 for an inner node.
+        children: [N] uint32, left child (the right one follows it), or a leaf's first triangle.
+        counts: [N] uint32, triangles of a leaf, 0 for an inner node.
         edges: [T, 9] first corner and the two edges from it.
         uv: [T, 6] texture coordinates of the three corners.
         normals: [T, 9] unit normals of the three corners.
@@ -36,8 +36,8 @@ class Geometry(NamedTuple):
     """
 
     bounds: Float
-    child: NDArray[np.uint32]
-    count: NDArray[np.uint32]
+    children: NDArray[np.uint32]
+    counts: NDArray[np.uint32]
     edges: Float
     uv: Float
     normals: Float

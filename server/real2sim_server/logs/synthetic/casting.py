@@ -159,7 +159,7 @@ def rotate(m, i, x, y, z):
 def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     """Nearest hit in the world: (distance, triangle, u, v, instance), instance -1 for static."""
     best, triangle, u, v = cast_mesh(
-        g.bounds, g.child, g.count, g.edges, 0, ox, oy, oz, dx, dy, dz, limit, False, stack
+        g.bounds, g.children, g.counts, g.edges, 0, ox, oy, oz, dx, dy, dz, limit, False, stack
     )
     instance = -1
     for i in range(len(instances.radius)):
@@ -170,8 +170,8 @@ def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
         qx, qy, qz = rotate(m, i, dx, dy, dz)
         t, k, a, b = cast_mesh(
             g.bounds,
-            g.child,
-            g.count,
+            g.children,
+            g.counts,
             g.edges,
             instances.root[i],
             px + m[i, 0, 3],
@@ -200,8 +200,8 @@ def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
         qx, qy, qz = rotate(m, i, dx, dy, dz)
         hit = cast_mesh(
             g.bounds,
-            g.child,
-            g.count,
+            g.children,
+            g.counts,
             g.edges,
             instances.root[i],
             px + m[i, 0, 3],
@@ -218,7 +218,7 @@ def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
             return True
     return (
         cast_mesh(
-            g.bounds, g.child, g.count, g.edges, 0, ox, oy, oz, dx, dy, dz, limit, True, stack
+            g.bounds, g.children, g.counts, g.edges, 0, ox, oy, oz, dx, dy, dz, limit, True, stack
         )[1]
         >= 0
     )

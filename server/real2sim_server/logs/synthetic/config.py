@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from ...scene import Camera, CameraRig
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ...scene.rotation import transform_from, yaw_quaternion
@@ -114,6 +116,6 @@ class SyntheticConfig:
 
     def _camera(self, spec: CameraSpec) -> Camera:
         focal = self.width / (2 * math.tan(spec.fov / 2))
-        k = [[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1]]
+        k = np.array([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1]])
         pose = transform_from(spec.position, yaw_quaternion(spec.yaw)) @ T_VEHICLE_OPTICAL
         return Camera(spec.name, self.width, self.height, k, pose)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...scene import CameraRig, Trajectory
+from ...scene import CameraRig
 from ...scene.rotation import Float, apply_transform, invert_transform
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..native_writer import write_native_log
@@ -20,9 +20,8 @@ from .casting import Instances
 from .config import SyntheticConfig
 from .sensors import shoot_image, shoot_lidar
 from .shading import World
-from .street import lay_street
 from .surroundings import build_surroundings
-from .traffic import Vehicle, drive_distance, drive_ego, place_vehicles, poses_at
+from .traffic import Drive, Vehicle, plan_drive, poses_at
 from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
 
 LIDAR_POSITION = (0.9, 0.0, 1.73)
@@ -60,26 +59,24 @@ class SyntheticSource:
     Attributes:
         config: of the drive.
         world: surroundings and vehicle shapes.
-        vehicles: in the order of the log's tracks.
+        drive: vehicles in the order of the log's tracks.
         roots: node [S] of each vehicle shape's mesh.
         body_paints: row [I] of each vehicle's body in the paint table.
-        rig, ego, frame_times_us: as in the log.
+        rig: as in the log.
     """
 
     config: SyntheticConfig
     world: World
-    vehicles: tuple[Vehicle, ...]
+    drive: Drive
     roots: NDArray[np.int64]
     body_paints: NDArray[np.int64]
     rig: CameraRig
-    ego: Trajectory
-    frame_times_us: NDArray[np.int64]
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """RGB uint8 [H, W, 3] of a camera."""
         lens = self.rig[camera]
-        t_us = int(self.frame_times_us[frame])
-        pose = self.ego.transform(t_us) @ lens.T_vehicle_camera
+        t_us = int(self.drive.frame_times_us[frame])
+        pose = self.drive.ego.transform(t_us) @ lens.T_vehicle_camera
         return self.render(pose, lens.K, lens.width, lens.height, t_us)[0]
 
     def render(
@@ -102,9 +99,9 @@ class SyntheticSource:
         return sweeps._replace(to_object=sweeps.to_object[0], to_world=sweeps.to_world[0])
 
     def _instances_over(self, times_us: Float) -> Instances:
-        shapes = np.array([v.shape for v in self.vehicles], dtype=np.int64)
-        to_world = np.zeros((len(times_us), len(self.vehicles), 4, 4))
-        for i, vehicle in enumerate(self.vehicles):
+        shapes = np.array([v.shape for v in self.drive.vehicles], dtype=np.int64)
+        to_world = np.zeros((len(times_us), len(self.drive.vehicles), 4, 4))
+        for i, vehicle in enumerate(self.drive.vehicles):
             to_world[:, i] = poses_at(vehicle.trajectory, times_us)
         half = np.array([SHAPES[s].size for s in shapes]).reshape(-1, 3) / 2
         return Instances(
@@ -123,12 +120,12 @@ class SyntheticSource:
         Every column is cast with the vehicles and the sensor where they are at its own instant;
         the sensor's motion is then taken out exactly, that of the vehicles is left in.
         """
-        config, t_us = self.config, int(self.frame_times_us[frame])
+        config, t_us = self.config, int(self.drive.frame_times_us[frame])
         if config.lidar_beams == 0:
             return _sweep(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
         step = (np.arange(config.lidar_columns) + 0.5) / config.lidar_columns
         offsets_us = np.round((step - 0.5) * config.frame_period_us)
-        poses = poses_at(self.ego, t_us + offsets_us)
+        poses = poses_at(self.drive.ego, t_us + offsets_us)
         local = _beam_directions(np.pi - 2 * np.pi * step, config.lidar_beams)
         directions = np.einsum("cij,cbj->cbi", poses[:, :3, :3], local)
         origins = apply_transform(poses, np.array([LIDAR_POSITION]))[:, 0]
@@ -144,7 +141,7 @@ class SyntheticSource:
         kept = (ranges > 0) & ~_lost(ranges, reflected, config.lidar_range, rng)
         column, beam = np.nonzero(kept)
         points = origins[column] + directions[column, beam] * measured[kept][:, None]
-        in_vehicle = apply_transform(invert_transform(self.ego.transform(t_us)), points)
+        in_vehicle = apply_transform(invert_transform(self.drive.ego.transform(t_us)), points)
         return _sweep(in_vehicle, reflected[kept], offsets_us[column])
 
 
@@ -179,19 +176,13 @@ def _sweep(points: Float, intensity: ArrayLike, offsets_us: ArrayLike) -> LidarS
 
 def generate_log(config: SyntheticConfig) -> SyntheticLog:
     """The drive that ``config`` describes; the world is built now, pictures are cast on demand."""
-    street_rng, traffic_rng, house_rng = (
-        np.random.default_rng([config.seed, stream]) for stream in range(3)
-    )
-    times_us = np.arange(config.frames, dtype=np.int64) * config.frame_period_us
-    distance = drive_distance(config, traffic_rng)
-    street = lay_street(street_rng, drive_length=float(distance(np.array(config.duration))))
-    ego = drive_ego(street, distance, times_us)
-    vehicles = place_vehicles(street, distance, config, times_us, traffic_rng)
+    drive = plan_drive(config)
     paints: list[tuple[float, ...]] = []
-    meshes = [build_surroundings(street, paints, house_rng)]
+    house_rng = np.random.default_rng([config.seed, 2])
+    meshes = [build_surroundings(drive.street, paints, house_rng)]
     meshes += [build_vehicle(shape, paints) for shape in SHAPES]
-    body_paints = len(paints) + np.arange(len(vehicles), dtype=np.int64)
-    paints += [(*v.colour, 0.0, 0.0, 0.0, 0.0, 0.0) for v in vehicles]
+    body_paints = len(paints) + np.arange(len(drive.vehicles), dtype=np.int64)
+    paints += [(*v.colour, 0.0, 0.0, 0.0, 0.0, 0.0) for v in drive.vehicles]
     geometry, roots = build_geometry(meshes)
     world = World(
         *geometry,
@@ -200,15 +191,13 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
         np.array([roof_heights(shape) for shape in SHAPES]),
         config.seed % 1_000_003 * 131,
     )
-    source = SyntheticSource(
-        config, world, tuple(vehicles), roots[1:], body_paints, config.rig(), ego, times_us
-    )
+    source = SyntheticSource(config, world, drive, roots[1:], body_paints, config.rig())
     return SyntheticLog(
         name=f"synthetic_{config.seed}",
         rig=source.rig,
-        frame_times_us=times_us,
-        ego=ego,
-        tracks=_tracks(vehicles),
+        frame_times_us=drive.frame_times_us,
+        ego=drive.ego,
+        tracks=_tracks(drive.vehicles),
         source=source,
         provenance={
             "dataset": "synthetic street",
@@ -219,7 +208,7 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
     )
 
 
-def _tracks(vehicles: list[Vehicle]) -> tuple[ObjectTrack, ...]:
+def _tracks(vehicles: tuple[Vehicle, ...]) -> tuple[ObjectTrack, ...]:
     seen: Counter[str] = Counter()
     tracks = []
     for vehicle in vehicles:

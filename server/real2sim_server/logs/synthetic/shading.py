@@ -37,7 +37,7 @@ class World(NamedTuple):
     One flat tuple, because parallel kernels take no nested ones.
 
     Attributes:
-        bounds, child, count, edges, uv, normals, material, paint: as in :class:`.bvh.Geometry`;
+        bounds, children, counts, edges, uv, normals, material, paint: as in :class:`.bvh.Geometry`;
             the surroundings have root 0.
         paints: [P, 8] paint table.
         shapes: [S, 16] measures of vehicle shapes.
@@ -46,8 +46,8 @@ class World(NamedTuple):
     """
 
     bounds: Float
-    child: NDArray[np.uint32]
-    count: NDArray[np.uint32]
+    children: NDArray[np.uint32]
+    counts: NDArray[np.uint32]
     edges: Float
     uv: Float
     normals: Float

@@ -203,4 +203,5 @@ def _close_street(builder: MeshBuilder, street: Street, rng: np.random.Generator
 
 
 def _above(point: Float, height: float) -> Float:
-    return point + np.array([0.0, 0.0, height])
+    raised: Float = point + np.array([0.0, 0.0, height])
+    return raised

@@ -12,7 +12,7 @@ from ...scene import Trajectory
 from ...scene.rotation import Float, slerp, transform_from, yaw_quaternion
 from .config import SyntheticConfig
 from .materials import PARKING_BAY
-from .street import EGO_OFFSET, KERB, LANE, Street
+from .street import EGO_OFFSET, KERB, LANE, Street, lay_street
 from .vehicles import SHAPES
 
 PARKED_OFFSET = (LANE + KERB) / 2 + 0.05
@@ -23,6 +23,23 @@ COLOURS = (
 )  # fmt: skip
 
 Distance = Callable[[Float], Float]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Everything about a drive but what it looks like.
+
+    Attributes:
+        street: its course.
+        frame_times_us: [F] int64 [us].
+        ego: ``T_world_vehicle``.
+        vehicles: all others, moving ones first.
+    """
+
+    street: Street
+    frame_times_us: NDArray[np.int64]
+    ego: Trajectory
+    vehicles: tuple[Vehicle, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +57,36 @@ class Vehicle:
     trajectory: Trajectory
 
 
-def drive_distance(config: SyntheticConfig, rng: np.random.Generator) -> Distance:
+def plan_drive(config: SyntheticConfig) -> Drive:
+    """Lay the street and plan who drives and parks where."""
+    street_rng, traffic_rng = (np.random.default_rng([config.seed, i]) for i in range(2))
+    times_us = np.arange(config.frames, dtype=np.int64) * config.frame_period_us
+    distance = _drive_distance(config, traffic_rng)
+    street = lay_street(street_rng, drive_length=float(distance(np.array(config.duration))))
+    ego = _drive_ego(street, distance, times_us)
+    vehicles = _place_vehicles(street, distance, config, times_us, traffic_rng)
+    return Drive(street, times_us, ego, tuple(vehicles))
+
+
+def _drive_distance(config: SyntheticConfig, rng: np.random.Generator) -> Distance:
     """Distance [m] the ego vehicle has driven at times [s]; it slows down and speeds up."""
     period, phase = rng.uniform(6, 10), rng.uniform(0, 2 * np.pi)
     rate = 2 * np.pi / period
 
     def distance(t: Float) -> Float:
-        return config.speed * (t + 0.22 / rate * (np.cos(phase) - np.cos(rate * t + phase)))
+        driven: Float = t + 0.22 / rate * (np.cos(phase) - np.cos(rate * t + phase))
+        return config.speed * driven
 
     return distance
 
 
-def follow(
+def _drive_ego(street: Street, distance: Distance, times_us: NDArray[np.int64]) -> Trajectory:
+    """``T_world_vehicle``: in the middle of the right lane."""
+    s = distance(_seconds(times_us))
+    return _follow(street, s, np.full_like(s, EGO_OFFSET), times_us, turn=0.0, z=0.0)
+
+
+def _follow(
     street: Street, s: Float, d: Float, times_us: NDArray[np.int64], *, turn: float, z: float
 ) -> Trajectory:
     """Motion along street coordinates s, d [T], facing ``turn`` [rad] to the street's heading."""
@@ -60,13 +95,7 @@ def follow(
     return Trajectory(times_us, positions, yaw_quaternion(street.heading(s) + turn))
 
 
-def drive_ego(street: Street, distance: Distance, times_us: NDArray[np.int64]) -> Trajectory:
-    """``T_world_vehicle``: in the middle of the right lane."""
-    s = distance(times_us * 1e-6)
-    return follow(street, s, np.full_like(s, EGO_OFFSET), times_us, turn=0.0, z=0.0)
-
-
-def place_vehicles(
+def _place_vehicles(
     street: Street,
     distance: Distance,
     config: SyntheticConfig,
@@ -90,7 +119,7 @@ def _drive_ahead(
     rng: np.random.Generator,
 ) -> list[Vehicle]:
     vehicles = []
-    t = times_us * 1e-6
+    t = _seconds(times_us)
     gap = rng.uniform(11, 14)
     for _ in range(count):
         shape = _pick(rng, longest=6.0)
@@ -117,7 +146,7 @@ def _drive_towards(
         shape = _pick(rng, longest=6.0) if i % 2 == 0 else _pick(rng, shortest=6.0)
         length = SHAPES[shape].size[0]
         start += length / 2
-        s = start - speed * (times_us * 1e-6)
+        s = start - speed * _seconds(times_us)
         vehicles.append(_moving(shape, street, s, times_us, rng, turn=np.pi))
         start += length / 2 + rng.uniform(10, 22)
     return vehicles
@@ -135,7 +164,7 @@ def _moving(
     z = SHAPES[shape].size[2] / 2
     # Both directions keep right, so those who come towards us drive left of the centre line.
     d = EGO_OFFSET if turn == 0.0 else -EGO_OFFSET
-    trajectory = follow(street, s, np.full_like(s, d), times_us, turn=turn, z=z)
+    trajectory = _follow(street, s, np.full_like(s, d), times_us, turn=turn, z=z)
     return Vehicle(shape, _colour(rng), trajectory)
 
 
@@ -161,7 +190,7 @@ def _park(
         offset = np.full(len(ends), side * (PARKED_OFFSET + rng.uniform(-0.08, 0.1)))
         turn = (np.pi if side > 0 else 0.0) + rng.normal(scale=0.012)
         z = SHAPES[shape].size[2] / 2
-        trajectory = follow(street, at, offset, ends, turn=turn, z=z)
+        trajectory = _follow(street, at, offset, ends, turn=turn, z=z)
         vehicles.append(Vehicle(shape, _colour(rng), trajectory))
     return vehicles
 
@@ -175,6 +204,10 @@ def _pick(rng: np.random.Generator, *, shortest: float = 0.0, longest: float = f
 def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
     r, g, b = np.array(COLOURS[rng.integers(len(COLOURS))]) * rng.uniform(0.9, 1.1)
     return float(r), float(g), float(b)
+
+
+def _seconds(times_us: NDArray[np.int64]) -> Float:
+    return times_us.astype(np.float64) * 1e-6
 
 
 def poses_at(trajectory: Trajectory, times_us: Float) -> Float:

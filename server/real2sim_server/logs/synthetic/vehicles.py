@@ -5,7 +5,9 @@ The frame of a shape is its box: origin at the box centre, x forward, z up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -142,11 +144,14 @@ def build_vehicle(shape: VehicleShape, paints: list[tuple[float, ...]]) -> Mesh:
 
 
 def _roof(shape: VehicleShape, x: Float) -> Float:
-    along, height = np.array(shape.roof).T
-    heights: Float = PchipInterpolator(along, height)(
-        np.clip(x / shape.size[0], along[0], along[-1])
-    )
+    ends = shape.roof[0][0], shape.roof[-1][0]
+    heights: Float = _roof_curve(shape)(np.clip(x / shape.size[0], *ends))
     return heights * shape.size[2]
+
+
+@cache
+def _roof_curve(shape: VehicleShape) -> PchipInterpolator:
+    return PchipInterpolator(*np.array(shape.roof).T)
 
 
 def _add_shell(builder: MeshBuilder, shape: VehicleShape) -> None:
@@ -202,7 +207,7 @@ def _plan(x: float, rear: float, front: float, shape: VehicleShape) -> float:
     ):
         if distance < reach:
             q = 1 - distance / reach
-            return 1 - depth * (1 - np.sqrt(max(1 - q * q, 0.0)))
+            return 1 - depth * (1 - math.sqrt(max(1 - q * q, 0.0)))
     return 1.0
 
 
@@ -248,5 +253,5 @@ def _add_cargo(builder: MeshBuilder, shape: VehicleShape, black: int) -> None:
     builder.box([rear + 0.1, -0.5, 0.5], [front + 0.6, 0.5, floor], PLAIN, black)
     red = builder.mix(0.45, 0.02, 0.02)
     for side in (-1.0, 1.0):
-        y = sorted((side * (half - 0.35), side * (half - 0.05)))
-        builder.box([rear, y[0], 0.8], [rear + 0.08, y[1], 0.94], PLAIN, red)
+        ends = sorted((side * (half - 0.35), side * (half - 0.05)))
+        builder.box([rear, ends[0], 0.8], [rear + 0.08, ends[1], 0.94], PLAIN, red)
