@@ -73,9 +73,13 @@ class _Lanes:
         """self * factor + addend, rounded once where the machine can."""
         return self._call("llvm.fmuladd", self._lift(factor), self._lift(addend))
 
-    def magnitude(self) -> _Lanes:
-        """Absolute value."""
-        return self._call("llvm.fabs")
+    def negative_where(self, mask: Any) -> _Lanes:
+        """Self with the sign bit set where ``mask`` holds."""
+        bits = ir.VectorType(ir.IntType(32), LANES)
+        sign = ir.Constant(bits, [-(2**31)] * LANES)
+        chosen = self.builder.and_(self.builder.sext(mask, bits), sign)
+        merged = self.builder.or_(self.builder.bitcast(self.value, bits), chosen)
+        return _Lanes(self.builder, self.builder.bitcast(merged, VECTOR))
 
     def _call(self, intrinsic_name: str, *others: Any) -> _Lanes:
         kind = ir.FunctionType(VECTOR, [VECTOR] * (1 + len(others)))
@@ -143,17 +147,18 @@ def _build_blend(builder: ir.IRBuilder, state: _PixelState, scalars: list[Any], 
     touched = exponent.compare("<=", EXPONENT_LIMIT)
     goes_on = after.compare(">", TRANSMITTANCE_MIN)
     blended = builder.and_(touched, goes_on)
-    finished = (-before.magnitude()).where(touched, before)
-    new = after.where(blended, finished)
+    finished = builder.and_(touched, builder.not_(goes_on))
+    # Sums and sign bits, since a choice between old and new value would become a masked store,
+    # which is slow on many processors.
     weight = weight.where(blended, 0.0)
+    new = (before - weight).negative_where(finished)
     state.store(0, new)
     for plane, value in enumerate(values[: 3 + (extras & 1)], start=1):
         state.store(plane, weight.fused(value, state.load(plane)))
     if extras & 2:
-        crossing = builder.and_(
-            blended, builder.and_(before.compare(">", 0.5), after.compare("<=", 0.5))
-        )
-        state.store(5, values[-1].where(crossing, state.load(5)))
+        halving = builder.and_(before.compare(">", 0.5), after.compare("<=", 0.5))
+        crossing = builder.and_(blended, halving)
+        state.store(5, state.load(5) + values[-1].where(crossing, 0.0))
     mask = builder.bitcast(new.compare(">", 0.0), ir.IntType(LANES))
     return builder.zext(mask, ir.IntType(64))
 
