@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from ..logs.open import open_log
 from ..logs.synthetic import SyntheticConfig, synthesize
 from .console import CommandError, console, print_figures, progress, refuse_existing, write_json
 
@@ -25,7 +26,8 @@ def run(
         raise CommandError(str(error)) from error
     start = time.perf_counter()
     with progress("casting rays") as report:
-        log = synthesize(config, out, on_progress=report)
+        synthesize(config, out, on_progress=report)
+    log = open_log(out)
     figures = {
         "log": str(out),
         "frames": log.frame_count,

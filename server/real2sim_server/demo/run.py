@@ -23,7 +23,7 @@ from .worker import own_worker
 
 SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
-LOG_HZ = 4.0
+LOG_HZ = 2.5
 STEP_US = 100_000
 
 
