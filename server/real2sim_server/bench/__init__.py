@@ -1,0 +1,1 @@
+"""Measurements of a worker as its users meet it. Stands above all rooms, the client included."""

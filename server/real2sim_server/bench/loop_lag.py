@@ -1,0 +1,100 @@
+"""How long the worker's event loop keeps others waiting while it draws large pictures."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import httpx2
+import numpy as np
+
+from .drive_probe import DriveProbe
+
+HEAVY_WIDTH = 1920
+PING_EVERY_S = 0.005
+IDLE_SECONDS = 3.0
+BUCKET = re.compile(r'^real2sim_event_loop_lag_seconds_bucket{le="([^"]+)"} (\S+)', re.MULTILINE)
+
+
+def loop_lag(
+    probe: DriveProbe, url: str, *, scene: str, camera: str, seconds: float
+) -> dict[str, Any]:
+    """Lag with the worker idle and under load, seen from both sides.
+
+    ``ping``: round trips of WebSocket pings [ms], which the loop answers by itself; they hold the
+    client's own wake-ups too. ``own``: the worker's histogram of how late its loop runs.
+    """
+    idle = _pings(probe, IDLE_SECONDS)
+    before = _buckets(url)
+    with _heavy_rendering(url, scene, camera) as pictures:
+        loaded = _pings(probe, seconds)
+    own = {le: count - before[le] for le, count in _buckets(url).items()}
+    samples = own.get("+Inf", 0.0)
+    within = own.get("0.005", 0.0) / samples if samples else float("nan")
+    return {
+        "heavy_picture_ms": float(np.mean(pictures)) if pictures else None,
+        "pictures": len(pictures),
+        "ping_idle_ms": _spread(idle),
+        "ping_loaded_ms": _spread(loaded),
+        "own_samples": int(samples),
+        "own_share_within_5_ms": within,
+        "own_p99_below_ms": _quantile_bound(own, 0.99),
+    }
+
+
+@contextlib.contextmanager
+def _heavy_rendering(url: str, scene: str, camera: str) -> Iterator[list[float]]:
+    """Pictures of HEAVY_WIDTH one after the other; yields the milliseconds each took."""
+    taken: list[float] = []
+    stop = threading.Event()
+
+    def work() -> None:
+        query = {"camera": camera, "width": str(HEAVY_WIDTH)}
+        with httpx2.Client(base_url=url, timeout=60) as client:
+            while not stop.is_set():
+                started = time.perf_counter()
+                answer = client.get(f"/v1/scenes/{scene}/render", params=query)
+                answer.raise_for_status()
+                taken.append((time.perf_counter() - started) * 1e3)
+
+    thread = threading.Thread(target=work, name="heavy", daemon=True)
+    thread.start()
+    try:
+        yield taken
+    finally:
+        stop.set()
+        thread.join(60)
+
+
+def _pings(probe: DriveProbe, seconds: float) -> list[float]:
+    """Milliseconds of ping round trips."""
+    trips = []
+    end = time.perf_counter() + seconds
+    while (started := time.perf_counter()) < end:
+        probe.socket.ping().wait(10)
+        trips.append((time.perf_counter() - started) * 1e3)
+        time.sleep(PING_EVERY_S)
+    return trips
+
+
+def _buckets(url: str) -> dict[str, float]:
+    text = httpx2.get(f"{url}/metrics", timeout=10).text
+    return {le: float(count) for le, count in BUCKET.findall(text)}
+
+
+def _quantile_bound(buckets: dict[str, float], share: float) -> float | None:
+    """Milliseconds of the first bucket that holds ``share`` of all samples."""
+    total = buckets.get("+Inf", 0.0)
+    for le, count in buckets.items():
+        if total and count >= share * total:
+            return float(le) * 1e3
+    return None
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    p50, p95, p99 = np.percentile(values, [50, 95, 99]).tolist()
+    return {"count": len(values), "p50": p50, "p95": p95, "p99": p99, "max": max(values)}
