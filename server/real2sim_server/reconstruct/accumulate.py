@@ -14,6 +14,7 @@ from ..scene import Trajectory
 from ..scene.rotation import Float, apply_transform, invert_transform
 from .options import InitialiseOptions
 from .points import PointSet, path_distance, thin, voxel_levels
+from .walls import ScanLimit
 
 HALF_TURN_US = 50_000
 EGO_MARGIN = 0.45
@@ -32,10 +33,12 @@ class Accumulation:
     Attributes:
         background: thinned points of everything that is in no box, world frame.
         objects: by object id, thinned points in the frame of the box (origin at its centre).
+        limit: the highest rays of the scanner.
     """
 
     background: PointSet
     objects: dict[str, PointSet]
+    limit: ScanLimit
 
 
 def accumulate(
@@ -52,9 +55,12 @@ def accumulate(
     path = drive_path(log)
     background: list[PointSet] = []
     objects: dict[str, list[PointSet]] = {t.object_id: [] for t in log.tracks}
-    pending = 0
+    pending, highest, heights = 0, [0.0], [0.0]
     for frame, sweep in _sweeps(log):
         points, intensity, offset_us = _usable(sweep, log, options)
+        if len(points):
+            highest.append(_highest_slope(points - sweep.origin))
+            heights.append(float(sweep.origin[2]))
         in_world = apply_transform(log.ego.transform(int(log.frame_times_us[frame])), points)
         owner, local = _assign(in_world, offset_us, log, frame, options)
         for index, track in enumerate(log.tracks):
@@ -70,7 +76,13 @@ def accumulate(
     return Accumulation(
         background=_thin_background(background, path, options),
         objects={k: thin(PointSet.join(v), options.object_voxel) for k, v in objects.items()},
+        limit=ScanLimit(path, heights[-1], float(np.median(highest))),
     )
+
+
+def _highest_slope(rays: Float) -> float:
+    """Tangent of the elevation that one ray in a thousand exceeds."""
+    return float(np.quantile(rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1]), 0.999))
 
 
 def drive_path(log: DrivingLog) -> Float:

@@ -27,25 +27,44 @@ from .unseen import (
     fill_ground,
 )
 from .views import Placed, View, chosen_frames, gather_views
+from .walls import continue_walls, real_walls
 
 OPACITY = 0.95
 ABOVE_GROUND = 0.1
 """Points this close to the ground surface are replaced by it [m]."""
 UNDERSIDE_COLOUR = 0.06
 SKY_FRAMES = 15
+WALL_FRAMES = 16
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """All Gaussians in the making, in this order: ground, structure, then object by object."""
+    """All Gaussians in the making.
+
+    In this order: ground, structure, continued walls, then object by object.
+    """
 
     surfels: Surfels
     intensity: NDArray[np.float32]
     instance: NDArray[np.uint16]
     is_underside: NDArray[np.bool_]
     ground_count: int
+    walls: slice
+
+    def without(self, dropped: NDArray[np.int64]) -> _Parts:
+        """Without the walls at these indices."""
+        kept = np.ones(len(self.surfels), dtype=np.bool_)
+        kept[dropped] = False
+        return _Parts(
+            self.surfels.select(kept),
+            self.intensity[kept],
+            self.instance[kept],
+            self.is_underside[kept],
+            self.ground_count,
+            slice(self.walls.start, self.walls.stop - len(dropped)),
+        )
 
 
 def initialise_scene(
@@ -87,6 +106,8 @@ def initialise_scene(
     with stages("shape"):
         surface = _fit_ground(log, measured.background)
         parts = _shape(log, measured, surface, options)
+    with stages("walls") as tell:
+        parts = _keep_real_walls(log, parts, options, tell)
     with stages("colour") as tell:
         colours, known, sky_samples = _look(log, parts, options, tell)
     with stages("fill"):
@@ -112,13 +133,17 @@ def _shape(
     supported = well_supported(above.points, 0.1 + 0.015 * distance)
     above, distance = above.select(supported), distance[supported]
     levels = voxel_levels(distance, options.voxel, options.voxel_per_metre)
-    limit = max(1, options.max_background - len(ground))
+    limit = max(1, options.max_background - len(ground) - options.max_background // 5)
     above = thin_to(above, options.voxel, limit, levels)
     largest = 0.03 + 0.006 * path_distance(above.points, path)
-    surfels = [ground, fit_surfels(above.points, largest=largest)]
+    structure = fit_surfels(above.points, largest=largest)
+    walls = continue_walls(structure, measured.limit, max_count=options.max_background // 5)
+    surfels = [ground, structure, walls]
+    standing = len(ground) + len(structure)
     intensity = [np.zeros(len(ground), np.float32), above.intensity]
-    instance = [np.zeros(len(ground) + len(above), np.uint16)]
-    is_underside = [np.zeros(len(ground) + len(above), np.bool_)]
+    intensity.append(np.zeros(len(walls), np.float32))
+    instance = [np.zeros(standing + len(walls), np.uint16)]
+    is_underside = [np.zeros(standing + len(walls), np.bool_)]
     for index, track in enumerate(log.tracks):
         points = _object_points(measured.objects[track.object_id], track, options)
         body = fit_surfels(points.points, largest=0.1, smallest=0.004)
@@ -133,6 +158,7 @@ def _shape(
         np.concatenate(instance),
         np.concatenate(is_underside),
         len(ground),
+        slice(standing, standing + len(walls)),
     )
 
 
@@ -161,6 +187,27 @@ def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOpti
     return thin_to(completed, options.object_voxel, options.max_object)
 
 
+def _keep_real_walls(
+    log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
+) -> _Parts:
+    """Drop continued walls that look like sky, or different from every view."""
+    if parts.walls.start == parts.walls.stop:
+        return parts
+    frames = chosen_frames(log, WALL_FRAMES)
+    done = 0
+
+    def on_view(view: View) -> None:
+        nonlocal done
+        done += 1
+        tell(done, len(frames) * len(log.rig))
+
+    placed = Placed(parts.surfels, parts.instance)
+    samples = gather_views(log, placed, frames=frames, slots=options.samples, on_view=on_view)
+    colours, known = (values[parts.walls] for values in samples.mean())
+    real = real_walls(colours, known, samples.spread()[parts.walls])
+    return parts.without(parts.walls.start + np.flatnonzero(~real))
+
+
 def _look(
     log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], SkySamples]:
@@ -176,14 +223,14 @@ def _look(
             sky.add(view)
         tell(done, len(frames) * len(log.rig))
 
-    colours, known = gather_views(
+    samples = gather_views(
         log,
         Placed(parts.surfels, parts.instance),
         frames=frames,
         slots=options.samples,
         on_view=on_view,
     )
-    return colours, known, sky
+    return *samples.mean(), sky
 
 
 def _fill_unseen(
@@ -271,9 +318,7 @@ def _assemble(
 def _cloud(
     parts: _Parts, colours: NDArray[np.float32], members: NDArray[np.int64]
 ) -> GaussianCloud:
-    surfels = Surfels(
-        parts.surfels.points[members], parts.surfels.axes[members], parts.surfels.scales[members]
-    )
+    surfels = parts.surfels.select(members)
     dc = (colours[members] - 0.5) / SH_C0
     return GaussianCloud(
         means=torch.from_numpy(surfels.points.copy()),

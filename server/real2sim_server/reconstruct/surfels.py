@@ -41,6 +41,10 @@ class Surfels:
         """[N, 4] float32, wxyz."""
         return matrix_to_quaternion(self.axes).astype(np.float32)
 
+    def select(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Surfels:
+        """The surfels picked by a mask or by indices."""
+        return Surfels(self.points[index], self.axes[index], self.scales[index])
+
     @classmethod
     def join(cls, parts: list[Surfels]) -> Surfels:
         """All surfels of ``parts``, in order."""

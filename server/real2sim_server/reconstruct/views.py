@@ -110,6 +110,15 @@ class ColourSamples:
         kernels.robust_mean(self._colours, self._weights, colours, known)
         return colours, known
 
+    def spread(self) -> NDArray[np.float32]:
+        """Standard deviation [N] of the brightness of each Gaussian's samples, 0 to 255."""
+        used = self._weights > 0
+        count = np.maximum(used.sum(axis=1), 1)
+        brightness = self._colours.mean(axis=2, dtype=np.float32) * used
+        mean = brightness.sum(axis=1) / count
+        variance = (brightness**2).sum(axis=1) / count - mean**2
+        return np.sqrt(np.maximum(variance, 0)).astype(np.float32)
+
     def _project(self, transforms: Float, present: NDArray[np.bool_]) -> None:
         matrices = np.ascontiguousarray(transforms[:, :3], dtype=np.float32)
 
@@ -200,8 +209,8 @@ def gather_views(
     frames: list[int],
     slots: int,
     on_view: Callable[[View], None],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Colour all Gaussians from all cameras at ``frames``, occlusion respected.
+) -> ColourSamples:
+    """Look at all Gaussians from all cameras at ``frames``, occlusion respected.
 
     A view counts for a Gaussian when nothing lies before it in a depth image of all Gaussians,
     and no other object lies before it that is drawn somewhat larger than it is. Of the ``slots``
@@ -209,14 +218,11 @@ def gather_views(
 
     Args:
         on_view: called with each view after it was looked at.
-
-    Returns:
-        Colours [N, 3] float32 in [0, 1], and which are known [N] bool.
     """
     samples = ColourSamples(placed, slots)
     for camera, frame, image in _images(log, frames):
         on_view(samples.add(log, camera, frame, image))
-    return samples.mean()
+    return samples
 
 
 def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, NDArray[np.uint8]]]:

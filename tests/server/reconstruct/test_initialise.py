@@ -160,7 +160,7 @@ def test_progress_names_the_stages_and_ends_each():
         on_progress=lambda *args: told.append(args),
         timing_s=timing,
     )
-    assert list(timing) == ["accumulate", "shape", "colour", "fill"]
+    assert list(timing) == ["accumulate", "shape", "walls", "colour", "fill"]
     for stage in timing:
         last = [(done, total) for name, done, total in told if name == stage][-1]
         assert last[0] == last[1]
