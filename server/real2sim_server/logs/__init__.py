@@ -6,6 +6,7 @@ The generator lives in :mod:`.synthetic` and is not imported here: it compiles k
 from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTrack
 from .native_writer import write_native_log
 from .open import open_log
+from .waymo_writer import RangeGrid, write_waymo_v2
 
 __all__ = [
     "DrivingLog",
@@ -13,6 +14,8 @@ __all__ = [
     "LidarSweep",
     "LogError",
     "ObjectTrack",
+    "RangeGrid",
     "open_log",
     "write_native_log",
+    "write_waymo_v2",
 ]

@@ -80,6 +80,8 @@ class DrivingLog:
         source: where images and sweeps come from.
         ego_size: (length, width, height) of the recording vehicle [m].
         provenance: dataset, sequence, licence, reader (JSON values only).
+        image_times_us: [F] int64 [us] by camera, when its images were really taken, where that
+            differs from the frame's time stamp; see :meth:`image_time_us`.
     """
 
     name: str
@@ -90,6 +92,7 @@ class DrivingLog:
     source: FrameSource
     ego_size: tuple[float, float, float] = (4.6, 1.85, 1.6)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    image_times_us: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     @property
     def frame_count(self) -> int:
@@ -110,6 +113,15 @@ class DrivingLog:
                 f"its calibration says ({expected.height}, {expected.width}, 3)"
             )
         return image
+
+    def image_time_us(self, camera: str, frame: int) -> int:
+        """When ``camera`` took its image of ``frame`` [us]; ``ego`` covers that instant.
+
+        Cameras of one vehicle are often triggered one after the other while the LiDAR turns: at
+        10 m/s half a metre lies between the first and the last image of a frame.
+        """
+        times = self.image_times_us.get(camera, self.frame_times_us)
+        return int(times[self._checked(frame)])
 
     def lidar(self, frame: int) -> LidarSweep:
         """The LiDAR sweep of ``frame``; it may be empty.

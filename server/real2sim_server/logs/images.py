@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from .driving_log import LogError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+END_BYTES = 1024
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -22,13 +25,27 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with path.open("rb") as file:
             head = file.read(24)
-            if len(head) == 24 and head.startswith(b"\x89PNG\r\n\x1a\n"):
-                return struct.unpack(">II", head[16:24])
-            if head.startswith(b"\xff\xd8"):
-                return _jpeg_size(head + file.read())
-    except (OSError, struct.error, IndexError) as error:
+            if head.startswith(JPEG_START):
+                head += file.read()
+    except OSError as error:
         raise LogError(f"{path}: cannot be read as an image ({error})") from error
-    raise LogError(f"{path}: expected a PNG or JPEG image, found {head[:8]!r}")
+    return encoded_size(head, str(path))
+
+
+def encoded_size(data: bytes, where: str) -> tuple[int, int]:
+    """(width, height) [px] of an encoded image, from its header only.
+
+    Raises:
+        LogError: ``data`` is neither PNG nor JPEG, or its header is cut off; ``where`` names it.
+    """
+    try:
+        if len(data) >= 24 and data.startswith(PNG_START):
+            return struct.unpack(">II", data[16:24])
+        if data.startswith(JPEG_START):
+            return _jpeg_size(data)
+    except (struct.error, IndexError) as error:
+        raise LogError(f"{where}: cannot be read as an image ({error})") from error
+    raise LogError(f"{where}: expected a PNG or JPEG image, found {data[:8]!r}")
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
@@ -49,24 +66,67 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         LogError: the file is missing or broken.
     """
+    return decode_image(_read_bytes(path), str(path))
+
+
+def decode_image(data: bytes, where: str, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """RGB uint8 [H, W, 3] of an encoded image; ``where`` names it in errors.
+
+    Raises:
+        LogError: it is broken, cut off, or not of the (width, height) that is expected.
+    """
     import cv2
 
+    check_encoded_image(data, where, size)
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise LogError(f"{where}: is no readable PNG or JPEG image ({len(data)} bytes)")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def check_image_file(path: Path, size: tuple[int, int] | None = None) -> None:
+    """Check an image file by its header and its end marker; like check_encoded_image."""
+    check_encoded_image(_read_bytes(path), str(path), size)
+
+
+def check_encoded_image(data: bytes, where: str, size: tuple[int, int] | None = None) -> None:
+    """Check an encoded image without decoding it.
+
+    Raises:
+        LogError: it is no PNG or JPEG, its end is missing, or it has another (width, height).
+    """
+    found = encoded_size(data, where)
+    # Some writers pad their files, so the end marker may be followed by a few bytes.
+    end = PNG_END if data.startswith(PNG_START) else JPEG_END
+    if end not in data[-END_BYTES:]:
+        raise LogError(f"{where}: the image is cut off ({len(data)} bytes, without an end marker)")
+    if size is not None and found != size:
+        raise LogError(
+            f"{where}: is {found[0]}x{found[1]}, but the calibration says {size[0]}x{size[1]}"
+        )
+
+
+def _read_bytes(path: Path) -> bytes:
     try:
-        data = np.fromfile(path, dtype=np.uint8)
+        return path.read_bytes()
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if image is None:
-        raise LogError(f"{path}: is no readable PNG or JPEG image ({data.size} bytes)")
-    return np.ascontiguousarray(image[..., ::-1])
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """Write RGB uint8 [H, W, 3] as PNG or JPEG (quality 95), by the suffix of ``path``."""
+    try:
+        path.write_bytes(encode_image(image, path.suffix))
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+
+
+def encode_image(image: NDArray[np.uint8], suffix: str) -> bytes:
+    """RGB uint8 [H, W, 3] as PNG or JPEG (quality 95), by ``suffix`` such as ``.png``."""
     import cv2
 
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 2] if path.suffix == ".png" else [1, 95]
-    done, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]), options)
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 2] if suffix == ".png" else [1, 95]
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
     if not done:
-        raise LogError(f"{path}: this image could not be encoded as {path.suffix!r}")
-    path.write_bytes(data.tobytes())
+        raise LogError(f"this image could not be encoded as {suffix!r}")
+    return bytes(data.tobytes())

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 
-from real2sim_server.logs import DrivingLog, write_native_log
+from real2sim_server.logs import DrivingLog, write_native_log, write_waymo_v2
 from real2sim_server.logs.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from real2sim_server.scene.rotation import apply_transform, invert_transform
 
@@ -40,6 +42,30 @@ def written_native(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFact
 def written_kitti(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kitti") / "root"
     _write_kitti_layout(tiny_log, folder / "training", sequence="0007")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def written_waymo_v2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("waymo_v2") / "root"
+    return write_waymo_v2(tiny_log, folder, segment="tiny_0_20")
+
+
+def _layout(name: str) -> ModuleType:
+    """A module of ``layouts``; test folders are no packages."""
+    path = Path(__file__).parent / "layouts" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"log_layouts_{name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def written_waymo_v1(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("waymo_v1")
+    _layout("waymo_v1").write(tiny_log, folder / "tiny.tfrecord")
     return folder
 
 

@@ -10,7 +10,7 @@ from real2sim_server.logs import DrivingLog, LogError, open_log
 from real2sim_server.logs.readers import READERS
 
 
-@pytest.fixture(params=["native", "kitti", "kitti_jam"])
+@pytest.fixture(params=["native", "kitti", "kitti_jam", "waymo_v2", "waymo_v1"])
 def folder(request: pytest.FixtureRequest) -> Path:
     if request.param == "kitti_jam":
         path: Path = request.getfixturevalue("test_data") / "kitti_jam"

@@ -3,8 +3,15 @@
 from .kitti import KittiReader
 from .native import NativeReader
 from .reader import LogReader
+from .waymo_v1 import WaymoV1Reader
+from .waymo_v2 import WaymoV2Reader
 
-READERS: tuple[LogReader, ...] = (NativeReader(), KittiReader())
+READERS: tuple[LogReader, ...] = (
+    NativeReader(),
+    KittiReader(),
+    WaymoV2Reader(),
+    WaymoV1Reader(),
+)
 """All known readers; the first that recognises a folder reads it."""
 
-__all__ = ["READERS", "KittiReader", "LogReader", "NativeReader"]
+__all__ = ["READERS", "KittiReader", "LogReader", "NativeReader", "WaymoV1Reader", "WaymoV2Reader"]
