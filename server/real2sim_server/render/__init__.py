@@ -4,7 +4,7 @@ from .backends import Backend, BackendStatus, describe_backends, select_backend
 from .encode import EncodedImage, encode_depth, encode_image, encode_instance, encode_rgb
 from .frame import Frame, render_cameras, warm_up
 from .rasterize import rasterize
-from .types import Instance, RasterOptions, RenderError, RenderOutput
+from .types import Instance, RasterOptions, RenderError, RenderOutput, ScreenStatistics
 
 __all__ = [
     "Backend",
@@ -15,6 +15,7 @@ __all__ = [
     "RasterOptions",
     "RenderError",
     "RenderOutput",
+    "ScreenStatistics",
     "describe_backends",
     "encode_depth",
     "encode_image",

@@ -37,6 +37,10 @@ def rasterize(
 ) -> RenderOutput:
     """Draw instances from C cameras of one size, with the semantics of gsplat 1.5.3.
 
+    RGB, alpha and depth carry gradients wherever an input requires them: all parts of clouds,
+    ``covars``, object poses, ``viewmats`` and the faces of the sky. The direction in which a pixel
+    sees the sky, ``Ks``, ``scale`` and ``background`` are constants.
+
     Gaussians are projected by the local affine approximation (EWA, Zwicker et al. 2001), sorted
     by the depth of their centres (ties keep list order) and blended front to back
     (Kerbl et al. 2023). Pixel centres lie at +0.5.
@@ -81,6 +85,8 @@ def _float64(values: Tensor | ArrayLike, name: str, matrix: tuple[int, int]) -> 
 
 
 def _check_cameras(request: RasterRequest) -> None:
+    if request.Ks.requires_grad:
+        raise RenderError("Ks carry no gradient here; give them without requires_grad")
     if len(request.Ks) != request.cameras:
         raise RenderError(f"{request.cameras} viewmats but {len(request.Ks)} Ks; give one each")
     for name, size in (("width", request.width), ("height", request.height)):
@@ -95,6 +101,10 @@ def _check_cameras(request: RasterRequest) -> None:
             raise RenderError(
                 f"Ks[{index}] must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], not {K.tolist()}"
             )
+
+
+def _values(matrix: Tensor | ArrayLike) -> np.ndarray:
+    return matrix.detach().cpu().numpy() if isinstance(matrix, Tensor) else np.asarray(matrix)
 
 
 def _check_rigid(matrix: np.ndarray, name: str) -> None:
@@ -125,7 +135,7 @@ def _check_options(options: RasterOptions) -> None:
 def _check_instance(index: int, instance: Instance) -> None:
     name = f"instances[{index}]"
     if instance.T_world_object is not None:
-        _check_rigid(np.asarray(instance.T_world_object), f"{name}.T_world_object")
+        _check_rigid(_values(instance.T_world_object), f"{name}.T_world_object")
     if not 0 <= instance.instance_id <= MAX_INSTANCE_ID:
         raise RenderError(
             f"{name}.instance_id must be 0 to {MAX_INSTANCE_ID}, not {instance.instance_id!r}"
@@ -150,11 +160,17 @@ def _check_instance(index: int, instance: Instance) -> None:
 def _check_cloud(cloud: GaussianCloud, name: str) -> None:
     """Values of a cloud; once for each cloud, since clouds are immutable."""
     for part in ("means", "quats", "scales", "opacities", "sh"):
-        finite = torch.isfinite(getattr(cloud, part).detach())
+        values = getattr(cloud, part).detach()
+        if torch.isfinite(values.sum()):
+            continue
+        finite = torch.isfinite(values)
         if not finite.all():
             row = int((~finite).reshape(len(cloud), -1).any(1).nonzero()[0])
             raise RenderError(f"{name}.{part} of Gaussian {row} is not finite; drop it first")
-    if (cloud.scales < 0).any():
+    if len(cloud) == 0:
+        return
+    if cloud.scales.detach().amin() < 0:
         raise RenderError(f"{name}.scales must be linear and >= 0; were logarithms given?")
-    if ((cloud.opacities < 0) | (cloud.opacities > 1)).any():
+    low, high = cloud.opacities.detach().aminmax()
+    if low < 0 or high > 1:
         raise RenderError(f"{name}.opacities must lie in [0, 1]; were logits given?")

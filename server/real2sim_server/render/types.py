@@ -21,7 +21,8 @@ class Instance:
 
     Attributes:
         cloud: Gaussians in their own frame.
-        T_world_object: [4, 4] float64 rigid transform; None for the identity (background).
+        T_world_object: [4, 4] rigid transform, float64; None for the identity (background). A
+            tensor (float32 or float64) that requires grad gets the gradient of the pose.
         instance_id: value in instance images, 0 (background) to 65535.
         scale: [3] multiplies the cloud about its own origin along its own axes.
         covars: [N, 3, 3] float32, covariances in the cloud's frame that replace quats and scales
@@ -29,7 +30,7 @@ class Instance:
     """
 
     cloud: GaussianCloud
-    T_world_object: NDArray[np.float64] | None = None
+    T_world_object: NDArray[np.float64] | Tensor | None = None
     instance_id: int = 0
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     covars: Tensor | None = None
@@ -46,6 +47,8 @@ class RasterOptions:
         rasterize_mode: ``classic``, or ``antialiased`` (opacity compensated for ``eps2d``).
         background: RGB in [0, 1] behind everything where there is no sky.
         depth, instance: whether these images are made besides RGB and alpha.
+        track_screen: whether ScreenStatistics are gathered, which densification reads; only in
+            passes that carry gradients.
     """
 
     near_plane: float = 0.01
@@ -56,6 +59,25 @@ class RasterOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth: bool = True
     instance: bool = True
+    track_screen: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenStatistics:
+    """How the Gaussians of each instance showed on the images, in the order of the instances.
+
+    Attributes:
+        radii: [C, N] float32 each, half the longer side of the box about what is drawn [px],
+            rounded up; 0 where a Gaussian was not drawn.
+        gradients: [N, 2] float32 each, zero until backward fills them in: sums over cameras of
+            the norm of the loss gradient by the centre on the image. Column 0 takes the gradient
+            itself, column 1 the sum over pixels of its absolute value (absgrad, Ye et al. 2024).
+            Before the norm x is multiplied by C width / 2 and y by C height / 2, as gsplat's
+            DefaultStrategy does, so that its thresholds hold. A second backward adds to them.
+    """
+
+    radii: tuple[Tensor, ...]
+    gradients: tuple[Tensor, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +92,7 @@ class RenderOutput:
         instance: [C, H, W] uint16, instance_id of the Gaussian at which transmittance first falls
             to 0.5 or below; 0 where it never does. None when not asked for.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
+        screen: sizes and gradients on the image; None when not asked for or without gradients.
     """
 
     rgb: Tensor
@@ -77,6 +100,7 @@ class RenderOutput:
     depth: Tensor | None
     instance: Tensor | None
     timing_ms: dict[str, float] = field(default_factory=dict)
+    screen: ScreenStatistics | None = None
 
 
-__all__ = ["Instance", "RasterOptions", "RenderError", "RenderOutput", "Sky"]
+__all__ = ["Instance", "RasterOptions", "RenderError", "RenderOutput", "ScreenStatistics", "Sky"]

@@ -48,6 +48,16 @@ class RasterRequest:
         return int(self.viewmats.shape[0])
 
 
+def needs_gradients(request: RasterRequest) -> bool:
+    """Whether the pictures must carry gradients to anything in the request."""
+    if not torch.is_grad_enabled():
+        return False
+    tensors: list[object] = [request.viewmats, request.sky.faces if request.sky else None]
+    for instance in request.instances:
+        tensors += [*vars(instance.cloud).values(), instance.T_world_object, instance.covars]
+    return any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in tensors)
+
+
 class Backend(Protocol):
     """One way to rasterize. All members give the same pictures within 1/255."""
 
@@ -83,12 +93,12 @@ class Placement:
 def place_instances(instances: Sequence[Instance], viewmats: Tensor) -> Placement:
     """Compose ``viewmats`` [C, 4, 4] float64 with the pose and scale of each instance."""
     like = {"dtype": torch.float64, "device": viewmats.device}
-    identity = torch.eye(4, dtype=torch.float64)
+    identity = torch.eye(4, **like)
     poses = [
-        identity if i.T_world_object is None else torch.as_tensor(i.T_world_object)
+        identity if i.T_world_object is None else torch.as_tensor(i.T_world_object, **like)
         for i in instances
     ]
-    T_world_object = torch.stack(poses).to(**like) if poses else torch.zeros(0, 4, 4, **like)
+    T_world_object = torch.stack(poses) if poses else torch.zeros(0, 4, 4, **like)
     scale = torch.tensor([i.scale for i in instances], **like).reshape(-1, 3)
     T_camera_object = viewmats[:, None] @ T_world_object[None]
     rotation, offset = T_camera_object[..., :3, :3], T_camera_object[..., :3, 3]

@@ -22,10 +22,12 @@ from ..types import Instance, RenderOutput
 from .base import (
     Placement,
     RasterRequest,
+    needs_gradients,
     pixel_directions,
     place_instances,
 )
 from .cuda_instance import instance_image
+from .cuda_screen import track_screen
 from .warm_up import warm_up_requests
 
 
@@ -52,6 +54,9 @@ class CudaBackend:
             world = self._world(on_device)
         with self._timed(timing, "blend"):
             rgb, alpha, depth, meta = _blend(on_device, world)
+        screen = None
+        if options.track_screen and needs_gradients(request):
+            screen = track_screen(on_device, meta, self.device)
         instance = None
         if options.instance:
             with self._timed(timing, "instance"):
@@ -66,6 +71,7 @@ class CudaBackend:
             depth=depth if options.depth else None,
             instance=instance,
             timing_ms=timing,
+            screen=screen,
         )
 
     def warm_up(self) -> None:
@@ -116,6 +122,8 @@ class CudaBackend:
     def _on_device(self, cloud: GaussianCloud) -> GaussianCloud:
         if cloud.device.type == self.device.type:
             return cloud
+        if any(tensor.requires_grad for tensor in vars(cloud).values()):
+            return cloud.to(self.device)
         if cloud not in self._resident:
             self._resident[cloud] = cloud.to(self.device)
         return self._resident[cloud]
@@ -190,6 +198,7 @@ def _blend(
         render_mode="RGB+ED" if options.depth else "RGB",
         rasterize_mode=options.rasterize_mode,
         packed=True,
+        absgrad=options.track_screen,
     )
     depth = images[..., 3] if options.depth else None
     return images[..., :3], alphas[..., 0], depth, meta

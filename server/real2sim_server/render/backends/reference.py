@@ -20,25 +20,31 @@ from .base import (
     TRANSMITTANCE_MIN,
     Placement,
     RasterRequest,
+    needs_gradients,
     pixel_directions,
     place_instances,
 )
+from .screen import ScreenTracker, ScreenWatch
 from .spherical_harmonics import evaluate_sh
 
 TILE = 32
 
 
 class ReferenceBackend:
-    """Plain torch on the CPU; gradients flow to clouds, covariances and view matrices.
+    """Plain torch on the CPU, made differentiable by torch itself.
 
     Args:
         dtype: float32 or float64 of everything after placement.
+        image_dtype: of the images given out; float64 for finite differences.
     """
 
     name = "reference"
 
-    def __init__(self, dtype: torch.dtype = torch.float64) -> None:
+    def __init__(
+        self, dtype: torch.dtype = torch.float64, image_dtype: torch.dtype = torch.float32
+    ) -> None:
         self.dtype = dtype
+        self.image_dtype = image_dtype
 
     def warm_up(self) -> None:
         """Nothing to compile."""
@@ -47,21 +53,29 @@ class ReferenceBackend:
         """Draw one camera after the other, tile by tile."""
         start = time.perf_counter()
         placement = place_instances(request.instances, request.viewmats)
-        images = [self._camera(request, placement, c) for c in range(request.cameras)]
+        options = request.options
+        tracker = None
+        if options.track_screen and needs_gradients(request):
+            tracker = ScreenTracker(request)
+        images = [self._camera(request, placement, c, tracker) for c in range(request.cameras)]
         rgb, alpha, depth, instance = (
             torch.stack([image[k] for image in images]) for k in range(4)
         )
-        options = request.options
         return RenderOutput(
-            rgb=rgb.float(),
-            alpha=alpha.float(),
-            depth=depth.float() if options.depth else None,
+            rgb=rgb.to(self.image_dtype),
+            alpha=alpha.to(self.image_dtype),
+            depth=depth.to(self.image_dtype) if options.depth else None,
             instance=instance.to(torch.uint16) if options.instance else None,
             timing_ms={"total": (time.perf_counter() - start) * 1e3},
+            screen=tracker.statistics if tracker else None,
         )
 
     def _camera(
-        self, request: RasterRequest, placement: Placement, camera: int
+        self,
+        request: RasterRequest,
+        placement: Placement,
+        camera: int,
+        tracker: ScreenTracker | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         splats = _concatenate(
             [
@@ -71,7 +85,10 @@ class ReferenceBackend:
             self.dtype,
         )
         splats = splats.select(torch.argsort(splats.depth_key, stable=True))
-        images = _blend_image(splats, request.width, request.height)
+        watch = None
+        if tracker is not None:
+            watch = tracker.watch(camera, splats.owners, splats.means2d, splats.extents)
+        images = _blend_image(splats, request.width, request.height, watch)
         behind = _behind(request, camera, self.dtype)
         rgb = images[0] + (1 - images[1])[..., None] * behind
         return rgb, *images[1:]
@@ -79,7 +96,10 @@ class ReferenceBackend:
 
 @dataclass(frozen=True, eq=False)
 class _Splats:
-    """Gaussians on the image plane: V of them, in the order of blending once sorted."""
+    """Gaussians on the image plane: V of them, in the order of blending once sorted.
+
+    ``owners`` [V, 2] int64 are the index of the instance and of the Gaussian in it.
+    """
 
     means2d: Tensor
     conics: Tensor
@@ -89,6 +109,7 @@ class _Splats:
     depth_key: Tensor
     extents: Tensor
     instance_ids: Tensor
+    owners: Tensor
 
     def select(self, index: Tensor) -> _Splats:
         return _Splats(*(tensor[index] for tensor in vars(self).values()))
@@ -97,7 +118,8 @@ class _Splats:
 def _concatenate(parts: list[_Splats], dtype: torch.dtype) -> _Splats:
     if not parts:
         shapes = ((0, 2), (0, 3), (0,), (0, 3), (0,), (0,), (0, 2), (0,))
-        return _Splats(*(torch.zeros(shape, dtype=dtype) for shape in shapes))
+        floats = (torch.zeros(shape, dtype=dtype) for shape in shapes)
+        return _Splats(*floats, owners=torch.zeros(0, 2, dtype=torch.int64))
     columns = zip(*(vars(part).values() for part in parts), strict=True)
     return _Splats(*(torch.cat(column) for column in columns))
 
@@ -149,6 +171,7 @@ def _project(
         depth_key=depth_key,
         extents=extents,
         instance_ids=torch.full((len(cloud),), instance.instance_id),
+        owners=torch.stack([torch.full((len(cloud),), index), torch.arange(len(cloud))], -1),
     )
     return splats.select(kept.nonzero()[:, 0])
 
@@ -187,7 +210,9 @@ def _jacobian(means: Tensor, z: Tensor, K: Tensor, width: int, height: int) -> T
     )
 
 
-def _blend_image(splats: _Splats, width: int, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _blend_image(
+    splats: _Splats, width: int, height: int, watch: ScreenWatch | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """RGB without background, alpha, depth and instance of the whole image, from square tiles."""
     rows = []
     for y0 in range(0, height, TILE):
@@ -196,8 +221,11 @@ def _blend_image(splats: _Splats, width: int, height: int) -> tuple[Tensor, Tens
         tiles = []
         for x0 in range(0, width, TILE):
             x1 = min(x0 + TILE, width)
-            touching = splats.select((touches_rows & _overlaps(splats, 0, x0, x1)).nonzero()[:, 0])
-            tiles.append(_blend_pixels(touching, x0, x1, y0, y1))
+            touching = (touches_rows & _overlaps(splats, 0, x0, x1)).nonzero()[:, 0]
+            dx, dy = _offsets(splats.means2d[touching], x0, x1, y0, y1)
+            if watch is not None:
+                watch.gather(touching, dx, dy)
+            tiles.append(_blend_pixels(splats.select(touching), dx, dy, (y1 - y0, x1 - x0)))
         rows.append([torch.cat(column, dim=1) for column in zip(*tiles, strict=True)])
     rgb, alpha, depth, instance = (torch.cat(c, dim=0) for c in zip(*rows, strict=True))
     return rgb, alpha, depth, instance
@@ -208,18 +236,22 @@ def _overlaps(splats: _Splats, axis: int, low: int, high: int) -> Tensor:
     return (centre + extent >= low) & (centre - extent <= high)
 
 
-def _blend_pixels(
-    splats: _Splats, x0: int, x1: int, y0: int, y1: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Front-to-back blending of sorted splats in the pixels [y0, y1) x [x0, x1)."""
-    dtype, size = splats.means2d.dtype, (y1 - y0, x1 - x0)
+def _offsets(means2d: Tensor, x0: int, x1: int, y0: int, y1: int) -> tuple[Tensor, Tensor]:
+    """From V centres to the pixel centres of [y0, y1) x [x0, x1): dx and dy [V, pixels]."""
+    dtype = means2d.dtype
     py, px = torch.meshgrid(
         torch.arange(y0, y1, dtype=dtype) + 0.5,
         torch.arange(x0, x1, dtype=dtype) + 0.5,
         indexing="ij",
     )
-    dx = px.reshape(1, -1) - splats.means2d[:, :1]
-    dy = py.reshape(1, -1) - splats.means2d[:, 1:]
+    return px.reshape(1, -1) - means2d[:, :1], py.reshape(1, -1) - means2d[:, 1:]
+
+
+def _blend_pixels(
+    splats: _Splats, dx: Tensor, dy: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Front-to-back blending of sorted splats in one tile of ``size`` (height, width)."""
+    dtype = splats.means2d.dtype
     a, b, c = splats.conics[:, 0:1], splats.conics[:, 1:2], splats.conics[:, 2:3]
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
