@@ -7,9 +7,16 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+START_S = 60.0
+
+
+class WorkerStartError(RuntimeError):
+    """A worker that did not start."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +25,28 @@ class Worker:
 
     url: str
     process: subprocess.Popen[bytes]
+    log_file: Path
+
+    def wait_until_it_answers(self, seconds: float) -> None:
+        """Wait for the port to open; whether the worker is ready is for it to say.
+
+        Raises:
+            WorkerStartError: it ended or did not listen in time, with its last words.
+        """
+        port = int(self.url.rsplit(":", 1)[1])
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            if self.process.poll() is not None:
+                raise self._failed(f"ended with exit code {self.process.returncode}")
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                return
+            time.sleep(0.1)
+        raise self._failed(f"did not listen within {seconds:.0f} s")
+
+    def _failed(self, what: str) -> WorkerStartError:
+        lines = self.log_file.read_text(errors="replace").strip().splitlines()
+        last = lines[-1] if lines else "it printed nothing"
+        return WorkerStartError(f"the worker {what}: {last} (see {self.log_file})")
 
 
 @contextlib.contextmanager
@@ -39,7 +68,9 @@ def own_worker(*, scenes: Path, data: Path, log_file: Path) -> Iterator[Worker]:
             command, stdout=output, stderr=subprocess.STDOUT, env=environment
         )
         try:
-            yield Worker(url=f"http://127.0.0.1:{port}", process=process)
+            worker = Worker(f"http://127.0.0.1:{port}", process, log_file)
+            worker.wait_until_it_answers(START_S)
+            yield worker
         finally:
             _stop(process)
 
