@@ -69,6 +69,13 @@ def written_waymo_v1(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFa
     return folder
 
 
+@pytest.fixture(scope="session")
+def written_argoverse2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("argoverse2") / "7fab2350"
+    _layout("argoverse2").write(tiny_log, folder)
+    return folder
+
+
 @pytest.fixture
 def native_folder(written_native: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written_native, tmp_path / "native"))

@@ -1,5 +1,6 @@
 """Log readers, one module per dataset layout."""
 
+from .argoverse2 import Argoverse2Reader
 from .kitti import KittiReader
 from .native import NativeReader
 from .reader import LogReader
@@ -11,7 +12,16 @@ READERS: tuple[LogReader, ...] = (
     KittiReader(),
     WaymoV2Reader(),
     WaymoV1Reader(),
+    Argoverse2Reader(),
 )
 """All known readers; the first that recognises a folder reads it."""
 
-__all__ = ["READERS", "KittiReader", "LogReader", "NativeReader", "WaymoV1Reader", "WaymoV2Reader"]
+__all__ = [
+    "READERS",
+    "Argoverse2Reader",
+    "KittiReader",
+    "LogReader",
+    "NativeReader",
+    "WaymoV1Reader",
+    "WaymoV2Reader",
+]

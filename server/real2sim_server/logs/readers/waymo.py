@@ -208,18 +208,23 @@ def _pinhole(camera: WaymoCamera) -> Camera:
 
 
 def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[Box]:
-    return [
-        Box(
-            key=box.key,
-            category=_category(box),
-            size=box.size,
-            time_us=frame.time_us,
-            T_world_object=to_first @ frame.pose @ upright_pose(box.centre, box.heading),
-            where=box.where,
-        )
-        for frame in frames
-        for box in frame.boxes
-    ]
+    boxes = []
+    for frame in frames:
+        to_world = to_first @ frame.pose
+        for box in frame.boxes:
+            if not np.isfinite([*box.centre, box.heading]).all():
+                raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
+            boxes.append(
+                Box(
+                    key=box.key,
+                    category=_category(box),
+                    size=box.size,
+                    time_us=frame.time_us,
+                    T_world_object=to_world @ upright_pose(box.centre, box.heading),
+                    where=box.where,
+                )
+            )
+    return boxes
 
 
 def _category(box: WaymoBox) -> str:
