@@ -20,6 +20,7 @@ from .cpu_records import (
     CHUNK,
     DEPTH,
     EXPONENT_UNIT,
+    EXTENT_X,
     EXTENT_Y,
     FALLOFF,
     GREEN,
@@ -27,6 +28,7 @@ from .cpu_records import (
     LEVEL,
     MEAN_X,
     MEAN_Y,
+    MEMBER,
     RED,
     SHARPNESS,
     SLOPE,
@@ -69,6 +71,7 @@ def project_cluster(cluster, view, base, records):
         for i in range(start, min(n, start + CHUNK)):
             box = project_gaussian(cluster, view, i, values, slot)
             if box != NOWHERE:
+                values[slot, MEMBER] = F32(i - start)
                 boxes[slot] = box
                 depths[slot] = values[slot, DEPTH]
                 slot += 1
@@ -126,6 +129,7 @@ def project_gaussian(cluster, view, i, values, slot):  # noqa: PLR0911 - each te
     out[LEVEL] = level * F32(1 / EXPONENT_UNIT)
     out[DEPTH] = z
     out[INSTANCE] = cluster.instance_id
+    out[EXTENT_X] = reach_x
     out[EXTENT_Y] = reach_y
     out[TIP_Y] = reach_x * F32(cxy) / F32(cxx)
     write_color(cluster, i, out)

@@ -30,6 +30,11 @@ RED, GREEN, BLUE, DEPTH, INSTANCE = 6, 7, 8, 9, 10
 EXTENT_Y, TIP_Y = 11, 12
 """Of the ellipse alpha >= 1/255: largest dy, and dy of its rightmost point [px]."""
 
+EXTENT_X = 13
+"""Of the same ellipse: largest dx [px]."""
+MEMBER = 14
+"""Which Gaussian of its chunk a record is, as a float: 0 to CHUNK - 1."""
+
 EXPONENT_UNIT = 16.0
 """Exponents are stored over this: exp(-s) = polynomial(s / 16)^16."""
 EXPONENT_LIMIT = math.log(255.0) / EXPONENT_UNIT

@@ -19,11 +19,11 @@ FOLDER = Path(__file__).parent
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit`` for entry points: cached on disk, divisions as in NumPy."""
+    """``numba.njit`` for entry points: cached on disk, free of the GIL, divisions as in NumPy."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         function.__qualname__ = f"{function.__qualname__}_{source_fingerprint()}"
-        return numba.njit(cache=True, error_model="numpy", **options)(function)
+        return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
 
     return decorate
 
