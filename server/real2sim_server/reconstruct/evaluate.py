@@ -98,7 +98,7 @@ def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.ui
     for index, item in enumerate(scene.objects.values()):
         if item.trajectory.covers(t_us):
             pose = item.trajectory.transform(t_us)
-            instances.append(Instance(item.cloud, pose, instance_id=index + 1))
+            instances.append(Instance(item.cloud_at(t_us), pose, instance_id=index + 1))
     options = RasterOptions(depth=False, instance=False)
     [frame] = render_cameras(
         instances, [camera], scene.ego.transform(t_us), sky=scene.sky, options=options

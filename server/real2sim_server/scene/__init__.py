@@ -6,6 +6,7 @@ Knows neither the passing of time nor HTTP.
 from .asset import Asset
 from .camera import Camera, CameraRig
 from .cloud import GaussianCloud
+from .colour import TimeColour
 from .errors import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from .scene import Scene, SceneObject
 from .sky import Sky
@@ -21,6 +22,7 @@ __all__ = [
     "SceneError",
     "SceneObject",
     "Sky",
+    "TimeColour",
     "TimeOutOfRangeError",
     "Trajectory",
     "UnknownObjectError",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .box import box_corners
 from .camera import CameraRig
 from .cloud import GaussianCloud
+from .colour import TimeColour
 from .errors import SceneError, UnknownObjectError
 from .rotation import Float
 from .sky import Sky
@@ -45,6 +46,10 @@ class SceneObject:
         size: (length, width, height) along the object's x, y, z [m].
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         trajectory: ``T_world_object`` over time; the object exists only in its range.
+        colour: how the cloud's colour changes over time, or None; see :meth:`cloud_at`.
+
+    Raises:
+        SceneError: for a size that is none, or a colour of another number of Gaussians.
     """
 
     object_id: str
@@ -52,9 +57,19 @@ class SceneObject:
     size: tuple[float, float, float]
     cloud: GaussianCloud
     trajectory: Trajectory
+    colour: TimeColour | None = None
 
     def __post_init__(self) -> None:
+        if self.colour is not None and len(self.colour.coefficients) != len(self.cloud):
+            raise SceneError(
+                f"object {self.object_id!r}: a colour of {len(self.colour.coefficients)} rows "
+                f"for {len(self.cloud)} Gaussians"
+            )
         object.__setattr__(self, "size", box_size(self.size, f"object {self.object_id!r}"))
+
+    def cloud_at(self, t_us: int) -> GaussianCloud:
+        """The cloud with the colours of ``t_us``; the cloud itself where they do not change."""
+        return self.cloud if self.colour is None else self.colour.at(self.cloud, t_us)
 
     def box_at(self, t_us: int) -> Float:
         """Corners [8, 3] [m] of the box in the world at ``t_us``; order of ``box_corners``.
@@ -67,7 +82,12 @@ class SceneObject:
     @property
     def nbytes(self) -> int:
         """Memory of the Gaussians [bytes]."""
-        return self.cloud.nbytes
+        return self.cloud.nbytes + (self.colour.nbytes if self.colour else 0)
+
+    def to(self, device: torch.device | str) -> SceneObject:
+        """The object on another device."""
+        colour = self.colour.to(device) if self.colour else None
+        return replace(self, cloud=self.cloud.to(device), colour=colour)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +176,7 @@ class Scene:
 
     def to(self, device: torch.device | str) -> Scene:
         """The scene on another device."""
-        objects = {k: replace(o, cloud=o.cloud.to(device)) for k, o in self.objects.items()}
+        objects = {k: o.to(device) for k, o in self.objects.items()}
         return replace(
             self,
             background=self.background.to(device),

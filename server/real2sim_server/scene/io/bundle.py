@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..asset import Asset
 from ..cloud import GaussianCloud
+from ..colour import TimeColour
 from ..errors import BundleError, SceneError
 from ..scene import Scene, SceneObject
 from ..sky import Sky
@@ -26,6 +27,7 @@ from .document import (
     Bounds,
     CameraPart,
     CloudPart,
+    ColourPart,
     EgoPart,
     ObjectPart,
     SceneContent,
@@ -61,6 +63,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
     """
     background = _outgoing(scene.background, "background")
     objects = [_outgoing(o.cloud, f"object {k!r}") for k, o in scene.objects.items()]
+    colours = [_outgoing_colour(o) for o in scene.objects.values()]
     sky = _outgoing_sky(scene.sky)
     content = SceneContent(
         cameras=[CameraPart.of(c) for c in scene.rig],
@@ -68,8 +71,8 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         frame_times_us=scene.frame_times_us.tolist(),
         background=_cloud_part(background),
         objects=[
-            _object_part(o, tensors)
-            for o, tensors in zip(scene.objects.values(), objects, strict=True)
+            _object_part(o, tensors, colour)
+            for o, tensors, colour in zip(scene.objects.values(), objects, colours, strict=True)
         ],
         sky=SkyPart(resolution=sky["faces"].shape[1], tensors=tensor_hashes(sky)) if sky else None,
     )
@@ -81,7 +84,8 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         content=content,
         **_UNWRITTEN,
     )
-    keyed = {f"{i}.{name}": t for i, part in enumerate(objects) for name, t in part.items()}
+    whole = [a | b for a, b in zip(objects, colours, strict=True)]
+    keyed = {f"{i}.{name}": t for i, part in enumerate(whole) for name, t in part.items()}
     files = {BACKGROUND_FILE: background, OBJECTS_FILE: keyed} | ({SKY_FILE: sky} if sky else {})
     written = write_container(document, Path(path), tensors=files, overwrite=overwrite)
     return replace(scene, content_hash=written.content_hash)
@@ -165,6 +169,15 @@ def _outgoing(cloud: GaussianCloud, what: str) -> dict[str, Tensor]:
     return cloud_tensors(cloud)
 
 
+def _outgoing_colour(scene_object: SceneObject) -> dict[str, Tensor]:
+    colour = scene_object.colour
+    if colour is None:
+        return {}
+    if not bool(torch.isfinite(colour.coefficients).all()):
+        raise SceneError(f"object {scene_object.object_id!r}: colour holds values not finite")
+    return {"fourier": colour.coefficients.detach().cpu().contiguous()}
+
+
 def _outgoing_sky(sky: Sky | None) -> dict[str, Tensor]:
     if sky is None:
         return {}
@@ -179,13 +192,28 @@ def _cloud_part(tensors: Mapping[str, Tensor]) -> CloudPart:
     return CloudPart(gaussians=n, sh_degree=degree, tensors=tensor_hashes(tensors))
 
 
-def _object_part(scene_object: SceneObject, tensors: Mapping[str, Tensor]) -> ObjectPart:
+def _object_part(
+    scene_object: SceneObject, tensors: Mapping[str, Tensor], colour: Mapping[str, Tensor]
+) -> ObjectPart:
     return ObjectPart(
         object_id=scene_object.object_id,
         category=scene_object.category,
         size=scene_object.size,
         trajectory=TrajectoryPart.of(scene_object.trajectory),
         cloud=_cloud_part(tensors),
+        colour=_colour_part(scene_object.colour, colour),
+    )
+
+
+def _colour_part(colour: TimeColour | None, tensors: Mapping[str, Tensor]) -> ColourPart | None:
+    if colour is None:
+        return None
+    return ColourPart(
+        harmonics=int(colour.coefficients.shape[1]),
+        basis=colour.basis,
+        start_us=colour.start_us,
+        end_us=colour.end_us,
+        tensors=tensor_hashes(tensors),
     )
 
 
@@ -229,8 +257,19 @@ def _objects(file: TensorFile, parts: list[ObjectPart]) -> dict[str, SceneObject
             size=part.size,
             cloud=_cloud(file, f"{index}.", part.cloud, f"object {part.object_id!r}"),
             trajectory=part.trajectory.build(),
+            colour=_colour(file, f"{index}.", part),
         )
     return objects
+
+
+def _colour(file: TensorFile, prefix: str, part: ObjectPart) -> TimeColour | None:
+    if part.colour is None:
+        return None
+    shapes = {"fourier": (part.cloud.gaussians, part.colour.harmonics, 3)}
+    coefficients = file.take(prefix, shapes=shapes, hashes=part.colour.tensors)["fourier"]
+    if file.verify and not bool(torch.isfinite(coefficients).all()):
+        raise SceneError(f"object {part.object_id!r}: colour holds values that are not finite")
+    return TimeColour(coefficients, part.colour.basis, part.colour.start_us, part.colour.end_us)
 
 
 def _sky(folder: Path, document: SceneDocument, verify: bool) -> Sky | None:

@@ -17,7 +17,8 @@ from .document import AssetDocument, SceneDocument
 from .tensors import write_tensors
 
 FORMAT = "real2sim-scene"
-VERSION = 1
+VERSION = 2
+"""Newest version read here; what needs no more is written in version 1."""
 DOCUMENT_NAME = "scene.json"
 
 
@@ -50,7 +51,7 @@ def write_container(
         document = document.model_copy(
             update={
                 "format": FORMAT,
-                "version": VERSION,
+                "version": document.content.version,
                 "content_hash": content_hash(document.kind, content),
                 "files": {name: write_tensors(t, folder / name) for name, t in tensors.items()},
             }

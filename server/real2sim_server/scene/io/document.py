@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from ..camera import Camera, CameraRig
 from ..trajectory import Trajectory
@@ -99,14 +99,36 @@ class EgoPart(_Part):
     trajectory: TrajectoryPart
 
 
+class ColourPart(_Part):
+    """How the colours of a cloud change; see :class:`~real2sim_server.scene.TimeColour`."""
+
+    harmonics: Count
+    basis: Literal["cosine", "real_dft"]
+    start_us: int
+    end_us: int
+    tensors: dict[str, Sha256]
+
+
 class ObjectPart(_Part):
-    """One object of a scene; its tensors are keyed by its position in the list."""
+    """One object of a scene; its tensors are keyed by its position in the list.
+
+    Attributes:
+        colour: left out of the JSON where there is none, as version 1 of the format asks.
+    """
 
     object_id: str
     category: str
     size: Vector3
     trajectory: TrajectoryPart
     cloud: CloudPart
+    colour: ColourPart | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_colour(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if values.get("colour") is None:
+            values.pop("colour", None)
+        return values
 
 
 class SceneContent(_Part):
@@ -119,6 +141,11 @@ class SceneContent(_Part):
     objects: list[ObjectPart]
     sky: SkyPart | None
 
+    @property
+    def version(self) -> int:
+        """Lowest version of the format that holds this content."""
+        return 2 if any(o.colour is not None for o in self.objects) else 1
+
     def build_rig(self) -> CameraRig:
         """The camera rig. Raises SceneError like its constructor."""
         return CameraRig(tuple(c.build() for c in self.cameras))
@@ -130,6 +157,11 @@ class AssetContent(_Part):
     category: str
     size: Vector3
     cloud: CloudPart
+
+    @property
+    def version(self) -> int:
+        """Lowest version of the format that holds this content."""
+        return 1
 
 
 class _Document(_Part):
