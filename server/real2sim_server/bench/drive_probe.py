@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self
 
@@ -23,9 +24,10 @@ class DriveProbe:
     def __init__(self, info: SessionInfo) -> None:
         self._info = info
         self._id = 0
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self.socket = connect(
+        connection = connect(
             self._info.ws_url,
             subprotocols=[DRIVE_SUBPROTOCOL],  # type: ignore[list-item]
             compression=None,
@@ -33,6 +35,7 @@ class DriveProbe:
             proxy=None,
             ping_interval=None,
         )
+        self.socket = self._stack.enter_context(connection)
         hello = {"type": "hello", "protocols": [DRIVE_SUBPROTOCOL], "token": self._info.token}
         self._ask(hello)
         return self
@@ -43,7 +46,7 @@ class DriveProbe:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.socket.close()
+        self._stack.close()
 
     def reset(
         self, sensors: Sequence[Mapping[str, Any]], *, dt_us: int

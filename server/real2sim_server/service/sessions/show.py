@@ -8,6 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from real2sim_proto import ErrorCode
+from real2sim_proto.base import Modality
+from real2sim_proto.codec import DEFAULT_MAX_BYTES
 from real2sim_proto.drive import SensorSpec
 
 from ...edit import ScenarioState, instances_at
@@ -16,11 +19,15 @@ from ...world import World
 from ..engine import Engine
 from ..metrics import Metrics
 from ..pictures import Image, Pictures, Shot, check_sensors
+from ..problems import ServiceError
 from .wire import EncodedFrame, Message, Stopwatch, encode_frame, pack_with_frames
 
 T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
+BYTES_PER_PIXEL: dict[Modality, int] = {"rgb": 3, "depth": 4, "instance": 2}
+MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
+"""Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +98,7 @@ class Show:
 
     def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
-        cameras = check_sensors(scene.rig, sensors, max_pixels=self._max_pixels)
+        cameras = self._checked(scene, sensors)
         return {s.camera: c for s, c in zip(sensors, cameras, strict=True)}
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
@@ -139,7 +146,7 @@ class Show:
             ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
             QueueFullError: too much waits for the engine.
         """
-        cameras = check_sensors(world.scene.rig, sensors, max_pixels=self._max_pixels)
+        cameras = self._checked(world.scene, sensors)
         watch = Stopwatch()
 
         def work() -> Drawn:
@@ -161,6 +168,22 @@ class Show:
             sensors=(SensorSpec(camera=scene.rig.names[0], width=WARM_UP_WIDTH),),
         )
         await self._pictures.take(shot, stream="warm-up")
+
+    def _checked(self, scene: Scene, sensors: Sequence[SensorSpec]) -> list[Camera]:
+        cameras = check_sensors(scene.rig, sensors, max_pixels=self._max_pixels)
+        raw_bytes = sum(
+            camera.width * camera.height * BYTES_PER_PIXEL[modality]
+            for camera, sensor in zip(cameras, sensors, strict=True)
+            for modality in sensor.modalities
+            if sensor.codec == "raw"
+        )
+        if raw_bytes > MAX_IMAGE_BYTES:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"{raw_bytes} bytes of raw images in one message; readers allow {MAX_IMAGE_BYTES}",
+                hint="ask for smaller or fewer images, or for codec 'jpeg' or 'png'",
+            )
+        return cameras
 
     def _images(
         self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]

@@ -1,0 +1,83 @@
+"""The same seed and actions give the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.network
+
+SENSORS = [
+    {"camera": "front", "modalities": ["rgb", "depth", "instance"]},
+    {"camera": "left", "codec": "jpeg"},
+]
+PLANS = [
+    {"kind": "trajectory", "times_us": [t, t + 500_000], "poses": [[1, 0.1, 0.02], [5, 0.6, 0.1]]}
+    for t in range(100_000, 900_000, 100_000)
+]
+
+
+def fingerprint(planner) -> list[str]:
+    """One hash for everything in each observation but its timing."""
+    obs = planner.reset(seed=7, action="trajectory", sensors=SENSORS, privileged=True)
+    hashes = [hashed(obs)]
+    for step, plan in enumerate(PLANS):
+        hashes.append(hashed(planner.ask("action", step=step, plan=plan)))
+    closer = {"op": "translate", "object_id": "post", "y": -2.5}
+    assert planner.ask("edit", operations=[closer])["type"] == "edited"
+    hashes.append(hashed(planner.ask("action", step=len(PLANS), plan=late_plan())))
+    return hashes
+
+
+def late_plan() -> dict:
+    return {"kind": "trajectory", "times_us": [1_500_000], "poses": [[4.0, 0.0, 0.0]]}
+
+
+def hashed(obs: dict) -> str:
+    assert obs["type"] == "obs", obs
+    obs = {k: v for k, v in obs.items() if k not in {"timing", "id"}}
+    digest = hashlib.sha256()
+    for frame in obs.pop("frames"):
+        digest.update(frame.pop("data") + repr(sorted(frame)).encode())
+        digest.update(frame["T_world_sensor"].tobytes() + frame["K"].tobytes())
+    digest.update(obs.pop("route").tobytes())
+    digest.update(json.dumps(obs, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def test_twice_in_one_worker(site, join):
+    first = fingerprint(join(site.create()))
+    assert fingerprint(join(site.create())) == first
+    assert len(set(first)) == len(first)
+
+
+def test_again_after_a_reset(site, join):
+    planner = join(site.create())
+    assert fingerprint(planner) == fingerprint(planner)
+
+
+def test_while_others_drive(site, join):
+    alone = fingerprint(join(site.create()))
+    other = join(site.create())
+    other.reset(sensors=[{"camera": "front", "width": 512}])
+    other.send("action", step=0, plan={"kind": "control", "acceleration": 0, "steering": 0})
+    assert fingerprint(join(site.create())) == alone
+
+
+def test_in_a_new_process_with_another_number_of_threads(site, join):
+    here = fingerprint(join(site.create()))
+    program = Path(__file__).with_name("drive_elsewhere.py")
+    done = subprocess.run(
+        [sys.executable, str(program), str(site.worker.settings.scenes_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == here

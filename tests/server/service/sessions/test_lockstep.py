@@ -1,0 +1,99 @@
+"""Rule 1, without a world."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from real2sim_proto import ErrorCode
+from real2sim_server.service.problems import ServiceError
+from real2sim_server.service.sessions.lockstep import LockStep
+
+ACTIONS = st.lists(
+    st.tuples(st.integers(min_value=-3, max_value=2), st.sampled_from([b"left", b"right"])),
+    max_size=40,
+)
+
+
+def begun(steps: int = 0) -> LockStep[str]:
+    lockstep: LockStep[str] = LockStep()
+    lockstep.reset()
+    for step in range(steps):
+        lockstep.advance(b"plan %d" % step, f"obs {step + 1}", over=False)
+    return lockstep
+
+
+def refusal(lockstep: LockStep[str], step: int, content: bytes = b"x") -> ErrorCode:
+    with pytest.raises(ServiceError) as refused:
+        lockstep.cached_answer(step, content)
+    return refused.value.code
+
+
+def test_the_due_action_has_no_answer_yet():
+    assert begun(3).cached_answer(3, b"anything") is None
+
+
+def test_the_same_action_again_gets_the_same_answer():
+    assert begun(3).cached_answer(2, b"plan 2") == "obs 3"
+
+
+def test_another_action_for_an_answered_step_is_a_conflict():
+    assert refusal(begun(3), 2, b"other") is ErrorCode.STEP_CONFLICT
+
+
+def test_only_the_last_answer_is_kept():
+    assert refusal(begun(3), 1, b"plan 1") is ErrorCode.STALE_STEP
+
+
+def test_an_action_from_the_future_is_refused():
+    assert refusal(begun(3), 4) is ErrorCode.BAD_STEP
+
+
+def test_nothing_can_be_done_before_a_reset():
+    assert refusal(LockStep(), 0) is ErrorCode.NOT_RESET
+
+
+def test_after_the_end_the_last_answer_can_be_had_again_and_nothing_else():
+    lockstep = begun(2)
+    lockstep.advance(b"last", "end", over=True)
+    assert lockstep.cached_answer(2, b"last") == "end"
+    assert refusal(lockstep, 3) is ErrorCode.EPISODE_OVER
+    assert refusal(lockstep, 4) is ErrorCode.EPISODE_OVER
+
+
+def test_a_reset_forgets_the_episode_before():
+    lockstep = begun(3)
+    lockstep.reset()
+    assert lockstep.step == 0
+    assert refusal(lockstep, 2, b"plan 2") is ErrorCode.BAD_STEP
+    assert lockstep.cached_answer(0, b"plan 0") is None
+
+
+def test_steps_made_by_other_means_leave_no_answer():
+    lockstep = begun(3)
+    lockstep.skip(4, over=False)
+    assert lockstep.step == 7
+    assert refusal(lockstep, 6, b"plan 6") is ErrorCode.STALE_STEP
+
+
+@given(ACTIONS)
+def test_the_clock_moves_exactly_once_for_each_accepted_action(actions):
+    lockstep = begun()
+    taken: list[bytes] = []
+    for offset, content in actions:
+        step = len(taken) + offset
+        try:
+            answer = lockstep.cached_answer(step, content)
+        except ServiceError:
+            assert step != len(taken)
+            assert not taken or (step, content) != (len(taken) - 1, taken[-1])
+        else:
+            if answer is None:
+                assert step == len(taken)
+                taken.append(content)
+                lockstep.advance(content, f"obs {len(taken)}", over=False)
+            else:
+                assert (step, taken[-1]) == (len(taken) - 1, content)
+                assert answer == f"obs {len(taken)}"
+        assert lockstep.step == len(taken)

@@ -1,0 +1,153 @@
+"""How many sessions there may be, how long they live, what is on record, what they weigh."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import tracemalloc
+
+import pytest
+
+from real2sim_proto import decode, encode
+
+pytestmark = pytest.mark.network
+
+CAMERA = {"camera": "front"}
+
+
+def entries(site, info) -> list:
+    loop = asyncio.new_event_loop()
+    try:
+        return loop.run_until_complete(site.worker.store.session_entries(info["session_id"]))
+    finally:
+        loop.close()
+
+
+def test_beyond_the_limit_creation_is_refused_with_a_time_to_come_back(own_site):
+    site = own_site(max_sessions=2)
+    made = [site.create() for _ in range(2)]
+    answer = site.http.post("/v1/sessions", params={"scene": "tiny"})
+    assert (answer.status_code, answer.json()["code"]) == (429, "OVER_CAPACITY")
+    assert int(answer.headers["Retry-After"]) > 0
+    ready = site.http.get("/readyz")
+    assert (ready.status_code, ready.json()["reasons"]) == (503, ["all 2 sessions are taken"])
+    site.call("DELETE", made[0])
+    assert site.http.get("/readyz").status_code == 200
+    site.create()
+
+
+def test_sessions_that_nobody_uses_end_and_connected_ones_stay(own_site, join):
+    site = own_site(session_idle_seconds=0.3)
+    left, held = site.create(), site.create()
+    planner = join(held)
+    until = time.monotonic() + 10
+    while len(site.worker.sessions) > 1 and time.monotonic() < until:
+        time.sleep(0.05)
+    answer = site.call("GET", left)
+    assert (answer.status_code, answer.json()["code"]) == (410, "SESSION_CLOSED")
+    assert "unused" in answer.json()["detail"]
+    assert planner.reset()["step"] == 0
+
+
+def test_sessions_of_an_earlier_run_are_unknown_with_a_hint(own_site, tmp_path):
+    url = f"sqlite:///{tmp_path / 'store.db'}"
+    info = own_site(store_url=url).create()
+    answer = own_site(store_url=url).call("GET", info)
+    assert (answer.status_code, answer.json()["code"]) == (404, "UNKNOWN_SESSION")
+    assert "earlier run" in answer.json()["detail"]
+    assert "POST /v1/sessions" in answer.json()["hint"]
+
+
+def test_the_workers_token_opens_every_session(own_site, join):
+    site = own_site(token="a-secret-token")
+    worker = {"Authorization": "Bearer a-secret-token"}
+    assert site.http.post("/v1/sessions", params={"scene": "tiny"}).status_code == 401
+    info = site.http.post("/v1/sessions", params={"scene": "tiny"}, headers=worker).json()
+    assert site.call("GET", info, headers=worker).status_code == 200
+    assert site.call("GET", info).status_code == 200
+    assert join(info | {"token": "a-secret-token"}).reset()["step"] == 0
+
+
+def test_what_took_effect_is_on_record_in_order(site, join):
+    info = site.create()
+    planner = join(info)
+    planner.reset(seed=4)
+    planner.act(0)
+    planner.ask("edit", operations=[{"op": "delete", "object_id": "post"}])
+    planner.act(1)
+    planner.reset()
+    log = entries(site, info)
+    assert [(e.seq, e.kind, e.step) for e in log] == [
+        (0, "reset", 0),
+        (1, "action", 0),
+        (2, "edit", 1),
+        (3, "action", 1),
+        (4, "reset", 0),
+    ]
+    assert decode(log[0].payload)["spec"]["seed"] == 4
+    assert decode(log[1].payload)["plan"]["kind"] == "control"
+    assert decode(log[2].payload)["operations"][0]["object_id"] == "post"
+
+
+def test_what_was_refused_or_repeated_is_not_on_record(site, join):
+    info = site.create()
+    planner = join(info)
+    planner.reset(start_us=99_000_000)
+    planner.reset()
+    planner.act(0)
+    planner.act(0)
+    planner.act(5)
+    planner.ask("action", step=1, plan={"kind": "pose", "x": 0.0, "y": 0.0, "yaw": 0.0})
+    planner.ask("edit", base_rev=9, operations=[{"op": "delete", "object_id": "post"}])
+    planner.socket.send(encode({"type": "nonsense"}))
+    planner.receive()
+    assert [e.kind for e in entries(site, info)] == ["reset", "action"]
+
+
+def test_steps_by_request_are_on_record_one_by_one(site):
+    info = site.create({"action": "control", "dt_us": 10_000})
+    plan = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
+    site.call("POST", info, "/step", json={"n": 45, "plan": plan})
+    log = entries(site, info)
+    assert [e.step for e in log] == [0, *range(45)]
+    assert [decode(e.payload)["plan"] is None for e in log[1:]] == [False] + [True] * 44
+
+
+def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeypatch):
+    planner = join(site.create())
+    planner.reset()
+
+    async def full_disk(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(site.worker.store, "append_session_entries", full_disk)
+        assert planner.act(0)["code"] == "INTERNAL"
+    obs = planner.act(0)
+    assert (obs["step"], obs["type"]) == (1, "obs")
+
+
+def test_ten_sessions_on_one_scene_are_light(site, join):
+    def driven() -> None:
+        planner = join(site.create())
+        planner.reset(sensors=[CAMERA | {"width": 640}], privileged=True)
+        planner.act(0)
+
+    driven()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(10):
+            driven()
+        each = (tracemalloc.get_traced_memory()[0] - before) / 10
+    finally:
+        tracemalloc.stop()
+    # This counts the ten clients of this process too.
+    assert each < 5e6
+
+
+def test_sessions_share_the_scene_and_its_objects(site):
+    one, two = site.session(site.create({})), site.session(site.create({}))
+    assert one.start.scene is two.start.scene
+    assert one.start.state is two.start.state
+    assert one.running_world().instances()[0].cloud is two.running_world().instances()[0].cloud

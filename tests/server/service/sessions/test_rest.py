@@ -1,0 +1,261 @@
+"""Sessions by plain requests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_proto import decode
+from real2sim_proto.drive import SERVER_MESSAGE
+from real2sim_proto.sessions import SessionInfo, SessionState
+
+pytestmark = pytest.mark.network
+
+CONTROL = {"kind": "control", "acceleration": 1.0, "steering": 0.0}
+RESET = {"action": "control", "dt_us": 100_000}
+CAMERA = {"camera": "front"}
+
+
+@pytest.fixture
+def info(site) -> dict:
+    return site.create(RESET)
+
+
+def problem(answer) -> tuple[int, str]:
+    return answer.status_code, answer.json()["code"]
+
+
+# --- life -------------------------------------------------------------------------------------
+
+
+def test_a_session_names_its_worker_and_where_it_is(site):
+    answer = site.http.post("/v1/sessions", params={"scene": "tiny"})
+    made = SessionInfo.model_validate_json(answer.content)
+    site.made.append(answer.json())
+    assert made.session_id.startswith("w0.")
+    assert answer.headers["Location"] == f"/v1/sessions/{made.session_id}"
+    assert made.ws_url == f"{site.url.replace('http', 'ws')}/v1/sessions/{made.session_id}/drive"
+    assert (made.scene, made.step, made.controller) == ("tiny", None, False)
+
+
+def test_with_a_body_the_first_episode_begins_at_once(info):
+    assert (info["step"], info["t_us"], info["reset"]["dt_us"]) == (0, 0, 100_000)
+
+
+def test_a_session_on_a_scenario_begins_with_its_edits(site):
+    scenario = site.http.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
+    operations = {"operations": [{"op": "delete", "object_id": "car_red"}]}
+    site.http.post(f"/v1/scenarios/{scenario}/operations", json=operations)
+    info = site.create(RESET, scenario=scenario)
+    state = site.call("GET", info, "/state").json()
+    assert info["scenario_id"] == scenario
+    assert {a["object_id"] for a in state["agents"]} == {"car_blue", "post"}
+    later = {"operations": [{"op": "delete", "object_id": "post"}]}
+    site.http.post(f"/v1/scenarios/{scenario}/operations", json=later)
+    site.call("POST", info, "/reset", json=RESET)
+    assert len(site.call("GET", info, "/state").json()["agents"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ({}, (422, "INVALID_REQUEST")),
+        ({"scene": "tiny", "scenario": "sc_1"}, (422, "INVALID_REQUEST")),
+        ({"scene": "moon"}, (404, "UNKNOWN_SCENE")),
+        ({"scenario": "sc_none"}, (404, "UNKNOWN_SCENARIO")),
+    ],
+)
+def test_a_session_needs_one_world_that_exists(site, query, expected):
+    assert problem(site.http.post("/v1/sessions", params=query)) == expected
+
+
+def test_a_session_whose_episode_cannot_begin_is_not_made(site):
+    body = {"reset": {"start_us": 99_000_000}}
+    answer = site.http.post("/v1/sessions", params={"scene": "tiny"}, json=body)
+    assert problem(answer) == (422, "TIME_OUT_OF_RANGE")
+    assert site.http.get("/v1/sessions").json()["sessions"] == []
+    assert site.worker.residency._resident["tiny"].pins == 0
+
+
+def test_the_list_tells_no_tokens(site, info):
+    (listed,) = site.http.get("/v1/sessions").json()["sessions"]
+    assert (listed["session_id"], listed["token"]) == (info["session_id"], "")
+
+
+@pytest.mark.parametrize("token", ["guess", ""])
+def test_a_session_answers_only_to_its_token(site, info, token):
+    headers = {"Authorization": f"Bearer {token}"} if token else {"Authorization": ""}
+    answer = site.call("GET", info, "/state", headers=headers)
+    assert problem(answer) == (401, "UNAUTHORIZED")
+    assert answer.headers["WWW-Authenticate"] == "Bearer"
+
+
+def test_unknown_sessions_are_told_apart_from_closed_ones(site, info):
+    unknown = info | {"session_id": "w0.0000000000000000"}
+    assert problem(site.call("GET", unknown)) == (404, "UNKNOWN_SESSION")
+    assert site.call("DELETE", info).status_code == 204
+    assert problem(site.call("GET", info)) == (410, "SESSION_CLOSED")
+    assert problem(site.call("DELETE", info)) == (410, "SESSION_CLOSED")
+
+
+def test_a_deleted_session_gives_its_scene_back(site, info):
+    assert site.worker.residency._resident["tiny"].pins == 1
+    site.call("DELETE", info)
+    assert site.worker.residency._resident["tiny"].pins == 0
+
+
+def test_the_same_creation_twice_makes_one_session(site):
+    headers = {"Idempotency-Key": "one-session"}
+    answers = [
+        site.http.post("/v1/sessions", params={"scene": "tiny"}, headers=headers) for _ in range(2)
+    ]
+    site.made.append(answers[0].json())
+    assert answers[1].json() == answers[0].json()
+    assert answers[1].headers["Location"] == answers[0].headers["Location"]
+    assert len(site.http.get("/v1/sessions").json()["sessions"]) == 1
+
+
+# --- time -------------------------------------------------------------------------------------
+
+
+def test_steps_move_the_clock_under_one_plan(site, info):
+    answer = site.call("POST", info, "/step", json={"n": 3, "plan": CONTROL})
+    state = SessionState.model_validate_json(answer.content)
+    assert (state.step, state.t_us) == (3, 300_000)
+    assert state.ego.speed == pytest.approx(5.3)
+
+
+def test_without_a_plan_the_ego_follows_the_log(site, info):
+    state = site.call("POST", info, "/step", json={"n": 10}).json()
+    assert state["ego"]["position"] == pytest.approx([5.0, 0.0, 0.0], abs=0.05)
+
+
+def test_many_steps_are_as_many_single_ones(site):
+    one, other = site.create(RESET), site.create(RESET)
+    at_once = site.call("POST", one, "/step", json={"n": 15, "plan": CONTROL}).json()
+    site.call("POST", other, "/step", json={"plan": CONTROL})
+    for _ in range(14):
+        single = site.call("POST", other, "/step", json={}).json()
+    assert single["ego"] == at_once["ego"]
+    assert single["metrics"] == at_once["metrics"]
+
+
+def test_steps_end_with_the_episode_and_tell_what_happened(site):
+    info = site.create(RESET | {"dt_us": 50_000})
+    state = site.call("POST", info, "/step", json={"n": 1000}).json()
+    assert (state["step"], state["truncated"], state["reason"]) == (40, True, "horizon")
+    assert [e["type"] for e in state["events"]] == ["horizon"]
+    assert problem(site.call("POST", info, "/step", json={})) == (409, "EPISODE_OVER")
+
+
+def test_events_are_told_until_the_next_step_answer(site):
+    info = site.create({"action": "pose", "on_collision": "continue"})
+    plan = {"kind": "pose", "x": 12.0, "y": -3.0, "yaw": 0.0}
+    first = site.call("POST", info, "/step", json={"plan": plan}).json()
+    assert [e["object_id"] for e in first["events"]] == ["car_red"]
+    again = site.call("POST", info, "/step", json={}).json()
+    assert again["events"] == []
+
+
+def test_reset_begins_anew(site, info):
+    before = site.call("GET", info, "/state").json()
+    site.call("POST", info, "/step", json={"n": 3, "plan": CONTROL})
+    answer = site.call("POST", info, "/reset", json=RESET)
+    assert answer.status_code == 200
+    assert site.call("GET", info, "/state").json() == before
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ({"n": 0}, (422, "INVALID_REQUEST")),
+        ({"n": 1001}, (422, "INVALID_REQUEST")),
+        ({"dt_us": 7}, (422, "INVALID_REQUEST")),
+        ({"plan": {"kind": "pose", "x": 0, "y": 0, "yaw": 0}}, (422, "INVALID_ACTION")),
+        ({"plan": CONTROL | {"acceleration": "NaN"}}, (422, "INVALID_REQUEST")),
+    ],
+)
+def test_a_step_that_is_refused_moves_nothing(site, info, body, expected):
+    assert problem(site.call("POST", info, "/step", json=body)) == expected
+    assert site.call("GET", info, "/state").json()["step"] == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [("GET", "/state", None), ("POST", "/step", {}), ("POST", "/render", {"sensors": [CAMERA]})],
+)
+def test_before_a_reset_there_is_nothing_to_see(site, method, path, body):
+    answer = site.call(method, site.create(), path, json=body)
+    assert problem(answer) == (409, "NOT_RESET")
+
+
+@pytest.mark.parametrize(("path", "body"), [("/step", {}), ("/reset", RESET)])
+def test_requests_keep_out_while_a_controller_is_connected(site, join, info, path, body):
+    planner = join(info)
+    assert problem(site.call("POST", info, path, json=body)) == (409, "CONTROLLER_TAKEN")
+    assert site.call("GET", info).json()["controller"]
+    assert planner.act(0)["step"] == 1
+    assert site.call("GET", info, "/state").json()["step"] == 1
+
+
+def test_a_controller_goes_on_where_requests_left_off(site, join, info):
+    site.call("POST", info, "/step", json={"n": 2, "plan": CONTROL})
+    planner = join(info, None)
+    assert planner.hello()["step"] == 2
+    assert planner.act(1)["code"] == "STALE_STEP"
+    assert planner.act(2)["step"] == 3
+
+
+# --- render -----------------------------------------------------------------------------------
+
+
+def test_many_images_come_as_msgpack(site, info):
+    sensors = [{"camera": "front", "modalities": ["rgb", "depth"]}, {"camera": "left"}]
+    answer = site.call("POST", info, "/render", json={"sensors": sensors})
+    view = SERVER_MESSAGE.validate_python(decode(answer.content))
+    assert answer.headers["Content-Type"] == "application/msgpack"
+    assert [(f.sensor, f.modality) for f in view.frames] == [
+        ("front", "rgb"),
+        ("front", "depth"),
+        ("left", "rgb"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("media_type", "magic"), [("image/jpeg", b"\xff\xd8\xff"), ("image/png", b"\x89PNG")]
+)
+def test_one_image_comes_as_a_file(site, info, media_type, magic):
+    headers = {"Accept": media_type}
+    answer = site.call("POST", info, "/render", json={"sensors": [CAMERA]}, headers=headers)
+    assert answer.headers["Content-Type"] == media_type
+    assert answer.content.startswith(magic)
+    assert "render;dur=" in answer.headers["Server-Timing"]
+
+
+def test_several_images_are_no_file(site, info):
+    body = {"sensors": [CAMERA, {"camera": "left"}]}
+    answer = site.call("POST", info, "/render", json=body, headers={"Accept": "image/png"})
+    assert problem(answer) == (406, "NOT_ACCEPTABLE")
+
+
+def test_what_is_rendered_by_request_is_what_the_socket_shows(site, join, info):
+    answer = site.call("POST", info, "/render", json={"sensors": [CAMERA]}, headers=MSGPACK)
+    rendered = decode(answer.content)["frames"][0]
+    observed = join(info).reset(sensors=[CAMERA])["frames"][0]
+    np.testing.assert_equal(rendered, observed)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "expected"),
+    [
+        ({"camera": "rear"}, (404, "UNKNOWN_CAMERA")),
+        ({"camera": "front", "width": 8192, "modalities": ["rgb"]}, (422, "INVALID_REQUEST")),
+        ({"camera": "front", "modalities": ["rgb", "rgb"]}, (422, "INVALID_REQUEST")),
+    ],
+)
+def test_images_that_cannot_be_are_refused(site, info, sensor, expected):
+    answer = site.call("POST", info, "/render", json={"sensors": [sensor]}, headers=MSGPACK)
+    assert problem(answer) == expected
+
+
+MSGPACK = {"Accept": "application/msgpack"}

@@ -1,0 +1,77 @@
+"""Messages joined from parts are the messages that the codec knows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from real2sim_proto import decode
+from real2sim_proto.drive import SERVER_MESSAGE, SensorSpec
+from real2sim_server.service.pictures import Image
+from real2sim_server.service.sessions.wire import (
+    Stopwatch,
+    encode_frame,
+    pack_message,
+    pack_with_frames,
+)
+
+
+def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) -> Image:
+    rng = np.random.default_rng(3)
+    pixels = {
+        "rgb": rng.integers(0, 255, (height, width, 3)).astype(np.uint8),
+        "depth": rng.uniform(0, 90, (height, width)).astype(np.float32),
+        "instance": rng.integers(0, 65535, (height, width)).astype(np.uint16),
+    }[modality]
+    sensor = SensorSpec(camera="front", modalities=[modality], codec=codec)
+    return Image(sensor, modality, 7, np.eye(4), np.eye(3), pixels)
+
+
+def view(frames: int, codec: str = "raw") -> bytes:
+    encoded = [encode_frame(image(codec)) for _ in range(frames)]
+    fields = {"t_us": 7, "revision": 2}
+    return pack_with_frames("view", fields, encoded, Stopwatch()).with_id(5)
+
+
+@given(st.integers(min_value=0, max_value=2**53))
+def test_the_id_of_a_message_is_filled_in_last(message_id):
+    assert decode(pack_message("progress", {"phase": "x"}).with_id(message_id))["id"] == message_id
+
+
+@pytest.mark.parametrize("members", [0, 1, 12, 13, 14, 40])
+def test_maps_of_any_size_are_joined(members):
+    fields = {f"f{i}": i for i in range(members)}
+    message = decode(pack_message("error", fields).with_id(1))
+    assert message == {"v": 1, "type": "error", "id": 1, **fields}
+
+
+@pytest.mark.parametrize("frames", [0, 1, 15, 16, 48])
+def test_any_number_of_frames_makes_a_valid_message(frames):
+    message = SERVER_MESSAGE.validate_python(decode(view(frames)))
+    assert len(message.frames) == frames
+    assert message.id == 5
+
+
+@pytest.mark.parametrize("modality", ["rgb", "depth", "instance"])
+def test_raw_pixels_arrive_as_they_were(modality):
+    drawn = image("raw", modality)
+    frame = encode_frame(drawn)
+    pixels = np.frombuffer(frame.data, frame.fields["dtype"]).reshape(frame.fields["shape"])
+    np.testing.assert_array_equal(pixels, drawn.pixels)
+
+
+def test_raw_pixels_are_not_copied_before_they_are_joined():
+    drawn = image("raw")
+    assert np.shares_memory(np.asarray(encode_frame(drawn).data), drawn.pixels)
+
+
+def test_depth_asked_for_as_jpeg_is_png():
+    assert encode_frame(image("jpeg", "depth")).codec == "png"
+
+
+def test_stages_are_measured_and_sent():
+    timing = decode(view(1))["timing"]
+    assert set(timing) == {"pack"}
+    assert timing["pack"] >= 0
