@@ -76,6 +76,38 @@ def written_argoverse2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPath
     return folder
 
 
+@pytest.fixture(scope="session")
+def written_kitti_raw(
+    tiny_log: SyntheticLog, written_kitti: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("kitti_raw")
+    _layout("kitti_raw").write(tiny_log, written_kitti, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def written_nuscenes(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("nuscenes")
+    _layout("nuscenes").write(tiny_log, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def written_street_gaussians(
+    tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("street") / "002"
+    _layout("street_gaussians").write(tiny_log, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def written_drivestudio(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drivestudio") / "023"
+    _layout("drivestudio").write(tiny_log, folder)
+    return folder
+
+
 @pytest.fixture
 def native_folder(written_native: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written_native, tmp_path / "native"))

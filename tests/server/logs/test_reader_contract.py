@@ -9,8 +9,21 @@ import pytest
 from real2sim_server.logs import DrivingLog, LogError, open_log
 from real2sim_server.logs.readers import READERS
 
+LAYOUTS = (
+    "native",
+    "kitti",
+    "kitti_raw",
+    "kitti_jam",
+    "waymo_v2",
+    "waymo_v1",
+    "argoverse2",
+    "nuscenes",
+    "street_gaussians",
+    "drivestudio",
+)
 
-@pytest.fixture(params=["native", "kitti", "kitti_jam", "waymo_v2", "waymo_v1", "argoverse2"])
+
+@pytest.fixture(params=LAYOUTS)
 def folder(request: pytest.FixtureRequest) -> Path:
     if request.param == "kitti_jam":
         path: Path = request.getfixturevalue("test_data") / "kitti_jam"
@@ -65,7 +78,7 @@ def test_sweeps_are_whole(log: DrivingLog) -> None:
 
 def test_sensor_is_above_the_ground_and_the_ground_at_zero(log: DrivingLog) -> None:
     sweep = log.lidar(0)
-    assert 1.5 < sweep.origin[2] < 2.0
+    assert 1.5 < sweep.origin[2] < 2.3
     x, y, z = sweep.points.T
     road = z[(np.hypot(x, y) < 9) & (np.abs(y) < 1.2) & (x > 2.5) & (z < 0.4)]
     assert len(road) > 50

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...scene import Camera, CameraRig, Trajectory
 from ...scene.rotation import Float, apply_transform, invert_transform
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from ..images import image_size, read_image
+from ..images import check_image_file, image_size, read_image
 from .kitti_files import (
     KittiCalibration,
     KittiLabel,
@@ -69,7 +69,7 @@ class KittiReader:
         calibration = read_calibration(root / "calib" / f"{sequence}.txt")
         images = _image_files(root, sequence)
         frame_count = len(images["image_02"])
-        rig = _read_rig(root / "calib" / f"{sequence}.txt", calibration, images)
+        rig = read_rig(root / "calib" / f"{sequence}.txt", calibration, images)
         check_images(images, rig)
         scans = _scan_files(root / "velodyne" / sequence, sequence, frame_count)
         times_us = read_times(root / "times" / f"{sequence}.txt", frame_count)
@@ -81,7 +81,7 @@ class KittiReader:
             frame_times_us=times_us,
             ego=Trajectory.from_transforms(times_us, vehicle_poses),
             tracks=_tracks(labels, vehicle_poses @ calibration.T_vehicle_cam0, times_us),
-            source=_KittiSource(images, scans, calibration.T_vehicle_velo, vehicle_poses),
+            source=KittiSource(images, scans, calibration.T_vehicle_velo, vehicle_poses),
             ego_size=KITTI_EGO_SIZE,
             provenance={
                 "dataset": "KITTI tracking layout",
@@ -129,9 +129,8 @@ def _image_files(root: Path, sequence: str) -> dict[str, list[Path]]:
     }
 
 
-def _read_rig(
-    path: Path, calibration: KittiCalibration, images: dict[str, list[Path]]
-) -> CameraRig:
+def read_rig(path: Path, calibration: KittiCalibration, images: dict[str, list[Path]]) -> CameraRig:
+    """Cameras by name ``image_NN``; ``path`` is the calibration, for errors."""
     cameras = []
     for name, files in images.items():
         index = int(name[-2:])
@@ -225,16 +224,24 @@ def _tracks(
 
 
 @dataclass(frozen=True, eq=False)
-class _KittiSource:
+class KittiSource:
+    """Files of a KITTI drive, and what it takes to bring scans to image time."""
+
     images: dict[str, list[Path]]
     scans: list[Path | None]
     T_vehicle_velo: Float
     vehicle_poses: Float
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """RGB [H, W, 3]; see :class:`FrameSource`."""
         return read_image(self.images[camera][frame])
 
+    def check_image(self, camera: str, frame: int) -> None:
+        """Raise LogError when the image is cut off."""
+        check_image_file(self.images[camera][frame])
+
     def lidar(self, frame: int) -> LidarSweep:
+        """The compensated scan; see :class:`FrameSource`."""
         scan = self._raw_scan(frame)
         points = scan[:, :3].astype(np.float64)
         offset = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,7 +74,11 @@ def read_calibration(path: Path) -> KittiCalibration:
     Raises:
         LogError: a matrix is missing, has a wrong number of values, or is no rigid transform.
     """
-    entries = _read_entries(path)
+    return calibration_from(read_entries(path), path)
+
+
+def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibration:
+    """A calibration of its matrices, named as in the tracking set; ``path`` is for errors."""
     rectification = _rigid(path, entries, _KEYS["rectification"])
     T_cam0_velo = rectification @ _rigid(path, entries, _KEYS["velo_to_cam"])
     T_velo_imu = _rigid(path, entries, _KEYS["imu_to_velo"])
@@ -91,16 +96,21 @@ def read_calibration(path: Path) -> KittiCalibration:
     )
 
 
-def _read_entries(path: Path) -> dict[str, Float]:
+def read_entries(path: Path, *, words: Sequence[str] = ()) -> dict[str, Float]:
+    """Lines ``key: numbers`` of a calibration file; ``words`` are keys of text, left out.
+
+    Raises:
+        LogError: with the line, for values that are no finite numbers.
+    """
     entries = {}
     for number, line in enumerate(read_lines(path), start=1):
-        words = line.replace(":", " ").split()
-        if words:
-            entries[words[0]] = parse_numbers(words[1:], f"{path} line {number}")
+        key, _, values = line.replace(":", " ").strip().partition(" ")
+        if key and key not in words:
+            entries[key] = parse_numbers(values.split(), f"{path} line {number}")
     return entries
 
 
-def _rigid(path: Path, entries: dict[str, Float], keys: tuple[str, ...]) -> Float:
+def _rigid(path: Path, entries: Mapping[str, Float], keys: tuple[str, ...]) -> Float:
     key = next((key for key in keys if key in entries), None)
     if key is None:
         raise LogError(f"{path}: has no line {' or '.join(f'{k}:' for k in keys)}")
@@ -143,7 +153,11 @@ def read_oxts(path: Path) -> Float:
     Raises:
         LogError: with the line.
     """
-    rows = read_number_table(path, columns=30, what="an OXTS record")
+    return oxts_poses(read_number_table(path, columns=30, what="an OXTS record"))
+
+
+def oxts_poses(rows: Float) -> Float:
+    """``T_world_imu`` [N, 4, 4] of OXTS records [N, 30], see :func:`read_oxts`."""
     latitude, longitude, altitude, roll, pitch, yaw = rows[:, :6].T
     scale = np.cos(np.radians(latitude[0]))
     poses = np.tile(np.eye(4), (len(rows), 1, 1))

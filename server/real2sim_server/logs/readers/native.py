@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from ..images import IMAGE_SUFFIXES, read_image
+from ..images import IMAGE_SUFFIXES, check_image_file, read_image
 from .tables import check_ego_covers, check_frame_times, check_images
 
 FORMAT = "real2sim-log"
@@ -211,6 +211,10 @@ class _NativeSource:
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         return read_image(self.images[camera][frame])
+
+    def check_image(self, camera: str, frame: int) -> None:
+        """Raise LogError when the image is cut off."""
+        check_image_file(self.images[camera][frame])
 
     def lidar(self, frame: int) -> LidarSweep:
         if self.sweeps is None:

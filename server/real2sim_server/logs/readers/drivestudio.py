@@ -1,0 +1,216 @@
+"""The preprocessed folder of drivestudio (Chen et al. 2024), made of Waymo segments.
+
+Source: ``datasets/waymo`` of the released program and its documentation. Unlike those of Street
+Gaussians, extrinsics are in Waymo's own axes. There are no time stamps: frames are 0.1 s apart.
+The other data sets it can prepare differ in ways that their folders do not tell, and are better
+read from their own files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ...scene.rotation import Float, invert_transform
+from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
+from ..images import image_size
+from .box_tracks import Box, build_tracks
+from .image_files import ImageFiles
+from .json_tables import read_json
+from .tables import check_rigid, parse_numbers, read_lines
+from .waymo import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
+
+PERIOD_US = 100_000
+COLUMNS = 14
+"""origin 3, point 3, flow 3, flow class, ground, intensity, elongation, laser: float32."""
+
+CATEGORIES = {"vehicle": "car", "pedestrian": "pedestrian", "cyclist": "cyclist", "sign": "sign"}
+
+
+class DrivestudioReader:
+    """Reads ``images``, ``ego_pose``, ``extrinsics``, ``intrinsics``, ``instances``, ``lidar``."""
+
+    name = "drivestudio"
+    expects = (
+        "images/%03d_<camera>.jpg, ego_pose/%03d.txt, extrinsics/, intrinsics/, lidar/%03d.bin, "
+        "instances/instances_info.json (Waymo)"
+    )
+
+    def recognises(self, path: Path) -> bool:
+        """Whether there are three-digit ``ego_pose`` files and no ``timestamps.json``."""
+        return (path / "ego_pose" / "000.txt").is_file() and not (path / "timestamps.json").exists()
+
+    def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
+        """The drive in the folder ``path``; ``sequence`` is refused: a folder holds one.
+
+        Raises:
+            LogError: see :class:`LogReader`.
+        """
+        if sequence is not None:
+            raise LogError(f"{path}: holds one drive; it has no sequence {sequence!r}")
+        poses = _read_poses(path / "ego_pose")
+        times_us = np.arange(len(poses), dtype=np.int64) * PERIOD_US
+        to_first = invert_transform(poses[0])
+        rig, images, without = _read_cameras(path, len(poses))
+        tracks, keys = _read_tracks(path / "instances" / "instances_info.json", to_first, times_us)
+        return DrivingLog(
+            name=f"drivestudio_{path.resolve().name}",
+            rig=rig,
+            frame_times_us=times_us,
+            ego=Trajectory.from_transforms(times_us, to_first @ poses),
+            tracks=tracks,
+            source=_DrivestudioSource(images, _sweep_files(path / "lidar", len(poses))),
+            ego_size=EGO_SIZE,
+            provenance={
+                "dataset": "drivestudio folder (Waymo)",
+                "sequence": path.resolve().name,
+                "licence": LICENCE,
+                "reader": self.name,
+                "track_ids": keys,
+                "cameras_without_images": without,
+            },
+        )
+
+
+def _read_poses(folder: Path) -> Float:
+    count = max(int(p.stem) for p in folder.glob("*.txt") if p.stem.isdecimal()) + 1
+    return np.array([_matrix(folder / f"{frame:03d}.txt") for frame in range(count)])
+
+
+def _matrix(path: Path) -> Float:
+    numbers = _numbers(path)
+    if numbers.size != 16:
+        raise LogError(f"{path}: expected 16 numbers, found {numbers.size}")
+    return check_rigid(numbers.reshape(4, 4), str(path))
+
+
+def _numbers(path: Path) -> Float:
+    return parse_numbers(" ".join(read_lines(path)).split(), str(path))
+
+
+def _read_cameras(path: Path, count: int) -> tuple[CameraRig, ImageFiles, list[str]]:
+    cameras, files, lenses, without = [], {}, {}, []
+    for intrinsics in sorted((path / "intrinsics").glob("*.txt")):
+        index = int(intrinsics.stem)
+        found = sorted((path / "images").glob(f"*_{index}.*"))
+        camera = waymo_camera(
+            index + 1,
+            size=image_size(found[0]) if found else (1, 1),
+            intrinsic=_numbers(intrinsics).tolist(),
+            extrinsic=_matrix(path / "extrinsics" / intrinsics.name),
+            shutter=0,
+            where=str(intrinsics),
+        )
+        if not found:
+            without.append(camera.name)
+            continue
+        names = [f"{frame:03d}_{index}{found[0].suffix}" for frame in range(count)]
+        files[camera.name] = [path / "images" / name for name in names]
+        lenses[camera.name] = camera.lens
+        cameras.append(camera)
+    images = ImageFiles(files, lenses)
+    images.check_sizes()
+    try:
+        rig = CameraRig(
+            tuple(
+                Camera(c.name, c.lens.width, c.lens.height, c.lens.pinhole_K, c.T_vehicle_camera)
+                for c in cameras
+            )
+        )
+    except SceneError as error:
+        raise LogError(f"{path}: {error}") from error
+    return rig, images, without
+
+
+def _read_tracks(
+    path: Path, to_first: Float, times_us: NDArray[np.int64]
+) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
+    if not path.exists():
+        return (), {}
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise LogError(f"{path}: expected an object of instances")
+    boxes = [
+        replace(box, T_world_object=to_first @ box.T_world_object)
+        for key, value in content.items()
+        for box in _boxes(path, key, value, times_us)
+    ]
+    return build_tracks(boxes)
+
+
+def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> list[Box]:
+    where = f"{path}: instance {key!r}"
+    try:
+        kind = str(value["class_name"]).lower()
+        rows = value["frame_annotations"]
+        frames = [int(f) for f in rows["frame_idx"]]
+        poses = np.array(rows["obj_to_world"], dtype=np.float64).reshape(len(frames), 4, 4)
+        sizes = np.array(rows["box_size"], dtype=np.float64).reshape(len(frames), 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogError(
+            f"{where}: needs class_name and frame_annotations with frame_idx, obj_to_world and "
+            f"box_size, as many of each ({error})"
+        ) from error
+    if frames and not 0 <= min(frames) <= max(frames) < len(times_us):
+        raise LogError(f"{where}: has frames {min(frames)} to {max(frames)}, outside the drive")
+    boxes = []
+    for frame, pose, size in zip(frames, poses, sizes.tolist(), strict=True):
+        check_rigid(pose, f"{where}, frame {frame}")
+        category = CATEGORIES.get(kind, kind)
+        if category == "car" and size[0] > TRUCK_LENGTH:
+            category = "truck"
+        length, width, height = size
+        boxes.append(Box(key, category, (length, width, height), int(times_us[frame]), pose, where))
+    return boxes
+
+
+def _sweep_files(folder: Path, count: int) -> list[Path] | None:
+    if not folder.is_dir():
+        return None
+    files = [folder / f"{frame:03d}.bin" for frame in range(count)]
+    for path in files:
+        if not path.is_file():
+            raise LogError(f"{path}: no such file; every frame needs its sweep")
+        size = path.stat().st_size
+        if size == 0 or size % (4 * COLUMNS):
+            raise LogError(
+                f"{path}: {size} bytes is no whole number of points of {COLUMNS} float32; only "
+                "folders made of Waymo segments can be read"
+            )
+    return files
+
+
+@dataclass(frozen=True, eq=False)
+class _DrivestudioSource:
+    images: ImageFiles
+    sweeps: list[Path] | None
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        return self.images.read(camera, frame)
+
+    def check_image(self, camera: str, frame: int) -> None:
+        """Raise LogError when the image is cut off or not of its camera's size."""
+        self.images.check(camera, frame)
+
+    def lidar(self, frame: int) -> LidarSweep:
+        rows = np.zeros((0, COLUMNS), np.float32)
+        if self.sweeps is not None:
+            path = self.sweeps[frame]
+            try:
+                rows = np.fromfile(path, dtype=np.float32).reshape(-1, COLUMNS)
+            except (OSError, ValueError) as error:
+                raise LogError(f"{path}: cannot be read ({error})") from error
+        rows = rows[np.isfinite(rows[:, :6]).all(axis=1)]
+        top = rows[rows[:, 13] == 0]
+        origin = np.median((top if len(top) else rows)[:, :3], axis=0) if len(rows) else np.zeros(3)
+        return LidarSweep(
+            points=rows[:, 3:6].copy(),
+            intensity=np.clip(rows[:, 11], 0, 1),
+            offset_us=np.zeros(len(rows), np.int32),
+            origin=origin.astype(np.float32),
+        )
