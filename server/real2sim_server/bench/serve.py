@@ -82,6 +82,9 @@ def _measure(console: Console, effort: Effort, *, url: str, pid: int) -> Figures
             info = client.wait_ready()
         setup = {"device": info.device.model_dump(), "cores": os.cpu_count(), **vars(effort)}
         figures: Figures = {"setup": setup}
+        # First, as long as the worker has no freed memory to fill again.
+        with console.status(f"memory of {SESSIONS} sessions"):
+            figures["memory"] = _memory(client, raw, pid)
         with console.status("drive steps without sensors"):
             figures["no_sensors"] = _drive(client, [], effort.steps, SHORT_STEP_US)
         with console.status("drive steps without sensors, by the SDK"):
@@ -90,8 +93,6 @@ def _measure(console: Console, effort: Effort, *, url: str, pid: int) -> Figures
             figures["one_raw_camera"] = _drive(client, raw, effort.camera_steps, CAMERA_STEP_US)
         with console.status("the event loop while large pictures are drawn"):
             figures["event_loop"] = _event_loop(client, url, effort.heavy_seconds)
-        with console.status(f"memory of {SESSIONS} sessions"):
-            figures["memory"] = _memory(client, raw, pid)
     return figures
 
 
@@ -113,13 +114,20 @@ def _drive(
                     stages.append(obs["timing"])
     finally:
         client.sessions.delete(info.session_id)
-    figures = percentiles(latencies)
-    means = {stage: float(np.mean([s.get(stage, 0.0) for s in stages])) for stage in stages[-1]}
-    total = float(np.mean(latencies))
-    means["socket, log and rest"] = total - sum(means.values())
-    figures["mean_by_stage_ms"] = means
-    figures["share_not_render"] = 1 - means["render"] / total
-    return figures
+    return percentiles(latencies) | _parts(latencies, stages)
+
+
+def _parts(latencies: Sequence[float], stages: Sequence[Mapping[str, float]]) -> Figures:
+    """Medians by stage, of what is in no stage, and of the share of a step that is not render."""
+    by_stage = {name: [stage[name] for stage in stages] for name in stages[-1]}
+    by_stage["socket, log and rest"] = [
+        total - sum(stage.values()) for total, stage in zip(latencies, stages, strict=True)
+    ]
+    shares = 1 - np.array(by_stage["render"]) / np.array(latencies)
+    return {
+        "p50_by_stage_ms": {name: float(np.median(ms)) for name, ms in by_stage.items()},
+        "share_not_render": float(np.median(shares)),
+    }
 
 
 def _drive_by_sdk(client: real2sim.Client, steps: int) -> Figures:
