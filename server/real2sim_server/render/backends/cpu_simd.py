@@ -76,6 +76,10 @@ class Lanes:
         """self * factor + addend, rounded once where the machine can."""
         return self._call("llvm.fmuladd", self._lift(factor), self._lift(addend))
 
+    def magnitude(self) -> Lanes:
+        """Absolute value."""
+        return self._call("llvm.fabs")
+
     def negative_where(self, mask: Any) -> Lanes:
         """Self with the sign bit set where ``mask`` holds."""
         bits = ir.VectorType(ir.IntType(32), LANES)

@@ -33,31 +33,48 @@ def add_sky(faces, matrix, rgb, alpha):
         y = F32(row) + HALF
         for column in range(width):
             if alpha[row, column] < OPAQUE:
-                x = F32(column) + HALF
-                direction = (
-                    x * matrix[0, 0] + y * matrix[0, 1] + matrix[0, 2],
-                    x * matrix[1, 0] + y * matrix[1, 1] + matrix[1, 2],
-                    x * matrix[2, 0] + y * matrix[2, 1] + matrix[2, 2],
-                )
+                direction = pixel_direction(matrix, F32(column) + HALF, y)
                 add_sample(faces, direction, rgb, alpha, row, column)
+
+
+@inlined()
+def pixel_direction(matrix, x, y):
+    """World direction through (x, y) [px]."""
+    return (
+        x * matrix[0, 0] + y * matrix[0, 1] + matrix[0, 2],
+        x * matrix[1, 0] + y * matrix[1, 1] + matrix[1, 2],
+        x * matrix[2, 0] + y * matrix[2, 1] + matrix[2, 2],
+    )
 
 
 @inlined()
 def add_sample(faces, direction, rgb, alpha, y, x):
     """Add the bilinear sample along ``direction`` behind one pixel."""
     weight = ONE - alpha[y, x]
-    size = faces.shape[1]
+    face, row, column = texel_coordinates(direction, faces.shape[1])
+    for k in range(3):
+        rgb[y, x, k] += weight * bilinear(faces[face], row, column, k)
+
+
+@inlined()
+def texel_coordinates(direction, size):
+    """Face index, and row and column in texels of its ``size``, held inside their centres."""
     face, u, v = face_coordinates(direction)
     limit = F32(size - 1)
     column = min(max((u + ONE) / F32(2) * F32(size) - HALF, ZERO), limit)
     row = min(max((v + ONE) / F32(2) * F32(size) - HALF, ZERO), limit)
+    return face, row, column
+
+
+@inlined()
+def bilinear(face, row, column, k):
+    """Channel ``k`` of a face [R, R, 3] between its texels."""
     c0, r0 = np.int64(math.floor(column)), np.int64(math.floor(row))
-    c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
+    c1, r1 = min(c0 + 1, face.shape[0] - 1), min(r0 + 1, face.shape[0] - 1)
     fc, fr = column - F32(c0), row - F32(r0)
-    for k in range(3):
-        top = faces[face, r0, c0, k] * (ONE - fc) + faces[face, r0, c1, k] * fc
-        bottom = faces[face, r1, c0, k] * (ONE - fc) + faces[face, r1, c1, k] * fc
-        rgb[y, x, k] += weight * (top * (ONE - fr) + bottom * fr)
+    top = face[r0, c0, k] * (ONE - fc) + face[r0, c1, k] * fc
+    bottom = face[r1, c0, k] * (ONE - fc) + face[r1, c1, k] * fc
+    return top * (ONE - fr) + bottom * fr
 
 
 @inlined()
