@@ -73,27 +73,83 @@ def reconstruct(
 
 @app.command("import")
 def import_(
-    file: Annotated[Path, typer.Argument(help="Gaussian splats: INRIA .ply, .compressed.ply")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="Splats (.ply, .compressed.ply, .spz, .splat) or a checkpoint (.pth) of Street "
+            "Gaussians or drivestudio."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", help="Bundle to write.")],
     asset: Annotated[
-        bool, typer.Option("--asset", help="As an object to insert, not a scene.")
+        bool, typer.Option("--asset", help="An object to insert, not a scene.")
     ] = False,
     category: Annotated[str, typer.Option(help="Class of an asset.")] = "car",
     up_axis: Annotated[
         str, typer.Option(help="Axis that points up in the file: z, y or -y.")
     ] = "z",
+    dataset: Annotated[
+        Path | None, typer.Option(help="Folder that a checkpoint was trained on.")
+    ] = None,
+    frames: Annotated[
+        tuple[int, int] | None, typer.Option(help="First and last frame of a checkpoint.")
+    ] = None,
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
-    """Turn a splat file into a scene or an asset."""
-    from .commands import import_splats as command
+    """Turn a splat file or a checkpoint of another system into a scene, or splats into an asset."""
+    if file.suffix == ".pth":
+        from .commands import import_checkpoint
+
+        _run(
+            import_checkpoint.run,
+            file=file,
+            out=out,
+            dataset=dataset,
+            frames=frames,
+            overwrite=overwrite,
+            json_path=json,
+        )
+        return
+    from .commands import import_splats
 
     _run(
-        command.run,
+        import_splats.run,
         file=file,
         out=out,
         category=category if asset else None,
         up_axis=up_axis,
+        overwrite=overwrite,
+        json_path=json,
+    )
+
+
+@app.command()
+def export(
+    scene: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File, or folder of one per object.")],
+    file_format: Annotated[
+        str, typer.Option("--format", help="ply, compressed.ply, spz, splat or gltf")
+    ] = "ply",
+    t_us: Annotated[
+        int | None, typer.Option(help="Bake everything at this time into one file [us].")
+    ] = None,
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="Only these objects; repeat it.")
+    ] = None,
+    overwrite: Overwrite = False,
+    json: JsonFile = None,
+) -> None:
+    """Write a scene for other programs: per object, baked at a time, or animated as glTF."""
+    from .commands import export as command
+
+    _run(
+        command.run,
+        scene=scene,
+        out=out,
+        file_format=file_format,
+        t_us=t_us,
+        objects=objects,
         overwrite=overwrite,
         json_path=json,
     )
