@@ -1,0 +1,1 @@
+"""Training: from a first scene to one that looks like the log."""

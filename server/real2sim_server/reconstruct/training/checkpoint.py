@@ -1,0 +1,78 @@
+"""State of a training run on disk, exact to the last bit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from ...scene.io.atomic import atomic_folder
+from ..options import ReconstructError
+
+FORMAT = "real2sim-training"
+VERSION = 1
+STATE_FILE, TENSOR_FILE = "state.json", "state.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Everything that a run needs to go on as if it had never stopped.
+
+    Attributes:
+        iteration: steps done.
+        counts: Gaussians of the background and of each object.
+        optimizer_steps: of the optimiser.
+        options: of training, JSON values.
+        log_name: of the log it learns from.
+        running: smoothed figures for progress.
+        tensors: parameters and moments by name.
+    """
+
+    iteration: int
+    counts: tuple[int, ...]
+    optimizer_steps: int
+    options: dict[str, Any]
+    log_name: str
+    running: dict[str, float]
+    tensors: dict[str, Tensor]
+
+
+def write_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
+    """Write ``checkpoint``; ``folder`` is replaced whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    state = {k: v for k, v in vars(checkpoint).items() if k != "tensors"}
+    state |= {"format": FORMAT, "version": VERSION}
+    with atomic_folder(folder) as new:
+        tensors = {k: t.detach().contiguous() for k, t in checkpoint.tensors.items()}
+        save_file(tensors, new / TENSOR_FILE)
+        (new / STATE_FILE).write_text(json.dumps(state) + "\n", encoding="ascii")
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """What :func:`write_checkpoint` wrote.
+
+    Raises:
+        ReconstructError: nothing there, damaged, or of another version.
+    """
+    path = folder / STATE_FILE
+    try:
+        state = json.loads(path.read_bytes())
+        tensors = load_file(folder / TENSOR_FILE)
+    except FileNotFoundError as error:
+        raise ReconstructError(f"{folder}: no checkpoint of a training run") from error
+    except (ValueError, OSError, SafetensorError) as error:
+        raise ReconstructError(f"{folder}: damaged checkpoint: {error}") from error
+    if state.pop("format", None) != FORMAT or state.pop("version", None) != VERSION:
+        raise ReconstructError(
+            f"{path}: not a checkpoint of version {VERSION} of {FORMAT}; train from the start"
+        )
+    state["counts"] = tuple(state["counts"])
+    return Checkpoint(**state, tensors=tensors)

@@ -1,0 +1,235 @@
+"""The images of a log as training sees them: split, shrunk, kept in memory, in a fixed order."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...logs import DrivingLog, LidarSweep
+from ...scene import Camera
+from ...scene.rotation import apply_transform
+from ..options import ReconstructError
+from .schedule import TrainOptions
+
+NEAR, FAR = 0.5, 80.0
+"""LiDAR depths outside are not compared [m]."""
+AHEAD = 4
+"""Images that are decoded before they are needed."""
+
+
+def held_out_frames(frame_count: int, every: int) -> list[int]:
+    """Frames that training never sees: the third of every ``every``; none for ``every`` = 0.
+
+    Neither the first nor the last frame of a drive is among them when ``every`` is 4 or more, so
+    that every one lies between two frames that are seen.
+    """
+    if every == 0:
+        return []
+    return list(range(min(2, every - 1), frame_count - 1, every))
+
+
+class _SomeFrames:
+    """A source without the frames that are held out."""
+
+    def __init__(self, log: DrivingLog, frames: list[int]) -> None:
+        self._log, self._frames = log, frames
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        return self._log.image(camera, self._frames[frame])
+
+    def lidar(self, frame: int) -> LidarSweep:
+        return self._log.lidar(self._frames[frame])
+
+
+def training_log(log: DrivingLog, hold_out: int) -> DrivingLog:
+    """``log`` without the held-out frames; paths and boxes stay whole."""
+    away = set(held_out_frames(log.frame_count, hold_out))
+    frames = [f for f in range(log.frame_count) if f not in away]
+    return replace(
+        log,
+        frame_times_us=log.frame_times_us[frames],
+        source=_SomeFrames(log, frames),
+        image_times_us={k: v[frames] for k, v in log.image_times_us.items()},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One training image.
+
+    Attributes:
+        camera: at the size of ``image``.
+        frame: of the log.
+        t_us: when the image was taken [us].
+        image: [H, W, 3] float32 in [0, 1].
+        pixels: [M] int64, row-major pixels that LiDAR hit.
+        depths: [M] float32 along the camera's z [m].
+        sky: [H, W] bool, where the sky is seen; None where that is not known.
+    """
+
+    camera: Camera
+    frame: int
+    t_us: int
+    image: Tensor
+    pixels: Tensor
+    depths: Tensor
+    sky: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Stored:
+    image: NDArray[np.uint8]
+    points: NDArray[np.float32]
+
+    @property
+    def nbytes(self) -> int:
+        return self.image.nbytes + self.points.nbytes
+
+
+class Views:
+    """The views of some frames of a log.
+
+    Decoded images are kept up to ``options.image_bytes``, the least recently used leave first.
+
+    Args:
+        log: with cameras.
+        frames: indices into ``log``.
+        options: of training.
+
+    Raises:
+        ReconstructError: nothing to see.
+    """
+
+    def __init__(self, log: DrivingLog, frames: list[int], options: TrainOptions) -> None:
+        if not frames or len(log.rig) == 0:
+            raise ReconstructError(f"log {log.name!r} has no image to train on")
+        self._log, self._options = log, options
+        self._keys = [(name, frame) for frame in frames for name in log.rig.names]
+        self._kept: OrderedDict[int, _Stored] = OrderedDict()
+        self._nbytes = 0
+        self._coming: dict[int, Future[_Stored]] = {}
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="views")
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def close(self) -> None:
+        """Stop reading ahead."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def order(self, iteration: int) -> int:
+        """Index of the view of ``iteration``: all in random order, then all in another."""
+        epoch, place = divmod(iteration, len(self))
+        rng = np.random.Generator(np.random.Philox(key=[self._options.seed, epoch]))
+        return int(rng.permutation(len(self))[place])
+
+    def prefetch(self, iteration: int) -> None:
+        """Begin to read what the next iterations will ask for."""
+        for ahead in range(1, AHEAD + 1):
+            index = self.order(iteration + ahead)
+            if index not in self._kept and index not in self._coming:
+                self._coming[index] = self._pool.submit(self._read, index)
+
+    def view(self, index: int, divisor: int = 1) -> View:
+        """The view at ``index``, at a ``divisor``-th of the training width.
+
+        Raises:
+            LogError: its image or sweep cannot be read.
+        """
+        stored = self._stored(index)
+        name, frame = self._keys[index]
+        width = self._width(self._log.rig[name])
+        camera = self._log.rig[name].resized(max(16, width // divisor))
+        pixels, depths = _pixels(stored.points, camera)
+        image = resized(stored.image, camera).astype(np.float32) / 255
+        return View(
+            camera=camera,
+            frame=frame,
+            t_us=image_time(self._log, name, frame),
+            image=torch.from_numpy(image),
+            pixels=torch.from_numpy(pixels),
+            depths=torch.from_numpy(depths),
+        )
+
+    def _width(self, camera: Camera) -> int:
+        options = self._options
+        return min(options.width or camera.width, options.max_width, camera.width)
+
+    def _stored(self, index: int) -> _Stored:
+        if index in self._kept:
+            self._kept.move_to_end(index)
+            return self._kept[index]
+        coming = self._coming.pop(index, None)
+        stored = coming.result() if coming is not None else self._read(index)
+        self._kept[index] = stored
+        self._nbytes += stored.nbytes
+        while self._nbytes > self._options.image_bytes and len(self._kept) > 1:
+            self._nbytes -= self._kept.popitem(last=False)[1].nbytes
+        return stored
+
+    def _read(self, index: int) -> _Stored:
+        name, frame = self._keys[index]
+        full = self._log.rig[name]
+        image = resized(self._log.image(name, frame), full.resized(self._width(full)))
+        return _Stored(image, self._points(full, frame))
+
+    def _points(self, camera: Camera, frame: int) -> NDArray[np.float32]:
+        """LiDAR points [M, 3] in the camera frame, those the image may show."""
+        if self._options.losses.depth <= 0:
+            return np.zeros((0, 3), np.float32)
+        log = self._log
+        t_us, seen_us = int(log.frame_times_us[frame]), image_time(log, camera.name, frame)
+        T_world_vehicle = log.ego.transform(t_us)
+        T_camera = camera.viewmat(log.ego.transform(seen_us)) @ T_world_vehicle
+        points = apply_transform(T_camera, log.lidar(frame).points)
+        x, y, z = points.T
+        safe = np.where(z > NEAR, z, 1.0)
+        u = camera.K[0, 0] * x / safe + camera.K[0, 2]
+        v = camera.K[1, 1] * y / safe + camera.K[1, 2]
+        inside = (z > NEAR) & (z < FAR) & (u >= 0) & (u < camera.width)
+        inside &= (v >= 0) & (v < camera.height)
+        chosen = np.flatnonzero(inside)
+        # Points come sorted by angle; a stride that is prime to the beams spreads what is kept.
+        step = max(1, len(chosen) // self._options.depth_points) | 1
+        return points[chosen[::step]].astype(np.float32)
+
+
+def image_time(log: DrivingLog, camera: str, frame: int) -> int:
+    """When the image was taken [us], held to the span of the ego path."""
+    t_us = log.image_time_us(camera, frame)
+    return int(min(max(t_us, log.ego.start_us), log.ego.end_us))
+
+
+def resized(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """``image`` at the size of ``camera``."""
+    import cv2
+
+    if image.shape[:2] == (camera.height, camera.width):
+        return image
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _pixels(
+    points: NDArray[np.float32], camera: Camera
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Pixels hit by points in the camera frame, the nearest point in each."""
+    x, y, z = points.T
+    u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2]).astype(np.int64)
+    v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2]).astype(np.int64)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    flat, depth = (v * camera.width + u)[inside], z[inside]
+    order = np.lexsort((depth, flat))
+    flat, depth = flat[order], depth[order]
+    first = np.ones(len(flat), dtype=np.bool_)
+    first[1:] = flat[1:] != flat[:-1]
+    return flat[first], depth[first]
+
+
+__all__ = ["View", "Views", "held_out_frames", "image_time", "resized", "training_log"]

@@ -1,0 +1,150 @@
+"""All trainable Gaussians, packed: background first, then object by object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ...scene import GaussianCloud, Scene
+from ...scene.colour import TimeColour
+from .schedule import TrainOptions
+
+FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
+OBJECT_FIELDS = ("fourier",)
+"""Fields that only the Gaussians of objects have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """Raw parameters of N Gaussians, leaves that require gradients.
+
+    Attributes:
+        means: [N, 3] in the frame of their instance [m].
+        log_scales: [N, 3].
+        quats: [N, 4] wxyz, not normalised.
+        logits: [N] of opacities.
+        sh: [N, K, 3].
+        fourier: [N - counts[0], F, 3], time-varying part of the constant colour of objects.
+        counts: Gaussians of the background and of each object.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    logits: Tensor
+    sh: Tensor
+    fourier: Tensor
+    counts: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @property
+    def owners(self) -> Tensor:
+        """[N] int64: 0 for the background, then 1 + position of the object."""
+        return torch.repeat_interleave(torch.arange(len(self.counts)), torch.tensor(self.counts))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Parameters by name."""
+        return {name: getattr(self, name) for name in FIELDS}
+
+    def rows(self, name: str, index: Tensor) -> Tensor:
+        """From rows [M] of Gaussians (sorted by owner) to rows of the tensor ``name``."""
+        return index[index >= self.counts[0]] - self.counts[0] if name in OBJECT_FIELDS else index
+
+    def take(self, source: Tensor) -> Gaussians:
+        """The Gaussians ``source`` [M] int64, which must stay sorted by owner."""
+        counts = torch.bincount(self.owners[source], minlength=len(self.counts))
+        taken = {
+            name: leaf(tensor.detach()[self.rows(name, source)])
+            for name, tensor in self.tensors().items()
+        }
+        return Gaussians(**taken, counts=tuple(counts.tolist()))
+
+    def clouds(
+        self, *, degree: int, tones: Tensor | None = None, mirrored: tuple[bool, ...] = ()
+    ) -> list[GaussianCloud]:
+        """Activated clouds of background and objects; they carry gradients.
+
+        Args:
+            degree: of the spherical harmonics.
+            tones: [M, F] basis values by which each object's Fourier part counts; None for none.
+            mirrored: objects to be reflected at their x z plane.
+        """
+        k = (degree + 1) ** 2
+        sh = self.sh[:, :k].contiguous()
+        if tones is not None and self.fourier.numel():
+            counts = torch.tensor(self.counts[1:])
+            weights = torch.repeat_interleave(tones, counts, dim=0)
+            change = (self.fourier * weights[..., None]).sum(1)
+            shift = torch.cat([change.new_zeros(self.counts[0], 3), change])
+            sh = torch.cat([sh[:, :1] + shift[:, None], sh[:, 1:]], dim=1)
+        parts = [
+            torch.split(tensor, self.counts)
+            for tensor in (
+                self.means,
+                torch.nn.functional.normalize(self.quats, dim=-1),
+                self.log_scales.exp(),
+                self.logits.sigmoid(),
+                sh,
+            )
+        ]
+        clouds = [GaussianCloud(*columns) for columns in zip(*parts, strict=True)]
+        for index, flip in enumerate(mirrored):
+            if flip:
+                clouds[index + 1] = mirror(clouds[index + 1])
+        return clouds
+
+
+def mirror(cloud: GaussianCloud) -> GaussianCloud:
+    """The cloud reflected at its x z plane, as a vehicle looks from its other side."""
+    sign = cloud.means.new_tensor
+    k = int(cloud.sh.shape[1])
+    return replace(
+        cloud,
+        means=cloud.means * sign([1.0, -1, 1]),
+        quats=cloud.quats * sign([1.0, -1, 1, -1]),
+        sh=cloud.sh * sign(ODD_IN_Y[:k])[:, None],
+    )
+
+
+ODD_IN_Y = (1.0, -1, 1, 1, -1, -1, 1, 1, 1, -1, -1, -1, 1, 1, 1, 1)
+"""Sign of each basis function of the spherical harmonics when y changes its sign."""
+
+
+def from_scene(scene: Scene, options: TrainOptions) -> Gaussians:
+    """Raw parameters of a scene; opacities are lowered so that all of them can still learn."""
+    clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
+    clouds = [c.with_sh_degree(options.sh_degree) for c in clouds]
+    joined = GaussianCloud.concatenate(clouds).with_sh_degree(options.sh_degree)
+    counts = tuple(len(c) for c in clouds)
+    opacities = joined.opacities.clamp(0.01, options.initial_opacity)
+    return Gaussians(
+        means=leaf(joined.means),
+        log_scales=leaf(joined.scales.log()),
+        quats=leaf(joined.quats),
+        logits=leaf(torch.logit(opacities)),
+        sh=leaf(joined.sh),
+        fourier=leaf(_fourier(scene, sum(counts) - counts[0], options.harmonics)),
+        counts=counts,
+    )
+
+
+def _fourier(scene: Scene, rows: int, harmonics: int) -> Tensor:
+    fourier = torch.zeros(rows, harmonics, 3)
+    start = 0
+    for item in scene.objects.values():
+        colour: TimeColour | None = item.colour
+        stop = start + len(item.cloud)
+        if colour is not None:
+            kept = min(harmonics, colour.coefficients.shape[1])
+            fourier[start:stop, :kept] = colour.coefficients[:, :kept]
+        start = stop
+    return fourier
+
+
+def leaf(tensor: Tensor) -> Tensor:
+    """A contiguous float32 copy that requires gradients."""
+    return tensor.detach().float().clone().contiguous().requires_grad_()

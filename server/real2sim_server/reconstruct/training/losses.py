@@ -1,0 +1,217 @@
+"""What training makes small. Every function returns a scalar that carries gradients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import ssim_kernels
+
+KEPT_QUANTILE = 0.95
+"""Share of LiDAR points that count; the rest are edges, reflections and moving things."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Factors of the terms of the loss; a term of weight 0 is not computed.
+
+    Attributes:
+        ssim: share of 1 - SSIM in the photometric loss, the rest is L1 (Kerbl et al. 2023).
+        depth: mean distance from LiDAR along the view [m] (drivestudio: 0.01).
+        sky: cross-entropy of accumulated opacity where the sky is seen (Street Gaussians: 0.05).
+        object_entropy: entropy of the objects' opacity inside their projected boxes, and what of
+            it lies outside (Street Gaussians: 0.1).
+        box: distance by which object Gaussians stick out of their box [m].
+        needle: excess of a Gaussian's longest over its second axis above ``needle_ratio``.
+        needle_ratio: that ratio (drivestudio: 10).
+        smooth: squared second differences of refined object poses [m, rad] (drivestudio: 0.01).
+        opacity, scale: mean opacity and mean size [m] (MCMC, Kheradmand et al. 2024: 0.01).
+        exposure: squared distance of exposures from the identity.
+    """
+
+    ssim: float = 0.2
+    depth: float = 0.01
+    sky: float = 0.05
+    object_entropy: float = 0.0
+    box: float = 0.1
+    needle: float = 0.01
+    needle_ratio: float = 10.0
+    smooth: float = 0.01
+    opacity: float = 0.0
+    scale: float = 0.0
+    exposure: float = 0.1
+
+
+class _Photometric(torch.autograd.Function):
+    """(1 - s) L1 + s (1 - SSIM) in one pass: the gradient is known as soon as the value is."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, truth: Tensor, share: float) -> tuple[Tensor, ...]:
+        x, y = image.detach(), truth
+        similarity, gradient = _ssim_and_gradient(x, y, scale=-share)
+        difference = x - y
+        if ctx.needs_input_grad[0]:
+            gradient += difference.sign() * ((1 - share) / x.numel())
+            ctx.save_for_backward(gradient)
+        l1 = difference.abs().mean()
+        loss = (1 - share) * l1 + share * (1 - similarity)
+        parts = l1, torch.tensor(similarity), (difference * difference).mean()
+        ctx.mark_non_differentiable(*parts)
+        return (loss, *parts)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * gradients[0], None, None
+
+
+def photometric(
+    image: Tensor, truth: Tensor, *, ssim_share: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``(1 - s) L1 + s (1 - SSIM)`` of RGB images.
+
+    Args:
+        image: [H, W, 3] float32, carries the gradient.
+        truth: [H, W, 3] float32 in [0, 1].
+        ssim_share: s.
+
+    Returns:
+        The loss; without gradients mean absolute error, SSIM, and mean squared error.
+    """
+    if image.device.type != "cpu":
+        return _photometric_plain(image, truth, ssim_share)
+    loss, l1, similarity, squared = _Photometric.apply(image, truth, ssim_share)
+    return loss, l1, similarity, squared
+
+
+def ssim(image: Tensor, truth: Tensor) -> float:
+    """Mean structural similarity of RGB images [H, W, 3] in [0, 1] (Wang et al. 2004).
+
+    Gaussian window of 11 px, standard deviation 1.5 px, zeros beyond the border.
+    """
+    return _ssim_and_gradient(image.detach().cpu(), truth.cpu(), scale=0.0)[0]
+
+
+def ssim_plain(image: Tensor, truth: Tensor) -> Tensor:
+    """The same in plain torch, on any device, differentiable by torch; [H, W, 3]."""
+    window = torch.from_numpy(ssim_kernels.gaussian_window()).to(image)
+    kernel = (window[:, None] * window)[None, None]
+    x, y = (t.movedim(-1, 0)[:, None] for t in (image, truth))
+    mx, my, xx, yy, xy = (
+        torch.nn.functional.conv2d(m, kernel, padding=ssim_kernels.REACH)
+        for m in (x, y, x * x, y * y, x * y)
+    )
+    c1, c2 = float(ssim_kernels.C1), float(ssim_kernels.C2)
+    luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
+    structure = (2 * (xy - mx * my) + c2) / (xx - mx * mx + yy - my * my + c2)
+    return (luminance * structure).mean()
+
+
+def _photometric_plain(
+    image: Tensor, truth: Tensor, share: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    difference = image - truth
+    l1, similarity = difference.abs().mean(), ssim_plain(image, truth)
+    loss = (1 - share) * l1 + share * (1 - similarity)
+    return loss, l1.detach(), similarity.detach(), (difference.detach() ** 2).mean()
+
+
+def _ssim_and_gradient(image: Tensor, truth: Tensor, *, scale: float) -> tuple[float, Tensor]:
+    """SSIM and ``scale`` times its gradient by ``image`` [H, W, 3]."""
+    height, width, _ = image.shape
+    x = image.contiguous().numpy().reshape(height, 3 * width)
+    y = truth.contiguous().numpy().reshape(height, 3 * width)
+    window = ssim_kernels.gaussian_window()
+    blurred = np.empty((5, *x.shape), np.float32)
+    slopes = np.empty((3, *x.shape), np.float32)
+    sums = np.empty(height, np.float64)
+    gradient = np.zeros_like(x)
+    ssim_kernels.blur_rows(x, y, window, blurred)
+    ssim_kernels.compare(blurred, window, sums, slopes)
+    if scale != 0:
+        factor = np.float32(scale / x.size)
+        ssim_kernels.gather_slopes(x, y, slopes, window, factor, gradient)
+    return float(sums.sum() / x.size), torch.from_numpy(gradient.reshape(height, width, 3))
+
+
+def lidar_depth(depth: Tensor, pixels: Tensor, measured: Tensor) -> Tensor:
+    """Mean distance [m] of rendered depth from LiDAR over the nearest 95 % of the points.
+
+    Args:
+        depth: [H, W] rendered [m].
+        pixels: [M] int64, row-major indices into the image.
+        measured: [M] float32 along the camera's z [m].
+    """
+    if len(pixels) == 0:
+        return depth.sum() * 0
+    error = (depth.reshape(-1)[pixels] - measured).abs()
+    kept = max(1, int(KEPT_QUANTILE * len(error)))
+    limit = error.detach().kthvalue(kept).values
+    return torch.where(error <= limit, error, 0.0).sum() / kept
+
+
+def sky_opacity(alpha: Tensor, sky: Tensor) -> Tensor:
+    """``-log(1 - alpha)`` averaged over all pixels, where ``sky`` [H, W] bool; alpha [H, W]."""
+    bounded = alpha.clamp(1e-6, 1 - 1e-3)
+    return torch.where(sky, -torch.log(1 - bounded), 0.0).mean()
+
+
+def object_accumulation(alpha: Tensor, inside: Tensor) -> Tensor:
+    """Entropy of the objects' opacity inside their boxes, ``-log(1 - alpha)`` outside.
+
+    Args:
+        alpha: [H, W] accumulated opacity of objects alone.
+        inside: [H, W] bool, within a projected box.
+
+    Source: Street Gaussians (Yan et al. 2024), eq. 10.
+    """
+    a = alpha.clamp(1e-4, 1 - 1e-3)
+    entropy = -(a * a.log() + (1 - a) * (1 - a).log())
+    return torch.where(inside, entropy, -torch.log(1 - a)).mean()
+
+
+def outside_box(means: Tensor, half_sizes: Tensor) -> Tensor:
+    """Mean over Gaussians of the distance [m] by which centres [N, 3] leave boxes [N, 3]."""
+    if len(means) == 0:
+        return means.sum()
+    return (means.abs() - half_sizes).clamp(min=0).sum(-1).mean()
+
+
+def needles(log_scales: Tensor, ratio: float) -> Tensor:
+    """Mean excess of longest / second longest axis over ``ratio``; flat discs are welcome."""
+    if len(log_scales) == 0:
+        return log_scales.sum()
+    low, high = log_scales.amin(-1), log_scales.amax(-1)
+    middle = log_scales.sum(-1) - low - high
+    return ((high - middle).exp() - ratio).clamp(min=0).mean()
+
+
+def second_differences(values: Tensor) -> Tensor:
+    """Mean of squared second differences over rows of [T, D]; 0 for fewer than three."""
+    if len(values) < 3:
+        return values.sum() * 0
+    return (values[2:] - 2 * values[1:-1] + values[:-2]).square().sum(-1).mean()
+
+
+def psnr_of(squared_error: float) -> float:
+    """[dB] of a mean squared error of values in [0, 1]; at most 100."""
+    return float(-10 * np.log10(max(squared_error, 1e-10)))
+
+
+__all__ = [
+    "LossWeights",
+    "lidar_depth",
+    "needles",
+    "object_accumulation",
+    "outside_box",
+    "photometric",
+    "psnr_of",
+    "second_differences",
+    "sky_opacity",
+    "ssim",
+    "ssim_plain",
+]

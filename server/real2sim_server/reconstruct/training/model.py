@@ -1,0 +1,233 @@
+"""The scene while it learns: everything that has gradients, drawn for any logged view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...render import Instance, RasterOptions, RenderOutput, rasterize
+from ...render.backends import Backend
+from ...scene import Camera, GaussianCloud, Scene, Sky, TimeColour
+from . import gaussians as packing
+from .gaussians import Gaussians
+from .poses import ObjectPoses
+from .schedule import TrainOptions
+
+MIRRORED = ("car", "truck", "van", "bus")
+"""Categories whose two sides look alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A view drawn from the model.
+
+    Attributes:
+        output: images of one camera; carries gradients.
+        rgb: [H, W, 3], with the camera's exposure.
+        drawn: indices of the instances drawn: 0 for the background, then 1 + object.
+    """
+
+    output: RenderOutput
+    rgb: Tensor
+    drawn: tuple[int, ...]
+
+
+class SceneModel:
+    """Trainable parameters of a scene.
+
+    Args:
+        scene: of stage 0; its cameras, ego path, boxes and times stay as they are.
+        options: of training.
+        key_times_us: [K] int64, times of training images, at which boxes may be refined.
+        backend: of the renderer.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        options: TrainOptions,
+        key_times_us: np.ndarray,
+        *,
+        backend: str | Backend = "auto",
+    ) -> None:
+        self.scene = scene
+        self.options = options
+        self.backend = backend
+        self.gaussians = packing.from_scene(scene, options)
+        self.poses = ObjectPoses(scene, key_times_us if options.refine_poses else None)
+        self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution))
+        cameras = len(scene.rig)
+        self.exposure = packing.leaf(torch.eye(3, 4).expand(cameras, 3, 4))
+        self.cameras = torch.zeros(cameras, 6, requires_grad=True)
+        half = [np.array(o.size) / 2 for o in scene.objects.values()]
+        self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float()
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Every trainable tensor by name."""
+        return {
+            **self.gaussians.tensors(),
+            "sky": self.sky,
+            "pose_translation": self.poses.shifts,
+            "pose_yaw": self.poses.yaws,
+            "exposure": self.exposure,
+            "camera": self.cameras,
+        }
+
+    def load(self, tensors: Mapping[str, Tensor], counts: tuple[int, ...]) -> None:
+        """Take over parameters as :meth:`parameters` gave them."""
+        fields = {name: packing.leaf(tensors[name]) for name in packing.FIELDS}
+        self.gaussians = Gaussians(**fields, counts=counts)
+        self.sky = packing.leaf(tensors["sky"])
+        self.poses.shifts = packing.leaf(tensors["pose_translation"])
+        self.poses.yaws = packing.leaf(tensors["pose_yaw"])
+        self.exposure = packing.leaf(tensors["exposure"])
+        self.cameras = packing.leaf(tensors["camera"])
+
+    def render(
+        self,
+        camera: Camera,
+        t_us: int,
+        *,
+        degree: int | None = None,
+        mirrored: tuple[bool, ...] = (),
+        depth: bool = False,
+    ) -> Rendered:
+        """Draw ``camera``, of the rig at any size, on the recording vehicle at ``t_us``.
+
+        Args:
+            degree: of the spherical harmonics; the highest by default.
+            mirrored: by object, whether its other side is shown.
+            depth: whether depth is drawn.
+        """
+        degree = self.options.sh_degree if degree is None else degree
+        clouds = self.gaussians.clouds(degree=degree, tones=self._tones(t_us), mirrored=mirrored)
+        instances, drawn = self._instances(clouds, t_us)
+        options = RasterOptions(depth=depth, instance=False, track_screen=True)
+        output = rasterize(
+            instances,
+            self.viewmat(camera, t_us)[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            sky=Sky(self.sky),
+            options=options,
+            backend=self.backend,
+        )
+        rgb = output.rgb[0]
+        if self.options.rates.exposure > 0:
+            affine = self.exposure[self.scene.rig.names.index(camera.name)]
+            rgb = rgb @ affine[:, :3].T + affine[:, 3]
+        return Rendered(output, rgb, tuple(drawn))
+
+    def objects_alpha(self, camera: Camera, t_us: int) -> Tensor:
+        """[H, W] accumulated opacity of the objects alone; carries gradients."""
+        clouds = self.gaussians.clouds(degree=0)
+        instances, _ = self._instances(clouds, t_us)
+        output = rasterize(
+            instances[1:],
+            self.viewmat(camera, t_us).detach()[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            options=RasterOptions(depth=False, instance=False),
+            backend=self.backend,
+        )
+        return output.alpha[0]
+
+    def _instances(
+        self, clouds: list[GaussianCloud], t_us: int
+    ) -> tuple[list[Instance], list[int]]:
+        instances, drawn = [Instance(clouds[0])], [0]
+        for index, key in enumerate(self.poses.keys):
+            if key.covers(t_us) and len(clouds[index + 1]):
+                pose = self.poses.transform(index, t_us)
+                instances.append(Instance(clouds[index + 1], pose, instance_id=index + 1))
+                drawn.append(index + 1)
+        return instances, drawn
+
+    def _tones(self, t_us: int) -> Tensor | None:
+        count = int(self.gaussians.fourier.shape[1])
+        if count == 0 or not self.scene.objects:
+            return None
+        empty = torch.zeros(0, count, 3)
+        return torch.stack(
+            [self._colour(i, empty).tones(t_us) for i in range(len(self.poses.keys))]
+        )
+
+    def _colour(self, index: int, coefficients: Tensor) -> TimeColour:
+        times = self.poses.keys[index].times_us
+        start, end = int(times[0]), int(times[-1])
+        return TimeColour(coefficients, self.options.harmonics_basis, start, max(end, start + 1))
+
+    def viewmat(self, camera: Camera, t_us: int) -> Tensor:
+        """``T_camera_world`` [4, 4] float64, refined where cameras are."""
+        viewmat = torch.from_numpy(camera.viewmat(self.scene.ego.transform(t_us)))
+        if self.options.rates.camera <= 0:
+            return viewmat
+        change = self.cameras[self.scene.rig.names.index(camera.name)].double()
+        return _small_motion(change) @ viewmat
+
+    def export(self, **provenance: Any) -> Scene:
+        """The scene as it is now, immutable, on its own memory."""
+        with torch.no_grad():
+            clouds = self.gaussians.clouds(degree=self.options.sh_degree)
+        clouds = [_own(cloud) for cloud in clouds]
+        parts = torch.split(self.gaussians.fourier.detach(), self.gaussians.counts[1:])
+        objects = {}
+        for index, (name, item) in enumerate(self.scene.objects.items()):
+            varies = parts[index].numel() > 0
+            objects[name] = replace(
+                item,
+                cloud=clouds[index + 1],
+                trajectory=self.poses.trajectory(index),
+                colour=self._colour(index, parts[index].clone()) if varies else None,
+            )
+        rig = replace(
+            self.scene.rig,
+            cameras=tuple(self._refined(camera, i) for i, camera in enumerate(self.scene.rig)),
+        )
+        return replace(
+            self.scene,
+            background=clouds[0],
+            objects=objects,
+            rig=rig,
+            sky=Sky(self.sky.detach().clamp(0, 1).clone()),
+            provenance={**self.scene.provenance, "reconstruction": provenance},
+            content_hash="",
+        )
+
+    def _refined(self, camera: Camera, index: int) -> Camera:
+        if self.options.rates.camera <= 0:
+            return camera
+        change = _small_motion(self.cameras[index].detach().double()).numpy()
+        return replace(camera, T_vehicle_camera=camera.T_vehicle_camera @ np.linalg.inv(change))
+
+
+def _own(cloud: GaussianCloud) -> GaussianCloud:
+    return GaussianCloud(*(tensor.detach().clone() for tensor in vars(cloud).values()))
+
+
+def _sky_faces(sky: Sky | None, resolution: int) -> Tensor:
+    if sky is None:
+        return torch.full((6, resolution, resolution, 3), 0.5)
+    faces = sky.faces.permute(0, 3, 1, 2)
+    if resolution != sky.resolution:
+        faces = torch.nn.functional.interpolate(faces, size=(resolution, resolution), mode="area")
+    return faces.permute(0, 2, 3, 1).contiguous()
+
+
+def _small_motion(change: Tensor) -> Tensor:
+    """[4, 4] rigid motion of [6] shift [m] and rotation vector [rad]; carries gradients."""
+    x, y, z = change[3:].unbind()
+    zero = torch.zeros_like(x)
+    skew = torch.stack(
+        [torch.stack([zero, -z, y]), torch.stack([z, zero, -x]), torch.stack([-y, x, zero])]
+    )
+    top = torch.cat([torch.linalg.matrix_exp(skew), change[:3, None]], dim=1)
+    last = torch.tensor([[0.0, 0, 0, 1]], dtype=change.dtype)
+    return torch.cat([top, last])

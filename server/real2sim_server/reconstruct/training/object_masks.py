@@ -1,0 +1,57 @@
+"""Where objects are on images: projected boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...scene import Camera, Scene, Trajectory
+
+NEAR = 0.2
+"""Boxes that reach behind this depth are cut there [m]."""
+MOVING_SPREAD, MOVING_DISTANCE = 0.5, 2.0
+"""Street Gaussians: a track moves when its positions spread or lie so far apart [m]."""
+STEPS = 9
+"""Points along each edge of a box, so that cut boxes keep their outline."""
+
+
+def is_moving(trajectory: Trajectory) -> bool:
+    """Whether an object drives at all."""
+    positions = trajectory.positions
+    spread = float(np.linalg.norm(positions.std(axis=0)))
+    far = float(np.linalg.norm(positions - positions[0], axis=1).max())
+    return spread > MOVING_SPREAD or far > MOVING_DISTANCE
+
+
+def box_mask(
+    scene: Scene, camera: Camera, t_us: int, *, only: Collection[str] | None = None
+) -> NDArray[np.bool_]:
+    """[H, W] bool, pixels within the outline of a box at ``t_us``.
+
+    Args:
+        only: ids of the objects that count; all by default.
+    """
+    import cv2
+
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    viewmat = camera.viewmat(scene.ego.transform(t_us))
+    for name, item in scene.objects.items():
+        if (only is not None and name not in only) or not item.trajectory.covers(t_us):
+            continue
+        edges = _along_edges(item.box_at(t_us))
+        points = edges @ viewmat[:3, :3].T + viewmat[:3, 3]
+        points = points[points[:, 2] > NEAR]
+        if len(points) < 3:
+            continue
+        pixels = points @ camera.K.T
+        outline = np.clip(pixels[:, :2] / pixels[:, 2:], -1e4, 1e4).astype(np.int32)
+        cv2.fillConvexPoly(mask, cv2.convexHull(outline), 1)
+    return np.asarray(mask > 0)
+
+
+def _along_edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points on the lines between all pairs of the 8 corners; their hull is that of the box."""
+    share = np.linspace(0, 1, STEPS)[:, None, None, None]
+    return np.asarray((corners[:, None] * share + corners[None] * (1 - share)).reshape(-1, 3))

@@ -1,0 +1,125 @@
+"""Refined poses of objects: small corrections of the tracked boxes at the training frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...scene import Scene, Trajectory
+from ...scene.rotation import Float, multiply_quaternions, quaternion_to_matrix, yaw_quaternion
+from .losses import second_differences
+
+
+@dataclass(frozen=True, eq=False)
+class KeyPoses:
+    """Corrections of one object, about its own axes.
+
+    Attributes:
+        times_us: [T] int64 key times [us].
+        positions, quaternions: [T, 3] and [T, 4] float64 of the boxes as given.
+        first_row: of this object in the packed corrections.
+    """
+
+    times_us: NDArray[np.int64]
+    positions: Float
+    quaternions: Float
+    first_row: int
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the packed corrections."""
+        return slice(self.first_row, self.first_row + len(self.times_us))
+
+    def covers(self, t_us: int) -> bool:
+        """Whether the object exists at ``t_us``."""
+        return bool(self.times_us[0] <= t_us <= self.times_us[-1])
+
+    def bracket(self, t_us: int) -> tuple[int, int, float]:
+        """Keys before and after ``t_us`` and the fraction of the way between them."""
+        after = int(np.searchsorted(self.times_us, t_us, side="left"))
+        if self.times_us[after] == t_us:
+            return after, after, 0.0
+        before = after - 1
+        span = float(self.times_us[after] - self.times_us[before])
+        return before, after, float(t_us - self.times_us[before]) / span
+
+
+class ObjectPoses:
+    """Poses of all objects with their corrections.
+
+    At a key time ``T_world_object = T_given [Rz(yaw) | shift]``; in between positions and
+    corrections are linear and rotations slerped, as in Trajectory.
+
+    Args:
+        scene: its trajectories are where refinement starts.
+        key_times_us: [K] times of training frames: only there do images correct a pose, so
+            other times between the first and last pose of a track lean on their neighbours.
+            None keeps every pose of the trajectories as it is.
+    """
+
+    def __init__(self, scene: Scene, key_times_us: NDArray[np.int64] | None) -> None:
+        self.keys: list[KeyPoses] = []
+        row = 0
+        for item in scene.objects.values():
+            times = _key_times(item.trajectory, key_times_us)
+            poses = [item.trajectory.pose(int(t)) for t in times]
+            key = KeyPoses(times, *(np.array(part) for part in zip(*poses, strict=True)), row)
+            self.keys.append(key)
+            row += len(times)
+        self.shifts = torch.zeros(row, 3, requires_grad=True)
+        self.yaws = torch.zeros(row, 1, requires_grad=True)
+
+    def transform(self, index: int, t_us: int) -> Tensor:
+        """``T_world_object`` [4, 4] float64 of object ``index``; carries gradients."""
+        key = self.keys[index]
+        before, after, fraction = key.bracket(t_us)
+        rows = key.first_row + before, key.first_row + after
+        shift = self.shifts[rows[0]] * (1 - fraction) + self.shifts[rows[1]] * fraction
+        yaw = self.yaws[rows[0], 0] * (1 - fraction) + self.yaws[rows[1], 0] * fraction
+        given = Trajectory(key.times_us, key.positions, key.quaternions).transform(t_us)
+        zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+        c, s, (x, y, z) = yaw.double().cos(), yaw.double().sin(), shift.double().unbind()
+        rows_of = ((c, -s, zero, x), (s, c, zero, y), (zero, zero, one, z))
+        last = torch.stack([zero, zero, zero, one])
+        correction = torch.stack([*(torch.stack(row) for row in rows_of), last])
+        return torch.from_numpy(given) @ correction
+
+    def roughness(self) -> Tensor:
+        """Mean squared second differences of all refined trajectories [m, rad], per 0.1 s step."""
+        terms = [
+            second_differences(torch.cat(self._refined(key), dim=1))
+            for key in self.keys
+            if len(key.times_us) >= 3
+        ]
+        return torch.stack(terms).mean() if terms else self.shifts.sum() * 0
+
+    def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor]:
+        """World positions [T, 3] about their mean and unwrapped yaws [T, 1], float32."""
+        turn = torch.from_numpy(quaternion_to_matrix(key.quaternions)).float()
+        base = torch.from_numpy(key.positions - key.positions.mean(0)).float()
+        positions = base + torch.einsum("tij,tj->ti", turn, self.shifts[key.rows])
+        heading = np.unwrap(np.arctan2(turn[:, 1, 0].numpy(), turn[:, 0, 0].numpy()))
+        yaws = torch.from_numpy(heading.astype(np.float32))[:, None] + self.yaws[key.rows]
+        return positions, yaws
+
+    def trajectory(self, index: int) -> Trajectory:
+        """The refined trajectory of object ``index``."""
+        key = self.keys[index]
+        shift = self.shifts.detach()[key.rows].double().numpy()
+        yaw = self.yaws.detach()[key.rows, 0].double().numpy()
+        turn = quaternion_to_matrix(key.quaternions)
+        positions = key.positions + np.einsum("tij,tj->ti", turn, shift)
+        quaternions = multiply_quaternions(key.quaternions, yaw_quaternion(yaw))
+        return Trajectory(key.times_us, positions, quaternions)
+
+
+def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    if key_times_us is None:
+        return trajectory.times_us
+    inside = key_times_us[(key_times_us > trajectory.start_us) & (key_times_us < trajectory.end_us)]
+    ends = np.array([trajectory.start_us, trajectory.end_us], dtype=np.int64)
+    return np.unique(np.concatenate([ends, inside]))

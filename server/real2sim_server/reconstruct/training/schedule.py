@@ -1,0 +1,250 @@
+"""How long training takes, how fast everything moves when, and the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from ..options import InitialiseOptions, ReconstructError
+from .losses import LossWeights
+
+DENSIFY_METHODS = ("none", "gradient", "mcmc")
+COLOUR_BASES = ("cosine", "real_dft")
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's step sizes; pairs fall exponentially from the first to the second value.
+
+    Attributes:
+        means: [m] a step.
+        scales, quats, opacities: of logarithms, raw quaternions and logits.
+        colour: of the constant part; the rest of the spherical harmonics takes 1/20 of it.
+        fourier: of the time-varying colour.
+        sky: of the cube map.
+        pose_translation: of object boxes [m].
+        pose_yaw: of object boxes [rad].
+        camera: of camera poses [m, rad]; 0 leaves them as calibrated.
+        exposure: of each camera's affine colour; 0 leaves colours as they are.
+
+    Sources: Kerbl et al. 2023; Street Gaussians (poses, sky); drivestudio (cameras).
+    """
+
+    means: tuple[float, float] = (1.6e-3, 1.6e-5)
+    scales: float = 5e-3
+    quats: float = 1e-3
+    opacities: float = 0.05
+    colour: float = 2.5e-3
+    fourier: float = 2.5e-3
+    sky: tuple[float, float] = (0.01, 1e-4)
+    pose_translation: tuple[float, float] = (5e-3, 5e-5)
+    pose_yaw: tuple[float, float] = (1e-3, 1e-5)
+    camera: float = 0.0
+    exposure: float = 0.0
+
+
+@dataclass(frozen=True)
+class DensifyOptions:
+    """When and how Gaussians are added and removed.
+
+    Attributes:
+        method: ``gradient`` (Kerbl et al. 2023, absgrad of Ye et al. 2024), ``mcmc``
+            (Kheradmand et al. 2024) or ``none``.
+        start, stop: share of all iterations between which it happens.
+        every: iterations from one round to the next.
+        max_gaussians: never more than so many.
+        background_gradient: absgrad on the image above which background grows.
+        object_gradient: plain gradient above which objects grow.
+        split_scale: Gaussians larger than this are split, smaller ones cloned [m].
+        min_opacity: below it Gaussians are removed, or moved by ``mcmc``.
+        max_scale: larger ones near the drive are removed [m].
+        reset_every: iterations between resets of opacity; 0 for never.
+        noise: of ``mcmc``: factor on the learning rate of means.
+        growth: of ``mcmc``: share by which the number grows in a round.
+    """
+
+    method: str = "gradient"
+    start: float = 0.02
+    stop: float = 0.5
+    every: int = 100
+    max_gaussians: int = 1_000_000
+    background_gradient: float = 6e-4
+    object_gradient: float = 2e-4
+    split_scale: float = 0.2
+    min_opacity: float = 0.005
+    max_scale: float = 4.0
+    reset_every: int = 3000
+    noise: float = 5e5
+    growth: float = 0.05
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Everything a training run depends on besides the log; the same values give the same scene.
+
+    Attributes:
+        iterations: steps, one image each.
+        seed: of the order of images and all noise.
+        width: of the training images [px]; None for the logged width. Never above ``max_width``.
+        max_width: largest width of training images [px].
+        coarse: (share of iterations, divisor of the width) stages before full size.
+        sh_degree: highest degree of the spherical harmonics.
+        sh_every: share of the iterations after which the degree grows by one.
+        harmonics: time-varying colours of objects, number of basis functions; 0 for none.
+        harmonics_basis: ``cosine`` (half periods) or ``real_dft``.
+        hold_out: every so many frames one is kept back for evaluation; 0 trains on all.
+        refine_poses: whether object boxes are refined.
+        pose_start: share of the iterations before which boxes stay.
+        mirror: share of steps at which vehicles are shown mirrored about their long axis.
+        initial_opacity: of Gaussians from LiDAR.
+        sky_resolution: edge of a face of the sky [px].
+        depth_points: LiDAR points that count in one step, at most.
+        regularise_every: steps between those with the costly object terms.
+        image_bytes: memory for decoded images.
+        log_every, preview_every, checkpoint_every: iterations between lines of metrics, preview
+            pictures and checkpoints; 0 for none but the last.
+        initialise: of stage 0.
+        rates, losses, densify: see there.
+
+    Raises:
+        ReconstructError: for a value out of range.
+    """
+
+    iterations: int = 30_000
+    seed: int = 0
+    width: int | None = None
+    max_width: int = 1600
+    coarse: tuple[tuple[float, int], ...] = ()
+    sh_degree: int = 1
+    sh_every: float = 0.05
+    harmonics: int = 4
+    harmonics_basis: str = "cosine"
+    hold_out: int = 4
+    refine_poses: bool = True
+    pose_start: float = 0.05
+    mirror: float = 0.2
+    initial_opacity: float = 0.8
+    sky_resolution: int = 256
+    depth_points: int = 4096
+    regularise_every: int = 10
+    image_bytes: int = 2 << 30
+    log_every: int = 50
+    preview_every: int = 2000
+    checkpoint_every: int = 1000
+    initialise: InitialiseOptions = field(default_factory=InitialiseOptions)
+    rates: LearningRates = field(default_factory=LearningRates)
+    losses: LossWeights = field(default_factory=LossWeights)
+    densify: DensifyOptions = field(default_factory=DensifyOptions)
+
+    def __post_init__(self) -> None:
+        _check_range(self, "iterations", 1, 10_000_000)
+        _check_range(self, "sh_degree", 0, 3)
+        _check_range(self, "harmonics", 0, 16)
+        _check_range(self, "mirror", 0, 1)
+        _check_range(self, "initial_opacity", 0.01, 0.99)
+        _check_range(self, "sky_resolution", 1, 4096)
+        if self.hold_out != 0:
+            _check_range(self, "hold_out", 2, 1_000_000)
+        if self.densify.method not in DENSIFY_METHODS:
+            raise ReconstructError(
+                f"densify.method must be one of {list(DENSIFY_METHODS)}, "
+                f"not {self.densify.method!r}"
+            )
+        if self.harmonics_basis not in COLOUR_BASES:
+            raise ReconstructError(
+                f"harmonics_basis must be one of {list(COLOUR_BASES)}, not {self.harmonics_basis!r}"
+            )
+
+    def active_degree(self, iteration: int) -> int:
+        """Degree of the spherical harmonics in use: grows by one every ``sh_every``."""
+        step = max(1, round(self.sh_every * self.iterations))
+        return min(self.sh_degree, iteration // step)
+
+    def divisor(self, iteration: int) -> int:
+        """By which the image width is divided at ``iteration``."""
+        share = iteration / self.iterations
+        for until, divisor in self.coarse:
+            if share < until:
+                return divisor
+        return 1
+
+
+def _check_range(options: TrainOptions, name: str, low: float, high: float) -> None:
+    value = getattr(options, name)
+    if not low <= value <= high:
+        raise ReconstructError(f"{name} must be from {low} to {high}, not {value!r}")
+
+
+PRESETS: dict[str, TrainOptions] = {
+    "cpu-small": TrainOptions(
+        iterations=4000,
+        max_width=640,
+        coarse=((0.25, 2),),
+        sky_resolution=128,
+        image_bytes=512 << 20,
+        checkpoint_every=500,
+        preview_every=500,
+        initialise=InitialiseOptions(
+            max_background=120_000,
+            max_object=6_000,
+            voxel=0.1,
+            ground_spacing=0.12,
+            object_voxel=0.05,
+            sky_resolution=128,
+        ),
+        losses=LossWeights(object_entropy=0.0),
+        densify=DensifyOptions(max_gaussians=220_000, every=200, reset_every=0),
+    ),
+    "standard": TrainOptions(
+        iterations=30_000,
+        sh_degree=3,
+        coarse=((0.01, 4), (0.02, 2)),
+        initialise=InitialiseOptions(max_background=800_000, voxel=0.1),
+        rates=LearningRates(exposure=1e-3),
+        losses=LossWeights(object_entropy=0.1),
+        densify=DensifyOptions(max_gaussians=3_000_000),
+    ),
+    "paper": TrainOptions(
+        iterations=50_000,
+        sh_degree=1,
+        harmonics=4,
+        harmonics_basis="real_dft",
+        mirror=0.5,
+        initial_opacity=0.1,
+        sky_resolution=1024,
+        initialise=InitialiseOptions(max_background=800_000, voxel=0.15, max_object=20_000),
+        losses=LossWeights(object_entropy=0.1, depth=0.0, box=0.0, needle=0.0),
+        densify=DensifyOptions(max_gaussians=6_000_000),
+    ),
+}
+
+
+def preset(name: str, **changes: Any) -> TrainOptions:
+    """The preset of that name with some values changed.
+
+    Raises:
+        ReconstructError: an unknown name, with those there are.
+    """
+    if name not in PRESETS:
+        raise ReconstructError(f"preset must be one of {list(PRESETS)}, not {name!r}")
+    return replace(PRESETS[name], **changes)
+
+
+def falling(span: tuple[float, float], share: float) -> float:
+    """From the first to the second value of ``span``, exponentially, as ``share`` goes 0 to 1."""
+    first, last = span
+    return float(first * (last / first) ** min(max(share, 0.0), 1.0)) if first > 0 else 0.0
+
+
+def from_values(kind: type, values: dict[str, Any]) -> Any:
+    """The frozen dataclass ``kind`` from ``dataclasses.asdict`` as read back from JSON."""
+    given = {}
+    for item in fields(kind):
+        value = values[item.name]
+        default = getattr(kind(), item.name)
+        if is_dataclass(default):
+            value = from_values(type(default), value)
+        elif isinstance(value, list):
+            value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+        given[item.name] = value
+    return kind(**given)

@@ -1,0 +1,133 @@
+"""Structural similarity of two images and its gradient, compiled.
+
+Rows of interleaved RGB are blurred with a stride of three, so images never change their layout.
+Every kernel writes whole rows, so results do not depend on the number of threads.
+"""
+# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+TAPS = 11
+REACH = TAPS // 2
+SIGMA = 1.5
+C1 = np.float32(0.01**2)
+C2 = np.float32(0.03**2)
+
+
+def gaussian_window() -> np.ndarray:
+    """[11] float32 that sums to 1, standard deviation 1.5 px (Wang et al. 2004)."""
+    x = np.arange(TAPS) - REACH
+    window = np.exp(-(x**2) / (2 * SIGMA**2))
+    return (window / window.sum()).astype(np.float32)
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+def blur_rows(image, truth, window, blurred):
+    """Blur x, y, xx, yy and xy along rows.
+
+    Args:
+        image, truth: [H, 3 W] float32.
+        window: [11] float32.
+        blurred: [5, H, 3 W] float32, written.
+    """
+    height, width = image.shape
+    pad = 3 * REACH
+    for row in prange(height):
+        padded = np.zeros((5, width + 2 * pad), np.float32)
+        for i in range(width):
+            x, y = image[row, i], truth[row, i]
+            padded[0, pad + i] = x
+            padded[1, pad + i] = y
+            padded[2, pad + i] = x * x
+            padded[3, pad + i] = y * y
+            padded[4, pad + i] = x * y
+        for m in range(5):
+            out = blurred[m, row]
+            source = padded[m]
+            for i in range(width):
+                out[i] = window[0] * source[i]
+            for k in range(1, TAPS):
+                weight = window[k]
+                for i in range(width):
+                    out[i] += weight * source[i + 3 * k]
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+def compare(blurred, window, sums, slopes):
+    """Blur along columns, compare, and differentiate by the blurred x, xx and xy.
+
+    Args:
+        blurred: [5, H, 3 W] float32 from :func:`blur_rows`.
+        window: [11] float32.
+        sums: [H] float64, written: sum of the similarity over each row.
+        slopes: [3, H, 3 W] float32, written: derivatives of the similarity.
+    """
+    height, width = blurred.shape[1], blurred.shape[2]
+    for row in prange(height):
+        local = np.zeros((5, width), np.float32)
+        for m in range(5):
+            mine = local[m]
+            for k in range(TAPS):
+                other = row + k - REACH
+                if 0 <= other < height:
+                    weight, source = window[k], blurred[m, other]
+                    for i in range(width):
+                        mine[i] += weight * source[i]
+        total = 0.0
+        for i in range(width):
+            mx, my = local[0, i], local[1, i]
+            sxx, syy = local[2, i] - mx * mx, local[3, i] - my * my
+            sxy = local[4, i] - mx * my
+            a, b = 2 * mx * my + C1, 2 * sxy + C2
+            c, d = mx * mx + my * my + C1, sxx + syy + C2
+            inverse = np.float32(1.0) / (c * d)
+            value = a * b * inverse
+            total += value
+            by_xx = -value / d
+            by_xy = 2 * a * inverse
+            by_mean = 2 * my * b * inverse - 2 * mx * value / c
+            # The variances hold the mean as well.
+            slopes[0, row, i] = by_mean - 2 * mx * by_xx - my * by_xy
+            slopes[1, row, i] = by_xx
+            slopes[2, row, i] = by_xy
+        sums[row] = total
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+def gather_slopes(image, truth, slopes, window, factor, gradient):
+    """Carry derivatives back through the blur; the window is symmetric, so it is its own transpose.
+
+    Args:
+        image, truth: [H, 3 W] float32.
+        slopes: [3, H, 3 W] float32 from :func:`compare`.
+        window: [11] float32.
+        factor: float32, multiplies the result.
+        gradient: [H, 3 W] float32, written: ``factor`` times the derivative of the summed
+            similarity by ``image``.
+    """
+    height, width = image.shape
+    pad = 3 * REACH
+    for row in prange(height):
+        padded = np.zeros((3, width + 2 * pad), np.float32)
+        for m in range(3):
+            mine = padded[m, pad : pad + width]
+            for k in range(TAPS):
+                other = row + k - REACH
+                if 0 <= other < height:
+                    weight, source = window[k], slopes[m, other]
+                    for i in range(width):
+                        mine[i] += weight * source[i]
+        blurred = np.zeros((3, width), np.float32)
+        for m in range(3):
+            mine, source = blurred[m], padded[m]
+            for k in range(TAPS):
+                weight = window[k]
+                for i in range(width):
+                    mine[i] += weight * source[i + 3 * k]
+        for i in range(width):
+            gradient[row, i] = factor * (
+                blurred[0, i] + 2 * image[row, i] * blurred[1, i] + truth[row, i] * blurred[2, i]
+            )

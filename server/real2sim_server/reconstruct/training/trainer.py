@@ -1,0 +1,396 @@
+"""The training loop: one image a step, until the scene looks like the log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...logs import DrivingLog
+from ...render.backends import Backend
+from ...scene import Scene
+from ..options import ReconstructError
+from . import losses
+from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from .data import View, Views, held_out_frames, image_time
+from .densify import Densifier, ScreenSums, generator, reset_opacity
+from .gaussians import FIELDS, OBJECT_FIELDS
+from .metrics import MetricsFile
+from .model import MIRRORED, Rendered, SceneModel
+from .object_masks import box_mask
+from .optimizer import SelectiveAdam
+from .schedule import TrainOptions, falling, from_values
+
+SMOOTHING = 0.98
+"""Share of the past in the running loss and PSNR."""
+REST_OF_HARMONICS = 1 / 20
+CHECKPOINT = "checkpoint"
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """How far a training run is.
+
+    Attributes:
+        iteration, iterations: steps done and in all.
+        rate: steps per second of late.
+        loss, psnr: smoothed over training images; PSNR in [dB].
+        gaussians: at the moment.
+        eta_s: seconds that are left at this rate.
+    """
+
+    iteration: int
+    iterations: int
+    rate: float
+    loss: float
+    psnr: float
+    gaussians: int
+    eta_s: float
+
+
+OnTraining = Callable[[TrainingProgress], None]
+
+
+@dataclass
+class Running:
+    """Smoothed figures and the time spent by stage [s]."""
+
+    loss: float = 0.0
+    squared: float = 0.0
+    weight: float = 0.0
+    stages: dict[str, float] = field(default_factory=dict)
+
+    def add(self, loss: float, squared: float) -> None:
+        """Take in one step."""
+        self.loss = SMOOTHING * self.loss + (1 - SMOOTHING) * loss
+        self.squared = SMOOTHING * self.squared + (1 - SMOOTHING) * squared
+        self.weight = SMOOTHING * self.weight + (1 - SMOOTHING)
+
+    @property
+    def mean_loss(self) -> float:
+        """Smoothed loss."""
+        return self.loss / max(self.weight, 1e-9)
+
+    @property
+    def psnr(self) -> float:
+        """Of the smoothed squared error [dB]."""
+        return losses.psnr_of(self.squared / max(self.weight, 1e-9))
+
+
+class Trainer:
+    """Trains one scene on one log. The same arguments give the same bits on the CPU.
+
+    Args:
+        log: the drive, all frames.
+        scene: of stage 0, made without the held-out frames.
+        options: of training.
+        folder: for checkpoints and metrics; None keeps nothing.
+        backend: of the renderer.
+    """
+
+    def __init__(
+        self,
+        log: DrivingLog,
+        scene: Scene,
+        options: TrainOptions,
+        *,
+        folder: Path | None = None,
+        backend: str | Backend = "auto",
+    ) -> None:
+        self.log, self.options, self.folder = log, options, folder
+        away = set(held_out_frames(log.frame_count, options.hold_out))
+        frames = [f for f in range(log.frame_count) if f not in away]
+        self.views = Views(log, frames, options)
+        keys = {image_time(log, name, f) for f in frames for name in log.rig.names}
+        key_times = np.array(sorted(keys), dtype=np.int64)
+        self.model = SceneModel(scene, options, key_times, backend=backend)
+        self.optimizer = SelectiveAdam(self.model.parameters())
+        self.densifier = Densifier(
+            options.densify,
+            self.model.half_sizes,
+            seed=options.seed,
+            iterations=options.iterations,
+        )
+        self.sums = ScreenSums.zeros(len(self.model.gaussians))
+        self.iteration = 0
+        self.running = Running()
+        self.metrics = MetricsFile(folder / "metrics.jsonl") if folder else None
+        self._mirrored = [o.category in MIRRORED for o in scene.objects.values()]
+
+    def run(
+        self,
+        *,
+        on_progress: OnTraining | None = None,
+        on_preview: Callable[[SceneModel, int], None] | None = None,
+        until: int | None = None,
+    ) -> None:
+        """Take all remaining steps, or those before ``until``.
+
+        Raises:
+            LogError: an image or sweep cannot be read.
+            ReconstructError: the loss is no longer finite.
+        """
+        options = self.options
+        last = options.iterations if until is None else min(until, options.iterations)
+        clock = _Clock(self.iteration)
+        while self.iteration < last:
+            terms = self.step()
+            done = self.iteration
+            if done % options.log_every == 0 or done == options.iterations:
+                self._report(terms, clock, on_progress)
+            if _is_due(done, options.preview_every) and on_preview is not None:
+                on_preview(self.model, done)
+            if _is_due(done, options.checkpoint_every) or done == options.iterations:
+                self.save()
+
+    def step(self) -> dict[str, float]:
+        """One iteration; the terms of its loss."""
+        i = self.iteration
+        timed = _Stopwatch(self.running.stages)
+        with timed("data"):
+            view = self.views.view(self.views.order(i), self.options.divisor(i))
+            self.views.prefetch(i)
+        with timed("forward"):
+            rendered = self.model.render(
+                view.camera,
+                view.t_us,
+                degree=self.options.active_degree(i),
+                mirrored=self._flips(i),
+                depth=len(view.pixels) > 0,
+            )
+        with timed("loss"):
+            terms, squared = self._terms(view, rendered)
+            total = torch.stack(list(terms.values())).sum()
+        if not bool(torch.isfinite(total)):
+            raise ReconstructError(
+                f"the loss is {float(total)} at iteration {i}; lower the learning rates"
+            )
+        with timed("backward"):
+            total.backward()
+        with timed("optimiser"):
+            self._update(rendered)
+        with timed("densify"):
+            self._change(i)
+        self.running.add(float(total.detach()), float(squared))
+        self.iteration += 1
+        return {name: float(value.detach()) for name, value in terms.items()}
+
+    def _flips(self, i: int) -> tuple[bool, ...]:
+        """Which vehicles show their other side in this step."""
+        if self.options.mirror <= 0 or not any(self._mirrored):
+            return ()
+        drawn = generator(self.options.seed + 1, i).random(len(self._mirrored))
+        return tuple(
+            bool(m and d < self.options.mirror) for m, d in zip(self._mirrored, drawn, strict=True)
+        )
+
+    def _terms(self, view: View, rendered: Rendered) -> tuple[dict[str, Tensor], Tensor]:
+        """Weighted terms of the loss, and the mean squared error of the image."""
+        weights, output = self.options.losses, rendered.output
+        picture, _, _, squared = losses.photometric(
+            rendered.rgb, view.image, ssim_share=weights.ssim
+        )
+        terms = {"picture": picture}
+        if weights.depth > 0 and len(view.pixels) and output.depth is not None:
+            term = losses.lidar_depth(output.depth[0], view.pixels, view.depths)
+            terms["depth"] = weights.depth * term
+        if weights.sky > 0 and view.sky is not None:
+            terms["sky"] = weights.sky * losses.sky_opacity(output.alpha[0], view.sky)
+        if self.iteration % self.options.regularise_every == 0:
+            # Rare but heavy: as much in all as every step with its own weight.
+            for name, term in self._regularisers(view).items():
+                terms[name] = term * self.options.regularise_every
+        if weights.opacity > 0:
+            terms["opacity"] = weights.opacity * self.model.gaussians.logits.sigmoid().mean()
+        if weights.scale > 0:
+            terms["scale"] = weights.scale * self.model.gaussians.log_scales.exp().mean()
+        return terms, squared
+
+    def _regularisers(self, view: View) -> dict[str, Tensor]:
+        weights, model = self.options.losses, self.model
+        gaussians, objects = model.gaussians, len(model.gaussians.counts) > 1
+        terms = {}
+        if weights.needle > 0:
+            terms["needle"] = weights.needle * losses.needles(
+                gaussians.log_scales, weights.needle_ratio
+            )
+        if weights.box > 0 and objects:
+            counts = torch.tensor(gaussians.counts[1:])
+            half = torch.repeat_interleave(model.half_sizes, counts, dim=0)
+            means = gaussians.means[gaussians.counts[0] :]
+            terms["box"] = weights.box * losses.outside_box(means, half)
+        if weights.smooth > 0 and objects and self.options.refine_poses:
+            terms["smooth"] = weights.smooth * model.poses.roughness()
+        if weights.exposure > 0 and self.options.rates.exposure > 0:
+            change = model.exposure - torch.eye(3, 4)
+            terms["exposure"] = weights.exposure * change.square().sum()
+        late = self.iteration >= self.options.densify.stop * self.options.iterations
+        if weights.object_entropy > 0 and objects and late:
+            inside = torch.from_numpy(box_mask(model.scene, view.camera, view.t_us))
+            alpha = model.objects_alpha(view.camera, view.t_us)
+            entropy = losses.object_accumulation(alpha, inside)
+            terms["object_entropy"] = weights.object_entropy * entropy
+        return terms
+
+    @torch.no_grad()
+    def _update(self, rendered: Rendered) -> None:
+        gaussians = self.model.gaussians
+        seen = torch.zeros(len(gaussians), dtype=torch.bool)
+        rows = self._rows(rendered.drawn)
+        if rendered.output.screen is None:
+            raise ReconstructError("this renderer does not count what it draws; choose another")
+        for part, radii in zip(rows, rendered.output.screen.radii, strict=True):
+            seen[part] = (radii > 0).any(0)
+        self.sums.add(rows, rendered.output.screen)
+        parameters = self.model.parameters()
+        masks = {name: seen for name in FIELDS if name not in OBJECT_FIELDS}
+        masks |= dict.fromkeys(OBJECT_FIELDS, seen[gaussians.counts[0] :])
+        for name in ("pose_translation", "pose_yaw", "exposure", "camera"):
+            gradient = parameters[name].grad
+            if gradient is not None:
+                masks[name] = gradient.reshape(len(gradient), -1).any(1)
+        rates = self._rates()
+        self.optimizer.step(parameters, rates, masks)
+        self.densifier.jitter(gaussians, float(rates["means"]), self.iteration)
+        for parameter in parameters.values():
+            parameter.grad = None
+
+    def _rows(self, drawn: tuple[int, ...]) -> list[slice]:
+        starts = np.concatenate([[0], np.cumsum(self.model.gaussians.counts)])
+        return [slice(int(starts[k]), int(starts[k + 1])) for k in drawn]
+
+    def _rates(self) -> dict[str, float | Tensor]:
+        rates, share = self.options.rates, self.iteration / self.options.iterations
+        k = int(self.model.gaussians.sh.shape[1])
+        columns = torch.full((k, 3), rates.colour * REST_OF_HARMONICS)
+        columns[0] = rates.colour
+        poses_move = float(self.options.refine_poses and share >= self.options.pose_start)
+        return {
+            "means": falling(rates.means, share),
+            "log_scales": rates.scales,
+            "quats": rates.quats,
+            "logits": rates.opacities,
+            "sh": columns.reshape(-1),
+            "fourier": rates.fourier,
+            "sky": falling(rates.sky, share),
+            "pose_translation": poses_move * falling(rates.pose_translation, share),
+            "pose_yaw": poses_move * falling(rates.pose_yaw, share),
+            "exposure": rates.exposure,
+            "camera": rates.camera,
+        }
+
+    def _change(self, i: int) -> None:
+        """Add, remove and reset Gaussians where it is time to."""
+        if self.densifier.is_due(i):
+            self.model.gaussians = self.densifier.round(
+                self.model.gaussians, self.optimizer, self.sums, i
+            )
+            self.sums = ScreenSums.zeros(len(self.model.gaussians))
+        if self.densifier.resets_opacity(i):
+            reset_opacity(self.model.gaussians, self.optimizer)
+
+    def _report(
+        self, terms: dict[str, float], clock: _Clock, on_progress: OnTraining | None
+    ) -> None:
+        rate = clock.rate(self.iteration)
+        progress = TrainingProgress(
+            iteration=self.iteration,
+            iterations=self.options.iterations,
+            rate=rate,
+            loss=self.running.mean_loss,
+            psnr=self.running.psnr,
+            gaussians=len(self.model.gaussians),
+            eta_s=(self.options.iterations - self.iteration) / rate,
+        )
+        if self.metrics is not None:
+            self.metrics.write({**asdict(progress), "terms": terms})
+        if on_progress is not None:
+            on_progress(progress)
+
+    def save(self) -> None:
+        """Write a checkpoint, when there is a folder for it."""
+        if self.folder is None:
+            return
+        tensors = {f"model.{k}": v for k, v in self.model.parameters().items()}
+        tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
+        tensors |= {"sums.gradients": self.sums.gradients, "sums.views": self.sums.views}
+        running = self.running
+        checkpoint = Checkpoint(
+            iteration=self.iteration,
+            counts=self.model.gaussians.counts,
+            optimizer_steps=self.optimizer.steps,
+            options=asdict(self.options),
+            log_name=self.log.name,
+            running={"loss": running.loss, "squared": running.squared, "weight": running.weight},
+            tensors=tensors,
+        )
+        write_checkpoint(checkpoint, self.folder / CHECKPOINT)
+
+    def resume(self) -> None:
+        """Go back to the last checkpoint in the folder.
+
+        Raises:
+            ReconstructError: there is none, or it is of another log or other options.
+        """
+        if self.folder is None:
+            raise ReconstructError("a run without a folder leaves no checkpoint to resume")
+        held = read_checkpoint(self.folder / CHECKPOINT)
+        if held.log_name != self.log.name:
+            raise ReconstructError(
+                f"{self.folder}: trains on log {held.log_name!r}, not {self.log.name!r}"
+            )
+        if from_values(TrainOptions, held.options) != self.options:
+            raise ReconstructError(
+                f"{self.folder}: was begun with other options; resume with the same or start anew"
+            )
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "adam": {}, "sums": {}}
+        for name, tensor in held.tensors.items():
+            group, key = name.split(".", 1)
+            parts[group][key] = tensor
+        self.model.load(parts["model"], held.counts)
+        self.optimizer.restore(parts["adam"], held.optimizer_steps)
+        self.sums = ScreenSums(**parts["sums"])
+        self.iteration = held.iteration
+        self.running = Running(**held.running)
+        if self.metrics is not None:
+            self.metrics.cut(held.iteration)
+
+
+class _Clock:
+    """Steps per second since the last look."""
+
+    def __init__(self, iteration: int) -> None:
+        self._iteration, self._time = iteration, time.perf_counter()
+
+    def rate(self, iteration: int) -> float:
+        now = time.perf_counter()
+        rate = max(iteration - self._iteration, 1) / max(now - self._time, 1e-6)
+        self._iteration, self._time = iteration, now
+        return rate
+
+
+class _Stopwatch:
+    """Adds the seconds of a block to a stage."""
+
+    def __init__(self, stages: dict[str, float]) -> None:
+        self._stages = stages
+
+    def __call__(self, name: str) -> _Stopwatch:
+        self._name = name
+        return self
+
+    def __enter__(self) -> None:
+        self._start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        spent = time.perf_counter() - self._start
+        self._stages[self._name] = self._stages.get(self._name, 0.0) + spent
+
+
+def _is_due(done: int, every: int) -> bool:
+    return every > 0 and done % every == 0
