@@ -3,18 +3,24 @@
 The generator lives in :mod:`.synthetic` and is not imported here: it compiles kernels.
 """
 
+from .check import check_log
 from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTrack
+from .inspect import CameraReport, LogReport, inspect_log
 from .native_writer import write_native_log
 from .open import open_log
 from .waymo_writer import RangeGrid, write_waymo_v2
 
 __all__ = [
+    "CameraReport",
     "DrivingLog",
     "FrameSource",
     "LidarSweep",
     "LogError",
+    "LogReport",
     "ObjectTrack",
     "RangeGrid",
+    "check_log",
+    "inspect_log",
     "open_log",
     "write_native_log",
     "write_waymo_v2",

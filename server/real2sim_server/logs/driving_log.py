@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import CameraRig, Trajectory
+from ..scene.rotation import Float
 
 
 class LogError(ValueError):
@@ -50,6 +51,17 @@ class ObjectTrack:
     category: str
     size: tuple[float, float, float]
     trajectory: Trajectory
+
+    def transform_near(self, t_us: int, *, reach_us: int = 60_000) -> Float | None:
+        """``T_world_object`` [4, 4] at ``t_us``, or None when the object is not there.
+
+        Boxes hold for the frames' time stamps, but images are taken around them: up to
+        ``reach_us`` before its first and after its last box the object stays where it is there.
+        """
+        path = self.trajectory
+        if not path.start_us - reach_us <= t_us <= path.end_us + reach_us:
+            return None
+        return path.transform(min(max(t_us, path.start_us), path.end_us))
 
 
 class FrameSource(Protocol):
@@ -105,6 +117,8 @@ class DrivingLog:
         Raises:
             LogError: the image is missing, broken or of another size.
         """
+        if camera in self.provenance.get("cameras_without_images", ()):
+            raise LogError(f"log {self.name!r}: camera {camera!r} has no images")
         expected = self.rig[camera]
         image = self.source.image(camera, self._checked(frame))
         if image.shape != (expected.height, expected.width, 3):

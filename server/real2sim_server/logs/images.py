@@ -78,10 +78,25 @@ def decode_image(data: bytes, where: str, size: tuple[int, int] | None = None) -
     import cv2
 
     check_encoded_image(data, where, size)
+    if data.startswith(JPEG_START):
+        return _decode_jpeg(data, where)
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise LogError(f"{where}: is no readable PNG or JPEG image ({len(data)} bytes)")
     return np.ascontiguousarray(image[..., ::-1])
+
+
+def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
+    """Unlike OpenCV, which shows damaged parts in grey and says nothing, this refuses them."""
+    import simplejpeg
+
+    try:
+        return np.asarray(simplejpeg.decode_jpeg(data, "RGB"))
+    except ValueError as error:
+        # Some cameras put a few bytes between segments, which harms nothing.
+        if "extraneous bytes" in str(error):
+            return np.asarray(simplejpeg.decode_jpeg(data, "RGB", strict=False))
+        raise LogError(f"{where}: is a damaged JPEG image ({error})") from error
 
 
 def check_image_file(path: Path, size: tuple[int, int] | None = None) -> None:

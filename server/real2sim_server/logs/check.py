@@ -1,0 +1,104 @@
+"""Checks a whole log before hours of work are spent on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from .driving_log import DrivingLog, LogError
+
+ENDS_ONLY = 3
+
+
+@runtime_checkable
+class ChecksImages(Protocol):
+    """A source that can check an image without decoding it."""
+
+    def check_image(self, camera: str, frame: int) -> None:
+        """Raise LogError when the image is missing, cut off or of another size."""
+        ...
+
+
+def check_log(
+    log: DrivingLog,
+    *,
+    decode_images: bool = False,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Touch everything that training will read, and stop at the first thing that is wrong.
+
+    Opening a log has checked its tables already; this goes on to its heavy files.
+
+    Args:
+        log: any log.
+        decode_images: decode every image and read every sweep, which finds damage inside files
+            too; by default image headers, sizes and end markers are checked, and the first, middle
+            and last sweep are read.
+        on_progress: called with (done, total) after each frame.
+
+    Raises:
+        LogError: names the file (or camera, frame, object), what is wrong and what is expected.
+    """
+    _check_cameras(log)
+    _check_times(log)
+    _check_tracks(log)
+    sweeps = range(log.frame_count) if decode_images else _few(log.frame_count)
+    for frame in range(log.frame_count):
+        for camera in log.rig.names:
+            if decode_images:
+                log.image(camera, frame)
+            elif isinstance(log.source, ChecksImages):
+                log.source.check_image(camera, frame)
+        if frame in sweeps:
+            log.lidar(frame)
+        if on_progress is not None:
+            on_progress(frame + 1, log.frame_count)
+
+
+def _check_cameras(log: DrivingLog) -> None:
+    if len(log.rig):
+        return
+    known = list(log.provenance.get("cameras_without_images", []))
+    named = f"its cameras {known} have no images" if known else "it has no cameras"
+    raise LogError(
+        f"log {log.name!r} cannot be trained on: {named}; put the images where the data set has "
+        "them (LiDAR and boxes can be used as they are)"
+    )
+
+
+def _check_times(log: DrivingLog) -> None:
+    times = log.frame_times_us
+    if len(times) == 0 or (np.diff(times) <= 0).any():
+        raise LogError(f"log {log.name!r}: frame times must increase strictly, at least one")
+    for camera in log.rig.names:
+        given = log.image_times_us.get(camera, times)
+        if given.shape != times.shape:
+            raise LogError(
+                f"log {log.name!r}: camera {camera!r} has {len(given)} image times for "
+                f"{len(times)} frames"
+            )
+        for t_us in (given.min(), given.max()):
+            if not log.ego.covers(int(t_us)):
+                raise LogError(
+                    f"log {log.name!r}: ego poses cover [{log.ego.start_us}, {log.ego.end_us}] us, "
+                    f"but camera {camera!r} takes an image at {t_us} us"
+                )
+
+
+def _check_tracks(log: DrivingLog) -> None:
+    names: set[str] = set()
+    for track in log.tracks:
+        if track.object_id in names:
+            raise LogError(f"log {log.name!r}: object {track.object_id!r} is there twice")
+        names.add(track.object_id)
+        if not (np.isfinite(track.size).all() and min(track.size) > 0):
+            raise LogError(
+                f"log {log.name!r}: object {track.object_id!r} needs a positive length, width and "
+                f"height, not {track.size}"
+            )
+
+
+def _few(count: int) -> set[int]:
+    return {round(i) for i in np.linspace(0, count - 1, min(ENDS_ONLY, count)).tolist()}

@@ -1,0 +1,272 @@
+"""Says what a log holds and draws it, so that one look tells whether its calibration is right."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.rotation import Float, apply_transform
+from .driving_log import DrivingLog, LidarSweep, ObjectTrack
+from .images import write_image
+from .overlay import draw_frame, points_in_box
+from .top_view import draw_top_view
+
+LOOKS = 3
+GAP = 1.6
+"""A frame is missing where the time step is this many times the usual one."""
+
+MOVING_DISTANCE, MOVING_SPREAD = 2.0, 0.5
+"""An object moves if it goes this far from end to end, or spreads this much along an axis [m]."""
+
+FASTEST = 70.0
+NEAR_BOXES = 30.0
+FEW_POINTS = 5
+PICTURE_WIDTH = 960
+
+
+@dataclass(frozen=True)
+class CameraReport:
+    """A camera: size [px], horizontal field of view [rad], delay of its images [s]."""
+
+    name: str
+    width: int
+    height: int
+    fov: float
+    image_delay: float
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """What a log holds.
+
+    Attributes:
+        name, dataset, sequence, reader, licence: where it comes from.
+        cameras: the rig.
+        frames: number of frames.
+        duration: from the first to the last frame [s].
+        rate: frames per second, 0 for a single frame.
+        gaps: (frame before the gap, its length [s]).
+        lidar_points: of the sweeps that were looked at, least, median and most.
+        lidar_range: 99th percentile of distances [m].
+        tracks: number of objects by category.
+        moving: number of moving objects by category.
+        ego_distance: way that was driven [m].
+        ego_speed: fastest [m/s].
+        problems: what looks wrong, in plain words; empty for a good log.
+        drawings: files that were written.
+    """
+
+    name: str
+    dataset: str
+    sequence: str
+    reader: str
+    licence: str
+    cameras: tuple[CameraReport, ...]
+    frames: int
+    duration: float
+    rate: float
+    gaps: tuple[tuple[int, float], ...]
+    lidar_points: tuple[int, int, int]
+    lidar_range: float
+    tracks: dict[str, int]
+    moving: dict[str, int]
+    ego_distance: float
+    ego_speed: float
+    problems: tuple[str, ...]
+    drawings: tuple[str, ...] = field(default=())
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values only."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """For people, one fact a line."""
+        rate = f", {self.rate:.4g} a second" if self.rate else ""
+        least, median, most = self.lidar_points
+        lines = [
+            f"{self.name}: {self.dataset}, {self.sequence} ({self.reader}; {self.licence})",
+            f"frames    {self.frames} in {self.duration:.1f} s{rate}",
+            f"ego       {self.ego_distance:.1f} m, at most {self.ego_speed:.1f} m/s",
+        ]
+        lines += [
+            f"camera    {c.name}: {c.width}x{c.height}, {np.degrees(c.fov):.0f} degrees wide"
+            + (f", {c.image_delay * 1e3:+.0f} ms" if c.image_delay else "")
+            for c in self.cameras
+        ] or ["camera    none"]
+        lidar = f"{median} points a sweep ({least} to {most}), to {self.lidar_range:.0f} m"
+        lines.append(f"lidar     {lidar if most else 'none'}")
+        lines += [
+            f"objects   {count} {category} ({self.moving.get(category, 0)} moving)"
+            for category, count in self.tracks.items()
+        ] or ["objects   none"]
+        lines += [f"problem   {text}" for text in self.problems]
+        lines += [f"drawing   {file}" for file in self.drawings]
+        return lines
+
+
+def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
+    """Look through a log; a few of its frames are read.
+
+    Args:
+        log: any log.
+        out: folder for drawings, created where it is missing: ``frame_%06d.jpg``, all cameras of
+            a frame with boxes and points coloured by depth, and ``top.png``, the middle frame from
+            above. None draws nothing.
+
+    Raises:
+        LogError: a frame that is looked at cannot be read.
+    """
+    chosen = sorted({round(i) for i in np.linspace(0, log.frame_count - 1, LOOKS).tolist()})
+    sweeps = {frame: log.lidar(frame) for frame in chosen}
+    moving = [t for t in log.tracks if is_moving(t)]
+    counts = [len(s.points) for s in sweeps.values()]
+    far = [np.linalg.norm(s.points - s.origin, axis=1) for s in sweeps.values() if len(s.points)]
+    steps = np.diff(log.frame_times_us) * 1e-6
+    return LogReport(
+        name=log.name,
+        dataset=str(log.provenance.get("dataset", "unknown")),
+        sequence=str(log.provenance.get("sequence", log.name)),
+        reader=str(log.provenance.get("reader", "unknown")),
+        licence=str(log.provenance.get("licence", "unknown")),
+        cameras=_cameras(log),
+        frames=log.frame_count,
+        duration=float(steps.sum()),
+        rate=1 / float(np.median(steps)) if len(steps) else 0.0,
+        gaps=_gaps(steps),
+        lidar_points=(min(counts), int(np.median(counts)), max(counts)),
+        lidar_range=float(np.percentile(np.concatenate(far), 99)) if far else 0.0,
+        tracks=dict(sorted(Counter(t.category for t in log.tracks).items())),
+        moving=dict(sorted(Counter(t.category for t in moving).items())),
+        ego_distance=float(_ego_steps(log).sum()),
+        ego_speed=float((_ego_steps(log) / steps).max()) if len(steps) else 0.0,
+        problems=tuple(_problems(log, sweeps, steps)),
+        drawings=() if out is None else tuple(_draw(log, sweeps, Path(out))),
+    )
+
+
+def is_moving(track: ObjectTrack) -> bool:
+    """Whether an object moves at all, by the distances of MOVING_DISTANCE and MOVING_SPREAD."""
+    positions = track.trajectory.positions
+    gone = np.linalg.norm(positions[-1] - positions[0])
+    return bool(gone > MOVING_DISTANCE or (positions.std(axis=0) > MOVING_SPREAD).any())
+
+
+def _cameras(log: DrivingLog) -> tuple[CameraReport, ...]:
+    return tuple(
+        CameraReport(
+            name=camera.name,
+            width=camera.width,
+            height=camera.height,
+            fov=float(2 * np.arctan(camera.width / 2 / camera.K[0, 0])),
+            image_delay=_delay(log, camera.name),
+        )
+        for camera in log.rig
+    )
+
+
+def _delay(log: DrivingLog, camera: str) -> float:
+    times = log.image_times_us.get(camera, log.frame_times_us)
+    return float(np.median(times - log.frame_times_us)) * 1e-6
+
+
+def _gaps(steps: Float) -> tuple[tuple[int, float], ...]:
+    if len(steps) < 2:
+        return ()
+    wide = np.flatnonzero(steps > GAP * np.median(steps))
+    return tuple((int(i), float(steps[i])) for i in wide)
+
+
+def _ego_steps(log: DrivingLog) -> Float:
+    positions = np.array([log.ego.pose(int(t))[0] for t in log.frame_times_us])
+    return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+
+
+def _problems(log: DrivingLog, sweeps: dict[int, LidarSweep], steps: Float) -> list[str]:
+    problems = [f"{s:.2f} s pass after frame {i}: are frames missing?" for i, s in _gaps(steps)]
+    without = log.provenance.get("cameras_without_images")
+    if without:
+        problems.append(f"cameras without images, left out: {', '.join(without)}")
+    if len(steps):
+        speed = _ego_steps(log) / steps
+        if speed.max() > FASTEST:
+            frame = int(speed.argmax())
+            problems.append(f"the ego jumps after frame {frame} ({speed[frame]:.0f} m/s)")
+    if not any(len(s.points) for s in sweeps.values()):
+        return [*problems, "there is no LiDAR: nothing to start a reconstruction from"]
+    if not log.tracks:
+        problems.append("there are no boxes: moving objects have to be tracked first")
+    problems += _ground_problems(sweeps)
+    return problems + _box_problems(log, sweeps)
+
+
+def _ground_problems(sweeps: dict[int, LidarSweep]) -> list[str]:
+    heights = []
+    for sweep in sweeps.values():
+        x, y, z = sweep.points.T
+        beside = (np.abs(x) < 12) & (np.abs(y) < 5) & ((np.abs(x) > 3) | (np.abs(y) > 1.5))
+        if beside.sum() > 100:
+            heights.append(float(np.percentile(z[beside], 10)))
+    if not heights or abs(np.median(heights)) < 0.5:
+        return []
+    return [
+        f"the road near the vehicle lies {np.median(heights):+.1f} m from the vehicle frame's "
+        "zero: is the LiDAR's pose right?"
+    ]
+
+
+def _box_problems(log: DrivingLog, sweeps: dict[int, LidarSweep]) -> list[str]:
+    held = near = 0
+    for frame, sweep in sweeps.items():
+        t_us = int(log.frame_times_us[frame])
+        here = log.ego.transform(t_us)
+        points = apply_transform(here, sweep.points.astype(np.float64))
+        for track in log.tracks:
+            if not track.trajectory.covers(t_us):
+                continue
+            pose = track.trajectory.transform(t_us)
+            if np.linalg.norm(pose[:2, 3] - here[:2, 3]) < NEAR_BOXES:
+                near += 1
+                held += points_in_box(points, pose, track.size) >= FEW_POINTS
+    if near < 3 or held >= near / 3:
+        return []
+    return [
+        f"only {held} of {near} boxes within {NEAR_BOXES:.0f} m hold LiDAR points: are they in the "
+        "right frame?"
+    ]
+
+
+def _draw(log: DrivingLog, sweeps: dict[int, LidarSweep], out: Path) -> list[str]:
+    out.mkdir(parents=True, exist_ok=True)
+    files = []
+    for frame in sweeps if len(log.rig) else ():
+        path = out / f"frame_{frame:06d}.jpg"
+        write_image(path, _montage([draw_frame(log, name, frame) for name in log.rig.names]))
+        files.append(str(path))
+    path = out / "top.png"
+    middle = sorted(sweeps)[len(sweeps) // 2]
+    write_image(path, draw_top_view(log, middle, sweeps[middle]))
+    return [*files, str(path)]
+
+
+def _montage(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Pictures side by side, up to three in a row, all made equally wide."""
+    import cv2
+
+    width = min(PICTURE_WIDTH if len(pictures) > 1 else 1920, max(p.shape[1] for p in pictures))
+    small = [
+        cv2.resize(p, (width, round(p.shape[0] * width / p.shape[1])), interpolation=cv2.INTER_AREA)
+        for p in pictures
+    ]
+    height = max(p.shape[0] for p in small)
+    padded = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0))) for p in small]
+    columns = min(3, len(padded))
+    while len(padded) % columns:
+        padded.append(np.zeros_like(padded[0]))
+    rows = [np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
+    return np.concatenate(rows, axis=0)
