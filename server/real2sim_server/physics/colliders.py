@@ -1,0 +1,158 @@
+"""Things that do not yield: ground planes, boxes, height fields, moving boxes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..scene.rotation import Float, is_rigid
+from .errors import ColliderError
+
+PLANE, BOX, HEIGHT_FIELD = range(3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Collider:
+    """What all colliders share.
+
+    Attributes:
+        name: unique among the colliders of a solver.
+        friction: Coulomb coefficient, >= 0; None takes the body's; infinity sticks.
+        separable: whether bodies may lift off; False holds whatever has touched.
+
+    Raises:
+        ColliderError: for values that make no sense.
+    """
+
+    name: str
+    friction: float | None = None
+    separable: bool = True
+
+    def __post_init__(self) -> None:
+        if self.friction is not None and not self.friction >= 0:
+            raise ColliderError(
+                f"friction of collider {self.name!r} must not be negative: {self.friction!r}"
+            )
+        self._check()
+
+    def _check(self) -> None:
+        """Check what a subclass adds."""
+
+    @property
+    def moving(self) -> bool:
+        """Whether its pose changes with time."""
+        return False
+
+    def after(self, duration: float) -> Collider:
+        """The collider ``duration`` [s] later."""
+        return self
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plane(Collider):
+    """A half-space; bodies stay on the side the normal points to.
+
+    Attributes:
+        point: [3] on the plane [m].
+        normal: [3], any length.
+    """
+
+    point: ArrayLike = (0.0, 0.0, 0.0)
+    normal: ArrayLike = (0.0, 0.0, 1.0)
+
+    def _check(self) -> None:
+        object.__setattr__(self, "point", _vector(self, "point"))
+        normal = _vector(self, "normal")
+        length = float(np.linalg.norm(normal))
+        if length < 1e-12:
+            raise ColliderError(f"normal of plane {self.name!r} must have a length: {normal!r}")
+        object.__setattr__(self, "normal", normal / length)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Box(Collider):
+    """A solid oriented box, at rest or moving as a rigid body.
+
+    Attributes:
+        T_world_box: [4, 4] pose; origin at the centre of the box.
+        size: [3] edge lengths [m].
+        velocity: [3] of its centre [m/s].
+        angular_velocity: [3] about its centre, world axes [rad/s].
+    """
+
+    T_world_box: ArrayLike
+    size: ArrayLike
+    velocity: ArrayLike = (0.0, 0.0, 0.0)
+    angular_velocity: ArrayLike = (0.0, 0.0, 0.0)
+
+    def _check(self) -> None:
+        pose = np.array(self.T_world_box, dtype=np.float64)
+        if not is_rigid(pose):
+            raise ColliderError(f"T_world_box of {self.name!r} must be rigid [4, 4]: {pose!r}")
+        object.__setattr__(self, "T_world_box", pose)
+        for name in ("size", "velocity", "angular_velocity"):
+            object.__setattr__(self, name, _vector(self, name))
+        if (np.asarray(self.size) <= 0).any():
+            raise ColliderError(f"size of box {self.name!r} must be positive: {self.size!r}")
+
+    @property
+    def moving(self) -> bool:
+        """Whether it has any velocity."""
+        return bool(np.any(self.velocity) or np.any(self.angular_velocity))
+
+    def after(self, duration: float) -> Box:
+        """The box ``duration`` [s] later, moved at its velocities."""
+        if not self.moving:
+            return self
+        pose = np.array(self.T_world_box)
+        pose[:3, 3] += duration * np.asarray(self.velocity)
+        pose[:3, :3] = _turn(np.asarray(self.angular_velocity) * duration) @ pose[:3, :3]
+        return replace(self, T_world_box=pose)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeightField(Collider):
+    """Ground given by heights on a regular grid; matter below it is pushed up.
+
+    Outside the grid the nearest rim height holds.
+
+    Attributes:
+        heights: [X, Y] float64 [m], X and Y >= 2.
+        origin: [2] (x, y) of ``heights[0, 0]`` [m].
+        spacing: distance of samples [m], > 0.
+    """
+
+    heights: NDArray[np.float64]
+    origin: ArrayLike = (0.0, 0.0)
+    spacing: float = 1.0
+
+    def _check(self) -> None:
+        heights = np.ascontiguousarray(self.heights, dtype=np.float64)
+        if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).all():
+            raise ColliderError(
+                f"heights of {self.name!r} must be finite [X, Y] with X, Y >= 2: {heights.shape}"
+            )
+        if not (math.isfinite(self.spacing) and self.spacing > 0):
+            raise ColliderError(f"spacing of {self.name!r} must be positive: {self.spacing!r}")
+        object.__setattr__(self, "heights", heights)
+        object.__setattr__(self, "origin", _vector(self, "origin", 2))
+
+
+def _vector(collider: Collider, name: str, length: int = 3) -> Float:
+    value = np.array(getattr(collider, name), dtype=np.float64)
+    if value.shape != (length,) or not np.isfinite(value).all():
+        raise ColliderError(f"{name} of {collider.name!r} must be {length} numbers, not {value!r}")
+    return value
+
+
+def _turn(rotation_vector: Float) -> Float:
+    """Rotation matrix [3, 3] of a rotation vector [3] [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(rotation_vector))
+    if angle < 1e-300:
+        return np.eye(3)
+    x, y, z = rotation_vector / angle
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)

@@ -1,0 +1,168 @@
+"""3x3 matrices as tuples of nine numbers, row by row; symmetric ones xx, yy, zz, xy, xz, yz."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from .shared import HALF, ONE, TINY, ZERO, law
+
+POLAR_STEPS = 16
+JACOBI_SWEEPS = 8
+
+
+@law
+def det(a: Any) -> Any:
+    """Determinant."""
+    return (
+        a[0] * (a[4] * a[8] - a[5] * a[7])
+        - a[1] * (a[3] * a[8] - a[5] * a[6])
+        + a[2] * (a[3] * a[7] - a[4] * a[6])
+    )
+
+
+@law
+def cofactors(a: Any) -> Any:
+    """Cofactor matrix: det(a) times the transposed inverse."""
+    return (
+        a[4] * a[8] - a[5] * a[7],
+        a[5] * a[6] - a[3] * a[8],
+        a[3] * a[7] - a[4] * a[6],
+        a[2] * a[7] - a[1] * a[8],
+        a[0] * a[8] - a[2] * a[6],
+        a[1] * a[6] - a[0] * a[7],
+        a[1] * a[5] - a[2] * a[4],
+        a[2] * a[3] - a[0] * a[5],
+        a[0] * a[4] - a[1] * a[3],
+    )
+
+
+@law
+def multiply(a: Any, b: Any) -> Any:
+    """a b."""
+    return (
+        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
+        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
+        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
+        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
+        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
+        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
+        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
+        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
+        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
+    )
+
+
+@law
+def gram(a: Any) -> Any:
+    """a a^T, symmetric."""
+    return (
+        a[0] * a[0] + a[1] * a[1] + a[2] * a[2],
+        a[3] * a[3] + a[4] * a[4] + a[5] * a[5],
+        a[6] * a[6] + a[7] * a[7] + a[8] * a[8],
+        a[0] * a[3] + a[1] * a[4] + a[2] * a[5],
+        a[0] * a[6] + a[1] * a[7] + a[2] * a[8],
+        a[3] * a[6] + a[4] * a[7] + a[5] * a[8],
+    )
+
+
+@law
+def symmetric_times(s: Any, a: Any) -> Any:
+    """s a of a symmetric s."""
+    return multiply((s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]), a)
+
+
+@law
+def polar_rotation(a: Any, determinant: Any) -> Any:
+    """Rotation R of the polar decomposition a = R S, by Newton's iteration (Higham 1986).
+
+    Needs det(a) > 0: the caller sees to inverted particles.
+    """
+    r = a
+    d = determinant
+    for _ in range(POLAR_STEPS):
+        half_inverse = HALF / d
+        c = cofactors(r)
+        n = (
+            HALF * r[0] + half_inverse * c[0],
+            HALF * r[1] + half_inverse * c[1],
+            HALF * r[2] + half_inverse * c[2],
+            HALF * r[3] + half_inverse * c[3],
+            HALF * r[4] + half_inverse * c[4],
+            HALF * r[5] + half_inverse * c[5],
+            HALF * r[6] + half_inverse * c[6],
+            HALF * r[7] + half_inverse * c[7],
+            HALF * r[8] + half_inverse * c[8],
+        )
+        change = (
+            abs(n[0] - r[0]) + abs(n[4] - r[4]) + abs(n[8] - r[8])
+            + abs(n[1] - r[1]) + abs(n[2] - r[2]) + abs(n[5] - r[5])
+        )  # fmt: skip
+        r = n
+        d = det(r)
+        # The error squares at each step, so this one is below what the numbers resolve.
+        if ONE + change * change == ONE:
+            break
+    return r
+
+
+@law
+def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
+    """Tangent, cosine and sine of the rotation that makes the element ``pq`` vanish."""
+    if abs(pq) < TINY:
+        return ZERO * pq, ONE + ZERO * pq, ZERO * pq
+    theta = HALF * (qq - pp) / pq
+    t = ONE / (abs(theta) + math.sqrt(theta * theta + ONE))
+    if theta < ZERO:
+        t = -t
+    c = ONE / math.sqrt(t * t + ONE)
+    return t, c, t * c
+
+
+@law
+def eigen_symmetric(s: Any) -> Any:
+    """Eigenvalues (3) and eigenvectors (9, in columns) of a symmetric matrix, by cyclic Jacobi.
+
+    Golub and Van Loan, Matrix Computations, 8.5. Not sorted.
+    """
+    xx, yy, zz, xy, xz, yz = s
+    one, zero = ONE + ZERO * xx, ZERO * xx
+    v0, v1, v2, v3, v4, v5, v6, v7, v8 = one, zero, zero, zero, one, zero, zero, zero, one
+    for _ in range(JACOBI_SWEEPS):
+        scale = abs(xx) + abs(yy) + abs(zz)
+        if scale + (abs(xy) + abs(xz) + abs(yz)) == scale:
+            break
+        t, c, n = jacobi_angle(xx, yy, xy)
+        xx, yy, xy = xx - t * xy, yy + t * xy, zero
+        xz, yz = c * xz - n * yz, n * xz + c * yz
+        v0, v1 = c * v0 - n * v1, n * v0 + c * v1
+        v3, v4 = c * v3 - n * v4, n * v3 + c * v4
+        v6, v7 = c * v6 - n * v7, n * v6 + c * v7
+        t, c, n = jacobi_angle(xx, zz, xz)
+        xx, zz, xz = xx - t * xz, zz + t * xz, zero
+        xy, yz = c * xy - n * yz, n * xy + c * yz
+        v0, v2 = c * v0 - n * v2, n * v0 + c * v2
+        v3, v5 = c * v3 - n * v5, n * v3 + c * v5
+        v6, v8 = c * v6 - n * v8, n * v6 + c * v8
+        t, c, n = jacobi_angle(yy, zz, yz)
+        yy, zz, yz = yy - t * yz, zz + t * yz, zero
+        xy, xz = c * xy - n * xz, n * xy + c * xz
+        v1, v2 = c * v1 - n * v2, n * v1 + c * v2
+        v4, v5 = c * v4 - n * v5, n * v4 + c * v5
+        v7, v8 = c * v7 - n * v8, n * v7 + c * v8
+    return (xx, yy, zz), (v0, v1, v2, v3, v4, v5, v6, v7, v8)
+
+
+@law
+def recompose(values: Any, vectors: Any) -> Any:
+    """vectors diag(values) vectors^T, symmetric."""
+    a, b, c = values
+    v = vectors
+    return (
+        a * v[0] * v[0] + b * v[1] * v[1] + c * v[2] * v[2],
+        a * v[3] * v[3] + b * v[4] * v[4] + c * v[5] * v[5],
+        a * v[6] * v[6] + b * v[7] * v[7] + c * v[8] * v[8],
+        a * v[0] * v[3] + b * v[1] * v[4] + c * v[2] * v[5],
+        a * v[0] * v[6] + b * v[1] * v[7] + c * v[2] * v[8],
+        a * v[3] * v[6] + b * v[4] * v[7] + c * v[5] * v[8],
+    )
