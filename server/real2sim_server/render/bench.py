@@ -32,6 +32,9 @@ REDUCED_GAUSSIANS = 20_000
 REDUCED_SIZE = 4
 """The reference draws every n-th Gaussian at this fraction of the size, where it takes seconds."""
 
+IMAGE_SETS = (("rgb", "RGB"), ("rgb_depth_instance", "RGB + depth + ids"))
+"""Key of a timing in a case, and what was drawn."""
+
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -226,29 +229,36 @@ def _time(draw: Callable[[], RenderOutput], repetitions: int) -> Timing:
 
 
 def _tables(result: dict[str, Any]) -> list[Table]:
-    stages = Table(title=f"drawn by {result['backend']} ({result['device']}), milliseconds")
-    for column in ("picture", "size", "Gaussians", "images", "best", "median"):
-        stages.add_column(column, justify="left" if column in ("picture", "images") else "right")
-    names = list(result["cases"][0]["rgb"]["stages_ms"])
-    for name in (*names, "M Gaussians/s"):
-        stages.add_column(name, justify="right")
-    against = Table(title="against the reference, milliseconds")
+    return [_stages_table(result), _reference_table(result)]
+
+
+def _stages_table(result: dict[str, Any]) -> Table:
+    drawn = [(row, row[key], images) for row in result["cases"] for key, images in IMAGE_SETS]
+    table = Table(title=f"drawn by {result['backend']} ({result['device']}), milliseconds")
+    table.add_column("")
+    for row, _, images in drawn:
+        size = f"{row['width']}x{row['height']}"
+        picture = f"{row['name'].split('.')[0]} {size}\n{row['gaussians']:,}\n{images}"
+        table.add_column(picture, justify="right")
+    for label, key in (("best", "best_ms"), ("median", "median_ms")):
+        table.add_row(label, *(f"{timing[key]:.1f}" for _, timing, _ in drawn))
+    for stage in drawn[0][1]["stages_ms"]:
+        table.add_row(stage, *(f"{timing['stages_ms'][stage]:.1f}" for _, timing, _ in drawn))
+    rates = (row["gaussians"] / timing["best_ms"] / 1e3 for row, timing, _ in drawn)
+    table.add_row("M Gaussians/s", *(f"{rate:.2f}" for rate in rates))
+    return table
+
+
+def _reference_table(result: dict[str, Any]) -> Table:
+    table = Table(title="against the reference, milliseconds")
     for column in ("picture", "size", "Gaussians", result["backend"], "reference", "times faster"):
-        against.add_column(column, justify="left" if column == "picture" else "right")
+        table.add_column(column, justify="left" if column == "picture" else "right")
     for row in result["cases"]:
-        for key, images in (("rgb", "RGB"), ("rgb_depth_instance", "RGB, depth, instance")):
-            timing = row[key]
-            stages.add_row(
-                *(row["name"], f"{row['width']}x{row['height']}", f"{row['gaussians']:,}", images),
-                *(f"{timing[name]:.1f}" for name in ("best_ms", "median_ms")),
-                *(f"{timing['stages_ms'][name]:.1f}" for name in names),
-                f"{row['gaussians'] / timing['best_ms'] / 1e3:.2f}",
-            )
         small = row["reduced"]
-        against.add_row(
+        table.add_row(
             *(row["name"], f"{small['width']}x{small['height']}", f"{small['gaussians']:,}"),
             f"{small[result['backend'] + '_ms']:.1f}",
             f"{small['reference_ms']:.0f}",
             f"{small['speedup']:.0f}",
         )
-    return [stages, against]
+    return table
