@@ -179,7 +179,8 @@ def _project(
 def _covariances(instance: Instance, dtype: torch.dtype) -> Tensor:
     """Covariances [N, 3, 3] in the cloud's frame."""
     if instance.covars is not None:
-        return instance.covars.to(dtype)
+        covars = instance.covars.to(dtype)
+        return (covars + covars.mT) / 2
     quats = torch.nn.functional.normalize(instance.cloud.quats.to(dtype), dim=-1)
     w, x, y, z = quats.unbind(-1)
     rotation = torch.stack(
