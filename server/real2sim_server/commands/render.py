@@ -106,7 +106,7 @@ def _write(frame: Frame, modality: str, out: Path) -> None:
 
 def _compare(scene: Scene, log_path: Path, view: View, camera: str) -> dict[str, float]:
     from ..logs.open import open_log
-    from ..reconstruct.evaluate import evaluate_views
+    from ..reconstruct.evaluation import evaluate_views
 
     log = open_log(log_path)
     console.print(

@@ -117,7 +117,7 @@ def test_the_front_of_the_box_has_the_colour_of_the_box(painted_scene):
 
 
 def test_taking_the_box_away_shows_the_wall(painted_scene):
-    from real2sim_server.reconstruct.evaluate import render_logged_view
+    from real2sim_server.reconstruct.evaluation import render_logged_view
 
     log = painted_log()
     emptied = replace(painted_scene, objects={})

@@ -13,7 +13,7 @@ from real2sim_server.reconstruct import (
     initialise_scene,
     reconstruct,
 )
-from real2sim_server.reconstruct.evaluate import lidar_mask, psnr, render_logged_view
+from real2sim_server.reconstruct.evaluation import lidar_mask, psnr, render_logged_view
 from real2sim_server.scene import Trajectory
 from real2sim_server.scene.io import load_scene
 

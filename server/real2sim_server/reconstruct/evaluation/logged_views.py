@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..logs import DrivingLog
-from ..render import Instance, RasterOptions, render_cameras
-from ..scene import Camera, Scene
-from ..scene.rotation import apply_transform, invert_transform
-from .options import ReconstructError
+from ...logs import DrivingLog
+from ...render import RasterOptions, render_cameras
+from ...scene import Camera, Scene
+from ...scene.rotation import apply_transform, invert_transform
+from ..options import ReconstructError
+from .image_metrics import psnr
+from .rendering import scene_instances
 
 NEAR = 0.5
 """LiDAR points nearer to the camera plane do not count as covering [m]."""
@@ -94,14 +96,13 @@ def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.ui
     Raises:
         TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
     """
-    instances = [Instance(scene.background)]
-    for index, item in enumerate(scene.objects.values()):
-        if item.trajectory.covers(t_us):
-            pose = item.trajectory.transform(t_us)
-            instances.append(Instance(item.cloud_at(t_us), pose, instance_id=index + 1))
     options = RasterOptions(depth=False, instance=False)
     [frame] = render_cameras(
-        instances, [camera], scene.ego.transform(t_us), sky=scene.sky, options=options
+        scene_instances(scene, t_us),
+        [camera],
+        scene.ego.transform(t_us),
+        sky=scene.sky,
+        options=options,
     )
     return frame.rgb
 
@@ -123,22 +124,6 @@ def lidar_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]
     mask[v[inside].astype(np.int64), u[inside].astype(np.int64)] = 1
     reach = max(1, round(camera.width / 600))
     return np.asarray(cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
-
-
-def psnr(
-    image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-) -> float:
-    """Peak signal-to-noise ratio [dB] of RGB images [H, W, 3] over ``mask`` [H, W].
-
-    Infinite for equal pixels, nan where the mask is empty.
-    """
-    difference = image.astype(np.float64) - truth
-    if mask is not None:
-        difference = difference[mask]
-    if difference.size == 0:
-        return float("nan")
-    error = float((difference**2).mean())
-    return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
 def _score(

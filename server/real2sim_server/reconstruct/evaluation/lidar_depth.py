@@ -1,0 +1,81 @@
+"""Rendered depth against the LiDAR."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...logs import DrivingLog
+from ...scene import Camera
+from ...scene.rotation import Float, apply_transform
+
+NEAR, FAR = 0.5, 80.0
+"""Points at other depths are not compared [m]."""
+HIDDEN_BEHIND, HIDDEN_SHARE = 0.3, 0.1
+"""A point is hidden when it lies this far, and this share of its depth more, behind another one
+that projects next to it [m]."""
+REACH = 1 / 300
+"""How far away on the image that other one may be, as a share of its width."""
+
+
+def points_in_camera(log: DrivingLog, camera: Camera, frame: int, t_us: int) -> Float:
+    """The sweep of ``frame`` [N, 3] [m] in the frame of ``camera`` as it stood at ``t_us``.
+
+    The motion of the recording vehicle between sweep and image is taken out. That of other
+    vehicles is not: it is a few decimetres at most, on few points.
+    """
+    T_world_vehicle = log.ego.transform(int(log.frame_times_us[frame]))
+    T_camera_vehicle = camera.viewmat(log.ego.transform(t_us)) @ T_world_vehicle
+    return apply_transform(T_camera_vehicle, log.lidar(frame).points)
+
+
+def seen_points(
+    points: Float, camera: Camera
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Rows [M], columns [M] and depths [M] [m] of the points that the camera can see.
+
+    The LiDAR stands elsewhere than the camera and looks over things that hide what is behind
+    them. A point counts as hidden when any point within REACH of it on the image is nearer by
+    more than HIDDEN_BEHIND plus HIDDEN_SHARE of its own depth; the share keeps the road, which
+    recedes quickly from row to row.
+
+    Args:
+        points: [N, 3] in the camera frame [m].
+        camera: gives size and K.
+    """
+    import cv2
+
+    points = points[(points[:, 2] > NEAR) & (points[:, 2] < FAR)]
+    depth = points[:, 2]
+    column = np.floor(camera.K[0, 0] * points[:, 0] / depth + camera.K[0, 2]).astype(np.int64)
+    row = np.floor(camera.K[1, 1] * points[:, 1] / depth + camera.K[1, 2]).astype(np.int64)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    row, column, depth = row[inside], column[inside], depth[inside]
+    nearest = np.full((camera.height, camera.width), FAR, dtype=np.float64)
+    np.minimum.at(nearest, (row, column), depth)
+    reach = max(1, round(camera.width * REACH))
+    # The default border is the largest finite number, which hides nothing.
+    nearest = np.asarray(cv2.erode(nearest, np.ones((2 * reach + 1,) * 2, np.uint8)))
+    seen = depth * (1 - HIDDEN_SHARE) - HIDDEN_BEHIND <= nearest[row, column]
+    return row[seen], column[seen], depth[seen]
+
+
+def depth_errors(depth: NDArray[np.float32], points: Float, camera: Camera) -> NDArray[np.float64]:
+    """Absolute errors [M] [m] of a rendered depth image at the points the camera can see.
+
+    Infinite where nothing was rendered, so that holes count and a median stays honest.
+
+    Args:
+        depth: [H, W] along the camera's z [m], 0 where nothing is.
+        points: [N, 3] in the camera frame [m].
+        camera: of the image.
+    """
+    row, column, expected = seen_points(points, camera)
+    rendered = depth[row, column].astype(np.float64)
+    return np.where(rendered > 0, np.abs(rendered - expected), np.inf)
+
+
+def median_error(errors: NDArray[np.float64]) -> float:
+    """Median [m]; nan for no points, infinite where most are holes."""
+    # The mean of a finite and an infinite middle value is infinite, as it should be.
+    return float(np.median(errors)) if len(errors) else float("nan")
