@@ -3,14 +3,13 @@
 from .evaluation import EvaluationReport, ViewScore, evaluate_views
 from .initialise import initialise_scene
 from .options import InitialiseOptions, ReconstructError
-from .run import ReconstructReport, TrainingFigures, reconstruct
+from .run import ReconstructReport, reconstruct
 
 __all__ = [
     "EvaluationReport",
     "InitialiseOptions",
     "ReconstructError",
     "ReconstructReport",
-    "TrainingFigures",
     "ViewScore",
     "evaluate_views",
     "initialise_scene",
