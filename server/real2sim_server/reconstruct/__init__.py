@@ -3,13 +3,14 @@
 from .evaluation import EvaluationReport, ViewScore, evaluate_views
 from .initialise import initialise_scene
 from .options import InitialiseOptions, ReconstructError
-from .run import ReconstructReport, reconstruct
+from .run import ReconstructReport, TrainingFigures, reconstruct
 
 __all__ = [
     "EvaluationReport",
     "InitialiseOptions",
     "ReconstructError",
     "ReconstructReport",
+    "TrainingFigures",
     "ViewScore",
     "evaluate_views",
     "initialise_scene",

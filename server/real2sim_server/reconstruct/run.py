@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 
@@ -15,9 +15,38 @@ from .evaluation import evaluate_views, render_logged_view
 from .initialise import initialise_scene
 from .options import InitialiseOptions, ReconstructError
 from .stages import OnProgress, Stages
+from .training import OnTraining, TrainOptions, held_out_frames, preset, train
 from .views import chosen_frames
 
 EVALUATED_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class TrainingFigures:
+    """What came out of training.
+
+    Attributes:
+        iterations: of training; ``steps`` of them in this run, the rest before it was resumed.
+        steps: see above.
+        seconds: that ``steps`` took.
+        rate: steps per second.
+        psnr, ssim: means over all held-out views at training size; PSNR in [dB].
+        psnr_objects: PSNR over the boxes of moving objects in these views [dB].
+        held_out_frames: frames that neither stage 0 nor training has read.
+        stage_ms: milliseconds of a step by stage.
+        folder: with checkpoint, metrics and preview pictures.
+    """
+
+    iterations: int
+    steps: int
+    seconds: float
+    rate: float
+    psnr: float
+    ssim: float
+    psnr_objects: float
+    held_out_frames: list[int]
+    stage_ms: dict[str, float]
+    folder: str
 
 
 @dataclass(frozen=True)
@@ -37,6 +66,7 @@ class ReconstructReport:
         evaluated_frames: indices of the frames behind these figures.
         total_s: seconds for everything.
         timing_s: seconds by stage.
+        training: figures of training; None without.
     """
 
     scene: str
@@ -52,6 +82,7 @@ class ReconstructReport:
     evaluated_frames: list[int]
     total_s: float
     timing_s: dict[str, float] = field(default_factory=dict)
+    training: TrainingFigures | None = None
 
 
 def reconstruct(
@@ -60,43 +91,59 @@ def reconstruct(
     *,
     iterations: int = 0,
     options: InitialiseOptions | None = None,
+    training: TrainOptions | None = None,
+    resume: bool = False,
     log_format: str | None = None,
     sequence: str | None = None,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
+    on_training: OnTraining | None = None,
 ) -> ReconstructReport:
     """Build a scene from the log in a folder and write it as a bundle.
 
-    Besides the bundle ``out`` a preview ``<out name>.preview.png`` is left next to it.
+    Besides the bundle ``out`` a preview ``<out name>.preview.png`` is left next to it, and by
+    training the folder ``<out name>.training`` with checkpoint, metrics and preview pictures.
 
     Args:
         log_path: folder of the log.
         out: folder of the bundle, by custom ``<name>.r2s``.
-        iterations: of training; only 0 is possible so far.
-        options: of stage 0.
+        iterations: of training; 0 for stage 0 alone.
+        options: of stage 0; by default those of ``training``.
+        training: its options, the preset ``cpu-small`` by default; ``iterations`` counts.
+        resume: go on from the checkpoint of a run of the same arguments that was broken off.
         log_format, sequence: passed to ``open_log``.
         overwrite: replace an existing bundle.
         on_progress: told the stage and how far it is.
+        on_training: told figures of training as it goes on.
 
     Raises:
-        ReconstructError: training was asked for, or the log has nothing to build from.
+        ReconstructError: the log has nothing to build from, or there is nothing to resume.
         LogError: the log cannot be read.
         BundleError: ``out`` exists and may not be replaced.
     """
-    if iterations != 0:
+    if iterations < 0 or (resume and iterations == 0):
         raise ReconstructError(
-            f"iterations={iterations!r}: training does not exist yet; "
-            "ask for 0 to build the scene from LiDAR and images alone"
+            f"iterations={iterations!r} must be 0 or more, and more than 0 to resume training"
         )
     timing_s: dict[str, float] = {}
     stages = Stages(on_progress, timing_s)
     with stages("open"):
         log = open_log(Path(log_path), format=log_format, sequence=sequence)
-    scene = initialise_scene(log, options=options, on_progress=on_progress, timing_s=timing_s)
+    figures = None
+    if iterations == 0:
+        scene = initialise_scene(log, options=options, on_progress=on_progress, timing_s=timing_s)
+    else:
+        scene, figures = _train(
+            log,
+            _training_options(training, iterations, options),
+            Path(out),
+            resume=resume,
+            stages=_Told(on_progress, on_training, timing_s),
+        )
     with stages("write"):
         scene = save_scene(scene, out, overwrite=overwrite)
     with stages("evaluate"):
-        frames = chosen_frames(log, EVALUATED_FRAMES)
+        frames = _evaluated_frames(log, figures)
         scores = evaluate_views(scene, log, frames=frames)
         preview = _write_preview(scene, log, Path(out), frames[len(frames) // 2])
     return ReconstructReport(
@@ -113,7 +160,61 @@ def reconstruct(
         evaluated_frames=frames,
         total_s=sum(timing_s.values()),
         timing_s=timing_s,
+        training=figures,
     )
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Who is told of progress."""
+
+    on_progress: OnProgress | None
+    on_training: OnTraining | None
+    timing_s: dict[str, float]
+
+
+def _training_options(
+    training: TrainOptions | None, iterations: int, options: InitialiseOptions | None
+) -> TrainOptions:
+    chosen = replace(training or preset("cpu-small"), iterations=iterations)
+    return chosen if options is None else replace(chosen, initialise=options)
+
+
+def _train(
+    log: DrivingLog, options: TrainOptions, out: Path, *, resume: bool, stages: _Told
+) -> tuple[Scene, TrainingFigures]:
+    folder = out.parent / f"{out.name}.training"
+    result = train(
+        log,
+        options,
+        folder,
+        resume=resume,
+        on_progress=stages.on_progress,
+        on_training=stages.on_training,
+        timing_s=stages.timing_s,
+    )
+    steps = max(result.steps, 1)
+    figures = TrainingFigures(
+        iterations=options.iterations,
+        steps=result.steps,
+        seconds=result.seconds,
+        rate=result.steps / max(result.seconds, 1e-9),
+        psnr=result.score.psnr,
+        ssim=result.score.ssim,
+        psnr_objects=result.score.psnr_objects,
+        held_out_frames=held_out_frames(log.frame_count, options.hold_out),
+        stage_ms={name: 1e3 * spent / steps for name, spent in result.stage_s.items()},
+        folder=str(folder),
+    )
+    return result.scene, figures
+
+
+def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[int]:
+    """A few frames all over the log, of those held out where there are any."""
+    held_out = figures.held_out_frames if figures else []
+    if not held_out:
+        return chosen_frames(log, EVALUATED_FRAMES)
+    return held_out[:: -(-len(held_out) // EVALUATED_FRAMES)]
 
 
 def _write_preview(scene: Scene, log: DrivingLog, out: Path, frame: int) -> Path:

@@ -88,6 +88,8 @@ def uncovered(view: View) -> NDArray[np.bool_]:
 def _bilinear(image: NDArray[np.uint8], u: NDArray, v: NDArray) -> NDArray[np.uint8]:
     import cv2
 
+    if len(u) == 0:
+        return np.zeros((0, 3), dtype=np.uint8)
     side = 1 << 14
     rows = -(-len(u) // side)
     maps = [np.zeros(rows * side, dtype=np.float32) for _ in range(2)]

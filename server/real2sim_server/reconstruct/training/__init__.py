@@ -1,1 +1,31 @@
 """Training: from a first scene to one that looks like the log."""
+
+from .boxes import smoothed_boxes, with_box_noise
+from .data import held_out_frames, training_log
+from .held_out import HeldOutScore, score_held_out
+from .losses import LossWeights
+from .model import SceneModel
+from .run import TrainResult, train
+from .schedule import PRESETS, DensifyOptions, LearningRates, TrainOptions, preset
+from .trainer import OnTraining, Trainer, TrainingProgress
+
+__all__ = [
+    "PRESETS",
+    "DensifyOptions",
+    "HeldOutScore",
+    "LearningRates",
+    "LossWeights",
+    "OnTraining",
+    "SceneModel",
+    "TrainOptions",
+    "TrainResult",
+    "Trainer",
+    "TrainingProgress",
+    "held_out_frames",
+    "preset",
+    "score_held_out",
+    "smoothed_boxes",
+    "train",
+    "training_log",
+    "with_box_noise",
+]

@@ -179,7 +179,7 @@ class Densifier:
         turn = rotations(gaussians.quats)
         along = torch.einsum("nji,nj->ni", turn, noise) * (2 * gaussians.log_scales).exp()
         step = torch.einsum("nij,nj->ni", turn, along)
-        gaussians.means += step * (freedom * rate * self.options.noise)[:, None]
+        gaussians.means.add_(step * (freedom * rate * self.options.noise)[:, None])
 
 
 def rearrange(
