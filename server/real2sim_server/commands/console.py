@@ -72,8 +72,8 @@ def progress(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
-def staged_progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Progress bars by stage; the yielded function takes (stage, done, total)."""
+def staged_progress() -> Iterator[Callable[..., None]]:
+    """Progress bars by stage; the yielded function takes (stage, done, total[, text])."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -83,10 +83,10 @@ def staged_progress() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=errors, transient=not sys.stderr.isatty()) as bar:
         tasks: dict[str, Any] = {}
 
-        def report(stage: str, done: int, total: int) -> None:
+        def report(stage: str, done: int, total: int, text: str | None = None) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
+            bar.update(tasks[stage], completed=done, total=total, description=text or stage)
 
         yield report
 

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from ..reconstruct import reconstruct
+from ..reconstruct.training.schedule import preset as training_preset
 from .console import console, print_figures, refuse_existing, staged_progress, write_json
+
+
+@dataclass(frozen=True)
+class Training:
+    """How to train: a preset's name, and whether a run that was broken off goes on."""
+
+    preset: str
+    resume: bool
 
 
 def run(
@@ -14,6 +26,7 @@ def run(
     log: Path,
     out: Path,
     iterations: int,
+    training: Training,
     log_format: str | None,
     sequence: str | None,
     overwrite: bool,
@@ -21,17 +34,35 @@ def run(
 ) -> None:
     """Reconstruct the log in folder ``log`` into the bundle ``out``."""
     refuse_existing(out, overwrite=overwrite)
-    with staged_progress() as report:
+    options = training_preset(training.preset)
+    with _told() as told:
         result = reconstruct(
             log,
             out,
             iterations=iterations,
+            training=options if iterations else None,
+            resume=training.resume,
             log_format=log_format,
             sequence=sequence,
             overwrite=overwrite,
-            on_progress=report,
+            **told,
         )
     figures = asdict(result)
-    print_figures(f"scene {out}", figures)
+    print_figures(f"scene {out}", {k: v for k, v in figures.items() if v is not None})
     console.print(f"next: real2sim render {out} --log {log} -o {out.name}.png")
     write_json(json_path, figures)
+
+
+@contextmanager
+def _told() -> Iterator[dict[str, Any]]:
+    """Progress bars for the stages, and the figures of training in the bar of that stage."""
+    with staged_progress() as report:
+
+        def on_training(news: Any) -> None:
+            stage = (
+                f"training {news.rate:.1f}/s, loss {news.loss:.4f}, {news.psnr:.2f} dB, "
+                f"{news.gaussians:,} Gaussians"
+            )
+            report("training", news.iteration, news.iterations, stage)
+
+        yield {"on_progress": report, "on_training": on_training}
