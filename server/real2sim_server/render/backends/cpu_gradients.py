@@ -22,8 +22,22 @@ from ..types import RenderOutput, ScreenStatistics
 from .base import Placement, RasterRequest, direction_matrix, place_instances
 from .cpu_blend import blend_tiles
 from .cpu_blend_backward import HALVES, SLOT, Losses, blend_tiles_backward, open_pixels
-from .cpu_inputs import NO_COVARS, Workspace, array_of, cluster_of, project, timed, view_of
-from .cpu_project_backward import PLACEMENT, Gradients, SlotSums, project_backward
+from .cpu_inputs import (
+    NO_COVARS,
+    Workspace,
+    array_of,
+    cluster_of,
+    project,
+    timed,
+    view_of,
+)
+from .cpu_project_backward import (
+    PLACEMENT,
+    Gradients,
+    SlotSums,
+    project_backward,
+    project_small_backward,
+)
 from .cpu_records import CHUNK, EXTENT_X, EXTENT_Y, MEMBER, TILE, Images, Records
 from .cpu_simd import LANES
 from .cpu_simd_backward import BACKWARD_PLANES
@@ -337,11 +351,12 @@ class _WayBack:
             return _constant_behind(request)[None, None]
         shape = (request.height, request.width)
         behind = self.space.array("behind", (*shape, 3), np.float32)
-        places = self.space.array("places", (*shape, 2), np.float32)
+        rows = self.space.array("texel_rows", shape, np.int32)
+        places = self.space.array("texel_places", (*shape, 2), np.float32)
         matrix = array_of(direction_matrix(request, self.camera))
-        sample_sky(array_of(request.sky.faces), matrix, behind, places)
+        sample_sky(array_of(request.sky.faces), matrix, behind, rows, places)
         if result.faces is not None:
-            sky_backward(places, self.images.alpha, self.losses.rgb, result.faces)
+            sky_backward(rows, places, self.images.alpha, self.losses.rgb, result.faces)
         return behind
 
     def _through_tiles(self, behind: NDArray[np.float32]) -> SlotSums:
@@ -376,6 +391,7 @@ class _WayBack:
                 cluster = cluster_of(instance, training.placement, camera, index)
                 sums = np.empty((regions, PLACEMENT))
                 out = result.clusters[index]
-                project_backward(cluster, view, base * CHUNK, records, slots, scale, out, sums)
+                go_back = project_backward if regions > 1 else project_small_backward
+                go_back(cluster, view, base * CHUNK, records, slots, scale, out, sums)
                 result.placements[camera, index] = sums.sum(0)
             base += regions

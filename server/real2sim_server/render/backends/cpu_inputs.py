@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..types import Instance
 from .base import CLAMP_MARGIN, Placement, RasterRequest
-from .cpu_project import project_cluster
+from .cpu_project import project_cluster, project_small_cluster
 from .cpu_records import CHUNK, RECORD, Cluster, Records, View
 
 NO_COVARS = np.zeros((0, 3, 3), np.float32)
@@ -51,7 +51,8 @@ def project(
     for index, instance in enumerate(request.instances):
         if regions[index]:
             cluster = cluster_of(instance, placement, camera, index)
-            project_cluster(cluster, view, base * CHUNK, records)
+            draw = project_cluster if regions[index] > 1 else project_small_cluster
+            draw(cluster, view, base * CHUNK, records)
         base += regions[index]
     return records, total
 

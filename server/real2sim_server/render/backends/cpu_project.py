@@ -66,16 +66,29 @@ def project_cluster(cluster, view, base, records):
     values, boxes = records.values, records.boxes
     depths, counts = records.depths, records.counts
     for chunk in prange((n + CHUNK - 1) // CHUNK):
-        start = chunk * CHUNK
-        slot = base + start
-        for i in range(start, min(n, start + CHUNK)):
-            box = project_gaussian(cluster, view, i, values, slot)
-            if box != NOWHERE:
-                values[slot, MEMBER] = F32(i - start)
-                boxes[slot] = box
-                depths[slot] = values[slot, DEPTH]
-                slot += 1
-        counts[(base + start) // CHUNK] = slot - base - start
+        project_chunk(cluster, view, base, chunk * CHUNK, values, boxes, depths, counts)
+
+
+@kernel(fastmath=FASTMATH)
+def project_small_cluster(cluster, view, base, records):
+    """Like project_cluster for one chunk, where waking threads would take longer than the work."""
+    project_chunk(
+        cluster, view, base, 0, records.values, records.boxes, records.depths, records.counts
+    )
+
+
+@inlined(fastmath=FASTMATH)
+def project_chunk(cluster, view, base, start, values, boxes, depths, counts):
+    """Write the records of CHUNK Gaussians from ``start`` on."""
+    slot = base + start
+    for i in range(start, min(cluster.means.shape[0], start + CHUNK)):
+        box = project_gaussian(cluster, view, i, values, slot)
+        if box != NOWHERE:
+            values[slot, MEMBER] = F32(i - start)
+            boxes[slot] = box
+            depths[slot] = values[slot, DEPTH]
+            slot += 1
+    counts[(base + start) // CHUNK] = slot - base - start
 
 
 @inlined(fastmath=FASTMATH)

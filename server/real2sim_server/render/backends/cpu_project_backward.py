@@ -79,17 +79,30 @@ def project_backward(cluster, view, base, records, slots, screen_scale, out, pla
         out: Gradients.
         placement: [chunks, PLACEMENT] float64, written.
     """
-    values, counts = records.values, records.counts
     for chunk in prange(placement.shape[0]):
-        first = base + chunk * CHUNK
         total = np.empty(SLOT, np.float64)
         sums = placement[chunk]
-        sums[:] = 0
-        for index in range(first, first + counts[first // CHUNK]):
-            if sum_slots(slots, index, total):
-                record = values[index]
-                i = chunk * CHUNK + np.int64(record[MEMBER])
-                gaussian_backward(cluster, view, i, record, total, screen_scale, out, sums)
+        chunk_backward(cluster, view, base, chunk, records, slots, screen_scale, out, total, sums)
+
+
+@kernel(fastmath=FASTMATH)
+def project_small_backward(cluster, view, base, records, slots, screen_scale, out, placement):
+    """Like project_backward for one chunk, where waking threads would take longer than the work."""
+    total = np.empty(SLOT, np.float64)
+    sums = placement[0]
+    chunk_backward(cluster, view, base, 0, records, slots, screen_scale, out, total, sums)
+
+
+@inlined(fastmath=FASTMATH)
+def chunk_backward(cluster, view, base, chunk, records, slots, screen_scale, out, total, sums):
+    """The records of one chunk; ``total`` [SLOT] is work space, ``sums`` [PLACEMENT] is written."""
+    first = base + chunk * CHUNK
+    sums[:] = 0
+    for index in range(first, first + records.counts[first // CHUNK]):
+        if sum_slots(slots, index, total):
+            record = records.values[index]
+            i = chunk * CHUNK + np.int64(record[MEMBER])
+            gaussian_backward(cluster, view, i, record, total, screen_scale, out, sums)
 
 
 @inlined()
