@@ -221,6 +221,38 @@ def render(
 
 
 @app.command()
+def evaluate(
+    scene: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    frames: Annotated[
+        str, typer.Option(help="held-out, all, or numbers such as 3,7,11")
+    ] = "held-out",
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Of images [px].")] = None,
+    shifts: Annotated[
+        str, typer.Option(help="Metres beside the path, for synthetic logs; or none.")
+    ] = "1,2,3",
+    report: Annotated[Path | None, typer.Option(help="Folder for a page with images.")] = None,
+    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference")] = "auto",
+    log_format: Annotated[str | None, typer.Option("--format", help="Default: recognised.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Where a dataset holds several.")] = None,
+    json: JsonFile = None,
+) -> None:
+    """Compare a scene with its log: images, moving objects, LiDAR depth, speed of rendering."""
+    from .commands import evaluate as command
+
+    _run(
+        command.run,
+        scene=scene,
+        log=log,
+        asked=command.Asked(frames=frames, shifts=shifts, width=width, backend=backend),
+        log_format=log_format,
+        sequence=sequence,
+        report=report,
+        json_path=json,
+    )
+
+
+@app.command()
 def serve(
     host: Annotated[
         str | None, typer.Option(help="Default 127.0.0.1; others need a token.")

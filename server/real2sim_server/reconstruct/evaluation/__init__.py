@@ -8,15 +8,21 @@ from .logged_views import (
     lidar_mask,
     render_logged_view,
 )
+from .report import write_report
+from .scores import EvaluateOptions, Evaluation, evaluate_scene
 
 __all__ = [
     "PSNR_CAP",
+    "EvaluateOptions",
+    "Evaluation",
     "EvaluationReport",
     "ViewScore",
+    "evaluate_scene",
     "evaluate_views",
     "lidar_mask",
     "mean_psnr",
     "psnr",
     "render_logged_view",
     "ssim",
+    "write_report",
 ]

@@ -11,11 +11,12 @@ from ...scene.rotation import Float, apply_transform
 
 NEAR, FAR = 0.5, 80.0
 """Points at other depths are not compared [m]."""
-HIDDEN_BEHIND, HIDDEN_SHARE = 0.3, 0.1
-"""A point is hidden when it lies this far, and this share of its depth more, behind another one
-that projects next to it [m]."""
-REACH = 1 / 300
-"""How far away on the image that other one may be, as a share of its width."""
+HIDDEN_BEHIND = 0.3
+"""What lies so much nearer hides a point, unless the road alone recedes as quickly [m]."""
+REACH = 0.006
+"""Up to how far away on the image it is looked for [rad]; about the distance of two beams."""
+ROAD_BELOW = 1.2
+"""The road is at least so far below the cameras [m]."""
 
 
 def points_in_camera(log: DrivingLog, camera: Camera, frame: int, t_us: int) -> Float:
@@ -36,8 +37,8 @@ def seen_points(
 
     The LiDAR stands elsewhere than the camera and looks over things that hide what is behind
     them. A point counts as hidden when any point within REACH of it on the image is nearer by
-    more than HIDDEN_BEHIND plus HIDDEN_SHARE of its own depth; the share keeps the road, which
-    recedes quickly from row to row.
+    more than HIDDEN_BEHIND plus what a road ROAD_BELOW the camera recedes over that distance,
+    z^2 angle / height, so that far stretches of road are compared too.
 
     Args:
         points: [N, 3] in the camera frame [m].
@@ -53,10 +54,13 @@ def seen_points(
     row, column, depth = row[inside], column[inside], depth[inside]
     nearest = np.full((camera.height, camera.width), FAR, dtype=np.float64)
     np.minimum.at(nearest, (row, column), depth)
-    reach = max(1, round(camera.width * REACH))
+    focal = camera.K[0, 0]
+    reach = max(1, round(REACH * focal))
     # The default border is the largest finite number, which hides nothing.
     nearest = np.asarray(cv2.erode(nearest, np.ones((2 * reach + 1,) * 2, np.uint8)))
-    seen = depth * (1 - HIDDEN_SHARE) - HIDDEN_BEHIND <= nearest[row, column]
+    # One pixel more, as points are rounded to pixels.
+    recedes = depth**2 * (reach + 1) / (focal * ROAD_BELOW)
+    seen = depth - nearest[row, column] <= HIDDEN_BEHIND + recedes
     return row[seen], column[seen], depth[seen]
 
 

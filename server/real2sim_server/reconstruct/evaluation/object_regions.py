@@ -80,8 +80,9 @@ def fill_outline(mask: NDArray[np.bool_], outline: Float) -> None:
     high = np.clip(np.ceil(outline.max(axis=0)), 0, limit).astype(int)
     u = np.arange(low[0], high[0])[None, :] + 0.5
     v = np.arange(low[1], high[1])[:, None] + 0.5
-    sides = np.roll(outline, -1, axis=0) - outline
-    area = np.cross(outline, np.roll(outline, -1, axis=0)).sum()
+    after = np.roll(outline, -1, axis=0)
+    sides = after - outline
+    area = (outline[:, 0] * after[:, 1] - outline[:, 1] * after[:, 0]).sum()
     inside = np.ones((high[1] - low[1], high[0] - low[0]), dtype=np.bool_)
     for (x, y), (dx, dy) in zip(outline, sides, strict=True):
         inside &= (dx * (v - y) - dy * (u - x)) * np.sign(area) >= 0

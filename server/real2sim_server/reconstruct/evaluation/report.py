@@ -1,0 +1,236 @@
+"""One HTML page with figures and images side by side; it holds everything and loads nothing."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from ...logs import DrivingLog
+from ...render import Frame
+from ...scene import Camera, Scene
+from ...scene.io.atomic import atomic_file
+from ..training.data import image_time
+from .choice import compared_cameras
+from .pictures import (
+    DEPTH_FAR,
+    DEPTH_NEAR,
+    ERROR_FULL,
+    Image,
+    depth_image,
+    error_image,
+    jpeg,
+    object_crops,
+)
+from .rendering import render_view
+from .scores import EvaluateOptions, Evaluation, logged_pair
+from .shifted import true_view
+from .truth import Truth, find_truth
+
+PAGE = "report.html"
+SHOWN_FRAMES, SHOWN_OBJECTS, SHOWN_SHIFT = 3, 3, 2.0
+IMAGE_WIDTH, CROP_WIDTH = 640, 320
+STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1500px;padding:0 1rem;
+color:#1a1d21;background:#fff}
+h1{font-size:1.5rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin-top:2.2rem}
+h3{font-size:1rem;margin:1.2rem 0 .3rem}p{margin:.3rem 0 .8rem;color:#4a525c;max-width:60rem}
+table{border-collapse:collapse;margin:.6rem 0}
+th,td{padding:.25rem .9rem;text-align:right;border-bottom:1px solid #dfe3e8}
+th:first-child,td:first-child{text-align:left}th{font-weight:600;background:#f4f6f8}
+td{font-variant-numeric:tabular-nums}
+.row{display:grid;grid-auto-flow:column;grid-auto-columns:1fr;gap:8px;margin-bottom:8px}
+.crops{grid-auto-columns:minmax(0,320px);justify-content:start}
+figure{margin:0}img{width:100%;display:block;border-radius:3px}
+figcaption{font-size:.8rem;color:#4a525c}
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """What the page is about."""
+
+    scene: Scene
+    log: DrivingLog
+    evaluation: Evaluation
+    truth: Truth
+    backend: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A picture with its caption."""
+
+    image: Image
+    caption: str
+
+
+def write_report(
+    scene: Scene,
+    log: DrivingLog,
+    evaluation: Evaluation,
+    folder: str | PathLike[str],
+    *,
+    options: EvaluateOptions | None = None,
+) -> Path:
+    """Write ``report.html`` into ``folder``, which is made where it is missing.
+
+    Args:
+        scene, log, options: as given to ``evaluate_scene``.
+        evaluation: what came out.
+
+    Returns:
+        The page.
+
+    Raises:
+        LogError: images that cannot be read.
+    """
+    options = options or EvaluateOptions()
+    cameras = compared_cameras(scene, log, options.width)
+    subject = _Subject(scene, log, evaluation, find_truth(log), options.backend)
+    frames = _spread(evaluation.frames, SHOWN_FRAMES)
+    parts = [_heading(evaluation), _figures(evaluation), _shift_figures(evaluation)]
+    parts.append("<h2>Recorded and rendered</h2>")
+    parts.append(
+        f"<p>Errors from black (none) to yellow ({ERROR_FULL:.0f} of 255 and more); depth from red "
+        f"({DEPTH_NEAR:.0f} m) to blue ({DEPTH_FAR:.0f} m), black where nothing is.</p>"
+    )
+    for frame in frames:
+        parts += [_view(subject, camera, frame) for camera in cameras]
+    parts.append(_beside(subject, cameras[0], frames[len(frames) // 2]))
+    parts.append(_view_figures(evaluation))
+    page = Path(folder) / PAGE
+    page.parent.mkdir(parents=True, exist_ok=True)
+    title = escape(f"{evaluation.scene}: evaluation")
+    with atomic_file(page) as file:
+        file.write(
+            f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+            f"<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n".encode()
+        )
+    return page
+
+
+def _heading(evaluation: Evaluation) -> str:
+    count = len(evaluation.frames)
+    seen = (
+        "none of which was used to make it"
+        if evaluation.frames_unseen
+        else "which may have been used to make it: figures on new images are lower"
+    )
+    return (
+        f"<h1>{escape(evaluation.scene)}</h1><p>{evaluation.gaussians:,} Gaussians against log "
+        f"{escape(evaluation.log)} at {evaluation.width}x{evaluation.height}, {count} frames, "
+        f"{seen}.</p>"
+    )
+
+
+def _figures(evaluation: Evaluation) -> str:
+    head = ("camera", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]", "LiDAR depth error [m]")
+    rows = [
+        (name, _number(s.psnr), _number(s.ssim, 3), _number(s.psnr_objects),
+         _number(s.depth_error_m, 3))
+        for name, s in (*evaluation.by_camera.items(), ("all", evaluation))
+    ]  # fmt: skip
+    rate = f"<p>Drawn at {evaluation.frames_per_second:.1f} images per second.</p>"
+    return "<h2>Figures</h2>" + _table(head, rows) + rate
+
+
+def _shift_figures(evaluation: Evaluation) -> str:
+    if not evaluation.shifted:
+        return f"<h2>Beside the recorded path</h2><p>{escape(evaluation.no_shifted)}</p>"
+    head = ("to both sides [m]", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
+            "depth error [m]", "views", "left out, inside a vehicle")  # fmt: skip
+    rows = [
+        (f"{s.shift_m:g}", _number(s.psnr), _number(s.ssim, 3), _number(s.psnr_objects),
+         _number(s.depth_error_m, 3), str(s.views), str(s.views_in_objects))
+        for s in evaluation.shifted
+    ]  # fmt: skip
+    return "<h2>Beside the recorded path</h2>" + _table(head, rows)
+
+
+def _view_figures(evaluation: Evaluation) -> str:
+    head = ("view", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]", "LiDAR depth error [m]",
+            "LiDAR points", "of these missed [%]")  # fmt: skip
+    rows = [
+        (f"frame {v.frame}, {v.camera}", _number(v.psnr), _number(v.ssim, 3),
+         _number(v.psnr_objects), _number(v.depth_error_m, 3), str(v.lidar_points),
+         _number(100 * v.lidar_missed, 1))
+        for v in evaluation.views
+    ]  # fmt: skip
+    return "<h2>All views</h2>" + _table(head, rows)
+
+
+def _view(subject: _Subject, camera: Camera, frame: int) -> str:
+    log, evaluation = subject.log, subject.evaluation
+    image, rendered = logged_pair(subject.scene, log, camera, frame, subject.backend)
+    assert rendered.depth is not None
+    score = next(v for v in evaluation.views if (v.camera, v.frame) == (camera.name, frame))
+    title = f"<h3>Frame {frame}, {escape(camera.name)}: {_number(score.psnr)} dB</h3>"
+    views = _row(
+        [
+            _Shown(image, "recorded"),
+            _Shown(rendered.rgb, "rendered"),
+            _Shown(error_image(rendered.rgb, image), "error"),
+            _Shown(depth_image(rendered.depth), "rendered depth"),
+        ]
+    )
+    return title + views + _objects(log, camera, frame, image, rendered)
+
+
+def _objects(log: DrivingLog, camera: Camera, frame: int, image: Image, rendered: Frame) -> str:
+    crops = []
+    for object_id, window in object_crops(log, camera, frame, SHOWN_OBJECTS):
+        crops.append(_Shown(image[window], f"{object_id}, recorded"))
+        crops.append(_Shown(rendered.rgb[window], f"{object_id}, rendered"))
+    return _row(crops, crops=True) if crops else ""
+
+
+def _beside(subject: _Subject, camera: Camera, frame: int) -> str:
+    truth, t_us = subject.truth, image_time(subject.log, camera.name, frame)
+    parts = [f"<h2>Frame {frame} from {SHOWN_SHIFT:g} m beside the path</h2>"]
+    for left, side in ((SHOWN_SHIFT, "left"), (-SHOWN_SHIFT, "right")):
+        view = render_view(subject.scene, camera, t_us, left=left, backend=subject.backend)
+        shown = [_Shown(view.rgb, f"rendered, {side}")]
+        if truth.log is not None:
+            image, _, _ = true_view(truth.log, camera, t_us, left)
+            error = error_image(view.rgb, image)
+            shown = [_Shown(image, f"truth, {side}"), *shown, _Shown(error, "error")]
+        parts.append(_row(shown))
+    return "".join(parts)
+
+
+def _row(shown: Sequence[_Shown], *, crops: bool = False) -> str:
+    figures = []
+    for item in shown:
+        width = CROP_WIDTH if crops else min(IMAGE_WIDTH, item.image.shape[1])
+        data = base64.b64encode(jpeg(np.ascontiguousarray(item.image), width=width)).decode()
+        caption = escape(item.caption)
+        figures.append(
+            f'<figure><img alt="{caption}" src="data:image/jpeg;base64,{data}">'
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+    return f'<div class="row{" crops" if crops else ""}">{"".join(figures)}</div>'
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{top}</tr>{body}</table>"
+
+
+def _number(value: float, digits: int = 2) -> str:
+    if np.isnan(value):
+        return "none"
+    return f"{value:.{digits}f}" if np.isfinite(value) else "infinite"
+
+
+def _spread(frames: Sequence[int], limit: int) -> list[int]:
+    count = min(limit, len(frames))
+    return [frames[i] for i in sorted({round(p) for p in np.linspace(0, len(frames) - 1, count)})]

@@ -1,0 +1,300 @@
+"""All figures of a scene against its log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...logs import DrivingLog
+from ...render import Frame
+from ...scene import Camera, Scene
+from ..options import ReconstructError
+from ..stages import OnProgress, Stages, Tell
+from ..training.data import image_time, resized
+from .choice import choose_frames, compared_cameras
+from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
+from .lidar_depth import depth_errors, median_error, points_in_camera
+from .object_regions import moving_mask, moving_tracks
+from .rendering import measure_rate, render_view
+from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
+from .truth import find_truth
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """What is measured.
+
+    Attributes:
+        frames: ``held-out``, ``all`` or indices; see :func:`.choice.choose_frames`.
+        width: of the compared images [px]; as logged by default.
+        shifts: distances beside the recorded path [m], where truth exists.
+        shifted_frames: at most so many frames, evenly spread, are looked at from there.
+        repeats: timed renders.
+        backend: of the renderer.
+
+    Raises:
+        ReconstructError: a value out of range.
+    """
+
+    frames: str | tuple[int, ...] = "held-out"
+    width: int | None = None
+    shifts: tuple[float, ...] = (1.0, 2.0, 3.0)
+    shifted_frames: int = 6
+    repeats: int = 10
+    backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.width is not None and not 16 <= self.width <= 8192:
+            raise ReconstructError(f"width must be from 16 to 8192 px, not {self.width!r}")
+        for shift in self.shifts:
+            if not 0 < shift <= 20:
+                raise ReconstructError(f"shifts must be above 0 and at most 20 m, not {shift!r}")
+        for name in ("shifted_frames", "repeats"):
+            if getattr(self, name) < 1:
+                raise ReconstructError(f"{name} must be at least 1, not {getattr(self, name)!r}")
+
+
+@dataclass(frozen=True)
+class LoggedViewScore:
+    """One rendered view against its logged image.
+
+    Attributes:
+        camera, frame: which view.
+        psnr: over all pixels [dB]; infinite for equal images.
+        ssim: structural similarity, at most 1.
+        psnr_objects: over the pixels within the boxes of moving objects [dB]; nan where these
+            are fewer than 50.
+        object_pixels: how many these are.
+        depth_error_m: median absolute error of the rendered depth at the LiDAR points of the
+            same sweep that the camera can see [m]; infinite where most hit nothing, nan without
+            points.
+        lidar_points: how many these are.
+        lidar_missed: share of them at which nothing is rendered, 0 to 1.
+    """
+
+    camera: str
+    frame: int
+    psnr: float
+    ssim: float
+    psnr_objects: float
+    object_pixels: int
+    depth_error_m: float
+    lidar_points: int
+    lidar_missed: float
+
+
+@dataclass(frozen=True)
+class CameraScore:
+    """Means over the views of one camera, as in :class:`Evaluation`."""
+
+    psnr: float
+    ssim: float
+    psnr_objects: float
+    depth_error_m: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A scene against its log.
+
+    Attributes:
+        scene, log: names.
+        frames: indices of the compared frames.
+        frames_unseen: whether the scene says that none of them was used to make it.
+        gaussians: of the scene.
+        psnr, ssim: means over views, all pixels [dB], [1].
+        psnr_objects: mean over the views that show moving objects, within their boxes [dB].
+        depth_error_m: median over all compared LiDAR points of all views [m].
+        frames_per_second: camera images drawn per second, see :class:`.rendering.RenderRate`.
+        width, height: of the first camera's compared image [px].
+        by_camera: the same by camera.
+        views: one score each, camera by camera within a frame.
+        shifted: views from beside the path; empty where no truth exists.
+        no_shifted: why it is empty; empty where it is not.
+    """
+
+    scene: str
+    log: str
+    frames: tuple[int, ...]
+    frames_unseen: bool
+    gaussians: int
+    psnr: float
+    ssim: float
+    psnr_objects: float
+    depth_error_m: float
+    frames_per_second: float
+    width: int
+    height: int
+    by_camera: dict[str, CameraScore]
+    views: tuple[LoggedViewScore, ...]
+    shifted: tuple[ShiftScore, ...] = ()
+    no_shifted: str = ""
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values; infinite ratios become PSNR_CAP, what is unknown null.
+
+        ``shifted`` is left out where no truth exists, and ``no_shifted`` says why.
+        """
+        values = _plain(asdict(self))
+        values.pop("no_shifted" if self.shifted else "shifted")
+        return dict(values)
+
+
+def evaluate_scene(
+    scene: Scene,
+    log: DrivingLog,
+    *,
+    options: EvaluateOptions | None = None,
+    on_progress: OnProgress | None = None,
+) -> Evaluation:
+    """Render logged views and compare them with images and LiDAR; time it; look from beside.
+
+    Every view is rendered when its image was taken, by the scene's own calibration and objects'
+    poses, which training may have refined. Where moving objects are is taken from the log.
+
+    Raises:
+        ReconstructError: the scene and the log do not belong together, or no frame is left.
+        LogError: images or sweeps that cannot be read.
+    """
+    options = options or EvaluateOptions()
+    timing_s: dict[str, float] = {}
+    stages = Stages(on_progress, timing_s)
+    chosen = choose_frames(scene, log, options.frames)
+    cameras = compared_cameras(scene, log, options.width)
+    pairs = [(camera, frame) for frame in chosen.frames for camera in cameras]
+    views, errors = [], []
+    with stages("views") as tell:
+        for done, (camera, frame) in enumerate(pairs):
+            view, error = _score(scene, log, camera, frame, options.backend)
+            views.append(view)
+            errors.append(error)
+            tell(done + 1, len(pairs))
+    times = [image_time(log, cameras[0].name, frame) for frame in chosen.frames]
+    with stages("rate"):
+        rate = measure_rate(scene, cameras, times, repeats=options.repeats, backend=options.backend)
+    with stages("shifted") as tell:
+        shifted, missing = _shifted(scene, log, cameras, times, options=options, tell=tell)
+    return Evaluation(
+        scene=scene.name,
+        log=log.name,
+        frames=chosen.frames,
+        frames_unseen=chosen.unseen,
+        gaussians=scene.gaussian_count,
+        frames_per_second=rate.frames_per_second,
+        width=cameras[0].width,
+        height=cameras[0].height,
+        by_camera=_by_camera(views, errors),
+        views=tuple(views),
+        shifted=shifted,
+        no_shifted=missing,
+        timing_s=timing_s,
+        **asdict(_summary(views, errors)),
+    )
+
+
+def logged_pair(
+    scene: Scene, log: DrivingLog, camera: Camera, frame: int, backend: str
+) -> tuple[NDArray[np.uint8], Frame]:
+    """The logged image at the size of ``camera``, and the view that the scene shows.
+
+    Raises:
+        LogError: the image cannot be read.
+    """
+    image = resized(log.image(camera.name, frame), camera)
+    t_us = image_time(log, camera.name, frame)
+    return image, render_view(scene, camera, t_us, backend=backend)
+
+
+def logged_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
+    """[H, W] bool, pixels within the boxes of moving objects."""
+    t_us = image_time(log, camera.name, frame)
+    pose = log.ego.transform(t_us) @ camera.T_vehicle_camera
+    return moving_mask(moving_tracks(log), camera, pose, t_us)
+
+
+def _score(
+    scene: Scene, log: DrivingLog, camera: Camera, frame: int, backend: str
+) -> tuple[LoggedViewScore, NDArray[np.float64]]:
+    image, rendered = logged_pair(scene, log, camera, frame, backend)
+    assert rendered.depth is not None
+    mask = logged_mask(log, camera, frame)
+    points = points_in_camera(log, camera, frame, image_time(log, camera.name, frame))
+    errors = depth_errors(rendered.depth, points, camera)
+    enough = int(mask.sum()) >= MIN_OBJECT_PIXELS
+    score = LoggedViewScore(
+        camera=camera.name,
+        frame=frame,
+        psnr=psnr(rendered.rgb, image),
+        ssim=ssim(rendered.rgb, image),
+        psnr_objects=psnr(rendered.rgb, image, mask) if enough else float("nan"),
+        object_pixels=int(mask.sum()),
+        depth_error_m=median_error(errors),
+        lidar_points=len(errors),
+        lidar_missed=float(np.isinf(errors).mean()) if len(errors) else float("nan"),
+    )
+    return score, errors
+
+
+def _shifted(
+    scene: Scene,
+    log: DrivingLog,
+    cameras: Sequence[Camera],
+    times_us: Sequence[int],
+    *,
+    options: EvaluateOptions,
+    tell: Tell,
+) -> tuple[tuple[ShiftScore, ...], str]:
+    if not options.shifts:
+        return (), "no shifts were asked for"
+    truth = find_truth(log)
+    if truth.log is None:
+        return (), f"no truth exists beside the recorded path: {truth.missing}"
+    count = min(options.shifted_frames, len(times_us))
+    spread = sorted({round(i) for i in np.linspace(0, len(times_us) - 1, count)})
+    scores = evaluate_shifts(
+        scene,
+        truth.log,
+        cameras,
+        [times_us[i] for i in spread],
+        options.shifts,
+        backend=options.backend,
+        on_view=tell,
+    )
+    return scores, ""
+
+
+def _by_camera(
+    views: Sequence[LoggedViewScore], errors: Sequence[NDArray[np.float64]]
+) -> dict[str, CameraScore]:
+    names = dict.fromkeys(view.camera for view in views)
+    places = {name: [i for i, view in enumerate(views) if view.camera == name] for name in names}
+    return {
+        name: _summary([views[i] for i in members], [errors[i] for i in members])
+        for name, members in places.items()
+    }
+
+
+def _summary(
+    views: Sequence[LoggedViewScore], errors: Sequence[NDArray[np.float64]]
+) -> CameraScore:
+    return CameraScore(
+        psnr=mean_psnr(view.psnr for view in views),
+        ssim=float(np.mean([view.ssim for view in views])),
+        psnr_objects=mean_psnr(view.psnr_objects for view in views),
+        depth_error_m=median_error(np.concatenate(errors)),
+    )
+
+
+def _plain(value: Any, key: str = "") -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(item, name) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, key) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return PSNR_CAP if key.startswith("psnr") and value > 0 else None
+    return value

@@ -1,0 +1,205 @@
+"""Scores of a whole scene, on a street small enough for every run, and of its log on disk."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from real2sim_server.cli import app
+from real2sim_server.logs import open_log, write_native_log
+from real2sim_server.logs.synthetic import CameraSpec, SyntheticConfig, generate_log
+from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
+from real2sim_server.reconstruct.evaluation import EvaluateOptions, evaluate_scene
+from real2sim_server.reconstruct.evaluation.choice import choose_frames
+from real2sim_server.reconstruct.evaluation.scores import logged_mask
+from real2sim_server.reconstruct.evaluation.shifted import evaluate_shifts, true_view
+from real2sim_server.reconstruct.evaluation.truth import find_truth
+from real2sim_server.scene.io import save_scene
+
+from ..conftest import painted_log
+
+SMALL = InitialiseOptions(
+    max_background=30_000,
+    max_object=3_000,
+    voxel=0.15,
+    ground_spacing=0.2,
+    sky_resolution=32,
+)
+ONCE = EvaluateOptions(repeats=1, shifts=())
+
+
+@pytest.fixture(scope="module")
+def street():
+    config = SyntheticConfig(
+        seed=5,
+        frames=6,
+        width=96,
+        height=64,
+        cameras=(CameraSpec("front"),),
+        samples=1,
+        moving_cars=2,
+        parked_cars=2,
+        lidar_columns=512,
+    )
+    return generate_log(config)
+
+
+@pytest.fixture(scope="module")
+def street_scene(street):
+    return initialise_scene(street, options=SMALL)
+
+
+@pytest.fixture(scope="module")
+def on_disk(street, street_scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evaluation")
+    write_native_log(street, folder / "log")
+    save_scene(street_scene, folder / "scene.r2s")
+    return folder
+
+
+def with_provenance(scene, **reconstruction):
+    return replace(scene, provenance={**scene.provenance, "reconstruction": reconstruction})
+
+
+def test_frames_that_training_kept_back_are_compared_and_count_as_unseen(street, street_scene):
+    trained = with_provenance(street_scene, stage=1, held_out_frames=[1, 4])
+    assert choose_frames(trained, street, "held-out") == choose_frames(trained, street, [4, 1])
+    assert choose_frames(trained, street, "held-out").frames == (1, 4)
+    assert choose_frames(trained, street, "held-out").unseen
+    assert not choose_frames(trained, street, [1, 2]).unseen
+
+
+def test_without_training_every_fourth_frame_is_compared_and_counts_as_seen(street, street_scene):
+    chosen = choose_frames(street_scene, street, "held-out")
+    assert (chosen.frames, chosen.unseen) == ((2,), False)
+    assert choose_frames(street_scene, street, "all").frames == tuple(range(6))
+
+
+def test_a_frame_that_is_not_there_is_refused(street, street_scene):
+    with pytest.raises(ReconstructError, match=r"frame 6: .* has frames 0 to 5"):
+        choose_frames(street_scene, street, [2, 6])
+    with pytest.raises(ReconstructError, match="'held-out', 'all' or numbers, not 'some'"):
+        choose_frames(street_scene, street, "some")
+
+
+def test_a_scene_of_another_rig_is_refused(street, street_scene):
+    log = painted_log(frames=3)
+    other = replace(log, rig=replace(log.rig, cameras=(replace(log.rig["front"], name="rear"),)))
+    with pytest.raises(ReconstructError, match=r"lacks \['rear'\]"):
+        evaluate_scene(street_scene, other, options=ONCE)
+
+
+def test_a_scene_of_a_flat_wall_and_box_has_small_depth_errors():
+    log = painted_log(frames=5)
+    options = InitialiseOptions(
+        max_background=60_000, max_object=4_000, ground_spacing=0.12, sky_resolution=32
+    )
+    result = evaluate_scene(initialise_scene(log, options=options), log, options=ONCE)
+    assert result.depth_error_m < 0.1
+    assert result.psnr > 20
+    assert result.psnr_objects > 15
+    assert result.views[0].lidar_missed < 0.05
+    assert result.views[0].object_pixels == logged_mask(log, log.rig["front"], 2).sum()
+
+
+def test_objects_are_scored_apart_from_the_rest(street, street_scene):
+    without = replace(street_scene, objects={})
+    whole = evaluate_scene(street_scene, street, options=ONCE)
+    bare = evaluate_scene(without, street, options=ONCE)
+    assert whole.views[0].object_pixels == bare.views[0].object_pixels > 0
+    assert bare.psnr_objects < whole.psnr_objects - 1
+
+
+def test_the_street_of_a_log_on_disk_is_built_again(street, on_disk):
+    truth = find_truth(open_log(on_disk / "log"))
+    assert truth.log is not None
+    camera, t_us = street.rig["front"], int(street.frame_times_us[3])
+    expected, depth, _ = true_view(street, camera, t_us, 1.5)
+    again, depth_again, _ = true_view(truth.log, camera, t_us, 1.5)
+    np.testing.assert_array_equal(again, expected)
+    np.testing.assert_array_equal(depth_again, depth)
+
+
+def test_a_log_that_does_not_show_its_config_has_no_truth(street, on_disk):
+    log = open_log(on_disk / "log")
+    config = {**log.provenance["config"], "seed": 6}
+    truth = find_truth(replace(log, provenance={**log.provenance, "config": config}))
+    assert truth.log is None
+    assert "another street" in truth.missing
+
+
+def test_a_recorded_log_has_no_truth_and_says_so():
+    log = painted_log(frames=3)
+    truth = find_truth(log)
+    assert truth.log is None
+    assert "only its own images are known" in truth.missing
+
+
+def test_a_shift_moves_the_camera_to_its_left(street):
+    t_us = int(street.frame_times_us[2])
+    camera = street.rig["front"]
+    _, _, here = true_view(street, camera, t_us, 0.0)
+    _, _, there = true_view(street, camera, t_us, 2.0)
+    # The camera's x axis points right.
+    np.testing.assert_allclose(np.linalg.inv(here) @ there @ [0, 0, 0, 1], [-2, 0, 0, 1], atol=1e-9)
+
+
+def test_views_beside_the_path_are_compared_on_both_sides(street, street_scene):
+    times = [int(street.frame_times_us[2])]
+    near, far = evaluate_shifts(street_scene, street, list(street.rig), times, [0.5, 3.0])
+    assert near.views + near.views_in_objects == far.views + far.views_in_objects == 2
+    assert 10 < near.psnr < 40
+    assert near.depth_error_m < 0.5
+
+
+def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
+    figures, page = on_disk / "figures.json", on_disk / "report" / "report.html"
+    arguments = ["evaluate", on_disk / "scene.r2s", on_disk / "log", "--json", figures]
+    arguments += ["--frames", "2,3", "--shifts", "1", "--report", page.parent]
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+    values = json.loads(figures.read_text())
+    for key in ("psnr", "ssim", "psnr_objects", "depth_error_m", "frames_per_second"):
+        assert values[key] > 0, key
+    assert [v["frame"] for v in values["views"]] == values["frames"] == [2, 3]
+    assert [s["shift_m"] for s in values["shifted"]] == [1.0]
+    assert "no_shifted" not in values
+    html = page.read_text()
+    assert html.count("data:image/jpeg;base64,") >= 8
+    assert not re.search(r"https?://|<script|<link", html)
+    assert f"{values['psnr']:.2f}" in html
+
+
+def test_the_command_says_what_frames_may_be(on_disk):
+    arguments = ["evaluate", str(on_disk / "scene.r2s"), str(on_disk / "log"), "--frames", "2-5"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 1
+    assert "held-out, all, or numbers" in result.output
+
+
+def test_figures_without_truth_say_why_and_hold_no_shifted_views():
+    log = painted_log(frames=3, boxes=False)
+    scene = initialise_scene(log, options=SMALL)
+    result = evaluate_scene(scene, log, options=replace(ONCE, shifts=(1.0,)))
+    values = json.loads(json.dumps(result.as_json(), allow_nan=False))
+    assert "shifted" not in values
+    assert "no truth exists" in values["no_shifted"]
+    assert values["psnr_objects"] is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": 4}, "width must be"),
+        ({"shifts": (0.0,)}, "shifts must be"),
+        ({"repeats": 0}, "repeats must be"),
+    ],
+)
+def test_options_out_of_range_are_refused(changes, message):
+    with pytest.raises(ReconstructError, match=message):
+        EvaluateOptions(**changes)
