@@ -15,7 +15,7 @@ from real2sim.planners import FollowRoute
 
 from ..commands.console import console, print_figures, staged_progress, write_json
 from ..logs.synthetic import SyntheticConfig, synthesize
-from ..reconstruct import reconstruct
+from ..reconstruct import InitialiseOptions, reconstruct
 from .drive import Drive, drive_through
 from .edits import Edits, make_room
 from .pictures import draw_map, write_png
@@ -23,8 +23,10 @@ from .worker import own_worker
 
 SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
-LOG_HZ = 2.5
+LOG_HZ = 2.0
 STEP_US = 100_000
+SMALL = InitialiseOptions(max_background=250_000, max_object=12_000)
+"""A third of the usual number of Gaussians: enough for images of this size, and fast to draw."""
 
 
 def run(*, out: Path, steps: int, leave_serving: bool) -> None:
@@ -91,7 +93,7 @@ def _build_street(out: Path, steps: int, clock: Clock) -> Path:
         synthesize(config, log, on_progress=lambda done, total: report("record", done, total))
         clock.seconds["record a synthetic drive"] = time.perf_counter() - begun
         begun = time.perf_counter()
-        reconstruct(log, scenes / SCENE, iterations=0, on_progress=report)
+        reconstruct(log, scenes / SCENE, options=SMALL, on_progress=report)
         clock.seconds["reconstruct it"] = time.perf_counter() - begun
     return scenes
 
