@@ -47,7 +47,8 @@ def object_crops(
 ) -> list[tuple[str, tuple[slice, slice]]]:
     """Id and rows and columns of at most ``limit`` moving objects, the largest on the image first.
 
-    Only objects that lie on the image with at least half of their outline's box are taken.
+    Only objects that lie on the image with at least half of their outline's box are taken, and
+    not those whose middle is behind another one.
     """
     t_us = image_time(log, camera.name, frame)
     T_camera_world = invert_transform(log.ego.transform(t_us) @ camera.T_vehicle_camera)
@@ -56,14 +57,19 @@ def object_crops(
         pose = track.transform_near(t_us)
         if pose is None:
             continue
-        outline = box_outline(box_corners(T_camera_world @ pose, track.size), camera.K)
+        T_camera_box = T_camera_world @ pose
+        outline = box_outline(box_corners(T_camera_box, track.size), camera.K)
         window = _window(outline, camera) if len(outline) else None
         if window is not None:
-            rows, columns = window
-            area = (rows.stop - rows.start) * (columns.stop - columns.start)
-            found.append((-area, track.object_id, window))
+            found.append((float(T_camera_box[2, 3]), track.object_id, window))
     found.sort(key=lambda item: item[:2])
-    return [(object_id, window) for _, object_id, window in found[:limit]]
+    windows = [window for _, _, window in found]
+    shown = [
+        (object_id, window)
+        for place, (_, object_id, window) in enumerate(found)
+        if not any(_holds_centre(nearer, window) for nearer in windows[:place])
+    ]
+    return sorted(shown, key=lambda item: -_area(item[1]))[:limit]
 
 
 def jpeg(image: Image, *, width: int | None = None) -> bytes:
@@ -95,3 +101,14 @@ def _window(outline: NDArray[np.float64], camera: Camera) -> tuple[slice, slice]
     first = np.floor(np.clip(low - margin, 0, limit)).astype(int)
     last = np.ceil(np.clip(high + margin, 0, limit)).astype(int)
     return slice(first[1], last[1]), slice(first[0], last[0])
+
+
+def _holds_centre(nearer: tuple[slice, slice], window: tuple[slice, slice]) -> bool:
+    return all(
+        a.start <= (b.start + b.stop) / 2 < a.stop for a, b in zip(nearer, window, strict=True)
+    )
+
+
+def _area(window: tuple[slice, slice]) -> int:
+    rows, columns = window
+    return int((rows.stop - rows.start) * (columns.stop - columns.start))

@@ -28,7 +28,7 @@ from .pictures import (
     object_crops,
 )
 from .rendering import render_view
-from .scores import EvaluateOptions, Evaluation, logged_pair
+from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
 from .shifted import true_view
 from .truth import Truth, find_truth
 
@@ -131,10 +131,11 @@ def _heading(evaluation: Evaluation) -> str:
 
 def _figures(evaluation: Evaluation) -> str:
     head = ("camera", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]", "LiDAR depth error [m]")
+    scores: list[tuple[str, CameraScore | Evaluation]] = list(evaluation.by_camera.items())
     rows = [
         (name, _number(s.psnr), _number(s.ssim, 3), _number(s.psnr_objects),
          _number(s.depth_error_m, 3))
-        for name, s in (*evaluation.by_camera.items(), ("all", evaluation))
+        for name, s in (*scores, ("all", evaluation))
     ]  # fmt: skip
     rate = f"<p>Drawn at {evaluation.frames_per_second:.1f} images per second.</p>"
     return "<h2>Figures</h2>" + _table(head, rows) + rate

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from real2sim_server.reconstruct.evaluation.object_regions import moving_mask, moving_tracks
+from real2sim_server.reconstruct.evaluation.pictures import (
+    depth_image,
+    error_image,
+    object_crops,
+)
+from real2sim_server.scene.rotation import transform_from
+
+from ..conftest import painted_log
+
+FRAME = 4
+
+
+def test_equal_images_have_a_black_error_and_larger_errors_are_brighter():
+    truth = np.full((4, 6, 3), 100, np.uint8)
+    image = truth.copy()
+    image[:, 2:4] += 20
+    image[:, 4:] += 60
+    brightness = error_image(image, truth).sum(axis=(0, 2))
+    assert error_image(truth, truth).max() < 10
+    assert brightness[0] < brightness[2] < brightness[4]
+
+
+def test_depth_is_red_near_blue_far_and_black_where_nothing_is():
+    image = depth_image(np.array([[3.0, 60.0, 0.0]], np.float32))[0].astype(int)
+    assert image[0, 0] > image[0, 2]
+    assert image[1, 2] > image[1, 0]
+    assert (image[2] == 0).all()
+
+
+def test_a_crop_shows_the_box_of_a_moving_object():
+    log = painted_log()
+    camera = log.rig["front"]
+    [(object_id, window)] = object_crops(log, camera, FRAME, 3)
+    t_us = int(log.frame_times_us[FRAME])
+    pose = log.ego.transform(t_us) @ camera.T_vehicle_camera
+    mask = moving_mask(moving_tracks(log), camera, pose, t_us)
+    assert object_id == "other_1"
+    assert mask[window].sum() == mask.sum() > 0
+    assert mask[window].mean() > 0.5
+
+
+def test_an_object_right_behind_another_one_is_not_cropped():
+    log = painted_log()
+    track = log.tracks[0]
+    path = track.trajectory
+    away = transform_from([3.0, 0, 0], [1.0, 0, 0, 0])
+    behind = replace(track, object_id="other_2", trajectory=path.moved(away))
+    both = replace(log, tracks=(behind, track))
+    assert [name for name, _ in object_crops(both, log.rig["front"], FRAME, 3)] == ["other_1"]
