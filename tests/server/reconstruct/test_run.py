@@ -14,6 +14,7 @@ from real2sim_server.reconstruct import (
     reconstruct,
 )
 from real2sim_server.reconstruct.evaluation import lidar_mask, psnr, render_logged_view
+from real2sim_server.reconstruct.training import TrainOptions
 from real2sim_server.scene import Trajectory
 from real2sim_server.scene.io import load_scene
 
@@ -36,9 +37,29 @@ def test_a_log_on_disk_becomes_a_bundle_with_a_preview(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "out.r2s", "out.r2s.preview.png"]
 
 
-def test_training_is_refused_until_there_is_a_trainer(tmp_path):
-    with pytest.raises(ReconstructError, match=r"iterations=100.*training does not exist yet"):
-        reconstruct(tmp_path, tmp_path / "out.r2s", iterations=100)
+def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
+    write_native_log(painted_log(frames=7), tmp_path / "log")
+    training = TrainOptions(sky_resolution=16, log_every=2, checkpoint_every=3, preview_every=4)
+    arguments = {"iterations": 6, "options": SMALL, "training": training}
+    report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", **arguments)
+    assert report.training.steps == 6
+    assert report.training.held_out_frames == report.evaluated_frames == [2]
+    assert report.training.psnr > 15
+    provenance = load_scene(tmp_path / "out.r2s").provenance["reconstruction"]
+    assert (provenance["iterations"], provenance["held_out_frames"]) == (6, [2])
+    folder = tmp_path / "out.r2s.training"
+    assert len((folder / "metrics.jsonl").read_text().splitlines()) == 3
+    assert (folder / "previews" / "000004.png").stat().st_size > 1000
+    again = reconstruct(
+        tmp_path / "log", tmp_path / "out.r2s", **arguments, resume=True, overwrite=True
+    )
+    assert again.training.steps == 0
+    assert again.training.psnr == pytest.approx(report.training.psnr)
+
+
+def test_negative_iterations_are_refused(tmp_path):
+    with pytest.raises(ReconstructError, match=r"iterations=-1 must be 0 or more"):
+        reconstruct(tmp_path, tmp_path / "out.r2s", iterations=-1)
 
 
 def test_psnr_of_a_constant_error_is_the_textbook_value():

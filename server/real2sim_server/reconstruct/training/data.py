@@ -110,7 +110,9 @@ class Views:
         if not frames or len(log.rig) == 0:
             raise ReconstructError(f"log {log.name!r} has no image to train on")
         self._log, self._options = log, options
-        self._keys = [(name, frame) for frame in frames for name in log.rig.names]
+        without = set(log.provenance.get("cameras_without_images", ()))
+        names = [name for name in log.rig.names if name not in without]
+        self._keys = [(name, frame) for frame in frames for name in names]
         self._kept: OrderedDict[int, _Stored] = OrderedDict()
         self._nbytes = 0
         self._coming: dict[int, Future[_Stored]] = {}

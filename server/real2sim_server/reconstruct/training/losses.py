@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from . import ssim_kernels
 
+FRAME_STEP = 0.1
+"""Second differences are given as for frames so far apart [s]."""
 KEPT_QUANTILE = 0.95
 """Share of LiDAR points that count; the rest are edges, reflections and moving things."""
 
@@ -190,11 +193,18 @@ def needles(log_scales: Tensor, ratio: float) -> Tensor:
     return ((high - middle).exp() - ratio).clamp(min=0).mean()
 
 
-def second_differences(values: Tensor) -> Tensor:
-    """Mean of squared second differences over rows of [T, D]; 0 for fewer than three."""
+def second_differences(values: Tensor, times_s: NDArray[np.float64]) -> Tensor:
+    """Mean of squared second differences over rows of [T, D], as if rows were 0.1 s apart.
+
+    Steady motion costs nothing however uneven the times [T] [s] are: frames are missing where
+    they are held out.
+    """
     if len(values) < 3:
         return values.sum() * 0
-    return (values[2:] - 2 * values[1:-1] + values[:-2]).square().sum(-1).mean()
+    steps = torch.from_numpy(np.diff(times_s)).to(values)[:, None]
+    speeds = (values[1:] - values[:-1]) / steps
+    bends = 2 * (speeds[1:] - speeds[:-1]) / (steps[1:] + steps[:-1])
+    return (bends * FRAME_STEP**2).square().sum(-1).mean()
 
 
 def psnr_of(squared_error: float) -> float:

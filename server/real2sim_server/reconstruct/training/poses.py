@@ -89,9 +89,9 @@ class ObjectPoses:
         return torch.from_numpy(given) @ correction
 
     def roughness(self) -> Tensor:
-        """Mean squared second differences of all refined trajectories [m, rad], per 0.1 s step."""
+        """Mean squared second differences of all refined trajectories [m, rad] at 10 Hz."""
         terms = [
-            second_differences(torch.cat(self._refined(key), dim=1))
+            second_differences(torch.cat(self._refined(key), dim=1), key.times_us * 1e-6)
             for key in self.keys
             if len(key.times_us) >= 3
         ]

@@ -180,6 +180,7 @@ PRESETS: dict[str, TrainOptions] = {
         iterations=4000,
         max_width=640,
         coarse=((0.25, 2),),
+        mirror=0.1,
         sky_resolution=128,
         image_bytes=512 << 20,
         checkpoint_every=500,
@@ -192,8 +193,8 @@ PRESETS: dict[str, TrainOptions] = {
             object_voxel=0.05,
             sky_resolution=128,
         ),
-        losses=LossWeights(object_entropy=0.0),
-        densify=DensifyOptions(max_gaussians=220_000, every=200, reset_every=0),
+        rates=LearningRates(colour=5e-3),
+        densify=DensifyOptions(max_gaussians=300_000, every=100, stop=0.7, reset_every=0),
     ),
     "standard": TrainOptions(
         iterations=30_000,

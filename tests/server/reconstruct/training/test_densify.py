@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.reconstruct.training.densify import (
+    Densifier,
+    ScreenSums,
+    rotations,
+)
+from real2sim_server.reconstruct.training.gaussians import FIELDS, Gaussians, leaf
+from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+from real2sim_server.reconstruct.training.relocation import share
+from real2sim_server.reconstruct.training.schedule import DensifyOptions
+
+COUNTS = (30, 10, 8)
+OPTIONS = DensifyOptions(every=1, start=0.0, stop=1.0, max_gaussians=1000, split_scale=0.3)
+
+
+def some_gaussians() -> Gaussians:
+    random = torch.Generator().manual_seed(0)
+    n = sum(COUNTS)
+
+    def make(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random)
+
+    return Gaussians(
+        means=leaf(make(n, 3) * 0.3),
+        log_scales=leaf(make(n, 3) * 0.1 - 2),
+        quats=leaf(make(n, 4)),
+        logits=leaf(make(n) + 2),
+        sh=leaf(make(n, 4, 3)),
+        fourier=leaf(make(n - COUNTS[0], 2, 3)),
+        counts=COUNTS,
+    )
+
+
+def marked(gaussians: Gaussians) -> SelectiveAdam:
+    """Moments that hold the values they belong to."""
+    optimizer = SelectiveAdam(gaussians.tensors())
+    for name, tensor in gaussians.tensors().items():
+        optimizer.first[name] = tensor.detach().clone()
+        optimizer.second[name] = tensor.detach().clone()
+    return optimizer
+
+
+def densifier(options: DensifyOptions = OPTIONS) -> Densifier:
+    return Densifier(options, torch.full((2, 3), 2.0), seed=4, iterations=100)
+
+
+def sums_for(gaussians: Gaussians, growing: list[int]) -> ScreenSums:
+    sums = ScreenSums.zeros(len(gaussians))
+    sums.views[:] = 1
+    sums.gradients[growing] = 1.0
+    return sums
+
+
+def check_alignment(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
+    """Moments are those of the same row, or zero for rows that are new."""
+    for name in FIELDS:
+        values, moments = getattr(gaussians, name).detach(), optimizer.first[name]
+        assert values.shape == moments.shape
+        old = moments.reshape(len(moments), -1).any(1)
+        assert torch.equal(values[old], moments[old])
+
+
+def test_small_ones_are_cloned_and_moments_stay_with_their_rows():
+    gaussians = some_gaussians()
+    optimizer = marked(gaussians)
+    grown = densifier().round(gaussians, optimizer, sums_for(gaussians, [2, 33, 45]), 7)
+    assert grown.counts == (31, 11, 9)
+    check_alignment(grown, optimizer)
+    assert all(getattr(grown, name).requires_grad for name in FIELDS)
+    fresh = (~optimizer.first["means"].any(1)).nonzero()[:, 0]
+    assert torch.equal(grown.means[fresh], gaussians.means[[2, 33, 45]])
+    of_objects = optimizer.first["fourier"].flatten(1).any(1)
+    assert int((~of_objects).sum()) == 2
+
+
+def test_large_ones_are_split_in_two_smaller_ones():
+    gaussians = some_gaussians()
+    with torch.no_grad():
+        gaussians.log_scales[5] = 0.0
+    optimizer = marked(gaussians)
+    grown = densifier().round(gaussians, optimizer, sums_for(gaussians, [5]), 7)
+    assert grown.counts == (31, 10, 8)
+    new = (~optimizer.first["means"].any(1)).nonzero()[:, 0]
+    assert len(new) == 2
+    np.testing.assert_allclose(grown.log_scales[new].detach().exp(), 1 / 1.6, rtol=1e-5)
+    assert not torch.equal(grown.means[new[0]], grown.means[new[1]])
+
+
+def test_transparent_ones_and_those_outside_their_box_go():
+    gaussians = some_gaussians()
+    with torch.no_grad():
+        gaussians.logits[3] = -20
+        gaussians.means[31] = 9.0
+        gaussians.means[1] = 9.0
+    grown = densifier().round(gaussians, marked(gaussians), ScreenSums.zeros(48), 7)
+    assert grown.counts == (29, 9, 8)
+
+
+def test_the_budget_holds_and_the_strongest_grow():
+    gaussians = some_gaussians()
+    sums = sums_for(gaussians, [1, 2, 3])
+    sums.gradients[2] = 5.0
+    options = replace(OPTIONS, max_gaussians=49)
+    grown = densifier(options).round(gaussians, marked(gaussians), sums, 7)
+    assert len(grown) == 49
+    assert int((grown.means == gaussians.means[2]).all(1).sum()) == 2
+
+
+def test_mcmc_moves_dead_ones_to_live_ones_and_keeps_the_number():
+    gaussians = some_gaussians()
+    with torch.no_grad():
+        gaussians.logits[:6] = -20
+    options = replace(OPTIONS, method="mcmc", max_gaussians=48)
+    optimizer = marked(gaussians)
+    moved = densifier(options).round(gaussians, optimizer, ScreenSums.zeros(48), 7)
+    assert len(moved) == 48
+    assert float(moved.logits.detach().min()) > -19
+    assert optimizer.first["means"].shape == moved.means.shape
+    assert optimizer.first["fourier"].shape == moved.fourier.shape
+
+
+def test_two_copies_look_like_the_one_they_replace():
+    opacity, factor = share(torch.tensor([0.6]), torch.tensor([2]), 0.005)
+    assert float(1 - (1 - opacity) ** 2) == pytest.approx(0.6, rel=1e-5)
+    # eq. 9 written out for N = 2: o / (2 a - a^2 / sqrt(2)).
+    a = float(opacity)
+    assert float(factor) == pytest.approx(0.6 / (2 * a - a * a / 2**0.5), rel=1e-5)
+
+
+def test_mcmc_noise_leaves_solid_ones_and_spreads_along_the_shape():
+    gaussians = some_gaussians()
+    with torch.no_grad():
+        gaussians.logits[0] = -6
+        gaussians.log_scales[0] = torch.tensor([0.0, -9.0, -9.0])
+    before = gaussians.means.detach().clone()
+    densifier(replace(OPTIONS, method="mcmc", noise=1.0)).jitter(gaussians, 1e-2, 3)
+    moved = (gaussians.means.detach() - before).norm(dim=1)
+    assert float(moved[0]) > 1e-4
+    assert float(moved[1:].max()) < 1e-6
+    axis = rotations(gaussians.quats)[0, :, 0].detach()
+    direction = (gaussians.means.detach() - before)[0] / moved[0]
+    assert abs(float(direction @ axis)) == pytest.approx(1, abs=1e-4)
+
+
+def test_the_same_seed_and_iteration_split_the_same_way():
+    def once() -> torch.Tensor:
+        gaussians = some_gaussians()
+        with torch.no_grad():
+            gaussians.log_scales[5] = 0.0
+        return densifier().round(gaussians, marked(gaussians), sums_for(gaussians, [5]), 7).means
+
+    assert torch.equal(once(), once())

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+
+
+def gradients(step: int) -> torch.Tensor:
+    return torch.randn(6, 3, generator=torch.Generator().manual_seed(step))
+
+
+def test_it_is_adam_where_everything_is_seen():
+    ours = torch.ones(6, 3, requires_grad=True)
+    theirs = torch.ones(6, 3, requires_grad=True)
+    optimizer, torch_adam = SelectiveAdam({"x": ours}), torch.optim.Adam([theirs], 0.01, eps=1e-15)
+    for step in range(5):
+        ours.grad, theirs.grad = gradients(step), gradients(step)
+        optimizer.step({"x": ours}, {"x": 0.01}, {})
+        torch_adam.step()
+    np.testing.assert_allclose(ours.detach(), theirs.detach(), rtol=1e-5)
+
+
+def test_unseen_rows_keep_value_and_moments():
+    x = torch.ones(6, 3, requires_grad=True)
+    optimizer = SelectiveAdam({"x": x})
+    x.grad = gradients(0)
+    seen = torch.tensor([True, False, True, True, False, True])
+    optimizer.step({"x": x}, {"x": 0.01}, {"x": seen})
+    assert torch.equal((x.detach() != 1).any(1), seen)
+    assert torch.equal(optimizer.first["x"].any(1), seen)
+
+
+def test_columns_may_learn_at_their_own_rates():
+    x = torch.zeros(6, 3, requires_grad=True)
+    x.grad = torch.ones(6, 3)
+    optimizer = SelectiveAdam({"x": x})
+    optimizer.step({"x": x}, {"x": torch.tensor([0.1, 0.2, 0.0])}, {})
+    np.testing.assert_allclose(x.detach()[0], [-0.1, -0.2, 0], rtol=1e-5)
+
+
+def test_moments_follow_their_rows():
+    x = torch.zeros(4, 2, requires_grad=True)
+    x.grad = torch.arange(8.0).reshape(4, 2)
+    optimizer = SelectiveAdam({"x": x})
+    optimizer.step({"x": x}, {"x": 0.1}, {})
+    before = optimizer.first["x"].clone()
+    source = torch.tensor([3, 1, 1])
+    optimizer.take("x", source, torch.tensor([False, False, True]))
+    assert torch.equal(optimizer.first["x"][:2], before[[3, 1]])
+    assert not optimizer.first["x"][2].any()

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.reconstruct import ReconstructError
+from real2sim_server.reconstruct.evaluation import render_logged_view
+from real2sim_server.reconstruct.training import (
+    DensifyOptions,
+    Trainer,
+    held_out_frames,
+    score_held_out,
+)
+from real2sim_server.reconstruct.training.gaussians import mirror
+from real2sim_server.reconstruct.training.losses import psnr_of
+from real2sim_server.reconstruct.training.threads import one_torch_thread
+from real2sim_server.scene.harmonics import sh_basis
+
+from .conftest import TINY
+
+
+@pytest.fixture(autouse=True)
+def calm():
+    with one_torch_thread():
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_log, tiny_scene):
+    trainer = Trainer(tiny_log, tiny_scene, TINY)
+    before = mean_psnr(trainer)
+    trainer.run()
+    trainer.views.close()
+    return trainer, before
+
+
+def mean_psnr(trainer: Trainer) -> float:
+    """Over the training images [dB]."""
+    errors = []
+    for index in range(len(trainer.views)):
+        view = trainer.views.view(index)
+        with torch.no_grad():
+            image = trainer.model.render(view.camera, view.t_us).rgb
+        errors.append(psnr_of(float((image - view.image).square().mean())))
+    return float(np.mean(errors))
+
+
+def test_training_images_become_better(trained):
+    trainer, before = trained
+    assert mean_psnr(trainer) > before + 1
+
+
+def test_a_grey_scene_learns_its_colours_to_several_decibels(tiny_log, tiny_scene):
+    grey = replace(tiny_scene.background, sh=torch.zeros_like(tiny_scene.background.sh))
+    scene = replace(tiny_scene, background=grey)
+    trainer = Trainer(tiny_log, scene, replace(TINY, densify=DensifyOptions(method="none")))
+    before = mean_psnr(trainer)
+    trainer.run()
+    assert mean_psnr(trainer) > before + 3
+
+
+def test_held_out_views_are_scored_whole_and_over_moving_objects(trained, tiny_log):
+    trainer, _ = trained
+    score = score_held_out(trainer.model, tiny_log, TINY)
+    assert score.views == 1
+    assert 15 < score.psnr < 40
+    assert 10 < score.psnr_objects < 40
+    assert 0.3 < score.ssim < 1
+
+
+def test_the_exported_scene_looks_like_the_model(trained, tiny_log):
+    trainer, _ = trained
+    scene = trainer.model.export(stage=1)
+    camera, t_us = tiny_log.rig.cameras[0], int(tiny_log.frame_times_us[3])
+    with torch.no_grad():
+        model = trainer.model.render(camera, t_us).rgb.clamp(0, 1)
+    exported = render_logged_view(scene, camera, t_us)
+    assert np.abs(model.numpy() * 255 - exported).max() < 1.51
+    assert any(o.colour is not None for o in scene.objects.values())
+
+
+def test_a_scene_that_was_exported_shares_nothing_with_the_model(trained):
+    trainer, _ = trained
+    scene = trainer.model.export()
+    before = scene.background.means.clone()
+    with torch.no_grad():
+        trainer.model.gaussians.means.add_(1)
+        trainer.model.gaussians.means.sub_(1)
+        trainer.model.gaussians.means[0] += 5
+    assert torch.equal(scene.background.means, before)
+
+
+def losses_of(folder) -> list[tuple[int, float]]:
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [(line["iteration"], line["loss"]) for line in map(json.loads, lines)]
+
+
+def test_a_run_that_was_broken_off_goes_on_bit_for_bit(tiny_log, tiny_scene, tmp_path):
+    options = replace(TINY, iterations=40, mirror=0.5)
+    whole = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "whole")
+    whole.run()
+    broken = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "broken")
+    broken.run(until=33)
+    resumed = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "broken")
+    resumed.resume()
+    assert resumed.iteration == 20
+    resumed.run()
+    for name, tensor in whole.model.parameters().items():
+        assert torch.equal(tensor, resumed.model.parameters()[name]), name
+    assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "broken")
+    assert [i for i, _ in losses_of(tmp_path / "broken")] == [10, 20, 30, 40]
+
+
+def test_resuming_with_other_options_is_refused(tiny_log, tiny_scene, tmp_path):
+    options = replace(TINY, iterations=2)
+    Trainer(tiny_log, tiny_scene, options, folder=tmp_path).run()
+    other = Trainer(tiny_log, tiny_scene, replace(options, seed=1), folder=tmp_path)
+    with pytest.raises(ReconstructError, match="other options"):
+        other.resume()
+
+
+def test_nothing_to_resume_is_said(tiny_log, tiny_scene, tmp_path):
+    with pytest.raises(ReconstructError, match="no checkpoint"):
+        Trainer(tiny_log, tiny_scene, TINY, folder=tmp_path).resume()
+
+
+def test_held_out_frames_lie_between_seen_ones():
+    assert held_out_frames(9, 4) == [2, 6]
+    assert held_out_frames(7, 4) == [2]
+    assert held_out_frames(9, 0) == []
+
+
+def test_a_mirrored_cloud_looks_from_one_side_as_the_cloud_from_the_other(trained):
+    trainer, _ = trained
+    gaussians = trainer.model.gaussians
+    with torch.no_grad():
+        cloud = gaussians.clouds(degree=1)[1].with_sh_degree(3)
+    cloud = replace(cloud, sh=torch.randn(len(cloud), 16, 3))
+    direction = np.array([0.3, 0.5, 0.8])
+    direction /= np.linalg.norm(direction)
+    basis = torch.from_numpy(sh_basis(direction, 3)).float()
+    turned = torch.from_numpy(sh_basis(direction * [1, -1, 1], 3)).float()
+    ours = torch.einsum("k,nkc->nc", basis, mirror(cloud).sh)
+    theirs = torch.einsum("k,nkc->nc", turned, cloud.sh)
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    assert torch.equal(mirror(cloud).means[:, 1], -cloud.means[:, 1])
