@@ -1,8 +1,8 @@
 """Gradients of the CPU backend are those of the reference, which torch differentiates in float64.
 
-Tolerance: largest difference over the largest gradient of an input. Float32 pixels carry rounding
-of some 1e-5 of it; a pixel on the rim of a Gaussian, where alpha is cut off at 1/255, may count
-for one backend and not for the other, which is worth up to 1e-3 in scenes this small.
+Tolerances are over the largest gradient of an input. Float32 pixels carry rounding of some 1e-5 of
+it, which 99 of 100 values must keep to. A pixel on the rim of a Gaussian, where alpha is cut off at
+1/255, may count for one backend and not for the other: worth up to 1e-3 in scenes this small.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CAMERAS = np.stack(
     [np.eye(4), transform_from([0.3, 0, 1], np.array([0.95, 0.1, 0.2, 0])), np.eye(4)]
 )
 POSE = transform_from([0.5, 0.2, 4.0], np.array([0.9, 0.1, -0.3, 0.2]))
-RELATIVE = 1e-3
+RELATIVE, RELATIVE_OF_MOST = 1e-3, 5e-5
 Leaves = dict[str, Tensor]
 
 
@@ -135,8 +135,11 @@ def assert_agree(given: dict[str, Tensor | None], expected: dict[str, Tensor | N
         assert mine is not None, name
         assert mine.dtype == reference.dtype, name
         largest = float(reference.abs().max())
-        error = float((mine - reference).abs().max())
-        assert error <= RELATIVE * largest, f"{name}: {error / largest:.1e} of {largest:.3g}"
+        errors = (mine - reference).abs().flatten()
+        worst, most = float(errors.max()), float(errors.quantile(0.99))
+        assert worst <= RELATIVE * largest, f"{name}: {worst / largest:.1e} of {largest:.3g}"
+        if errors.numel() > 100:
+            assert most <= RELATIVE_OF_MOST * largest, f"{name}: mostly {most / largest:.1e}"
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
