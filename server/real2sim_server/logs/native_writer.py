@@ -120,6 +120,11 @@ def _manifest(log: DrivingLog, has_lidar: bool) -> dict[str, Any]:
             for track in log.tracks
         ],
         "lidar": has_lidar,
+        "image_times_us": {
+            name: log.image_times_us[name].tolist()
+            for name in log.rig.names
+            if name in log.image_times_us
+        },
         "provenance": dict(log.provenance),
     }
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -195,3 +196,31 @@ def test_documented_example_is_a_log(tmp_path: Path) -> None:
     log = open_log(tmp_path)
     assert log.rig.names == ("front",)
     assert log.tracks[0].object_id == "car_0"
+
+
+def test_times_of_images_survive(tiny_log: SyntheticLog, tmp_path: Path) -> None:
+    late = {"front_left": tiny_log.frame_times_us - [0, 3000, 9000]}
+    given = dataclasses.replace(tiny_log, image_times_us=late)
+    read = open_log(write_native_log(given, tmp_path / "late"))
+    assert [read.image_time_us("front_left", f) for f in range(3)] == late["front_left"].tolist()
+    assert read.image_time_us("front", 2) == tiny_log.frame_times_us[2]
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ({"rear": [0, 1, 2]}, "image_times_us: rear: there is no such camera"),
+        ({"front": [0, 1]}, "front: 2 times for 3 frames"),
+        ({"front": [0, 2, 1]}, "front: frame times must increase"),
+        ({"front": [0, 1, 10**9]}, "front: ego poses cover"),
+    ],
+)
+def test_bad_times_of_images_are_refused(
+    native_folder: Path, times: dict[str, list[int]], message: str
+) -> None:
+    manifest = native_folder / "log.json"
+    content = json.loads(manifest.read_text())
+    content["image_times_us"] = times
+    manifest.write_text(json.dumps(content))
+    with pytest.raises(LogError, match=message):
+        open_log(native_folder)

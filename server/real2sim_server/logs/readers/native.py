@@ -58,6 +58,7 @@ class NativeReader:
             source=_NativeSource(images, _sweep_files(path, content, len(times_us))),
             ego_size=ego.size("size"),
             provenance=dict(content.get("provenance", dict)),
+            image_times_us=_read_image_times(content, rig, times_us, trajectory),
         )
 
 
@@ -179,6 +180,25 @@ def _read_tracks(content: _Section) -> tuple[ObjectTrack, ...]:
             trajectory=_read_trajectory(entry),
         )
     return tuple(tracks.values())
+
+
+def _read_image_times(
+    content: _Section, rig: CameraRig, times_us: NDArray[np.int64], ego: Trajectory
+) -> dict[str, NDArray[np.int64]]:
+    """Times of images by camera; the key may be left out, and so may any camera."""
+    if "image_times_us" not in content.content:
+        return {}
+    section, found = content.section("image_times_us"), {}
+    for name in section.content:
+        where = f"{section.where}: {name}"
+        if name not in rig.names:
+            raise LogError(f"{where}: there is no such camera")
+        given = check_frame_times(section.integers(name), where)
+        if len(given) != len(times_us):
+            raise LogError(f"{where}: {len(given)} times for {len(times_us)} frames")
+        check_ego_covers(ego, given, where)
+        found[name] = given
+    return found
 
 
 def _image_files(path: Path, rig: CameraRig, frame_count: int) -> dict[str, list[Path]]:
