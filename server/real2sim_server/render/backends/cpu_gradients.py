@@ -51,6 +51,7 @@ from .screen import empty_statistics, screen_scale
 CLOUD_PARTS = ("means", "quats", "scales", "opacities", "sh")
 STAGES = ("project", "sort", "tile", "blend", "sky")
 NOTHING = np.zeros((0, 0), np.float32)
+NO_INSTANCES = np.zeros((0, 0), np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,8 @@ class TrainingPasses:
         result = BackwardResult(training.request)
         with self.lock:
             for camera in range(training.request.cameras):
-                seen = Images(*(_camera_image(image, camera) for image in images), NOTHING)
+                rgb, alpha, depth = (_camera_image(image, camera) for image in images)
+                seen = Images(rgb, alpha, depth, NO_INSTANCES)
                 by_image = Losses(*(_camera_image(loss, camera) for loss in losses))
                 if losses[0] is None:
                     by_image = by_image._replace(rgb=NOTHING[..., None])
