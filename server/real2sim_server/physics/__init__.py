@@ -10,11 +10,15 @@ from .errors import (
     SolverError,
     UnstableError,
 )
+from .fill import Filling, fill_object
+from .masses import CLASS_MASSES, default_mass
 from .materials import Foam, Jelly, Material, Metal, NearRigid, NeoHookean, Sand, Snow
 from .particles import Particles, ball_particles, box_particles
+from .restitution import RestitutionFit, fit_restitution
 from .solver import BodyState, Contact, Energies, Solver, SolverOptions, StepReport
 
 __all__ = [
+    "CLASS_MASSES",
     "Body",
     "BodyState",
     "Box",
@@ -22,6 +26,7 @@ __all__ = [
     "ColliderError",
     "Contact",
     "Energies",
+    "Filling",
     "Foam",
     "HeightField",
     "Jelly",
@@ -34,6 +39,7 @@ __all__ = [
     "Particles",
     "PhysicsError",
     "Plane",
+    "RestitutionFit",
     "Sand",
     "Snow",
     "Solver",
@@ -43,4 +49,7 @@ __all__ = [
     "UnstableError",
     "ball_particles",
     "box_particles",
+    "default_mass",
+    "fill_object",
+    "fit_restitution",
 ]

@@ -28,6 +28,10 @@ class Body:
         angular_velocity: [3] about the centre of mass [rad/s].
         friction: Coulomb coefficient of its surface, >= 0; between two bodies the geometric mean
             of both holds, at a collider the collider's where it has one.
+        particle_velocities: [N, 3] [m/s], instead of a rigid motion.
+        particle_gradients: [N, 3, 3] velocity gradients [1/s]; those of the rigid motion when not
+            given.
+        history: [N] plastic memory, as ``BodyState.history`` gave it; none when not given.
         deformation: [N, 3, 3] initial F_elastic; identity when not given.
         total_deformation: [N, 3, 3] initial F_total, of an already dented body; ``deformation``
             when not given.
@@ -43,6 +47,9 @@ class Body:
     velocity: ArrayLike = (0.0, 0.0, 0.0)
     angular_velocity: ArrayLike = (0.0, 0.0, 0.0)
     friction: float = 0.5
+    particle_velocities: Float | None = None
+    particle_gradients: Float | None = None
+    history: Float | None = None
     deformation: Float | None = None
     total_deformation: Float | None = None
     materials: tuple[Material, ...] = field(init=False)
@@ -65,6 +72,12 @@ class Body:
                 f"friction of body {self.name!r} must not be negative: {self.friction!r}"
             )
         self._check_regions()
+        for name, shape in (
+            ("particle_velocities", (3,)),
+            ("particle_gradients", (3, 3)),
+            ("history", ()),
+        ):
+            self._check_array(name, shape)
         self._check_deformation("deformation")
         self._check_deformation("total_deformation")
 
@@ -78,6 +91,17 @@ class Body:
                 f"of materials; they are {regions.shape}, {regions.min()} to {regions.max()}"
             )
         object.__setattr__(self, "regions", regions.astype(np.int64))
+
+    def _check_array(self, name: str, shape: tuple[int, ...]) -> None:
+        if getattr(self, name) is None:
+            return
+        value = np.array(getattr(self, name), dtype=np.float64)
+        wanted = (len(self.particles), *shape)
+        if value.shape != wanted or not np.isfinite(value).all():
+            raise ParticleError(
+                f"{name} of body {self.name!r} must be {wanted} and finite, not {value.shape}"
+            )
+        object.__setattr__(self, name, value)
 
     def _check_deformation(self, name: str) -> None:
         value = getattr(self, name)
@@ -94,5 +118,16 @@ class Body:
     @property
     def velocities(self) -> Float:
         """[N, 3] of its particles at the start [m/s]."""
+        if self.particle_velocities is not None:
+            return self.particle_velocities
         r = self.particles.positions - self.particles.centre_of_mass
         return np.asarray(self.velocity) + np.cross(np.asarray(self.angular_velocity), r)
+
+    @property
+    def gradients(self) -> Float:
+        """[N, 3, 3] velocity gradients of its particles at the start [1/s]."""
+        if self.particle_gradients is not None:
+            return self.particle_gradients
+        x, y, z = np.asarray(self.angular_velocity)
+        spin = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return np.tile(spin, (len(self.particles), 1, 1))

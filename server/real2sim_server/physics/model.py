@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike
 from .backends.base import Model, ParticleArrays
 from .body import Body
 from .errors import ParticleError, SolverError
+from .laws.contact import STICKS
 from .materials import Material
 
 PRECISIONS: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
 BODIES_MAX = 4096
 """What the grid's block keys have room for."""
-FRICTION_MAX = 1e6
-"""Stands for infinity, which products with zero do not survive."""
 BYTES_PER_PARTICLE = {"single": 900, "double": 1400}
 """Peak while solving, saved state and float64 copies included; measured."""
 
@@ -91,28 +90,26 @@ def _assemble(
     for b in bodies:
         index.append(np.asarray(b.regions) + len(materials))
         materials.extend(b.materials)
-    n = len(body)
     elastic = np.concatenate([_deformation(b, "deformation") for b in bodies])
     total = np.concatenate([_deformation(b, "total_deformation") for b in bodies])
     positions = np.concatenate([b.particles.positions for b in bodies])
-    spin = np.concatenate(
-        [np.broadcast_to(_gradient(b), (s, 3, 3)) for b, s in zip(bodies, sizes, strict=True)]
-    )
     return Model(
         start=ParticleArrays(
             positions,
             np.concatenate([b.velocities for b in bodies]),
-            spin,
+            np.concatenate([b.gradients for b in bodies]),
             elastic,
             total,
-            np.zeros(n),
+            np.concatenate(
+                [np.zeros(len(b.particles)) if b.history is None else b.history for b in bodies]
+            ),
         ),
         masses=np.concatenate([b.particles.masses for b in bodies]),
         volumes=np.concatenate([b.particles.volumes for b in bodies]),
         material=np.concatenate(index),
         body=body,
         table=np.stack([m.row() for m in materials]),
-        friction=np.array([min(b.friction, FRICTION_MAX) for b in bodies]),
+        friction=np.array([min(b.friction, float(STICKS)) for b in bodies]),
         dx=dx,
         gravity=gravity,
         dtype=dtype,
@@ -126,9 +123,3 @@ def _deformation(body: Body, name: str) -> Any:
     if value is None:
         return np.tile(np.eye(3), (len(body.particles), 1, 1))
     return value
-
-
-def _gradient(body: Body) -> Any:
-    """Velocity gradient [3, 3] of its rotation."""
-    x, y, z = np.asarray(body.angular_velocity)
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

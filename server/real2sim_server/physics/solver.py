@@ -182,11 +182,12 @@ class Solver:
         o = self.options
         self.model: Model = build_model(bodies, dx=o.dx, gravity=o.gravity, precision=o.precision)
         backend = select_backend(o.backend)
-        self._simulation: Simulation = backend.start(self.model, self._colliders)
+        # Public for benches and restorers of single substeps; time and guard are the solver's.
+        self.simulation: Simulation = backend.start(self.model, self._colliders)
         self._viscous_dt = _viscous_limit(self.model)
         self._share = 1.0
         self.time = 0.0
-        self._measure = self._simulation.measure()
+        self._measure = self.simulation.measure()
         self._start_energy = self._mechanical(self._measure)
 
     @property
@@ -244,7 +245,7 @@ class Solver:
 
     def states(self) -> list[BodyState]:
         """All bodies, in order."""
-        arrays, m = self._simulation.particles(), self._measure
+        arrays, m = self.simulation.particles(), self._measure
         states = []
         for b in range(len(self.bodies)):
             own = self.model.body == b
@@ -274,12 +275,12 @@ class Solver:
 
     def particles(self) -> ParticleArrays:
         """All particles, body after body."""
-        return self._simulation.particles()
+        return self.simulation.particles()
 
     @property
     def contacts(self) -> list[Contact]:
         """Everything that touched since the start, one entry for each body and other."""
-        by_collider, by_body = self._simulation.contacts()
+        by_collider, by_body = self.simulation.contacts()
         names = [b.name for b in self.bodies]
         found = []
         others = [c.name for c in self._colliders]
@@ -305,17 +306,17 @@ class Solver:
 
     def snapshot(self) -> Any:
         """The present state, bit by bit; for :meth:`restore` of this solver only."""
-        return self._simulation.save(), list(self._colliders), self.time, self._share, self._measure
+        return self.simulation.save(), list(self._colliders), self.time, self._share, self._measure
 
     def restore(self, snapshot: Any) -> None:
         """Go back to a snapshot; from there on everything is as it was, to the bit."""
         saved, colliders, self.time, self._share, self._measure = snapshot
         self._colliders = list(colliders)
-        self._simulation.restore(saved)
+        self.simulation.restore(saved)
 
     def _try(self, count: int, report: StepReport) -> bool:
         """Make ``count`` substeps; take them back and halve the step if they went wrong."""
-        before, saved = self._measure, self._simulation.save()
+        before, saved = self._measure, self.simulation.save()
         work_before = self._contact_energies()[1]
         reason = self._advance(count, report.dt)
         if not reason:
@@ -325,7 +326,7 @@ class Solver:
             self.time += count * report.dt
             self._share = min(1.0, self._share * 1.1)
             return True
-        self._simulation.restore(saved)
+        self.simulation.restore(saved)
         self._measure = before
         self._share *= 0.5
         report.rollbacks += 1
@@ -340,8 +341,8 @@ class Solver:
 
     def _advance(self, count: int, dt: float) -> str:
         try:
-            self._simulation.advance(count, dt, self._colliders)
-            self._measure = self._simulation.measure()
+            self.simulation.advance(count, dt, self._colliders)
+            self._measure = self.simulation.measure()
         except Blowup:
             return "particles left the grid"
         return ""
@@ -368,7 +369,7 @@ class Solver:
 
     def _contact_energies(self) -> tuple[float, float]:
         """Friction heat, and work of moving colliders, since the start [J]."""
-        by_collider, by_body = self._simulation.contacts()
+        by_collider, by_body = self.simulation.contacts()
         heat = by_collider[:, :, 6].sum() + by_body[:, :, 6].sum()
         return float(heat), float(by_collider[:, :, 7].sum())
 

@@ -149,3 +149,21 @@ def test_a_restored_snapshot_goes_on_to_the_same_bits(backend):
 def test_unknown_backends_are_named():
     with pytest.raises(SolverError, match="allowed are 'auto'"):
         select_backend("gpu")
+
+
+def test_bodies_travel_through_blocks_as_in_the_reference():
+    runs = [
+        solve(
+            [cube(edge=0.2, velocity=(30, -20, 10), angular_velocity=(0, 30, 60))],
+            backend=backend,
+            precision="double",
+            gravity=(0, 0, 0),
+            dt_max=5e-4,
+        )
+        for backend in ("reference", "cpu")
+    ]
+    for run in runs:
+        run.step(0.05)
+    expected, found = (run.particles() for run in runs)
+    assert np.abs(expected.positions - runs[0].bodies[0].particles.positions).max() > 1.5
+    assert np.abs(found.positions - expected.positions).max() < 1e-9

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...scene.rotation import Float
 from ..colliders import Box, Collider, HeightField, Plane
 from ..laws import obstacle
+from ..laws.contact import STICKS
 
 TOTALS = 8
 """Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
@@ -157,7 +158,8 @@ def pack_colliders(colliders: Sequence[Collider]) -> tuple[Float, Float]:
     heights: list[Float] = []
     stored = 0
     for row, collider in zip(rows, colliders, strict=True):
-        row[obstacle.FRICTION] = -1.0 if collider.friction is None else collider.friction
+        own = collider.friction
+        row[obstacle.FRICTION] = -1.0 if own is None else min(own, float(STICKS))
         row[obstacle.SEPARABLE] = collider.separable
         if isinstance(collider, Plane):
             row[obstacle.KIND] = obstacle.PLANE

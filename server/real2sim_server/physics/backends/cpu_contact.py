@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..laws.contact import coulomb, surface_offset
+from ..laws.contact import OPPOSED, coulomb, face_score, surface_offset
 from ..laws.obstacle import (
     FRICTION,
     SEPARABLE,
@@ -19,9 +19,6 @@ from ..laws.obstacle import (
 from ..laws.shared import ZERO
 from .cpu_layout import BLOCK
 from .kernel import inner
-
-SAME_PLACE = 1e-6
-"""Bodies whose mass centres coincide at a node [cells] have no contact normal there."""
 
 
 @inner()
@@ -48,7 +45,7 @@ def meet_colliders(field: Any, layout: Any, work: Any, rules: Any) -> None:
                 distance, n = obstacle_distance(row, rules.heights, x, y, z)
                 if distance <= 0.0:
                     d = work.offset[field, node]
-                    depth = (d[0] * n[0] + d[1] * n[1] + d[2] * n[2]) / m
+                    depth = (d[0] * n[0] + d[1] * n[1] + d[2] * n[2]) / d[3]
                     if distance / rules.dx + surface_offset(depth) <= 0.0:
                         u = obstacle_velocity(row, x, y, z)
                         touch_node(
@@ -100,30 +97,34 @@ def meet_bodies(begin: Any, end: Any, layout: Any, work: Any, rules: Any) -> Non
                     meet_node(
                         work.velocity[a, node], work.velocity[b, node],
                         work.offset[a, node], work.offset[b, node],
-                        friction, at, work.by_body[a, body_b], work.by_body[b, body_a],
+                        friction, rules.dx, at, work.by_body[a, body_b], work.by_body[b, body_a],
                     )  # fmt: skip
 
 
 @inner()
 def meet_node(
     node_a: Any, node_b: Any, moment_a: Any, moment_b: Any,
-    friction: Any, at: Any, total_a: Any, total_b: Any,
+    friction: Any, dx: Any, at: Any, total_a: Any, total_b: Any,
 ) -> None:  # fmt: skip
     """Contact of two bodies at a node, where their surfaces have met.
 
-    The normal points from the centroid of the one's mass near the node to the other's; each
-    surface lies where a half-space with that centroid would have it.
+    The normal is that of the body that shows more of a face, or edges would plough through faces;
+    surfaces that do not look at each other pass by. Each surface lies where a half-space with that
+    centroid has it.
     """
     ma, mb = node_a[3], node_b[3]
-    n, apart = unit(
-        moment_b[0] / mb - moment_a[0] / ma,
-        moment_b[1] / mb - moment_a[1] / ma,
-        moment_b[2] / mb - moment_a[2] / ma,
-    )
-    if apart < SAME_PLACE:
+    volume_a, volume_b = moment_a[3], moment_b[3]
+    into_b, size_b = unit(moment_b[0], moment_b[1], moment_b[2])
+    out_of_a, size_a = unit(-moment_a[0], -moment_a[1], -moment_a[2])
+    facing = into_b[0] * out_of_a[0] + into_b[1] * out_of_a[1] + into_b[2] * out_of_a[2]
+    if facing < OPPOSED:
         return
-    depth_a = -(moment_a[0] * n[0] + moment_a[1] * n[1] + moment_a[2] * n[2]) / ma
-    depth_b = (moment_b[0] * n[0] + moment_b[1] * n[1] + moment_b[2] * n[2]) / mb
+    per_cell = 1.0 / (dx * dx * dx)
+    score_a = face_score(size_a * per_cell, volume_a * per_cell)
+    score_b = face_score(size_b * per_cell, volume_b * per_cell)
+    n = out_of_a if score_a > score_b else into_b
+    depth_a = -(moment_a[0] * n[0] + moment_a[1] * n[1] + moment_a[2] * n[2]) / volume_a
+    depth_b = (moment_b[0] * n[0] + moment_b[1] * n[1] + moment_b[2] * n[2]) / volume_b
     if surface_offset(depth_a) + surface_offset(depth_b) > ZERO:
         return
     relative = (node_b[0] - node_a[0], node_b[1] - node_a[1], node_b[2] - node_a[2])

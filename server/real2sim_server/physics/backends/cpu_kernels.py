@@ -61,7 +61,7 @@ class Work(NamedTuple):
 
     Attributes:
         tiles: [P, 512, 4] momentum and mass, then velocities.
-        moments: [Q, 512, 4] first moment of mass about the nodes [kg cells].
+        moments: [Q, 512, 4] first moment of volume about the nodes [m^3 cells], and volume [m^3].
         velocity: [M, 64, 4] velocity and mass of the fields.
         offset: [M, 64, 4] first moments of the fields.
         strayed: [P] bool, whether a particle left its home's reach.
@@ -156,15 +156,15 @@ def scatter_particles(begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: 
 
 @inner()
 def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
-    """Add m w (x_p - x_i) [kg cells] of one home's particles to its moments."""
+    """Add w V (x_p - x_i) and w V of one home's particles to its moments; V at rest."""
     for p in range(begin, end):
         first, fx, fy, fz = place(state.xi, p)
-        m = state.mass[p]
-        zero = ZERO * m
+        V = state.volume[p]
+        zero = ZERO * V
         wx, wy, wz = spline_weights(fx), spline_weights(fy), spline_weights(fz)
-        start = (m * fx, m * fy, m * fz, zero)
+        start = (V * fx, V * fy, V * fz, V)
         scatter(
-            moments, first, wx, wy, wz, start, (-m, zero, zero), (zero, -m, zero), (zero, zero, -m)
+            moments, first, wx, wy, wz, start, (-V, zero, zero), (zero, -V, zero), (zero, zero, -V)
         )
 
 
@@ -266,9 +266,16 @@ def gather_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving
             for o in range(27):
                 copy_field(work.velocity[layout.home_fields[home, o]], o, tile)
             begin, end = layout.home_start[home], layout.home_start[home + 1]
-            work.strayed[home] = gather_particles(
+            gone = gather_particles(
                 begin, end, dt, rules.dx, state, rules.table, tile.reshape(-1), moving
             )
+            note(work.strayed, home, gone)
+
+
+@inner()
+def note(flags: Any, index: Any, flag: Any) -> None:
+    """Store a flag. As a plain assignment in the parallel loop Numba takes it for dead code."""
+    flags[index] = flag
 
 
 @inner()
@@ -300,7 +307,10 @@ def gather_particles(
                 state.v[p, axis] = v[axis]
                 xi = state.xi[p, axis] + stride * v[axis]
                 state.xi[p, axis] = xi
-                strayed |= not (LOW <= xi < HIGH)
+                # NaN fails both comparisons, so it counts as strayed.
+                if xi >= LOW and xi < HIGH:
+                    continue
+                strayed = True
             for c in range(9):
                 state.L[p, c] = L[c]
         deform(p, dt, state, table[state.material[p]])

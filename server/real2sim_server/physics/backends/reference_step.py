@@ -15,12 +15,13 @@ from torch import Tensor
 from ..colliders import Box, Collider, HeightField, Plane
 from ..errors import ColliderError
 from ..laws import stress as laws
-from ..laws.contact import SURFACE
+from ..laws.contact import FLAT_MOMENT, OPPOSED, STICKS, SURFACE
 from .reference_stress import respond
 
 OFFSETS = torch.cartesian_prod(*[torch.arange(3)] * 3)
 """[27, 3] offsets of a particle's nodes from the first."""
 SURFACE_TABLE = torch.from_numpy(SURFACE.astype(np.float64))
+FLAT_TABLE = torch.from_numpy(FLAT_MOMENT.astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +101,11 @@ def substep(
 ) -> tuple[TorchState, list[Touch]]:
     """MLS-MPM with APIC (Hu et al. 2018), contact on separate velocity fields."""
     index, weights, arm, nodes = _stencil(state.x, rules.dx)
-    velocity, mass, offset = _to_grid(state, rules, dt, index, weights, arm, len(nodes))
+    velocity, mass, moment = _to_grid(state, rules, dt, index, weights, arm, len(nodes))
     velocity = velocity + dt * rules.gravity
     touches: list[Touch] = []
-    velocity = _meet_bodies(velocity, mass, offset, nodes, rules, touches)
-    velocity = _meet_colliders(velocity, mass, offset, nodes, rules, colliders, touches)
+    velocity = _meet_bodies(velocity, mass, moment, nodes, rules, touches)
+    velocity = _meet_colliders(velocity, mass, moment, nodes, rules, colliders, touches)
 
     seen = velocity[rules.body[:, None], index]
     v = (weights[:, :, None] * seen).sum(1)
@@ -164,28 +165,41 @@ def _to_grid(
     arm: Tensor,
     nodes: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocity [B, U, 3], mass [B, U] and centroid offset [B, U, 3] [cells] of each body."""
+    """Velocity [B, U, 3], mass [B, U], volume and its first moment [B, U, 4] of each body."""
     scale = (-dt * 4 / rules.dx**2 * rules.volume)[:, None, None]
     Q = scale * state.tau + rules.mass[:, None, None] * state.L
     momentum = (rules.mass[:, None] * state.v)[:, None] + torch.einsum("nij,nkj->nki", Q, arm)
     m = weights * rules.mass[:, None]
-    values = torch.cat([weights[..., None] * momentum, m[..., None], -m[..., None] * arm], dim=-1)
+    V = (weights * rules.volume[:, None])[..., None]
+    values = torch.cat([weights[..., None] * momentum, m[..., None], -V * arm / rules.dx, V], -1)
     bodies = len(rules.friction)
     flat = (rules.body[:, None] * nodes + index).reshape(-1)
-    grid = torch.zeros(bodies * nodes, 7, dtype=state.x.dtype)
-    grid = grid.index_add(0, flat, values.reshape(-1, 7)).reshape(bodies, nodes, 7)
+    grid = torch.zeros(bodies * nodes, 8, dtype=state.x.dtype)
+    grid = grid.index_add(0, flat, values.reshape(-1, 8)).reshape(bodies, nodes, 8)
     mass = grid[..., 3]
     safe = torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
-    return grid[..., :3] / safe, mass, grid[..., 4:] / safe / rules.dx
+    return grid[..., :3] / safe, mass, grid[..., 4:]
 
 
 def surface_offset(centroid: Tensor) -> Tensor:
     """Where surfaces lie, from centroid offsets [cells]; see ``laws.contact``."""
-    last = len(SURFACE_TABLE) - 1
-    scaled = (centroid / 1.5).clamp(0, 1) * last
+    return _look_up(SURFACE_TABLE, centroid / 1.5)
+
+
+def _look_up(table: Tensor, at: Tensor) -> Tensor:
+    """Linear interpolation in a table over [0, 1]."""
+    last = len(table) - 1
+    scaled = at.clamp(0, 1) * last
     index = scaled.detach().floor().clamp(max=last - 1).long()
-    low, high = SURFACE_TABLE[index], SURFACE_TABLE[index + 1]
+    low, high = table[index], table[index + 1]
     return low + (scaled - index) * (high - low)
+
+
+def _depth(moment: Tensor, n: Tensor) -> Tensor:
+    """Offset [U] [cells] along ``n`` of the centroid of the volume [U, 4] near each node."""
+    volume = moment[:, 3]
+    safe = torch.where(volume > 0, volume, torch.ones_like(volume))
+    return (moment[:, :3] * n).sum(-1) / safe
 
 
 def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
@@ -195,14 +209,15 @@ def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
     square = t.square().sum(-1, keepdim=True)
     speed = torch.where(square > 0, square, torch.ones_like(square)).sqrt()
     keep = (1 - friction * approach.abs() / speed).clamp(min=0)
-    slid = torch.where(square > 0, keep, torch.zeros_like(keep)) * t
+    slides = (square > 0) & (friction < STICKS)
+    slid = torch.where(slides, keep, torch.zeros_like(keep)) * t
     return torch.where((approach >= 0) & separable, v, slid)
 
 
 def _meet_bodies(
     velocity: Tensor,
     mass: Tensor,
-    offset: Tensor,
+    moment: Tensor,
     nodes: Tensor,
     rules: TorchRules,
     touches: list[Touch],
@@ -212,11 +227,9 @@ def _meet_bodies(
     for a in range(len(fields)):
         for b in range(a + 1, len(fields)):
             ma, mb = mass[a], mass[b]
-            apart = offset[b] - offset[a]
-            length = apart.norm(dim=-1, keepdim=True).clamp(min=1e-30)
-            n = apart / length
-            gap = surface_offset(-(offset[a] * n).sum(-1)) + surface_offset((offset[b] * n).sum(-1))
-            meet = (ma > 0) & (mb > 0) & (length[:, 0] >= 1e-6) & (gap <= 0)
+            n, opposed = _normal(moment[a] / rules.dx**3, moment[b] / rules.dx**3)
+            gap = surface_offset(_depth(moment[a], -n)) + surface_offset(_depth(moment[b], n))
+            meet = (ma > 0) & (mb > 0) & opposed & (gap <= 0)
             relative = fields[b] - fields[a]
             friction = (rules.friction[a] * rules.friction[b]).sqrt()
             change = coulomb(relative, n, friction, separable=True) - relative
@@ -232,10 +245,26 @@ def _meet_bodies(
     return torch.stack(fields)
 
 
+def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
+    """Contact normals [U, 3] from a to b, and where [U] the surfaces look at each other."""
+    size_a, size_b = moment_a[:, :3].norm(dim=-1), moment_b[:, :3].norm(dim=-1)
+    out_of_a = -moment_a[:, :3] / size_a.clamp(min=1e-30)[:, None]
+    into_b = moment_b[:, :3] / size_b.clamp(min=1e-30)[:, None]
+    from_a = _face_score(size_a, moment_a[:, 3]) > _face_score(size_b, moment_b[:, 3])
+    n = torch.where(from_a[:, None], out_of_a, into_b)
+    return n, (out_of_a * into_b).sum(-1) >= float(OPPOSED)
+
+
+def _face_score(size: Tensor, share: Tensor) -> Tensor:
+    """How well first moments tell normals; see ``laws.contact``."""
+    flat = _look_up(FLAT_TABLE, share).clamp(min=1e-3)
+    return (size / flat) ** 2 * size
+
+
 def _meet_colliders(
     velocity: Tensor,
     mass: Tensor,
-    offset: Tensor,
+    moment: Tensor,
     nodes: Tensor,
     rules: TorchRules,
     colliders: Sequence[Collider],
@@ -245,10 +274,12 @@ def _meet_colliders(
     for b in range(len(fields)):
         for k, collider in enumerate(colliders):
             distance, n = _distance(collider, nodes)
-            gap = distance / rules.dx + surface_offset((offset[b] * n).sum(-1))
+            gap = distance / rules.dx + surface_offset(_depth(moment[b], n))
             meet = (mass[b] > 0) & (distance <= 0) & (gap <= 0)
             own = collider.friction is None
-            friction = rules.friction[b] if own else torch.tensor(min(collider.friction, 1e6))
+            friction = (
+                rules.friction[b] if own else torch.tensor(min(collider.friction, float(STICKS)))
+            )
             u = _material_velocity(collider, nodes)
             after = u + coulomb(fields[b] - u, n, friction, collider.separable)
             new = torch.where(meet[:, None], after, fields[b])

@@ -12,24 +12,30 @@ from .shared import F32, ONE, TINY, ZERO, law
 REACH = F32(1.5)
 """Half width of the spline: a node sees matter up to this many cells away."""
 _ENTRIES = 256
+STICKS = F32(1e6)
+"""Stands for infinite friction, which times no pressure would be no number."""
 
 
-def _surface_table() -> Any:
-    """Surface offset [cells] by centroid offset, for matter that fills u > surface at a node.
+def _half_space_tables() -> Any:
+    """What a node sees of matter that fills u > surface, as the surface passes it [cells].
 
-    The centroid of N(u) over (s, 1.5) grows with s; the table is its inverse at even steps.
+    Two tables at even steps: surface by centroid in [0, 1.5], and first moment by filled share.
     """
     u = np.linspace(-1.5, 1.5, 60_001)
     a = np.abs(u)
-    n = np.where(a < 0.5, 0.75 - a**2, 0.5 * (1.5 - a) ** 2)
-    mass = np.cumsum(n[::-1])[::-1]
-    centroid = np.cumsum((u * n)[::-1])[::-1] / np.maximum(mass, 1e-300)
+    n = np.where(a < 0.5, 0.75 - a**2, 0.5 * (1.5 - a) ** 2) * (u[1] - u[0])
+    share = np.cumsum(n[::-1])[::-1]
+    moment = np.cumsum((u * n)[::-1])[::-1]
+    centroid = moment / np.maximum(share, 1e-300)
     centroid[-1] = 1.5
-    even = np.linspace(0.0, 1.5, _ENTRIES + 1)
-    return np.interp(even, centroid, u).astype(np.float32)
+    even = np.linspace(0.0, 1.0, _ENTRIES + 1)
+    surface = np.interp(1.5 * even, centroid, u)
+    return surface.astype(np.float32), np.interp(even, share[::-1], moment[::-1]).astype(np.float32)
 
 
-SURFACE = _surface_table()
+SURFACE, FLAT_MOMENT = _half_space_tables()
+OPPOSED = F32(0.5)
+"""Surfaces meet only where the cosine between their normals is beyond this; else they pass by."""
 
 
 @law
@@ -51,13 +57,31 @@ def surface_offset(centroid: Any) -> Any:
 
 
 @law
+def face_score(moment: Any, share: Any) -> Any:
+    """How well a body's first moment [cells] tells the normal: how large, and how like a face.
+
+    Args:
+        moment: length of the first moment of the filled share.
+        share: filled share of the node's surroundings.
+
+    Among bodies of one share a face has the largest moment; edges and corners have less.
+    """
+    scaled = min(share, ONE) * F32(_ENTRIES)
+    index = min(int(scaled), _ENTRIES - 1)
+    fraction = scaled - F32(index)
+    flat = FLAT_MOMENT[index] + fraction * (FLAT_MOMENT[index + 1] - FLAT_MOMENT[index])
+    likeness = moment / max(flat, F32(1e-3))
+    return likeness * likeness * moment
+
+
+@law
 def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
     """Relative velocity after a touch: no approach along ``n``, Coulomb friction across it.
 
     Args:
         v: velocity relative to the obstacle, three numbers.
         n: unit normal out of the obstacle.
-        friction: Coulomb coefficient; infinity sticks.
+        friction: Coulomb coefficient; from STICKS on nothing slides.
         separable: false keeps the normal velocity at zero when it points away, too.
 
     v_t' = max(0, 1 - mu |v_n| / |v_t|) v_t. Takes kinetic energy or leaves it, never adds any.
@@ -65,6 +89,8 @@ def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
     approach = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
     if approach >= ZERO and separable:
         return v
+    if friction >= STICKS:
+        return ZERO * v[0], ZERO * v[1], ZERO * v[2]
     t = (v[0] - approach * n[0], v[1] - approach * n[1], v[2] - approach * n[2])
     speed = math.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
     keep = ZERO * speed

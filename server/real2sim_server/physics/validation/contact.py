@@ -1,0 +1,187 @@
+"""Contact: friction, rebound, impulse."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..colliders import Plane
+from ..materials import Jelly
+from ..restitution import fit_restitution
+from ..solver import SolverOptions
+from .check import Check, block, solve
+
+GRAVITY = 9.81
+RUBBER = Jelly(young=2e5, poisson=0.2, viscosity=200)
+"""Damped, so that a block that is set down comes to rest and stays in touch."""
+
+
+def incline(backend: str, *, duration: float = 0.5) -> list[Check]:
+    """A block on a slope of 24 degrees slides at g (sin - mu cos), or sticks."""
+    slope = math.radians(24)
+    gravity = (GRAVITY * math.sin(slope), 0.0, -GRAVITY * math.cos(slope))
+    checks = []
+    for name, mu in (("slides", math.tan(math.radians(15))), ("sticks", 0.6)):
+        body = block(RUBBER, size=(0.6, 0.6, 0.3), at=(0, 0, 0.15), friction=mu)
+        solver = solve([body], [Plane(name="slope")], gravity=gravity, backend=backend)
+        # Let it settle against the slope first.
+        solver.step(0.1)
+        x, v = solver.measure.centre[0, 0], solver.measure.momentum[0, 0] / solver.measure.mass[0]
+        solver.step(duration)
+        acceleration = max(GRAVITY * (math.sin(slope) - mu * math.cos(slope)), 0.0)
+        moved = float(solver.measure.centre[0, 0] - x - v * duration * (acceleration > 0))
+        exact = acceleration * duration**2 / 2
+        tolerance = 0.02 * exact if exact else 2e-3
+        checks.append(Check(f"incline: {name}", moved, exact, tolerance, "m"))
+    return checks
+
+
+def braking(backend: str, *, speed: float = 10.0) -> list[Check]:
+    """A block sliding to rest: v^2 / (2 mu g), after v / (mu g)."""
+    mu = 0.7
+    body = block(RUBBER, size=(0.8, 0.8, 0.2), at=(0, 0, 0.1), friction=mu, velocity=(speed, 0, 0))
+    solver = solve([body], [Plane(name="road")], gravity=(0, 0, -GRAVITY), backend=backend)
+    distance, duration = speed**2 / (2 * mu * GRAVITY), speed / (mu * GRAVITY)
+    stopped = math.nan
+    while solver.time < 1.2 * duration:
+        solver.step(duration / 200)
+        if (
+            math.isnan(stopped)
+            and solver.measure.momentum[0, 0] <= 0.005 * speed * body.particles.mass
+        ):
+            stopped = solver.time
+    moved = float(solver.measure.centre[0, 0])
+    return [
+        Check("braking: distance", moved, distance, 0.03 * distance, "m"),
+        Check("braking: time", stopped, duration, 0.03 * duration, "s"),
+    ]
+
+
+def oblique_impact(backend: str) -> list[Check]:
+    """A block that hits a wall and slides: the wall's impulse leans by mu, delta-v follows."""
+    checks = []
+    for mu in (0.1, 0.3):
+        body = block(
+            Jelly(young=2e6, poisson=0.2),
+            size=(0.8, 0.8, 0.2),
+            at=(0, 0, 0.11),
+            velocity=(6, 0, -2),
+            friction=mu,
+        )
+        solver = solve([body], [Plane(name="wall")], backend=backend)
+        solver.step(0.03)
+        m = solver.measure
+        v = m.momentum[0] / m.mass[0]
+        e = float(v[2]) / 2
+        checks.append(
+            Check(f"oblique impact, mu {mu}", 6 - float(v[0]), mu * (1 + e) * 2, 0.03 * mu * 4)
+        )
+    return checks
+
+
+def frictionless_slide(backend: str) -> list[Check]:
+    """Two blocks pressed together that slide with mu = 0 keep their slip, touch, and part.
+
+    Stiff enough that edges do not dig in, which would brake them in earnest.
+    """
+    material = Jelly(young=2e6, poisson=0.2)
+    upper = block(material, at=(0.1, 0, 0.205), velocity=(-3, 0, -0.5), friction=0, name="upper")
+    lower = block(
+        material,
+        size=(0.8, 0.6, 0.4),
+        at=(0, 0, -0.2),
+        velocity=(0, 0, 0.5),
+        friction=0,
+        name="lower",
+    )
+    solver = solve([upper, lower], backend=backend)
+    solver.step(0.06)
+    m = solver.measure
+    v = m.momentum / m.mass[:, None]
+    pushed = [float(c.impulse[2]) for c in solver.contacts if c.body == "upper"]
+    return [
+        Check("slide with mu 0: slip kept", float(v[1, 0] - v[0, 0]) / 3, 1, 0.05),
+        Check("slide with mu 0: they touched", float(bool(pushed) and pushed[0] > 1), 1, 0),
+        Check("slide with mu 0: they part", float(v[0, 2] > v[1, 2]), 1, 0),
+    ]
+
+
+def restitution(backend: str, *, requests: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7)) -> list[Check]:
+    """Requested against achieved, by an impact made after the fit, in which no energy appears."""
+    checks = []
+    options = SolverOptions(dx=0.08, backend=backend, gravity=(0.0, 0.0, 0.0))
+    body = block(Jelly(young=2e6, poisson=0.4), size=(0.48, 0.48, 0.48), spacing=0.04)
+    for e in requests:
+        fit = fit_restitution(body, e, speed=2.5, options=options)
+        thrown = block(
+            fit.body.materials[0],
+            size=(0.48, 0.48, 0.48),
+            spacing=0.04,
+            at=(0.013, 0.027, 0.26),
+            velocity=(0, 0, -2.5),
+        )
+        solver = solve([thrown], [Plane(name="wall")], dx=0.08, backend=backend)
+        start = highest = solver.energies().total
+        while solver.time < 0.06:
+            solver.step(0.003)
+            highest = max(highest, solver.energies().total)
+        m = solver.measure
+        checks += [
+            Check(f"restitution {e}", float(m.momentum[0, 2] / m.mass[0]) / 2.5, e, 0.03),
+            Check(f"restitution {e}: energy gained", max(highest / start - 1, 0.0), 0, 1e-3),
+        ]
+    return checks
+
+
+def collinear_cars(backend: str) -> list[Check]:
+    """Delta-v of two cars in line: m2 / (m1 + m2) (1 + e) Vc (momentum theory)."""
+    front = block(
+        Jelly(young=2e6, poisson=0.2, density=150, viscosity=3000),
+        size=(1.6, 0.8, 0.6),
+        spacing=0.1,
+        at=(-0.85, 0, 0),
+        velocity=(8, 0, 0),
+        name="bullet",
+    )
+    target = block(
+        Jelly(young=2e6, poisson=0.2, density=250, viscosity=3000),
+        size=(1.6, 0.8, 0.6),
+        spacing=0.1,
+        at=(0.85, 0, 0),
+        name="target",
+    )
+    solver = solve([front, target], backend=backend, dx=0.2)
+    solver.step(0.12)
+    m = solver.measure
+    v = m.momentum[:, 0] / m.mass
+    e = float(v[1] - v[0]) / 8
+    expected = m.mass[1] / m.mass.sum() * (1 + e) * 8
+    impulse = next(c.impulse for c in solver.contacts if c.body == "bullet")
+    return [
+        Check("collinear cars: delta-v", 8 - float(v[0]), expected, 0.05 * expected, "m/s"),
+        Check(
+            "collinear cars: impulse over mass",
+            -float(impulse[0]) / float(m.mass[0]),
+            expected,
+            0.05 * expected,
+            "m/s",
+        ),
+        Check("collinear cars: restitution in (0, 0.6)", e, 0.3, 0.3),
+    ]
+
+
+def rest(backend: str) -> list[Check]:
+    """A block dropped on the ground comes to rest on it: no gap, no sinking, the weight held."""
+    body = block(RUBBER, size=(0.4, 0.4, 0.4), at=(0, 0, 0.3))
+    solver = solve([body], [Plane(name="ground")], gravity=(0, 0, -GRAVITY), backend=backend)
+    solver.step(1.5)
+    before = float(solver.contacts[0].impulse[2])
+    solver.step(0.2)
+    force = (float(solver.contacts[0].impulse[2]) - before) / 0.2
+    weight = body.particles.mass * GRAVITY
+    lowest = float(np.min(solver.particles().positions[:, 2])) - 0.025
+    return [
+        Check("rest: gap below", lowest, 0, 0.025, "m"),
+        Check("rest: weight held", force, weight, 0.02 * weight, "N"),
+    ]

@@ -1,0 +1,63 @@
+"""Gradients through the reference against central differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..backends.reference import torch_model
+from ..backends.reference_step import TorchRules, TorchState, settle, substep
+from ..colliders import Plane
+from ..laws import stress as laws
+from ..materials import Metal
+from .check import Check, block, solve
+
+STEPS, DT = 60, 5e-4
+
+
+def gradients(backend: str = "reference") -> list[Check]:
+    """How a bounce changes with stiffness, yield, viscosity, friction and speed."""
+    metal = Metal(young=2e5, poisson=0.3, yield_stress=4e3, hardening=1e4, viscosity=50)
+    body = block(
+        metal, size=(0.2, 0.2, 0.2), at=(0.013, 0.027, 0.12), velocity=(1, 0.2, -2), friction=0.3
+    )
+    state, rules = torch_model(solve([body], backend="reference").model)
+    names = ("stiffness", "yield stress", "viscosity", "friction", "speed")
+    knobs = torch.zeros(len(names), dtype=torch.float64, requires_grad=True)
+    outcome = _outcome(state, rules)
+    outcome(knobs).backward()
+    assert knobs.grad is not None
+    checks = []
+    for i, name in enumerate(names):
+        step = torch.zeros_like(knobs)
+        step[i] = 1e-5
+        with torch.no_grad():
+            slope = float((outcome(knobs + step) - outcome(knobs - step)) / 2e-5)
+        checks.append(Check(f"gradient: {name}", float(knobs.grad[i]), slope, 1e-3 * abs(slope)))
+    return checks
+
+
+def _outcome(state: TorchState, rules: TorchRules) -> Callable[[Tensor], Tensor]:
+    """Final motion as one number, of logarithms of factors on five parameters."""
+
+    def run(knobs: Tensor) -> Tensor:
+        factor = knobs.exp()
+        ones = torch.ones_like(factor[0])
+        columns = [ones] * laws.ROW
+        columns[laws.MU] = columns[laws.LAMBDA] = factor[0]
+        columns[laws.A], columns[laws.VISCOSITY] = factor[1], factor[2]
+        changed = replace(
+            rules,
+            rows=rules.rows * torch.stack(columns),
+            friction=rules.friction * factor[3],
+        )
+        now = settle(replace(state, v=state.v * factor[4]), changed)
+        for _ in range(STEPS):
+            now, _ = substep(now, changed, [Plane(name="ground")], DT)
+        momentum = (rules.mass[:, None] * now.v).sum(0)
+        return momentum @ torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64)
+
+    return run

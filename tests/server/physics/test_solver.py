@@ -1,0 +1,199 @@
+"""The solver's promises: refusals, survival, guard, ledger."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_server.physics import (
+    Body,
+    Box,
+    ColliderError,
+    HeightField,
+    Jelly,
+    MaterialError,
+    ParticleError,
+    Particles,
+    Plane,
+    Solver,
+    SolverError,
+    SolverOptions,
+    box_particles,
+    model,
+)
+
+from .scenes import SOFT, at, cube, ground, solve
+
+
+def lumps(**changes):
+    values = {
+        "positions": np.zeros((2, 3)),
+        "volumes": np.ones(2),
+        "masses": np.ones(2),
+        "source": np.full(2, -1),
+        **changes,
+    }
+    return Particles(**values)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: lumps(masses=[1.0, 0.0]), ParticleError, "1 of 2 particles: masses"),
+        (lambda: lumps(volumes=[1.0, -1.0]), ParticleError, "volumes"),
+        (lambda: lumps(positions=[[0, 0, 0], [np.nan, 0, 0]]), ParticleError, "first: 1"),
+        (lambda: lumps(masses=np.ones(3)), ParticleError, r"must be \(2,\)"),
+        (lambda: lumps().with_mass(0), ParticleError, "must be positive"),
+        (lambda: box_particles([1, 1, 0], spacing=0.1, density=1), ParticleError, "box"),
+        (lambda: cube(friction=-1), MaterialError, "friction"),
+        (lambda: cube(velocity=(1, 2)), ParticleError, "velocity"),
+        (lambda: cube(velocity=(np.inf, 0, 0)), ParticleError, "finite"),
+        (lambda: cube(regions=np.ones(216, int)), MaterialError, "regions"),
+        (lambda: cube(deformation=-np.ones((216, 3, 3))), ParticleError, "det > 0"),
+        (lambda: solve([]), SolverError, "1 to 4096"),
+        (lambda: solve([cube(), cube()]), SolverError, "unique"),
+        (lambda: solve([cube()], [ground(), ground()]), SolverError, "unique"),
+        (lambda: solve([cube()], dx=-1), SolverError, "dx"),
+        (lambda: solve([cube()], dx=0.02), ParticleError, "do not see each other"),
+        (lambda: solve([cube()], gravity=(0, 0)), SolverError, "gravity"),
+        (lambda: solve([cube()], precision="half"), SolverError, "precision"),
+        (lambda: solve([cube(position=(1e9, 0, 0))]), ParticleError, "nearer to the origin"),
+        (lambda: SolverOptions(cfl=1.5), SolverError, "cfl"),
+        (lambda: Plane(name="p", normal=(0, 0, 0)), ColliderError, "normal"),
+        (lambda: Plane(name="p", friction=-0.1), ColliderError, "friction"),
+        (lambda: Box(name="b", T_world_box=np.eye(3), size=(1, 1, 1)), ColliderError, "rigid"),
+        (lambda: Box(name="b", T_world_box=np.eye(4), size=(1, 0, 1)), ColliderError, "size"),
+        (lambda: HeightField(name="h", heights=np.zeros((1, 5))), ColliderError, "heights"),
+        (lambda: solve([cube()]).step(0), SolverError, "duration"),
+        (lambda: solve([cube()]).step(float("nan")), SolverError, "duration"),
+        (lambda: solve([cube()]).state("car"), SolverError, "there are"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_reason(make, error, words):
+    with pytest.raises(error, match=words):
+        make()
+
+
+def test_more_particles_than_memory_are_refused_before_they_are_made(monkeypatch):
+    monkeypatch.setattr(model, "available_memory", lambda: 4 * 2**30)
+    with pytest.raises(ParticleError, match=r"10,000,000 particles need about .* GiB"):
+        model.check_memory(10_000_000, "single")
+    model.check_memory(1_000_000, "single")
+
+
+def test_a_velocity_of_a_million_is_refused_or_survived():
+    fast = solve([cube(position=(0, 0, 1), velocity=(0, 0, -1e6))], [ground()])
+    with pytest.raises(SolverError, match="fastest particle moves at 1e"):
+        fast.step(1.0)
+    fast.step(1e-6)
+    assert fast.measure.finite
+    assert fast.energies().kinetic <= 0.5 * fast.measure.mass[0] * 1e12 * 1.001
+
+
+def test_bodies_that_overlap_from_the_start_stay_calm():
+    bodies = [cube("a", (0, 0, 0.2)), cube("b", (0.1, 0.05, 0.25))]
+    run = solve(bodies, gravity=(0, 0, 0))
+    run.step(0.1)
+    assert run.measure.finite
+    assert run.energies().total < 1e-3
+
+
+def test_the_ledger_adds_up_and_nothing_is_gained():
+    run = solve([cube(position=(0, 0, 0.2), velocity=(3, 0, -2), friction=0.4)], [ground()])
+    start = run.energies()
+    for _ in range(10):
+        run.step(0.02)
+        now = run.energies()
+        gone = now.friction_heat + now.dissipated - now.collider_work
+        assert now.total + gone == pytest.approx(start.total, rel=1e-6)
+        assert now.total <= start.total * (1 + 1e-3)
+    assert now.friction_heat > 1
+    assert now.dissipated > 0
+
+
+def test_a_moving_box_gives_its_work_to_the_ledger():
+    ram = Box(name="ram", T_world_box=at(-0.4, 0, 0), size=(0.4, 1, 1), velocity=(2, 0, 0))
+    run = solve([cube()], [ram], gravity=(0, 0, 0))
+    run.step(0.1)
+    energies = run.energies()
+    assert energies.collider_work > 1
+    assert energies.total < energies.collider_work
+    assert run.state("cube").velocity[0] > 1.9
+    assert np.asarray(run.colliders[0].T_world_box)[0, 3] == pytest.approx(-0.2)
+
+
+def test_the_guard_takes_back_steps_that_blow_up():
+    run = solve([cube(velocity=(0, 0, 0), angular_velocity=(0, 0, 30))], cfl=0.9, gravity=(0, 0, 0))
+    start = run.energies().total
+    # Steps twice as long as asked for are beyond what is stable.
+    run.time_step = lambda: 3.0 * run._share * 0.9 * run.dx / SOFT.wave_speed  # type: ignore[method-assign]
+    report = run.step(0.3)
+    assert report.rollbacks > 0
+    assert all("energy rose" in r or "finite" in r or "left" in r for r in report.reasons)
+    assert run.energies().total <= start * 1.05
+
+
+def test_impulses_are_the_change_of_momentum():
+    bodies = [
+        cube("left", (-0.2, 0, 0), velocity=(2, 0, 0)),
+        cube("right", (0.2, 0.05, 0), velocity=(-1, 0, 0)),
+    ]
+    run = solve(bodies, gravity=(0, 0, 0), precision="double")
+    before = run.measure.momentum
+    run.step(0.08)
+    change = run.measure.momentum - before
+    by_name = {c.body: c.impulse for c in run.contacts}
+    np.testing.assert_allclose(by_name["left"], change[0], atol=1e-9)
+    np.testing.assert_allclose(by_name["right"], change[1], atol=1e-9)
+    assert np.linalg.norm(change[0]) > 1
+
+
+def test_a_body_goes_on_where_another_solver_left_it():
+    first = solve(
+        [cube(position=(0, 0, 0.17), velocity=(1, 0, -2))], [ground()], precision="double"
+    )
+    first.step(0.02)
+    kept = first.state("cube")
+    body = first.bodies[0]
+    moved = Particles(
+        kept.positions, body.particles.volumes, body.particles.masses, body.particles.source
+    )
+    second = solve(
+        [
+            Body(
+                name="cube",
+                particles=moved,
+                material=SOFT,
+                particle_velocities=kept.velocities,
+                particle_gradients=kept.gradients,
+                deformation=kept.F_elastic,
+                total_deformation=kept.F_total,
+                history=kept.history,
+            )
+        ],
+        [ground()],
+        precision="double",
+    )
+    first.step(0.02)
+    second.step(0.02)
+    np.testing.assert_allclose(second.particles().positions, first.particles().positions, atol=1e-9)
+
+
+def test_regions_of_one_body_may_differ_in_stiffness():
+    particles = box_particles([0.6, 0.2, 0.2], spacing=0.05, density=200)
+    front = (particles.positions[:, 0] > 0).astype(int)
+    body = Body(
+        name="car",
+        particles=particles,
+        material=[Jelly(young=2e6), Jelly(young=2e4)],
+        regions=front,
+        velocity=(3, 0, 0),
+    )
+    run = Solver(
+        [body],
+        [Plane(name="wall", point=(0.32, 0, 0), normal=(-1, 0, 0))],
+        SolverOptions(dx=0.1, gravity=(0, 0, 0)),
+    )
+    run.step(0.05)
+    strain = np.abs(run.particles().F_elastic - np.eye(3)).max(axis=(1, 2))
+    assert strain[front == 1].mean() > 5 * strain[front == 0].mean()
