@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import httpx2
 import numpy as np
@@ -51,7 +52,7 @@ def problem(status: int, code: str, **members: object) -> httpx2.Response:
 @pytest.fixture
 def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     delays: list[float] = []
-    monkeypatch.setattr(_transport.time, "sleep", delays.append)
+    monkeypatch.setattr(_transport, "time", SimpleNamespace(sleep=delays.append))
     return delays
 
 
@@ -210,7 +211,7 @@ def test_the_async_client_retries_alike(monkeypatch):
     async def no_sleep(seconds: float) -> None:
         delays.append(seconds)
 
-    monkeypatch.setattr(_transport.asyncio, "sleep", no_sleep)
+    monkeypatch.setattr(_transport, "asyncio", SimpleNamespace(sleep=no_sleep))
     busy = problem(503, "QUEUE_FULL")
     busy.headers["Retry-After"] = "2"
     script = Script(busy, httpx2.Response(200, json=SCENES))
