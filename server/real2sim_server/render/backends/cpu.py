@@ -106,15 +106,16 @@ class CpuBackend:
         starts = self._space.array("starts", (tiles_x * tiles_y + 1,), np.int64)
         with timed(timing, "tile"):
             cursors = self._space.array("cursors", (TILE_CHUNKS, tiles_x * tiles_y), np.int64)
-            boxes = self._space.array("ordered_boxes", order.shape, np.int64)
-            count_tiles(records.values, records.boxes, order, tiles_x, boxes, cursors)
+            footprints = self._space.array("ordered_footprints", order.shape, np.int64)
+            count_tiles(records.values, records.footprints, order, tiles_x, footprints, cursors)
             bands = _bands(cursors.sum(0).reshape(tiles_y, tiles_x).sum(1))
         for first, last in bands:
             tiles = first * tiles_x, last * tiles_x
             with timed(timing, "tile"):
                 tile_starts(cursors, *tiles, starts)
                 lists = self._space.array("lists", (int(starts[tiles[1]]),), np.int32)
-                scatter_tiles(records.values, boxes, order, tiles_x, first, last, cursors, lists)
+                rows = first, last
+                scatter_tiles(records.values, footprints, order, tiles_x, *rows, cursors, lists)
             with timed(timing, "blend"):
                 blend_tiles(records.values, lists, starts, tiles_x, *tiles, behind, images)
 

@@ -274,9 +274,9 @@ def _make_lists(
     tiles_x, tiles_y = -(-request.width // TILE), -(-request.height // TILE)
     tiles = tiles_x * tiles_y
     cursors = space.array("cursors", (TILE_CHUNKS, tiles), np.int64)
-    boxes = space.array("ordered_boxes", order.shape, np.int64)
+    footprints = space.array("ordered_footprints", order.shape, np.int64)
     starts = space.array("starts", (tiles + 1,), np.int64)
-    count_tiles(records.values, records.boxes, order, tiles_x, boxes, cursors)
+    count_tiles(records.values, records.footprints, order, tiles_x, footprints, cursors)
     by_chunk = cursors.sum(1)
     first_slots = np.cumsum(by_chunk) - by_chunk
     tile_starts(cursors, 0, tiles, starts)
@@ -285,12 +285,12 @@ def _make_lists(
         records=records,
         lists=space.array("lists", (length,), np.int32),
         slots=space.array("slots", (length,), np.int32),
-        spans=space.array("spans", (len(records.boxes), 2), np.int32),
+        spans=space.array("spans", (len(records.footprints), 2), np.int32),
         starts=starts,
     )
     scatter_slots(
         records.values,
-        boxes,
+        footprints,
         order,
         tiles_x,
         first_slots,

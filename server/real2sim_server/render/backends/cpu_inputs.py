@@ -42,7 +42,7 @@ def project(
     total = sum(regions)
     records = Records(
         space.array("values", (total * CHUNK, RECORD), np.float32),
-        space.array("boxes", (total * CHUNK,), np.int64),
+        space.array("footprints", (total * CHUNK,), np.int64),
         space.array("depths", (total * CHUNK,), np.float32),
         space.array("counts", (total,), np.int64),
     )

@@ -15,6 +15,7 @@ import numpy as np
 from numba import prange
 
 from .base import ALPHA_MIN
+from .cpu_footprint import NOWHERE, footprint_of
 from .cpu_records import (
     BLUE,
     CHUNK,
@@ -32,7 +33,6 @@ from .cpu_records import (
     RED,
     SHARPNESS,
     SLOPE,
-    TILE,
     TIP_Y,
 )
 from .kernel import inlined, kernel
@@ -43,11 +43,6 @@ LEAST_ALPHA = F32(ALPHA_MIN)
 REACH_MAX = F32(math.sqrt(2 * math.log(255.0)))
 LOG_255 = F32(math.log(255.0))
 HALF_UNIT = F32(0.5 / EXPONENT_UNIT)
-PER_TILE = F32(1.0 / TILE)
-EDGE, SLACK = F32(0.5), F32(0.01)
-"""From the edge of a pixel to its centre, and how much boxes are widened against rounding [px]."""
-NOWHERE = np.int64(0)
-"""Box of what cannot be seen; no box has this value since x1 and y1 are at least 1."""
 COVARIANCE_MAX = F32(1e30)
 """Larger than any picture [px^2]; beyond it float32 gives out."""
 FASTMATH = {"contract", "nsz", "arcp"}
@@ -63,29 +58,29 @@ def project_cluster(cluster, view, base, records):
     """
     n = cluster.means.shape[0]
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
-    values, boxes = records.values, records.boxes
+    values, footprints = records.values, records.footprints
     depths, counts = records.depths, records.counts
     for chunk in prange((n + CHUNK - 1) // CHUNK):
-        project_chunk(cluster, view, base, chunk * CHUNK, values, boxes, depths, counts)
+        project_chunk(cluster, view, base, chunk * CHUNK, values, footprints, depths, counts)
 
 
 @kernel(fastmath=FASTMATH)
 def project_small_cluster(cluster, view, base, records):
     """Like project_cluster for one chunk, where waking threads would take longer than the work."""
     project_chunk(
-        cluster, view, base, 0, records.values, records.boxes, records.depths, records.counts
+        cluster, view, base, 0, records.values, records.footprints, records.depths, records.counts
     )
 
 
 @inlined(fastmath=FASTMATH)
-def project_chunk(cluster, view, base, start, values, boxes, depths, counts):
+def project_chunk(cluster, view, base, start, values, footprints, depths, counts):
     """Write the records of CHUNK Gaussians from ``start`` on."""
     slot = base + start
     for i in range(start, min(cluster.means.shape[0], start + CHUNK)):
-        box = project_gaussian(cluster, view, i, values, slot)
-        if box != NOWHERE:
+        footprint = project_gaussian(cluster, view, i, values, slot)
+        if footprint != NOWHERE:
             values[slot, MEMBER] = F32(i - start)
-            boxes[slot] = box
+            footprints[slot] = footprint
             depths[slot] = values[slot, DEPTH]
             slot += 1
     counts[(base + start) // CHUNK] = slot - base - start
@@ -93,7 +88,7 @@ def project_chunk(cluster, view, base, start, values, boxes, depths, counts):
 
 @inlined(fastmath=FASTMATH)
 def project_gaussian(cluster, view, i, values, slot):  # noqa: PLR0911 - each test drops as early as it can
-    """Write the record of Gaussian ``i`` to ``slot``; returns its box of tiles, see pack_box."""
+    """Write the record of Gaussian ``i`` to ``slot``; returns its footprint."""
     out = values[slot]
     opacity = cluster.opacities[i]
     if not opacity >= LEAST_ALPHA:
@@ -146,7 +141,7 @@ def project_gaussian(cluster, view, i, values, slot):  # noqa: PLR0911 - each te
     out[EXTENT_Y] = reach_y
     out[TIP_Y] = reach_x * F32(cxy) / F32(cxx)
     write_color(cluster, i, out)
-    return pack_box(view, mean_x, mean_y, reach_x, reach_y)
+    return footprint_of(view, out, reach_x, reach_y)
 
 
 @inlined(fastmath=FASTMATH)
@@ -158,19 +153,6 @@ def on_image(view, x, y, reach_x, reach_y):
         and y + reach_y > ZERO
         and y - reach_y < view.height
     )
-
-
-@inlined(fastmath=FASTMATH)
-def pack_box(view, x, y, reach_x, reach_y):
-    """Tiles [x0, x1) x [y0, y1) whose pixel centres a box may hold; NOWHERE when none."""
-    reach_x, reach_y = reach_x + SLACK, reach_y + SLACK
-    x0 = math.floor(max(x - reach_x - EDGE, ZERO) * PER_TILE)
-    y0 = math.floor(max(y - reach_y - EDGE, ZERO) * PER_TILE)
-    x1 = math.floor(min(x + reach_x - EDGE, view.width - ONE) * PER_TILE) + 1
-    y1 = math.floor(min(y + reach_y - EDGE, view.height - ONE) * PER_TILE) + 1
-    if x1 <= x0 or y1 <= y0:
-        return NOWHERE
-    return np.int64(x0) | np.int64(x1) << 16 | np.int64(y0) << 32 | np.int64(y1) << 48
 
 
 @inlined(fastmath=FASTMATH)

@@ -90,14 +90,13 @@ class Records(NamedTuple):
 
     Attributes:
         values: [M, RECORD] float32.
-        boxes: [M] int64, tiles [x0, x1) x [y0, y1) that may be touched: four times 16 bits in the
-            order x0, x1, y0, y1 from the lowest; fits a cache where the records do not.
+        footprints: [M] int64, see cpu_footprint; they fit a cache where the records do not.
         depths: [M] float32, depth of the centres [m].
         counts: [M / CHUNK] int64, records in use of each region.
     """
 
     values: NDArray[np.float32]
-    boxes: NDArray[np.int64]
+    footprints: NDArray[np.int64]
     depths: NDArray[np.float32]
     counts: NDArray[np.int64]
 

@@ -13,16 +13,17 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from .cpu_tile import LOW_BITS, TILE_CHUNKS, tile_columns, tile_rows
+from .cpu_footprint import tile_columns, tile_rows
+from .cpu_tile import LOW_BITS, TILE_CHUNKS
 from .kernel import kernel
 
 
 @kernel(parallel=True)
-def scatter_slots(values, ordered_boxes, order, tiles_x, first_slots, cursors, lists, slots, spans):
+def scatter_slots(values, footprints, order, tiles_x, first_slots, cursors, lists, slots, spans):
     """Like scatter_tiles for the whole picture, and number the places by record.
 
     Args:
-        values, ordered_boxes, order, tiles_x, cursors: as for scatter_tiles.
+        values, footprints, order, tiles_x, cursors: as for scatter_tiles.
         first_slots: [TILE_CHUNKS] int64, number of places in the chunks before.
         lists: [L] int32, written: record at each place.
         slots: [L] int32, written: slot of each place.
@@ -34,11 +35,11 @@ def scatter_slots(values, ordered_boxes, order, tiles_x, first_slots, cursors, l
         slot = first_slots[chunk]
         for i in range(chunk * step, min(total, (chunk + 1) * step)):
             index = np.int64(order[i] & LOW_BITS)
-            box = ordered_boxes[i]
-            first, last = tile_rows(box)
+            footprint = footprints[i]
+            first, last = tile_rows(footprint)
             spans[index, 0] = slot
             for row in range(first, last):
-                left, right = tile_columns(values, box, index, row)
+                left, right = tile_columns(values, footprint, index, row)
                 for column in range(left, right):
                     tile = row * tiles_x + column
                     place = cursors[chunk, tile]

@@ -1,0 +1,106 @@
+"""What a footprint says about tiles, against asking the ellipse itself."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+from real2sim_server.render.backends.cpu_footprint import (
+    FIELD,
+    FIELD_MASK,
+    NOWHERE,
+    ellipse_columns,
+    footprint_of,
+    tile_columns,
+    tile_rows,
+)
+from real2sim_server.render.backends.cpu_records import (
+    EXPONENT_LIMIT,
+    EXTENT_X,
+    EXTENT_Y,
+    FALLOFF,
+    LEVEL,
+    MEAN_X,
+    MEAN_Y,
+    RECORD,
+    SHARPNESS,
+    SLOPE,
+    TILE,
+    TIP_Y,
+)
+
+WIDTH, HEIGHT = 320, 240
+
+
+class Size(NamedTuple):
+    width: np.float32
+    height: np.float32
+
+
+@numba.njit
+def columns_by_row(values, index, size):
+    """Rows of tiles, and for each the columns by footprint and by ellipse; and the footprint."""
+    record = values[index]
+    footprint = footprint_of(size, record, record[EXTENT_X], record[EXTENT_Y])
+    found = []
+    if footprint != NOWHERE:
+        first, last = footprint & FIELD_MASK, (footprint >> FIELD) & FIELD_MASK
+        top, bottom = tile_rows(footprint)
+        for row in range(top, bottom):
+            short = tile_columns(values, footprint, index, row)
+            found.append((row, short, ellipse_columns(record, row, first, last)))
+    return found, footprint
+
+
+def random_records(count, largest, seed=0):
+    """Records of random ellipses with half axes up to ``largest`` [px], and their conics."""
+    rng = np.random.default_rng(seed)
+    values = np.zeros((count, RECORD), np.float32)
+    conics = []
+    for record in values:
+        angle, axes = rng.uniform(0, np.pi), rng.uniform(0.5, largest, 2)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        # The ellipse d^T S^-1 d <= 1 is where the exponent, LIMIT d^T S^-1 d, is within LIMIT.
+        S = turn @ np.diag(axes**2) @ turn.T
+        conic = EXPONENT_LIMIT * np.linalg.inv(S)
+        record[[MEAN_X, MEAN_Y]] = rng.uniform(-20, (WIDTH + 20, HEIGHT + 20))
+        record[SHARPNESS] = np.sqrt(conic[0, 0])
+        record[SLOPE] = -conic[0, 1] / conic[0, 0]
+        record[FALLOFF] = conic[1, 1] - conic[0, 1] ** 2 / conic[0, 0]
+        record[LEVEL] = 0
+        record[EXTENT_X], record[EXTENT_Y] = np.sqrt(np.diag(S))
+        record[TIP_Y] = np.sqrt(S[0, 0]) * S[0, 1] / S[0, 0]
+        conics.append(conic)
+    return values, conics
+
+
+@pytest.mark.parametrize("largest", [8, 30, 120])
+def test_short_answers_agree_with_the_ellipse(largest):
+    values, _ = random_records(300, largest)
+    small = 0
+    for index in range(len(values)):
+        found, footprint = columns_by_row(values, index, Size(WIDTH, HEIGHT))
+        width = ((footprint >> FIELD) & FIELD_MASK) - (footprint & FIELD_MASK)
+        for _, short, exact in found:
+            empty = exact[1] <= exact[0]
+            if width > 1 and len(found) > 1 and not empty:
+                assert short == exact
+                small += 1
+            elif width > 1 and len(found) > 1:
+                assert short[1] <= short[0]
+    assert small > 50
+
+
+@pytest.mark.parametrize("largest", [8, 30, 120])
+def test_every_tile_with_a_pixel_in_the_ellipse_is_named(largest):
+    values, conics = random_records(100, largest, seed=1)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    for index, (record, conic) in enumerate(zip(values, conics, strict=True)):
+        dx, dy = x - record[MEAN_X], y - record[MEAN_Y]
+        exponent = conic[0, 0] * dx**2 + 2 * conic[0, 1] * dx * dy + conic[1, 1] * dy**2
+        rows, columns = np.nonzero(exponent < EXPONENT_LIMIT * (1 - 1e-4))
+        inside = set(zip((rows // TILE).tolist(), (columns // TILE).tolist(), strict=True))
+        found, _ = columns_by_row(values, index, Size(WIDTH, HEIGHT))
+        named = {(row, column) for row, (a, b), _ in found for column in range(a, b)}
+        assert inside <= named
