@@ -10,7 +10,7 @@ demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check proto client server tests
