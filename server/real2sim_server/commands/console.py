@@ -92,11 +92,13 @@ def staged_progress() -> Iterator[Callable[..., None]]:
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """A two-column table of figures."""
+    """A two-column table of figures; those within a mapping get rows of their own."""
     table = Table(title=title, show_header=False, title_justify="left")
     for name, value in figures.items():
-        text = f"{value:.4g}" if isinstance(value, float) else str(value)
-        table.add_row(escape(name), escape(text))
+        parts = value if isinstance(value, Mapping) else {"": value}
+        for part, figure in parts.items():
+            text = f"{figure:.4g}" if isinstance(figure, float) else str(figure)
+            table.add_row(escape(f"{name} {part}".strip()), escape(text))
     console.print(table)
 
 
