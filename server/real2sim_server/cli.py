@@ -107,6 +107,41 @@ def log_info(
     )
 
 
+@app.command()
+def track(
+    log: Annotated[Path, typer.Argument(help="Folder of a driving log with LiDAR.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the log to write, with boxes.")],
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep the log's own boxes and add what they lack.")
+    ] = False,
+    reach: Annotated[
+        float, typer.Option(min=5, max=200, help="How far from the vehicle to look [m].")
+    ] = 55.0,
+    least_distance: Annotated[
+        float, typer.Option(min=0.1, help="How far an object must go [m].")
+    ] = 1.5,
+    least_frames: Annotated[int, typer.Option(min=2, help="In how many frames it is seen.")] = 6,
+    images: Annotated[str, typer.Option(help="png (exact) or jpg (smaller).")] = "jpg",
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    json: JsonFile = None,
+) -> None:
+    """Find what moves in the LiDAR of a log without boxes, and write the log with them."""
+    from .commands import track as command
+
+    _run(
+        command.run,
+        log=log,
+        out=out,
+        options={"reach": reach, "least_distance": least_distance, "least_frames": least_frames},
+        keep=keep,
+        image_format=images,
+        log_format=log_format,
+        sequence=sequence,
+        json_path=json,
+    )
+
+
 @app.command("import")
 def import_(
     file: Annotated[
