@@ -24,6 +24,9 @@ def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, 
         raise ValueError(
             f"quaternion {quaternion!r} has length {norm:.6g}; a rotation needs a unit one, wxyz"
         )
+    if abs(norm - 1.0) < 1e-15:
+        # Left bit for bit, so that reading back what was stored changes nothing.
+        return quaternion
     w, x, y, z = quaternion
     return (w / norm, x / norm, y / norm, z / norm)
 

@@ -1,21 +1,56 @@
 """Edits of a scenario, as a discriminated union on ``op``.
 
-Every operation names objects by id, never carries them, and has an inverse.
+Every operation names things by id, never carries them, and has an inverse. Ids of objects, erased
+regions and colliders share one name space.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, TypeAdapter, field_validator
+from pydantic import Field, TypeAdapter, field_validator, model_validator
 
-from .base import Identifier, Metres, Model, Pose, Track, Vector3
+from .base import Identifier, Metres, Microseconds, Model, Pose, Quaternion, Track, Vector3
 
 Frame = Literal["world", "object"]
 
+MaterialName = Literal["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"]
+"""What an object may be made of; the numbers behind the names belong to the physics."""
+
+Size3 = tuple[
+    Annotated[float, Field(gt=0, le=1000.0)],
+    Annotated[float, Field(gt=0, le=1000.0)],
+    Annotated[float, Field(gt=0, le=1000.0)],
+]
+Friction = Annotated[float, Field(ge=0, le=10.0)]
+Speed = Annotated[float, Field(ge=-200.0, le=200.0)]
+Vector3Speed = tuple[Speed, Speed, Speed]
+
+Snap = Annotated[
+    bool,
+    Field(description="put the bottom of the box onto the ground, at every pose"),
+]
+
+
+class TimeRange(Model):
+    """When an edit has effect: it grows smoothly from 0 at `start_us` to the whole `blend_us`
+    later, and falls back to 0 at `end_us` in the same way."""
+
+    start_us: Microseconds | None = Field(default=None, description="default: from the beginning")
+    end_us: Microseconds | None = Field(default=None, description="default: to the end")
+    blend_us: int = Field(default=500_000, ge=0, le=60_000_000)
+
+    @model_validator(mode="after")
+    def _starts_before_it_ends(self) -> TimeRange:
+        if self.start_us is not None and self.end_us is not None and self.start_us >= self.end_us:
+            raise ValueError(
+                f"start_us {self.start_us} is not before end_us {self.end_us}; an edit needs time"
+            )
+        return self
+
 
 class Translate(Model):
-    """Shift the whole trajectory of an object."""
+    """Shift an object: the whole trajectory, or a time range of it with smooth ends."""
 
     op: Literal["translate"] = "translate"
     object_id: Identifier
@@ -23,23 +58,25 @@ class Translate(Model):
     y: Metres = 0.0
     z: Metres = 0.0
     frame: Frame = Field(default="world", description="axes of x, y, z; 'object' turns with it")
+    time_range: TimeRange | None = Field(default=None, description="default: at all times")
+    snap: Snap = False
 
 
 class Rotate(Model):
-    """Turn an object about its own centre, at every time stamp of its trajectory."""
+    """Turn an object about its own centre, at all times or in a time range with smooth ends."""
 
     op: Literal["rotate"] = "rotate"
     object_id: Identifier
     angle: Annotated[float, Field(ge=-1e4, le=1e4)] = Field(description="[rad]")
     axis: Vector3 = Field(default=(0.0, 0.0, 1.0), description="of any length above 0")
     frame: Frame = Field(default="world", description="frame of the axis")
+    time_range: TimeRange | None = Field(default=None, description="default: at all times")
+    snap: Snap = False
 
     @field_validator("axis")
     @classmethod
     def _axis_is_not_zero(cls, axis: Vector3) -> Vector3:
-        if sum(a * a for a in axis) < 1e-12:
-            raise ValueError(f"axis {axis!r} has no direction; give a vector that is not zero")
-        return axis
+        return _direction(axis, "axis")
 
 
 class Scale(Model):
@@ -62,6 +99,7 @@ class SetPose(Model):
     op: Literal["set_pose"] = "set_pose"
     object_id: Identifier
     pose: Pose
+    snap: Snap = False
 
 
 class SetTrajectory(Model):
@@ -70,6 +108,18 @@ class SetTrajectory(Model):
     op: Literal["set_trajectory"] = "set_trajectory"
     object_id: Identifier
     trajectory: Track
+    snap: Snap = False
+
+
+class Retime(Model):
+    """Let an object do the same earlier, later, faster or slower."""
+
+    op: Literal["retime"] = "retime"
+    object_id: Identifier
+    delay_us: Microseconds = Field(default=0, description="later by this; negative: earlier")
+    speed: Annotated[float, Field(ge=0.01, le=100.0)] = Field(
+        default=1.0, description="2 takes half the time, from its first pose on"
+    )
 
 
 class Duplicate(Model):
@@ -82,26 +132,189 @@ class Duplicate(Model):
     y: Metres = 0.0
     z: Metres = 0.0
     frame: Frame = "world"
+    snap: Snap = False
 
 
 class Delete(Model):
-    """Remove an object. Its id stays reserved, so that `restore` can bring it back."""
+    """Remove an object, erased region or collider. Its id stays reserved for `restore`."""
 
     op: Literal["delete"] = "delete"
     object_id: Identifier
 
 
 class Restore(Model):
-    """Bring a deleted object back as it was."""
+    """Bring a deleted object, erased region or collider back as it was."""
 
     op: Literal["restore"] = "restore"
     object_id: Identifier
 
 
+class Insert(Model):
+    """Add an object from the asset library, standing at a pose or following a trajectory."""
+
+    op: Literal["insert"] = "insert"
+    asset_id: Identifier
+    object_id: Identifier | None = Field(
+        default=None, description="id of the new object; default: <asset_id>_<n>"
+    )
+    pose: Pose | None = Field(default=None, description="of the box centre; or `trajectory`")
+    trajectory: Track | None = None
+    size: Size3 | None = Field(default=None, description="box to fit [m]; default: its own size")
+    snap: Snap = True
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> Insert:
+        if (self.pose is None) == (self.trajectory is None):
+            raise ValueError("an insert needs either a pose or a trajectory, not both")
+        return self
+
+
+class Replace(Model):
+    """Give an object another look, fitted into its box: an asset's, or a recorded object's."""
+
+    op: Literal["replace"] = "replace"
+    object_id: Identifier
+    asset_id: Identifier | None = Field(default=None, description="from the asset library")
+    recorded_id: Identifier | None = Field(
+        default=None, description="instead of an asset: the look of this object of the scene"
+    )
+    fit: Literal["box", "length"] = Field(
+        default="box",
+        description="'box' fills the box along each axis; 'length' keeps the look's proportions",
+    )
+    size: Size3 | None = Field(default=None, description="box to fill [m]; default: the present")
+
+    @model_validator(mode="after")
+    def _names_one_look(self) -> Replace:
+        if (self.asset_id is None) == (self.recorded_id is None):
+            raise ValueError("a replace needs either asset_id or recorded_id, not both")
+        return self
+
+
+class EraseRegion(Model):
+    """Hide the Gaussians of the background whose centres lie in a box."""
+
+    op: Literal["erase_region"] = "erase_region"
+    region_id: Identifier | None = Field(default=None, description="default: region_<n>")
+    pose: Pose = Field(description="of the box centre")
+    size: Size3 = Field(description="[m]")
+
+
+class SetPhysics(Model):
+    """Say what an object is for the physics. What is left out goes back to its default."""
+
+    op: Literal["set_physics"] = "set_physics"
+    object_id: Identifier
+    mass: Annotated[float, Field(gt=0, le=1e7)] | None = Field(
+        default=None, description="[kg]; default: by category and size"
+    )
+    material: MaterialName | None = Field(default=None, description="default: by category")
+    friction: Friction | None = Field(default=None, description="Coulomb coefficient")
+    restitution: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        default=None, description="share of the approach speed that is left after a bounce"
+    )
+
+
+class SetVelocity(Model):
+    """Velocity with which an object enters the physics; left out, that of its trajectory."""
+
+    op: Literal["set_velocity"] = "set_velocity"
+    object_id: Identifier
+    linear: Vector3Speed | None = Field(default=None, description="of the box centre [m/s]")
+    angular: Vector3Speed | None = Field(default=None, description="[rad/s]")
+    frame: Frame = Field(default="world", description="axes of both; 'object' counts x forward")
+
+
+class PlaneShape(Model):
+    """A half-space; things stay on the side that the normal points to."""
+
+    kind: Literal["plane"] = "plane"
+    point: Vector3 = Field(description="on the plane [m]")
+    normal: Vector3 = (0.0, 0.0, 1.0)
+
+    @field_validator("normal")
+    @classmethod
+    def _normal_is_not_zero(cls, normal: Vector3) -> Vector3:
+        return _direction(normal, "normal")
+
+
+class BoxShape(Model):
+    """A solid box."""
+
+    kind: Literal["box"] = "box"
+    position: Vector3 = Field(description="centre [m]")
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    size: Size3 = Field(description="[m]")
+
+
+class GroundShape(Model):
+    """The recorded ground, moved up or down."""
+
+    kind: Literal["ground"] = "ground"
+    offset: Metres = Field(default=0.0, description="[m]")
+
+
+class AddCollider(Model):
+    """Add something invisible that does not yield, for the physics."""
+
+    op: Literal["add_collider"] = "add_collider"
+    collider_id: Identifier | None = Field(default=None, description="default: collider_<n>")
+    shape: Annotated[PlaneShape | BoxShape | GroundShape, Field(discriminator="kind")]
+    friction: Friction | None = Field(default=None, description="default: that of what touches it")
+
+
+class SetTime(Model):
+    """The span in which the scenario plays: where previews, physics and exports begin and end."""
+
+    op: Literal["set_time"] = "set_time"
+    start_us: Microseconds | None = Field(default=None, description="default: of the recording")
+    end_us: Microseconds | None = Field(default=None, description="default: of the recording")
+
+    @model_validator(mode="after")
+    def _starts_before_it_ends(self) -> SetTime:
+        if self.start_us is not None and self.end_us is not None and self.start_us >= self.end_us:
+            raise ValueError(f"start_us {self.start_us} is not before end_us {self.end_us}")
+        return self
+
+
+def _direction(vector: Vector3, name: str) -> Vector3:
+    if sum(a * a for a in vector) < 1e-12:
+        raise ValueError(f"{name} {vector!r} has no direction; give a vector that is not zero")
+    return vector
+
+
 Operation = Annotated[
-    Translate | Rotate | Scale | SetPose | SetTrajectory | Duplicate | Delete | Restore,
+    Translate
+    | Rotate
+    | Scale
+    | SetPose
+    | SetTrajectory
+    | Retime
+    | Duplicate
+    | Delete
+    | Restore
+    | Insert
+    | Replace
+    | EraseRegion
+    | SetPhysics
+    | SetVelocity
+    | AddCollider
+    | SetTime,
     Field(discriminator="op"),
 ]
 
 OPERATION: TypeAdapter[Operation] = TypeAdapter(Operation)
 OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
+
+
+def subject_of(operation: Operation) -> str | None:
+    """Id that an operation names; None where it leaves the choice of a new one open."""
+    match operation:
+        case EraseRegion():
+            return operation.region_id
+        case AddCollider():
+            return operation.collider_id
+        case SetTime():
+            return None
+        case _:
+            return operation.object_id

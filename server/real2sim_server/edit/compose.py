@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import replace
+from typing import TypeVar
+from weakref import WeakKeyDictionary
+
+import torch
+
+from real2sim_proto.operations import EraseRegion
+
 from ..render.types import Instance
-from ..scene import Scene
+from ..scene import GaussianCloud, Scene
+from ..scene.rotation import invert_transform, transform_from
+from .ground import RecordedGround
+from .shadow import shadow_under
 from .state import ObjectState, ScenarioState
 from .tracks import Placed
 
+T = TypeVar("T")
+
+KEPT_BACKGROUNDS = 4
+"""Backgrounds with erased regions that are kept for each scene; one costs 4 bytes a Gaussian."""
+
 
 def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance]:
-    """Background first, then every visible object that exists at ``t_us``; only colours that
-    change over time are computed.
+    """Background first, then every visible object that exists at ``t_us``, then soft shadows under
+    objects that an edit has put where they are; only what changes over time is computed.
 
     Args:
         scene: holds the Gaussians; it must be the one that ``state`` was made of.
@@ -20,13 +39,85 @@ def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance
     Raises:
         UnknownObjectError: ``state`` is of another scene.
     """
-    return compose(scene, state.tracks.at(t_us), t_us)
+    return compose(scene, state.tracks.at(t_us), t_us, erased=state.erased)
 
 
-def compose(scene: Scene, placed: Placed[ObjectState], t_us: int) -> list[Instance]:
+def compose(
+    scene: Scene,
+    placed: Placed[ObjectState],
+    t_us: int,
+    *,
+    erased: tuple[EraseRegion, ...] = (),
+) -> list[Instance]:
     """The same for objects already looked up. Raises like :func:`instances_at`."""
-    instances = [Instance(scene.background)]
+    instances = [Instance(background_without(scene, erased))]
+    shadows = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        cloud = scene.object(subject.source_id).cloud_at(t_us)
+        cloud = cloud_of(scene, subject, t_us)
         instances.append(Instance(cloud, transform, subject.instance_id, subject.scale))
-    return instances
+        if subject.placed and not _as_recorded(scene, subject, transform, t_us):
+            ground = _kept(scene, "ground", lambda: _ground(scene))
+            device = scene.background.device
+            shadows.append(shadow_under(transform, subject.scaled_size, ground, device=device))
+    return instances + [s for s in shadows if s is not None]
+
+
+def cloud_of(scene: Scene, subject: ObjectState, t_us: int) -> GaussianCloud:
+    """The Gaussians an object shows at ``t_us``, before its own scale, in its own frame.
+
+    Raises:
+        UnknownObjectError: ``subject`` is of another scene.
+    """
+    if subject.asset is not None:
+        return subject.asset.cloud_in(scene)
+    return scene.object(subject.source_id).cloud_at(t_us)
+
+
+def background_without(scene: Scene, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
+    """The background with all Gaussians inside ``erased`` made invisible; the rest is shared."""
+    if not erased:
+        return scene.background
+    return _kept(scene, erased, lambda: _hidden(scene.background, erased))
+
+
+def _hidden(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
+    opacities = background.opacities.clone()
+    for region in erased:
+        T_region_world = invert_transform(
+            transform_from(region.pose.position, region.pose.quaternion)
+        )
+        to_region = torch.from_numpy(T_region_world).to(background.means)
+        local = background.means @ to_region[:3, :3].T + to_region[:3, 3]
+        half = torch.tensor(region.size).to(background.means) / 2
+        opacities[(local.abs() <= half).all(dim=1)] = 0.0
+    return replace(background, opacities=opacities)
+
+
+def _as_recorded(scene: Scene, subject: ObjectState, transform: object, t_us: int) -> bool:
+    """Whether the object is where the recording, and so its shadow in the background, has it."""
+    if subject.asset is not None or subject.object_id != subject.source_id:
+        return False
+    recorded = scene.object(subject.source_id).trajectory
+    if not recorded.covers(t_us):
+        return False
+    return bool(abs(recorded.transform(t_us) - transform).max() < 0.02)
+
+
+def _ground(scene: Scene) -> RecordedGround:
+    return RecordedGround.of(scene.ego, scene.objects.values())
+
+
+_derived: WeakKeyDictionary[Scene, OrderedDict[Hashable, object]] = WeakKeyDictionary()
+_deriving = threading.Lock()
+
+
+def _kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
+    """What ``make`` made of ``scene`` before, or makes now."""
+    with _deriving:
+        kept = _derived.setdefault(scene, OrderedDict())
+        if key not in kept:
+            kept[key] = make()
+        kept.move_to_end(key)
+        while len(kept) > KEPT_BACKGROUNDS + 1:
+            kept.popitem(last=False)
+        return kept[key]  # type: ignore[return-value]

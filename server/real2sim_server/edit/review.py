@@ -45,7 +45,8 @@ def review(
         times = _sample_times(subject)
         transforms, _ = sample(subject.trajectory, times)
         yield from _overlaps(subject, state, times, transforms)
-        yield from _off_ground(subject, state.recorded[subject.source_id], transforms, ground)
+        recorded = None if subject.asset else state.recorded[subject.source_id]
+        yield from _off_ground(subject, recorded, transforms, ground)
         yield from _outside_map(subject, state.extent, transforms)
 
 
@@ -91,10 +92,12 @@ def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Ite
 
 
 def _off_ground(
-    subject: ObjectState, recorded: ObjectState, own: Float, ground: GroundHeight | None
+    subject: ObjectState, recorded: ObjectState | None, own: Float, ground: GroundHeight | None
 ) -> Iterator[EditWarning]:
-    theirs, _ = sample(recorded.trajectory, _sample_times(recorded))
-    usual = float(np.median(_clearance(theirs, recorded, ground)))
+    usual = 0.0
+    if recorded is not None:
+        theirs, _ = sample(recorded.trajectory, _sample_times(recorded))
+        usual = float(np.median(_clearance(theirs, recorded, ground)))
     off = _clearance(own, subject, ground) - usual
     worst = float(off[np.argmax(np.abs(off))])
     if abs(worst) > OFF_GROUND:
@@ -102,8 +105,8 @@ def _off_ground(
         yield EditWarning(
             code="off_ground",
             object_id=subject.object_id,
-            message=f"the bottom of {subject.object_id!r} is {abs(worst):.2f} m {side} where it "
-            "stood in the recording",
+            message=f"the bottom of {subject.object_id!r} is {abs(worst):.2f} m {side} "
+            + ("where it stood in the recording" if recorded else "the ground"),
         )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -11,7 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Trajectory
+from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
+
+from ..scene import GaussianCloud, Scene, Trajectory
+from .ground import RecordedGround
 from .tracks import PackedTracks
 
 
@@ -26,6 +29,27 @@ class ObjectSource(Protocol):
     def size(self) -> tuple[float, float, float]: ...  # noqa: D102
     @property
     def trajectory(self) -> Trajectory: ...  # noqa: D102
+
+
+class AssetSource(Protocol):
+    """What is needed of an asset that objects may show."""
+
+    @property
+    def asset_id(self) -> str: ...  # noqa: D102
+    @property
+    def category(self) -> str: ...  # noqa: D102
+    @property
+    def size(self) -> tuple[float, float, float]: ...  # noqa: D102
+    @property
+    def gaussians(self) -> int: ...  # noqa: D102
+
+    def cloud_in(self, scene: Scene) -> GaussianCloud:
+        """Its Gaussians in the light of ``scene``."""
+        ...
+
+
+AssetLookup = Callable[[str], "AssetSource | None"]
+"""The asset of an id; assets never change, so that logs can be replayed."""
 
 
 class SceneSource(Protocol):
@@ -43,13 +67,17 @@ class ObjectState:
 
     Attributes:
         object_id: unique in the scenario, also among deleted objects.
-        source_id: object of the scene whose Gaussians it shows.
+        source_id: object of the scene whose Gaussians it shows; empty where it shows an asset.
         category: as in the scene.
         size: (length, width, height) in the scene, before ``scale`` [m].
         scale: factors along the object's x, y, z, about its origin.
         trajectory: ``T_world_object``; origin at the box centre; exists only in its range.
         instance_id: value of its pixels in instance images; fixed while the object exists.
         deleted: a tombstone: not shown, not hit, its id stays taken.
+        asset: what it shows instead of an object of the scene.
+        physics: what it is for the physics; None for defaults throughout.
+        velocity: with which it enters the physics; None for that of its trajectory.
+        placed: whether an edit gave it its trajectory or its look.
     """
 
     object_id: str
@@ -60,6 +88,10 @@ class ObjectState:
     trajectory: Trajectory
     instance_id: int
     deleted: bool = False
+    asset: AssetSource | None = None
+    physics: SetPhysics | None = None
+    velocity: SetVelocity | None = None
+    placed: bool = False
 
     @property
     def scaled_size(self) -> tuple[float, float, float]:
@@ -76,7 +108,13 @@ class ScenarioState:
         objects: by id in a stable order: those of the scene, then copies as they were made.
         next_instance_id: what the next new object gets.
         time_range: first and last time of the scene's clock [us].
+        clock: first and last time at which the scenario plays, within ``time_range`` [us].
+        regions: boxes erased from the background, by id, deleted ones too.
+        colliders: by id, deleted ones too.
+        gone: ids of deleted regions and colliders.
         recorded: the objects as the scene has them, by id.
+        ground: as the recording knows it.
+        assets: the asset library, or None where there is none.
         extent: [2, 2] lowest and highest x, y that the ego or an object reaches in the scene [m].
     """
 
@@ -85,9 +123,15 @@ class ScenarioState:
     time_range: tuple[int, int]
     recorded: Mapping[str, ObjectState] = field(repr=False)
     extent: NDArray[np.float64] = field(repr=False)
+    clock: tuple[int, int]
+    ground: RecordedGround = field(repr=False)
+    assets: AssetLookup | None = field(default=None, repr=False)
+    regions: Mapping[str, EraseRegion] = field(default_factory=dict)
+    colliders: Mapping[str, AddCollider] = field(default_factory=dict)
+    gone: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, scene: SceneSource) -> ScenarioState:
+    def of(cls, scene: SceneSource, *, assets: AssetLookup | None = None) -> ScenarioState:
         """The state before any edit, of a Scene or of a summary of one."""
         given = scene.objects
         sources = list(given.values() if isinstance(given, Mapping) else given)
@@ -111,6 +155,9 @@ class ScenarioState:
             time_range=(scene.ego.start_us, scene.ego.end_us),
             recorded=frozen,
             extent=np.stack([reached.min(axis=0), reached.max(axis=0)]),
+            clock=(scene.ego.start_us, scene.ego.end_us),
+            ground=RecordedGround.of(scene.ego, sources),
+            assets=assets,
         )
 
     def with_object(self, changed: ObjectState) -> ScenarioState:
@@ -122,6 +169,20 @@ class ScenarioState:
             objects=MappingProxyType(objects),
             next_instance_id=max(self.next_instance_id, changed.instance_id + 1),
         )
+
+    def knows(self, thing_id: str) -> bool:
+        """Whether an object, region or collider has this id, deleted ones included."""
+        return thing_id in self.objects or thing_id in self.regions or thing_id in self.colliders
+
+    @property
+    def erased(self) -> tuple[EraseRegion, ...]:
+        """Regions in effect, in order."""
+        return tuple(r for i, r in self.regions.items() if i not in self.gone)
+
+    @property
+    def standing_colliders(self) -> tuple[AddCollider, ...]:
+        """Colliders in effect, in order."""
+        return tuple(c for i, c in self.colliders.items() if i not in self.gone)
 
     @property
     def visible(self) -> tuple[ObjectState, ...]:

@@ -118,6 +118,15 @@ def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, 
     """
     times = trajectory.times_us
     covered = (times_us >= times[0]) & (times_us <= times[-1])
+    return transform_from(*sample_poses(trajectory, times_us)), covered
+
+
+def sample_poses(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, Float]:
+    """Positions [S, 3] and quaternions [S, 4] at ``times_us`` [S]; the nearest known pose outside.
+
+    Poses that the trajectory holds come back bit for bit.
+    """
+    times = trajectory.times_us
     clipped = np.clip(times_us, times[0], times[-1])
     after = np.searchsorted(times, clipped, side="left")
     before = np.maximum(after - 1, 0)
@@ -125,7 +134,10 @@ def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, 
     share = np.where(after > before, (clipped - times[before]) / span, 0.0)
     p, q = trajectory.positions, trajectory.quaternions
     positions = (1 - share)[:, None] * p[before] + share[:, None] * p[after]
-    return transform_from(positions, slerp(q[before], q[after], share)), covered
+    quaternions = slerp(q[before], q[after], share)
+    known = times[after] == clipped
+    positions[known], quaternions[known] = p[after[known]], q[after[known]]
+    return positions, quaternions
 
 
 ROTATION_OF_PRODUCTS = np.zeros((4, 4, 3, 3))

@@ -198,7 +198,7 @@ class World:
 
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
-        return compose(self.scene, self.agents, self.t_us)
+        return compose(self.scene, self.agents, self.t_us, erased=self.state.erased)
 
     def due_sensors(self) -> list[SensorSpec]:
         """Sensors of the reset that deliver a frame at this step; all of them at step 0."""

@@ -37,6 +37,12 @@ def turning(x: float, y: float, *, radius: float, speed: float) -> Trajectory:
     return Trajectory(times, positions, yaw_quaternion(yaw))
 
 
+def on_the_ground(trajectory: Trajectory) -> Trajectory:
+    """The same for a vehicle, whose origin is on the ground."""
+    flat = trajectory.positions * [1.0, 1.0, 0.0]
+    return Trajectory(trajectory.times_us, flat, trajectory.quaternions)
+
+
 def thing(object_id: str, trajectory: Trajectory, *, category: str = "car") -> SimpleNamespace:
     return SimpleNamespace(
         object_id=object_id, category=category, size=(4.0, 2.0, 1.6), trajectory=trajectory
@@ -53,10 +59,17 @@ def summary() -> SimpleNamespace:
             thing("turning", turning(40.0, 10.0, radius=15.0, speed=6.0)),
             thing("late", drive(60.0, -8.0, speed=3.0, yaw=-2.0, first=20, last=40)),
         ],
-        ego=drive(0.0, 0.0, speed=10.0),
+        ego=on_the_ground(drive(0.0, 0.0, speed=10.0)),
     )
 
 
 @pytest.fixture(scope="session")
 def state(summary: SimpleNamespace) -> ScenarioState:
     return ScenarioState.of(summary)
+
+
+@pytest.fixture(scope="session")
+def state_with_assets(summary: SimpleNamespace) -> ScenarioState:
+    """The same, beside a library that holds a van."""
+    van = SimpleNamespace(asset_id="van", category="truck", size=(5.0, 2.1, 2.0), gaussians=7)
+    return ScenarioState.of(summary, assets={"van": van}.get)

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_proto.operations import Delete, Duplicate, Scale, Translate
+from real2sim_proto.base import Pose
+from real2sim_proto.operations import Delete, Duplicate, EraseRegion, Scale, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, instances_at
 from real2sim_server.scene import Scene, SceneObject
 from real2sim_server.scene.errors import UnknownObjectError
@@ -65,7 +66,7 @@ def test_edits_show(street):
     ).state
     instances = instances_at(street, edited, 0)
 
-    assert [i.instance_id for i in instances] == [0, 1, 3, 5]
+    assert [i.instance_id for i in instances if i.instance_id] == [1, 3, 5]
     assert instances[1].scale == (2, 1, 1)
     np.testing.assert_allclose(instances[1].T_world_object[:3, 3], [21, 5, 0.8])
     assert instances[3].cloud is street.objects["turning"].cloud
@@ -74,3 +75,48 @@ def test_edits_show(street):
 def test_a_state_of_another_scene_is_refused(street, tiny_scene):
     with pytest.raises(UnknownObjectError):
         instances_at(tiny_scene, ScenarioState.of(street), 0)
+
+
+def shadows(instances):
+    return [i for i in instances[1:] if i.instance_id == 0]
+
+
+def test_recorded_objects_cast_no_second_shadow(street):
+    assert shadows(instances_at(street, ScenarioState.of(street), 0)) == []
+
+
+def test_a_moved_object_has_a_shadow_of_its_footprint_on_the_ground(street):
+    state = ScenarioState.of(street)
+    moved = apply_operations(state, [Translate(object_id="parked", x=-6, y=-3)]).state
+    (shadow,) = shadows(instances_at(street, moved, 0))
+
+    np.testing.assert_allclose(shadow.T_world_object[:3, 3], [14, 2, 0.04], atol=0.02)
+    np.testing.assert_allclose(shadow.scale, [4.7, 2.7, 1.0])
+
+
+def test_an_object_moved_back_has_none(street):
+    there = Translate(object_id="parked", x=-6)
+    back = Translate(object_id="parked", x=6)
+    state = apply_operations(ScenarioState.of(street), [there, back]).state
+
+    assert shadows(instances_at(street, state, 0)) == []
+
+
+def test_a_shadow_pales_as_its_object_rises_and_then_is_gone(street):
+    def darkness(height: float) -> float:
+        lift = Translate(object_id="parked", x=-6, z=height)
+        state = apply_operations(ScenarioState.of(street), [lift]).state
+        return sum(float(s.cloud.opacities.max()) for s in shadows(instances_at(street, state, 0)))
+
+    assert darkness(0) > darkness(0.5) > darkness(2) == 0
+
+
+def test_erased_regions_hide_their_gaussians_and_share_the_rest(street):
+    inside = street.background.means[:, 0].double().numpy() < 15.0
+    region = EraseRegion(pose=Pose(position=(5, 0, 0)), size=(20, 100, 100))
+    state = apply_operations(ScenarioState.of(street), [region]).state
+    shown = instances_at(street, state, 0)[0].cloud
+
+    np.testing.assert_array_equal(shown.opacities.numpy() == 0, inside)
+    assert shown.means is street.background.means
+    assert instances_at(street, state, 100)[0].cloud is shown

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from real2sim_proto.base import Pose
-from real2sim_proto.operations import Delete, Duplicate, Rotate, Scale, SetPose, Translate
+from real2sim_proto.operations import Delete, Duplicate, Insert, Rotate, Scale, SetPose, Translate
 from real2sim_server.edit import apply_operations
 
 
@@ -79,6 +79,14 @@ def test_the_ground_is_asked_where_it_is_known(state):
 
     assert warnings(state, up_the_hill, ground=slope) == []
     assert warnings(state, up_the_hill) == [("off_ground", "parked")]
+
+
+def test_a_floating_asset_is_reported_against_the_ground(state_with_assets):
+    floating = Insert(asset_id="van", pose=Pose(position=(8, 3, 3)), snap=False)
+    outcome = apply_operations(state_with_assets, [floating])
+
+    assert [w.code for w in outcome.warnings] == ["off_ground"]
+    assert outcome.warnings[0].message.endswith("2.00 m above the ground")
 
 
 @pytest.mark.parametrize(("y", "expected"), [(90, []), (150, [("outside_map", "parked")])])

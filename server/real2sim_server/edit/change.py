@@ -1,0 +1,108 @@
+"""What one operation does, and what operations ask of the state first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.base import Track
+from real2sim_proto.operations import Operation
+
+from ..scene import Trajectory
+from .errors import EditError
+from .state import ObjectState, ScenarioState
+
+MAX_ID_LENGTH = 80
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One operation's doing.
+
+    Attributes:
+        state: after it.
+        inverse: what takes it back.
+        touched: id of the object that a person should look at; None where there is none.
+        created: id of what is new; None where nothing is.
+    """
+
+    state: ScenarioState
+    inverse: Operation
+    touched: str | None = None
+    created: str | None = None
+
+
+def changed(state: ScenarioState, subject: ObjectState, inverse: Operation) -> Change:
+    """The change that puts ``subject`` in the place of the object of its id."""
+    return Change(state.with_object(subject), inverse, touched=subject.object_id)
+
+
+def refused(message: str, *, hint: str | None = None) -> EditError:
+    """An INVALID_OPERATION."""
+    return EditError(ErrorCode.INVALID_OPERATION, message, hint=hint)
+
+
+def existing(state: ScenarioState, object_id: str) -> ObjectState:
+    """The object of that id. Raises EditError: UNKNOWN_OBJECT, or INVALID_OPERATION if deleted."""
+    found = state.objects.get(object_id)
+    if found is None:
+        known = ", ".join(o.object_id for o in state.visible) or "none"
+        raise EditError(
+            ErrorCode.UNKNOWN_OBJECT,
+            f"there is no object {object_id!r}",
+            hint=f"objects of this scenario: {known}",
+        )
+    if found.deleted:
+        raise refused(
+            f"object {object_id!r} is deleted",
+            hint=f"bring it back with restore of {object_id!r} first",
+        )
+    return found
+
+
+def new_id(state: ScenarioState, wanted: str | None, stem: str) -> str:
+    """The id ``wanted``, or the first free one of ``stem`` with a number.
+
+    Raises:
+        EditError: INVALID_OPERATION when it is taken, or would be too long.
+    """
+    if wanted is not None:
+        if state.knows(wanted):
+            gone = wanted in state.gone or (
+                wanted in state.objects and state.objects[wanted].deleted
+            )
+            deleted = " (deleted; its id stays reserved)" if gone else ""
+            raise refused(
+                f"the id {wanted!r} is taken{deleted}",
+                hint="give another id, or none to get the next free one",
+            )
+        return wanted
+    n = 1
+    while state.knows(free := f"{stem}{n}"):
+        n += 1
+    if len(free) > MAX_ID_LENGTH:
+        raise refused(
+            f"the new id {free!r} would be longer than {MAX_ID_LENGTH} characters",
+            hint="give a shorter new_id",
+        )
+    return free
+
+
+def wire_track(trajectory: Trajectory) -> Track:
+    """A trajectory as operations carry it."""
+    return Track(
+        times_us=trajectory.times_us.tolist(),
+        positions=trajectory.positions.tolist(),
+        quaternions=trajectory.quaternions.tolist(),
+    )
+
+
+def trajectory_of(track: Track) -> Trajectory:
+    """The trajectory an operation carries. Raises SceneError when it is none."""
+    return Trajectory(
+        np.array(track.times_us, dtype=np.int64),
+        np.array(track.positions, dtype=np.float64),
+        np.array(track.quaternions, dtype=np.float64),
+    )

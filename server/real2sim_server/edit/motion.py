@@ -1,0 +1,250 @@
+"""Operations on where objects are, when."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.base import Pose, Track
+from real2sim_proto.operations import (
+    Frame,
+    Operation,
+    Retime,
+    Rotate,
+    Scale,
+    SetPose,
+    SetTrajectory,
+    TimeRange,
+    Translate,
+)
+
+from ..scene import Trajectory
+from ..scene.rotation import Float, multiply_quaternions, quaternion_to_matrix, transform_from
+from .change import Change, changed, refused, trajectory_of, wire_track
+from .ground import RecordedGround, bottoms_of
+from .state import ObjectState, ScenarioState
+from .tracks import sample_poses
+
+MAX_COORDINATE = 1e6
+"""Positions stay within what the wire can carry [m]."""
+
+MAX_TIME_US = 2**62
+
+SCALE_RANGE = (1e-3, 1e3)
+"""All scalings of an object together stay within this, along each axis."""
+
+BLEND_STEP_US = 50_000
+"""Spacing of the poses in which an edit grows or fades."""
+
+
+def translate(state: ScenarioState, subject: ObjectState, operation: Translate) -> Change:
+    """Shift it, at all times or in a time range."""
+    shift = (operation.x, operation.y, operation.z)
+    track, weights = _weighted(subject.trajectory, operation.time_range)
+    moved = shifted(track, shift, operation.frame, weights=weights)
+    if operation.time_range is None and not operation.snap:
+        inverse = operation.model_copy(update={k: -v for k, v in zip("xyz", shift, strict=True)})
+        return _moved(state, subject, moved, inverse)
+    return _follow(state, subject, moved, snap=operation.snap)
+
+
+def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> Change:
+    """Turn it about its own centre, at all times or in a time range."""
+    axis = np.array(operation.axis) / np.linalg.norm(operation.axis)
+    track, weights = _weighted(subject.trajectory, operation.time_range)
+    half = operation.angle / 2 * (weights if weights is not None else np.ones(1))[:, None]
+    turns = np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
+    if operation.frame == "world":
+        quaternions = multiply_quaternions(turns, track.quaternions)
+    else:
+        quaternions = multiply_quaternions(track.quaternions, turns)
+    turned = Trajectory(track.times_us, track.positions, quaternions)
+    if operation.time_range is None and not operation.snap:
+        inverse = operation.model_copy(update={"angle": -operation.angle})
+        return _moved(state, subject, turned, inverse)
+    return _follow(state, subject, turned, snap=operation.snap)
+
+
+def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> Change:
+    """Multiply its size; what the anchor names stays where it is."""
+    factors = (operation.x, operation.y, operation.z)
+    a, b, c = subject.scale
+    scaled = rescaled(
+        subject,
+        (a * operation.x, b * operation.y, c * operation.z),
+        keep_bottom=operation.anchor == "bottom",
+    )
+    inverse = operation.model_copy(update={k: 1 / v for k, v in zip("xyz", factors, strict=True)})
+    return changed(state, scaled, inverse)
+
+
+def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> Change:
+    """Let it stand for the whole time range of the scene."""
+    stood = trajectory_of(standing(operation.pose, state.time_range))
+    return _follow(state, subject, stood, snap=operation.snap)
+
+
+def set_trajectory(state: ScenarioState, subject: ObjectState, operation: SetTrajectory) -> Change:
+    """Let it follow a trajectory."""
+    return _follow(state, subject, trajectory_of(operation.trajectory), snap=operation.snap)
+
+
+def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> Change:
+    """Let it do the same at other times."""
+    old = subject.trajectory
+    since = (old.times_us - old.start_us).astype(np.float64) / operation.speed
+    times = old.start_us + operation.delay_us + np.rint(since).astype(np.int64)
+    if (np.diff(times) <= 0).any():
+        raise refused(
+            f"at {operation.speed:g} times the speed, poses would fall on the same microsecond",
+            hint="choose a lower speed",
+        )
+    if max(abs(int(times[0])), abs(int(times[-1]))) > MAX_TIME_US:
+        raise refused(
+            f"the object would move from {times[0]} to {times[-1]} us, beyond what can be stored",
+            hint="choose a smaller delay_us or a higher speed",
+        )
+    return _follow(state, subject, Trajectory(times, old.positions, old.quaternions))
+
+
+# --- parts that placing and replacing need too -------------------------------------------------
+
+
+def standing(pose: Pose, time_range: tuple[int, int]) -> Track:
+    """The trajectory of what stands for the whole time range."""
+    times = sorted(set(time_range))
+    return Track(
+        times_us=times,
+        positions=[pose.position] * len(times),
+        quaternions=[pose.quaternion] * len(times),
+    )
+
+
+def snapped(
+    trajectory: Trajectory, size: tuple[float, float, float], ground: RecordedGround
+) -> Trajectory:
+    """The trajectory with the bottoms of its boxes on the ground."""
+    poses = transform_from(trajectory.positions, trajectory.quaternions)
+    bottoms = bottoms_of(poses, size)
+    positions = trajectory.positions.copy()
+    positions[:, 2] += ground(bottoms[:, :2]) - bottoms[:, 2]
+    return Trajectory(trajectory.times_us, positions, trajectory.quaternions)
+
+
+def shifted(
+    trajectory: Trajectory,
+    shift: tuple[float, float, float],
+    frame: Frame,
+    *,
+    weights: Float | None = None,
+) -> Trajectory:
+    """The trajectory shifted [m], at each pose by the share in ``weights`` [T].
+
+    Raises:
+        EditError: INVALID_OPERATION when it leaves what the wire can carry.
+    """
+    offset: Float = np.array(shift)
+    if frame == "object":
+        offset = quaternion_to_matrix(trajectory.quaternions) @ offset
+    if weights is not None:
+        offset = weights[:, None] * offset
+    positions = trajectory.positions + offset
+    if np.abs(positions).max() > MAX_COORDINATE:
+        raise refused(
+            f"the object would be {np.abs(positions).max():.6g} m away from the origin; "
+            f"{MAX_COORDINATE:g} m is allowed",
+            hint="shift it by less",
+        )
+    return Trajectory(trajectory.times_us, positions, trajectory.quaternions)
+
+
+def rescaled(
+    subject: ObjectState, scale: tuple[float, float, float], *, keep_bottom: bool
+) -> ObjectState:
+    """The object at another ``scale``, its box centre or the bottom's centre where it was.
+
+    Raises:
+        EditError: INVALID_OPERATION outside ``SCALE_RANGE``.
+    """
+    lowest, highest = SCALE_RANGE
+    if min(scale) < lowest or max(scale) > highest:
+        raise refused(
+            f"scalings together would be {scale}; {lowest:g} to {highest:g} is allowed",
+            hint="scale by factors nearer to 1",
+        )
+    scaled = replace(subject, scale=scale)
+    if not keep_bottom:
+        return scaled
+    # The origin is the box centre, so a bottom that stays lifts it by half the growth.
+    lift = (scaled.scaled_size[2] - subject.scaled_size[2]) / 2
+    raised = shifted(subject.trajectory, (0.0, 0.0, lift), "object")
+    return replace(scaled, trajectory=raised)
+
+
+# --- inside -------------------------------------------------------------------------------------
+
+
+def _follow(
+    state: ScenarioState, subject: ObjectState, trajectory: Trajectory, *, snap: bool = False
+) -> Change:
+    inverse = SetTrajectory(object_id=subject.object_id, trajectory=wire_track(subject.trajectory))
+    if snap:
+        trajectory = snapped(trajectory, subject.scaled_size, state.ground)
+    return _moved(state, subject, trajectory, inverse)
+
+
+def _moved(
+    state: ScenarioState, subject: ObjectState, trajectory: Trajectory, inverse: Operation
+) -> Change:
+    return changed(state, replace(subject, trajectory=trajectory, placed=True), inverse)
+
+
+def _weighted(
+    trajectory: Trajectory, time_range: TimeRange | None
+) -> tuple[Trajectory, Float | None]:
+    """The trajectory with poses wherever the edit's weight bends, and that weight at each [T]."""
+    if time_range is None:
+        return trajectory, None
+    times = np.union1d(trajectory.times_us, _bends(trajectory, time_range))
+    positions, quaternions = sample_poses(trajectory, times)
+    return Trajectory(times, positions, quaternions), _weights(times, time_range)
+
+
+def _bends(trajectory: Trajectory, time_range: TimeRange) -> NDArray[np.int64]:
+    blend = time_range.blend_us
+    ramps = []
+    if time_range.start_us is not None:
+        ramps.append(_ramp(time_range.start_us, blend))
+    if time_range.end_us is not None:
+        ramps.append(_ramp(time_range.end_us - blend, blend))
+    bends = np.concatenate([np.zeros(0, dtype=np.int64), *ramps])
+    return bends[(bends > trajectory.start_us) & (bends < trajectory.end_us)]
+
+
+def _ramp(start_us: int, blend_us: int) -> NDArray[np.int64]:
+    if blend_us == 0:
+        # A jump: the pose before it and the pose after it, one microsecond apart.
+        return np.array([start_us - 1, start_us], dtype=np.int64)
+    steps = max(2, -(-blend_us // BLEND_STEP_US))
+    return start_us + np.arange(steps + 1, dtype=np.int64) * blend_us // steps
+
+
+def _weights(times_us: NDArray[np.int64], time_range: TimeRange) -> Float:
+    weights = np.ones(len(times_us))
+    if time_range.start_us is not None:
+        weights *= _smooth(times_us - time_range.start_us, time_range.blend_us)
+    if time_range.end_us is not None:
+        weights *= _smooth(time_range.end_us - times_us, time_range.blend_us)
+    return weights
+
+
+def _smooth(since_us: NDArray[np.int64], blend_us: int) -> Float:
+    """0 before, 1 after; between them 6 s^5 - 15 s^4 + 10 s^3, which starts and ends without
+    velocity or acceleration (Flash and Hogan 1985, minimum jerk)."""
+    if blend_us == 0:
+        return np.where(since_us >= 0, 1.0, 0.0)
+    s = np.clip(since_us / blend_us, 0.0, 1.0)
+    smooth: Float = s**3 * (10 + s * (6 * s - 15))
+    return smooth

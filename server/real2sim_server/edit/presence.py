@@ -1,0 +1,170 @@
+"""Operations on what there is: copies, assets, tombstones, looks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.operations import Delete, Duplicate, Insert, Replace, Restore
+
+from ..scene.scene import MAX_OBJECTS
+from .change import Change, changed, existing, new_id, refused, trajectory_of
+from .errors import EditError
+from .motion import rescaled, shifted, snapped, standing
+from .state import AssetSource, ObjectState, ScenarioState
+
+
+def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) -> Change:
+    """Add a copy, shifted."""
+    _require_room(state)
+    shift = (operation.x, operation.y, operation.z)
+    trajectory = shifted(subject.trajectory, shift, operation.frame)
+    if operation.snap:
+        trajectory = snapped(trajectory, subject.scaled_size, state.ground)
+    copy = replace(
+        subject,
+        object_id=new_id(state, operation.new_id, f"{subject.object_id}_copy"),
+        instance_id=state.next_instance_id,
+        trajectory=trajectory,
+        placed=True,
+    )
+    return _added(state, copy)
+
+
+def insert(state: ScenarioState, operation: Insert) -> Change:
+    """Add an object that shows an asset."""
+    _require_room(state)
+    asset = _asset(state, operation.asset_id)
+    if operation.trajectory is not None:
+        track = operation.trajectory
+    else:
+        assert operation.pose is not None  # the model has one of the two
+        track = standing(operation.pose, state.time_range)
+    added = ObjectState(
+        object_id=new_id(state, operation.object_id, f"{operation.asset_id}_"),
+        source_id="",
+        category=asset.category,
+        size=asset.size,
+        scale=(1.0, 1.0, 1.0),
+        trajectory=trajectory_of(track),
+        instance_id=state.next_instance_id,
+        asset=asset,
+        placed=True,
+    )
+    if operation.size is not None:
+        added = rescaled(added, _fitting(operation.size, asset.size), keep_bottom=False)
+    if operation.snap:
+        on_ground = snapped(added.trajectory, added.scaled_size, state.ground)
+        added = replace(added, trajectory=on_ground)
+    return _added(state, added)
+
+
+def replace_look(state: ScenarioState, subject: ObjectState, operation: Replace) -> Change:
+    """Show something else in the box; the centre of its bottom stays where it is."""
+    look = _look(state, operation)
+    box = operation.size or subject.scaled_size
+    factors = _fitting(box, look.size)
+    if operation.fit == "length":
+        factors = (factors[0],) * 3
+    old_size = subject.scaled_size
+    dressed = replace(
+        subject,
+        source_id=look.source_id,
+        asset=look.asset,
+        category=look.category,
+        size=look.size,
+        scale=tuple(o / n for o, n in zip(old_size, look.size, strict=True)),
+        placed=True,
+    )
+    dressed = rescaled(dressed, factors, keep_bottom=True)
+    inverse = Replace(
+        object_id=subject.object_id,
+        asset_id=subject.asset.asset_id if subject.asset else None,
+        recorded_id=None if subject.asset else subject.source_id,
+        size=old_size,
+    )
+    return changed(state, dressed, inverse)
+
+
+def delete(state: ScenarioState, operation: Delete) -> Change:
+    """Leave a tombstone."""
+    thing, inverse = operation.object_id, Restore(object_id=operation.object_id)
+    if thing in state.regions or thing in state.colliders:
+        if thing in state.gone:
+            raise refused(f"{thing!r} is deleted already", hint="leave the delete out")
+        return Change(replace(state, gone=state.gone | {thing}), inverse)
+    return changed(state, replace(existing(state, thing), deleted=True), inverse)
+
+
+def restore(state: ScenarioState, operation: Restore) -> Change:
+    """Take a tombstone away."""
+    thing, inverse = operation.object_id, Delete(object_id=operation.object_id)
+    if thing in state.gone:
+        return Change(replace(state, gone=state.gone - {thing}), inverse)
+    found = state.objects.get(thing)
+    if found is None and not state.knows(thing):
+        existing(state, thing)
+    if found is None or not found.deleted:
+        raise refused(f"{thing!r} is not deleted", hint="leave the restore out")
+    return changed(state, replace(found, deleted=False), inverse)
+
+
+def _added(state: ScenarioState, added: ObjectState) -> Change:
+    return Change(
+        state.with_object(added),
+        Delete(object_id=added.object_id),
+        touched=added.object_id,
+        created=added.object_id,
+    )
+
+
+def _require_room(state: ScenarioState) -> None:
+    if state.next_instance_id > MAX_OBJECTS:
+        raise refused(
+            f"the scenario has {len(state.objects)} objects, deleted ones included, the most "
+            "that instance images can tell apart",
+            hint="start from a new scenario",
+        )
+
+
+def _asset(state: ScenarioState, asset_id: str) -> AssetSource:
+    found = state.assets(asset_id) if state.assets else None
+    if found is None:
+        raise EditError(
+            ErrorCode.UNKNOWN_ASSET,
+            f"there is no asset {asset_id!r} in the library",
+            hint="GET /v1/assets lists them; POST /v1/assets adds one",
+        )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    source_id: str
+    category: str
+    size: tuple[float, float, float]
+    asset: AssetSource | None = None
+
+
+def _look(state: ScenarioState, operation: Replace) -> _Look:
+    if operation.asset_id is not None:
+        asset = _asset(state, operation.asset_id)
+        return _Look("", asset.category, asset.size, asset)
+    recorded: Mapping[str, Any] = state.recorded
+    found = recorded.get(operation.recorded_id or "")
+    if found is None:
+        raise EditError(
+            ErrorCode.UNKNOWN_OBJECT,
+            f"the recording has no object {operation.recorded_id!r}",
+            hint=f"it has: {', '.join(recorded) or 'none'}",
+        )
+    return _Look(found.source_id, found.category, found.size)
+
+
+def _fitting(
+    box: tuple[float, float, float], size: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    x, y, z = (b / s for b, s in zip(box, size, strict=True))
+    return (x, y, z)
