@@ -266,6 +266,9 @@ def evaluate(
     shifts: Annotated[
         str, typer.Option(help="Metres beside the path, for synthetic logs; or none.")
     ] = "1,2,3",
+    around: Annotated[
+        bool, typer.Option("--around", help="Also see vehicles from all sides (synthetic logs).")
+    ] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for a page with images.")] = None,
     backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference")] = "auto",
     log_format: Annotated[str | None, typer.Option("--format", help="Default: recognised.")] = None,
@@ -279,7 +282,9 @@ def evaluate(
         command.run,
         scene=scene,
         log=log,
-        asked=command.Asked(frames=frames, shifts=shifts, width=width, backend=backend),
+        asked=command.Asked(
+            frames=frames, shifts=shifts, width=width, backend=backend, around=around
+        ),
         log_format=log_format,
         sequence=sequence,
         report=report,

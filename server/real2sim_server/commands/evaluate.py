@@ -20,12 +20,14 @@ class Asked:
         shifts: distances [m] with commas between them, or ``none``.
         width: of the compared images [px].
         backend: of the renderer.
+        around: whether to look at vehicles from all sides.
     """
 
     frames: str = "held-out"
     shifts: str = "1,2,3"
     width: int | None = None
     backend: str = "auto"
+    around: bool = False
 
 
 def run(
@@ -44,6 +46,7 @@ def run(
         width=asked.width,
         shifts=_shifts(asked.shifts),
         backend=asked.backend,
+        around=asked.around,
     )
     loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)
     with staged_progress() as tell:
@@ -95,4 +98,10 @@ def _table(result: Evaluation) -> dict[str, object]:
     }
     for shift in result.shifted:
         figures[f"psnr from {shift.shift_m:g} m beside [dB]"] = shift.psnr
+    if result.around is not None:
+        figures |= {
+            "vehicles' seen sides [dB]": result.around.psnr_seen,
+            "vehicles' other sides [dB]": result.around.psnr_unseen,
+            "of these covered": result.around.coverage_unseen,
+        }
     return figures

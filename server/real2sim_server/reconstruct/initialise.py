@@ -25,6 +25,7 @@ from .unseen import (
     fill_from_mirror,
     fill_from_neighbours,
     fill_ground,
+    own_paint,
 )
 from .views import Placed, View, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
@@ -37,6 +38,8 @@ SKY_FRAMES = 15
 WALL_FRAMES = 16
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
+PAINT_REACH = 0.2
+"""How far the colours of a vehicle's seen parts reach beyond them [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +276,10 @@ def _fill_objects(
         points = parts.surfels.points[mine]
         mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
         likely = prior.colour(relative[mine], parts.intensity[mine])
-        colours[mine] = fill_from_neighbours(points, mirrored, now_known, likely)
+        paint = own_paint(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
+        colours[mine] = fill_from_neighbours(
+            points, mirrored, now_known, paint, trust_reach=PAINT_REACH
+        )
     colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
     return colours
 

@@ -12,6 +12,10 @@ MIRROR_REACH = 0.15
 """An unseen point takes the colour of its mirror image when that was seen this near [m]."""
 TRUST = 1.0
 """Distance at which a seen neighbour's colour has lost most of its say [m]."""
+LEAST_SEEN = 30
+"""Fewer seen points than this tell nothing about a paint."""
+LIKENESS = 0.06
+"""Standard deviation of colours that count as one."""
 GREY = np.array([0.4, 0.4, 0.4], dtype=np.float32)
 
 Colours = NDArray[np.float32]
@@ -60,9 +64,17 @@ class ColourPrior:
 
 
 def fill_from_neighbours(
-    points: NDArray[np.float32], colours: Colours, known: Known, prior: Colours
+    points: NDArray[np.float32],
+    colours: Colours,
+    known: Known,
+    prior: Colours,
+    *,
+    trust_reach: float = TRUST,
 ) -> Colours:
-    """Colour unseen points from seen ones nearby, and from ``prior`` [N, 3] where none is near."""
+    """Colour unseen points from seen ones nearby, and from ``prior`` [N, 3] where none is near.
+
+    Neighbours' colours have lost most of their say at the distance ``trust_reach`` [m].
+    """
     from scipy.spatial import cKDTree
 
     if known.all():
@@ -74,9 +86,47 @@ def fill_from_neighbours(
         distance, index = tree.query(points[~known], k=[*range(1, count + 1)], workers=-1)
         weight = 1 / (distance + 0.05)
         near = (colours[known][index] * weight[..., None]).sum(axis=1) / weight.sum(1)[:, None]
-        trust = np.exp(-distance[:, :1] / TRUST)
+        trust = np.exp(-distance[:, :1] / trust_reach)
         filled[~known] = trust * near + (1 - trust) * prior[~known]
     return filled.astype(np.float32)
+
+
+def own_paint(
+    heights: NDArray[np.float32],
+    colours: Colours,
+    known: Known,
+    prior: Colours,
+    edges: tuple[float, ...],
+) -> Colours:
+    """The commonest colour of an object's seen points at about the same height.
+
+    Lamps, plates and reflections are no guide to the rest of a body, its paint is; so it is the
+    mode that counts and not the mean.
+
+    Args:
+        heights: [N] as a share of the object's height, 0 at its middle.
+        colours: [N, 3] where ``known`` [N].
+        prior: [N, 3] for bands of height of which too little was seen.
+        edges: where bands end.
+    """
+    if known.sum() < LEAST_SEEN:
+        return prior
+    bands = np.searchsorted(edges, heights)
+    paint = np.broadcast_to(commonest(colours[known]), colours.shape).copy()
+    for band in range(len(edges) + 1):
+        seen = known & (bands == band)
+        if seen.sum() >= LEAST_SEEN:
+            paint[bands == band] = commonest(colours[seen])
+    return paint
+
+
+def commonest(colours: Colours) -> Colours:
+    """The colour [3] around which most of ``colours`` [N, 3] lie."""
+    few = colours[:: -(-len(colours) // 400)]
+    distance = np.linalg.norm(few[:, None] - few[None], axis=2)
+    votes = np.exp(-0.5 * (distance / LIKENESS) ** 2)
+    winner = votes[votes.sum(axis=1).argmax()]
+    return np.asarray((few * winner[:, None]).sum(axis=0) / winner.sum(), dtype=np.float32)
 
 
 def fill_from_mirror(

@@ -75,7 +75,7 @@ class ColourSamples:
         n = len(placed.surfels)
         self._placed = placed
         self._means = np.ascontiguousarray(placed.surfels.points, dtype=np.float32)
-        self._normals = np.ascontiguousarray(placed.surfels.normals, dtype=np.float32)
+        self._normals = _outward_normals(placed)
         tangents = placed.surfels.scales[:, :2]
         self._radii = (1.4 * tangents.max(axis=1)).astype(np.float32)
         self._footprints = np.sqrt(tangents[:, 0] * tangents[:, 1]).astype(np.float32)
@@ -88,7 +88,7 @@ class ColourSamples:
 
     def add(self, log: DrivingLog, camera: Camera, frame: int, image: NDArray[np.uint8]) -> View:
         """Look at all Gaussians from ``camera`` at ``frame``."""
-        t_us = int(log.frame_times_us[frame])
+        t_us = log.image_time_us(camera.name, frame)
         T_camera_world = camera.viewmat(log.ego.transform(t_us))
         poses = _instance_poses(log, t_us)
         transforms = np.stack(
@@ -238,10 +238,15 @@ def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, N
 
 def _instance_poses(log: DrivingLog, t_us: int) -> list[Float | None]:
     """``T_world_instance``, first the background, then the tracks; None where there is none."""
-    tracks = [
-        t.trajectory.transform(t_us) if t.trajectory.covers(t_us) else None for t in log.tracks
-    ]
-    return [np.eye(4), *tracks]
+    return [np.eye(4), *(track.transform_near(t_us) for track in log.tracks)]
+
+
+def _outward_normals(placed: Placed) -> NDArray[np.float32]:
+    """Normals [N, 3] of which those of objects point away from the middle of their box."""
+    points, normals = placed.surfels.points, placed.surfels.normals
+    inwards = (placed.instance > 0) & ((points * normals).sum(axis=1) < 0)
+    turned = np.where(inwards[:, None], -normals, normals)
+    return np.ascontiguousarray(turned, dtype=np.float32)
 
 
 def nearest_objects(

@@ -94,7 +94,11 @@ def write_report(
     cameras = compared_cameras(scene, log, options.width)
     subject = _Subject(scene, log, evaluation, find_truth(log), options.backend)
     frames = _spread(evaluation.frames, SHOWN_FRAMES)
-    parts = [_heading(evaluation), _figures(evaluation), _shift_figures(evaluation)]
+    parts = [
+        _heading(evaluation),
+        _figures(evaluation),
+        _shift_figures(evaluation) + _around_figures(evaluation),
+    ]
     parts.append("<h2>Recorded and rendered</h2>")
     parts.append(
         f"<p>Errors from black (none) to yellow ({ERROR_FULL:.0f} of 255 and more); depth from red "
@@ -152,6 +156,21 @@ def _shift_figures(evaluation: Evaluation) -> str:
         for s in evaluation.shifted
     ]  # fmt: skip
     return "<h2>Beside the recorded path</h2>" + _table(head, rows)
+
+
+def _around_figures(evaluation: Evaluation) -> str:
+    around = evaluation.around
+    if around is None:
+        return ""
+    head = ("sides of vehicles", "PSNR [dB]", "covered [%]", "views")
+    seen = sum(side.seen for side in around.sides)
+    rows = [
+        ("seen by a camera", _number(around.psnr_seen), _number(100 * around.coverage_seen),
+         str(seen)),
+        ("never seen", _number(around.psnr_unseen), _number(100 * around.coverage_unseen),
+         str(len(around.sides) - seen)),
+    ]  # fmt: skip
+    return "<h2>Vehicles from all around</h2>" + _table(head, rows)
 
 
 def _view_figures(evaluation: Evaluation) -> str:

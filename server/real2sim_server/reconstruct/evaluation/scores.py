@@ -15,6 +15,7 @@ from ...scene import Camera, Scene
 from ..options import ReconstructError
 from ..stages import OnProgress, Stages, Tell
 from ..training.data import image_time, resized
+from .around import AroundScore, evaluate_around
 from .choice import choose_frames, compared_cameras
 from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
 from .lidar_depth import depth_errors, median_error, points_in_camera
@@ -35,6 +36,7 @@ class EvaluateOptions:
         shifted_frames: at most so many frames, evenly spread, are looked at from there.
         repeats: timed renders.
         backend: of the renderer.
+        around: whether vehicles are looked at from all around, where truth exists.
 
     Raises:
         ReconstructError: a value out of range.
@@ -46,6 +48,7 @@ class EvaluateOptions:
     shifted_frames: int = 6
     repeats: int = 10
     backend: str = "auto"
+    around: bool = False
 
     def __post_init__(self) -> None:
         if self.width is not None and not 16 <= self.width <= 8192:
@@ -115,6 +118,7 @@ class Evaluation:
         views: one score each, camera by camera within a frame.
         shifted: views from beside the path; empty where no truth exists.
         no_shifted: why it is empty; empty where it is not.
+        around: vehicles from all sides; None unless asked for, or where no truth exists.
     """
 
     scene: str
@@ -133,6 +137,7 @@ class Evaluation:
     views: tuple[LoggedViewScore, ...]
     shifted: tuple[ShiftScore, ...] = ()
     no_shifted: str = ""
+    around: AroundScore | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
@@ -179,6 +184,8 @@ def evaluate_scene(
         rate = measure_rate(scene, cameras, times, repeats=options.repeats, backend=options.backend)
     with stages("shifted") as tell:
         shifted, missing = _shifted(scene, log, cameras, times, options=options, tell=tell)
+    with stages("around"):
+        around = _around(scene, log) if options.around else None
     return Evaluation(
         scene=scene.name,
         log=log.name,
@@ -192,6 +199,7 @@ def evaluate_scene(
         views=tuple(views),
         shifted=shifted,
         no_shifted=missing,
+        around=around,
         timing_s=timing_s,
         **asdict(_summary(views, errors)),
     )
@@ -266,6 +274,11 @@ def _shifted(
         on_view=tell,
     )
     return scores, ""
+
+
+def _around(scene: Scene, log: DrivingLog) -> AroundScore | None:
+    truth = find_truth(log).log
+    return None if truth is None else evaluate_around(scene, truth)
 
 
 def _by_camera(
