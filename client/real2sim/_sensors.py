@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias, TypedDict
 
-from real2sim_proto.drive import EgoSpec, ResetSpec, SensorSpec
+from real2sim_proto.episode import EgoSpec, ResetSpec, SensorSpec
 
 from ._requests import checked
 

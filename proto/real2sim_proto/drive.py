@@ -6,6 +6,7 @@ messages with ``id``; the answer carries the same ``id``. The clock moves only o
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,11 +20,11 @@ from pydantic import (
 )
 
 from .base import Codec, Identifier, Metres, Microseconds, Modality, Model, Quaternion, Vector3
+from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .operations import Operation
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import CameraInfo, ObjectInfo
 
-MAX_SENSORS = 16
 MAX_PLAN_POSES = 1024
 
 
@@ -68,58 +69,12 @@ class Answer(Envelope, Told):
 # --- shared by socket and REST sessions -------------------------------------------------------
 
 
-class SensorSpec(Model):
-    """One camera of an observation."""
-
-    camera: Identifier
-    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=3)
-    width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
-    codec: Codec = Field(default="raw", description="of rgb; depth and instance are raw or png")
-    quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
-    period_us: int | None = Field(
-        default=None, gt=0, description="time between frames; a multiple of dt_us; default: dt_us"
-    )
-
-    @model_validator(mode="after")
-    def _modalities_differ(self) -> SensorSpec:
-        if len(set(self.modalities)) != len(self.modalities):
-            raise ValueError(f"modalities {self.modalities!r} repeat one")
-        return self
-
-
-class EgoSpec(Model):
-    """How the controlled vehicle moves."""
-
-    dynamics: Literal["kinematic_bicycle"] = "kinematic_bicycle"
-    wheelbase: Annotated[float, Field(ge=0.5, le=20)] = Field(default=2.8, description="[m]")
-    max_steer: Annotated[float, Field(gt=0, le=1.4)] = Field(default=0.6, description="[rad]")
-    max_steer_rate: Annotated[float, Field(gt=0, le=10)] = Field(default=0.8, description="[rad/s]")
-    max_acceleration: Annotated[float, Field(gt=0, le=50)] = Field(
-        default=4.0, description="[m/s^2]"
-    )
-    max_braking: Annotated[float, Field(gt=0, le=50)] = Field(default=8.0, description="[m/s^2]")
-    max_speed: Annotated[float, Field(gt=0, le=150)] = Field(default=60.0, description="[m/s]")
-
-
-class ResetSpec(Model):
-    """How an episode begins and runs."""
-
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    start_us: Microseconds | None = Field(default=None, description="default: start of the log")
-    dt_us: int = Field(default=100_000, ge=1_000, le=1_000_000, description="clock step")
-    horizon: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000,
-        description="steps; default and most: to the end of the log",
-    )
-    sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
-    ego: EgoSpec = EgoSpec()
-    action: Literal["trajectory", "control", "pose"] = "trajectory"
-    privileged: bool = Field(default=False, description="fill `agents` of every observation")
-    on_collision: Literal["terminate", "continue"] = Field(
-        default="terminate", description="'continue' reports contacts and drives on unhindered"
-    )
+def check_times(times_us: list[int], poses: int) -> None:
+    """Raises ValueError unless there is one time for each pose and they increase."""
+    if len(times_us) != poses:
+        raise ValueError(f"{len(times_us)} times for {poses} poses")
+    if any(b <= a for a, b in itertools.pairwise(times_us)):
+        raise ValueError("times_us must increase strictly")
 
 
 class TrajectoryPlan(Model):
@@ -137,10 +92,7 @@ class TrajectoryPlan(Model):
 
     @model_validator(mode="after")
     def _times_increase(self) -> TrajectoryPlan:
-        if len(self.times_us) != len(self.poses):
-            raise ValueError(f"{len(self.times_us)} times for {len(self.poses)} poses")
-        if any(b <= a for a, b in zip(self.times_us, self.times_us[1:], strict=False)):
-            raise ValueError("times_us must increase strictly")
+        check_times(self.times_us, len(self.poses))
         return self
 
 
@@ -174,6 +126,7 @@ class EgoState(Told):
     quaternion: Quaternion
     yaw: float = Field(description="heading in the world [rad]")
     speed: float = Field(description="along vehicle x [m/s]")
+    lateral_speed: float = Field(default=0.0, description="of the rear axle along vehicle y [m/s]")
     acceleration: float = Field(description="along vehicle x [m/s^2]")
     steering: float = Field(description="road-wheel angle [rad]")
     yaw_rate: float = Field(description="[rad/s]")
@@ -194,13 +147,46 @@ class AgentState(Told):
 class Event(Told):
     """Something that happened in this step."""
 
-    type: Literal["collision", "left_log", "horizon", "edited"]
+    type: Literal[
+        "collision",
+        "left_log",
+        "off_road",
+        "agents_react",
+        "deadline_missed",
+        "horizon",
+        "edited",
+        "stopped",
+    ]
     t_us: Microseconds
     object_id: str | None = None
+    other_id: str | None = Field(default=None, description="second object, without the ego")
     data: dict[str, float] = Field(default_factory=dict)
 
 
+class Score(Told):
+    """One score of an episode, with the version of its formula.
+
+    Scores of different versions must not be compared.
+    """
+
+    name: str
+    version: str
+    value: float | None = Field(description="None where it is not defined, see `missing`")
+    terms: dict[str, float] = Field(default_factory=dict, description="what it is made of")
+    assumed: list[str] = Field(
+        default_factory=list, description="terms taken as 1 for want of inputs"
+    )
+    missing: list[str] = Field(default_factory=list, description="inputs it cannot do without")
+
+
 # --- client to server -------------------------------------------------------------------------
+
+
+class Resume(Model):
+    """Goes on with a session whose connection was lost."""
+
+    token: str = Field(max_length=500, description="`resume_token` of the welcome")
+    last_step: int | None = Field(default=None, ge=0, description="newest observation received")
 
 
 class Hello(Envelope):
@@ -209,8 +195,11 @@ class Hello(Envelope):
     type: Literal["hello"] = "hello"
     protocols: list[str] = Field(min_length=1, max_length=16)
     sdk: str = Field(default="", max_length=100, description="name and version of the client")
-    role: Literal["controller", "observer"] = "controller"
+    role: Literal["controller", "observer", "agent"] = Field(
+        default="controller", description="'agent' drives objects whose driver is 'external'"
+    )
     token: str | None = Field(default=None, max_length=500)
+    resume: Resume | None = Field(default=None, description="of a controller")
 
 
 class Reset(Envelope):
@@ -243,13 +232,50 @@ class Render(Envelope):
     sensors: list[SensorSpec] = Field(min_length=1, max_length=MAX_SENSORS)
 
 
+class Agent(Envelope):
+    """Where an externally driven object goes from the next step on; answered by `driven`."""
+
+    type: Literal["agent"] = "agent"
+    object_id: Identifier
+    times_us: PlanTimes = Field(description="[N] int64 absolute simulation time")
+    poses: PlanPoses = Field(description="[N, 3] x [m], y [m], yaw [rad] of its box, world")
+
+    @model_validator(mode="after")
+    def _times_increase(self) -> Agent:
+        check_times(self.times_us, len(self.poses))
+        return self
+
+
+class Snapshot(Envelope):
+    """Keeps the present instant to return to; answered by `kept`."""
+
+    type: Literal["snapshot"] = "snapshot"
+    name: Identifier
+
+
+class Restore(Envelope):
+    """Goes back to a snapshot; answered by its obs."""
+
+    type: Literal["restore"] = "restore"
+    name: Identifier
+
+
+class Fork(Envelope):
+    """Makes a new session that goes on from the present instant; answered by `forked`."""
+
+    type: Literal["fork"] = "fork"
+
+
 class Bye(Envelope):
     """Ends the session; the answer is `result`."""
 
     type: Literal["bye"] = "bye"
 
 
-ClientMessage = Annotated[Hello | Reset | Action | Edit | Render | Bye, Field(discriminator="type")]
+ClientMessage = Annotated[
+    Hello | Reset | Action | Edit | Render | Agent | Snapshot | Restore | Fork | Bye,
+    Field(discriminator="type"),
+]
 CLIENT_MESSAGE: TypeAdapter[ClientMessage] = TypeAdapter(ClientMessage)
 
 
@@ -276,14 +302,18 @@ class Welcome(Answer):
     type: Literal["welcome"] = "welcome"
     protocol: str
     session_id: str
-    role: Literal["controller", "observer"]
-    versions: dict[str, str] = Field(description="server, scene_hash")
+    role: Literal["controller", "observer", "agent"]
+    versions: dict[str, str] = Field(description="server, scene_hash, metrics")
     limits: dict[str, int]
     cameras: list[CameraInfo]
     objects: list[ObjectInfo]
     start_us: Microseconds
     end_us: Microseconds
     step: int | None = Field(description="of the running episode; None before reset")
+    revision: int = Field(default=0, description="of the session's edits")
+    resume_token: str | None = Field(
+        default=None, description="of a controller: lets it come back after a lost connection"
+    )
 
 
 class Obs(Answer):
@@ -303,6 +333,7 @@ class Obs(Answer):
     terminated: bool = False
     truncated: bool = False
     reason: str | None = None
+    warming_up: bool = Field(default=False, description="the ego still moves as recorded")
     timing: dict[str, float] = Field(default_factory=dict, description="milliseconds by stage")
 
 
@@ -323,6 +354,33 @@ class View(Answer):
     revision: int
     frames: list[Frame]
     timing: dict[str, float] = Field(default_factory=dict)
+
+
+class Driven(Answer):
+    """Answer to agent."""
+
+    type: Literal["driven"] = "driven"
+    object_id: str
+    step: int = Field(description="the plan holds from this step on")
+
+
+class Kept(Answer):
+    """Answer to snapshot."""
+
+    type: Literal["kept"] = "kept"
+    name: str
+    step: int
+    t_us: Microseconds
+
+
+class Forked(Answer):
+    """Answer to fork: another session at the same instant."""
+
+    type: Literal["forked"] = "forked"
+    session_id: str
+    token: str
+    ws_url: str
+    step: int
 
 
 class Progress(Answer):
@@ -353,9 +411,11 @@ class Result(Answer):
     t_us: Microseconds | None
     reason: str | None
     metrics: dict[str, float]
+    scores: list[Score] = Field(default_factory=list)
 
 
 ServerMessage = Annotated[
-    Welcome | Obs | Edited | View | Progress | Error | Result, Field(discriminator="type")
+    Welcome | Obs | Edited | View | Driven | Kept | Forked | Progress | Error | Result,
+    Field(discriminator="type"),
 ]
 SERVER_MESSAGE: TypeAdapter[ServerMessage] = TypeAdapter(ServerMessage)

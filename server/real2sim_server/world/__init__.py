@@ -7,10 +7,11 @@ from .events import Event
 from .ground import LoggedGround
 from .observation import Observation
 from .path import LoggedPath
-from .world import METRICS, Plan, World
+from .pilot import Plan
+from .scoring import Score, metrics_version
+from .world import World
 
 __all__ = [
-    "METRICS",
     "Agents",
     "Event",
     "LoggedGround",
@@ -18,7 +19,9 @@ __all__ = [
     "Motion",
     "Observation",
     "Plan",
+    "Score",
     "World",
     "WorldError",
     "agent_fields",
+    "metrics_version",
 ]

@@ -20,11 +20,11 @@ class Contact:
     """One object whose box began to overlap the ego box.
 
     Attributes:
-        object_id: the object.
+        object_id: the object; None for the background.
         relative_speed: length of the difference of the two velocities [m/s].
     """
 
-    object_id: str
+    object_id: str | None
     relative_speed: float
 
 
@@ -48,21 +48,3 @@ def touching(T_world_box: Float, size: tuple[float, float, float], agents: Agent
         return []
     hit = boxes_overlap(T_world_box, size, agents.transforms[near], sizes[near])
     return [int(i) for i in near[hit]]
-
-
-def begun(
-    touching_now: list[int], before: frozenset[str], agents: Agents, ego_velocity: Float
-) -> list[Contact]:
-    """Contacts with objects that were not in contact one step before, in the state's order.
-
-    Objects that overlap the ego box when an episode starts count as being in contact already, so
-    they are reported only after they have separated once: boxes of a recording often overlap
-    slightly, and nobody drove into anybody then.
-    """
-    contacts = []
-    for i in touching_now:
-        object_id = agents.objects[i].object_id
-        if object_id not in before:
-            relative = ego_velocity - agents.velocities[i]
-            contacts.append(Contact(object_id, float(np.sqrt(relative @ relative))))
-    return contacts

@@ -1,4 +1,4 @@
-"""The controlled vehicle: a kinematic bicycle on the plane, referred to its rear axle."""
+"""The controlled vehicle: a bicycle on the plane, referred to its rear axle."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from real2sim_proto.drive import EgoSpec
+from real2sim_proto.episode import EgoSpec
 
 from ..scene import Trajectory
 from ..scene.rotation import quaternion_yaw
+from . import dynamic
+from .actuators import Command, at_wheels
+from .vehicle import GRAVITY, vehicle_of
 
 SUBSTEP_US = 10_000
 SLOW = 0.1
@@ -28,6 +31,9 @@ class Motion(NamedTuple):
         acceleration: along the heading, mean over the last step [m/s^2].
         steering: road-wheel angle, positive to the left [rad].
         yaw_rate: [rad/s].
+        lateral_speed: of the rear axle, positive to the left; 0 while its wheels roll [m/s].
+        drive: acceleration that engine or brakes bring about now [m/s^2].
+        pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
     """
 
     x: float
@@ -37,13 +43,18 @@ class Motion(NamedTuple):
     acceleration: float = 0.0
     steering: float = 0.0
     yaw_rate: float = 0.0
+    lateral_speed: float = 0.0
+    drive: float = 0.0
+    pending: tuple[Command, ...] = ()
 
-
-class Command(NamedTuple):
-    """What the driver asks for: acceleration [m/s^2] and road-wheel angle [rad]."""
-
-    acceleration: float
-    steering: float
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Of the rear axle in the world [m/s]."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return (
+            self.speed * cos - self.lateral_speed * sin,
+            self.speed * sin + self.lateral_speed * cos,
+        )
 
 
 Driver = Callable[[Motion, float], Command]
@@ -53,20 +64,28 @@ Driver = Callable[[Motion, float], Command]
 def drive(motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int) -> Motion:
     """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
 
-    Within a substep the steering angle moves at most at its rate limit and the arc of its mean is
-    followed exactly; speed changes linearly until it meets 0 or the greatest speed. Braking never
-    ends in reversing.
+    Within a substep the steering angle moves at most at its rate limit. The kinematic bicycle
+    follows the arc of its mean exactly; speed changes linearly until it meets 0 or the greatest
+    speed. The dynamic bicycle does the same at walking pace and slips on its tyres above, see
+    :mod:`.dynamic`. Braking never ends in reversing.
     """
     substeps = -(-dt_us // SUBSTEP_US)
     h = dt_us * 1e-6 / substeps
+    model = _roll if spec.dynamics == "kinematic_bicycle" else _slip
     start = motion
     for k in range(substeps):
-        motion = _substep(motion, driver(motion, k * h), spec, h)
+        asked = driver(motion, k * h)
+        now = Command(motion.drive, motion.steering)
+        command, pending = at_wheels(asked, motion.pending, now, spec, h)
+        motion = model(motion, command, spec, h)._replace(drive=command.acceleration)
+        if pending or motion.pending:
+            motion = motion._replace(pending=pending)
     acceleration = (motion.speed - start.speed) / (dt_us * 1e-6)
     return motion._replace(acceleration=acceleration)
 
 
-def _substep(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
+def _roll(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
+    """Kinematic bicycle: wheels go where they point."""
     steering = _steered(motion.steering, command.steering, spec, h)
     speed, distance = _sped_up(motion.speed, command.acceleration, spec, h)
     curvature = math.tan((motion.steering + steering) / 2) / spec.wheelbase
@@ -80,6 +99,47 @@ def _substep(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motio
         speed=speed,
         steering=steering,
         yaw_rate=speed * math.tan(steering) / spec.wheelbase,
+    )
+
+
+def _slip(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
+    """Dynamic bicycle; fades into the kinematic one where it is slow."""
+    vehicle = vehicle_of(spec)
+    most = vehicle.friction * GRAVITY
+    command = command._replace(acceleration=min(max(command.acceleration, -most), most))
+    rolled = _roll(motion, command, spec, h)
+    share = dynamic.tyre_share(min(motion.speed, rolled.speed))
+    if share == 0.0:
+        return rolled
+    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
+    centre = (
+        motion.x + vehicle.rear * cos,
+        motion.y + vehicle.rear * sin,
+        motion.yaw,
+        motion.speed,
+        motion.lateral_speed + vehicle.rear * motion.yaw_rate,
+        motion.yaw_rate,
+    )
+    acceleration = (rolled.speed - motion.speed) / h
+    steering = (motion.steering, rolled.steering)
+    x, y, yaw, vx, vy, turn = dynamic.integrate(vehicle, centre, steering, acceleration, h)
+    rest = 1 - share
+    slipped = Motion(
+        x=x - vehicle.rear * math.cos(yaw),
+        y=y - vehicle.rear * math.sin(yaw),
+        yaw=yaw,
+        speed=max(vx, 0.0),
+        steering=rolled.steering,
+        yaw_rate=share * turn + rest * rolled.yaw_rate,
+        lateral_speed=share * (vy - vehicle.rear * turn),
+    )
+    if rest == 0.0:
+        return slipped
+    return slipped._replace(
+        x=share * slipped.x + rest * rolled.x,
+        y=share * slipped.y + rest * rolled.y,
+        yaw=share * slipped.yaw + rest * rolled.yaw,
+        speed=share * slipped.speed + rest * rolled.speed,
     )
 
 

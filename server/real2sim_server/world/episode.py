@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import ResetSpec, SensorSpec
+from real2sim_proto.episode import ResetSpec, SensorSpec
 
 from ..scene import Scene
 from .errors import WorldError
@@ -65,6 +65,13 @@ def _clock(scene: Scene, spec: ResetSpec) -> Clock:
             else f"the log is only {scene.end_us - scene.start_us} us long; take a smaller dt_us",
         )
     longest = (scene.end_us - start) // spec.dt_us
+    if spec.warmup_us % spec.dt_us or spec.warmup_us > longest * spec.dt_us:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"warmup_us {spec.warmup_us} is no whole number of steps of {spec.dt_us} us within "
+            f"the {longest} that are left of the log",
+            hint="the warm-up follows the log in clock steps; choose a multiple of dt_us",
+        )
     if spec.horizon is not None and spec.horizon > longest:
         raise WorldError(
             ErrorCode.TIME_OUT_OF_RANGE,

@@ -6,20 +6,32 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-EventType = Literal["collision", "left_log", "horizon", "edited"]
+EventType = Literal[
+    "collision",
+    "left_log",
+    "off_road",
+    "agents_react",
+    "deadline_missed",
+    "horizon",
+    "edited",
+    "stopped",
+]
 
 
 @dataclass(frozen=True)
 class Event:
     """Something that happened; the fields of the wire's Event.
 
-    Data of a ``collision``: ``relative_speed`` [m/s]. Of ``left_log``: ``distance`` from the
-    recorded path [m]. Of ``edited``: ``revision``.
+    Data of a ``collision``: ``relative_speed`` [m/s] and ``at_fault`` (0 or 1), and where momentum
+    is exchanged what :class:`~.impact.Impact` says; ``object_id`` is None for the background,
+    ``other_id`` the second object where the ego had no part. Of ``left_log`` and
+    ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
     """
 
     type: EventType
     t_us: int
     object_id: str | None = None
+    other_id: str | None = None
     data: Mapping[str, float] = field(default_factory=dict)
 
     def fields(self) -> dict[str, Any]:
@@ -28,5 +40,6 @@ class Event:
             "type": self.type,
             "t_us": self.t_us,
             "object_id": self.object_id,
+            "other_id": self.other_id,
             "data": dict(self.data),
         }

@@ -26,8 +26,9 @@ class Observation:
         route: [20, 2] float64, the recorded way ahead in the vehicle frame [m].
         agents: all objects, or None where the episode is not privileged.
         events: of the step that led here.
-        metrics: see ``METRICS``.
+        metrics: see :func:`~.scoring.running`.
         terminated, truncated, reason: how the episode ended, if it did.
+        warming_up: whether the ego still moves as recorded.
     """
 
     step: int
@@ -44,6 +45,7 @@ class Observation:
     terminated: bool
     truncated: bool
     reason: str | None
+    warming_up: bool = False
 
     def ego_fields(self) -> dict[str, Any]:
         """The wire's EgoState as a plain map."""
@@ -53,6 +55,7 @@ class Observation:
             "quaternion": _quaternion(self.T_world_vehicle),
             "yaw": math.remainder(motion.yaw, math.tau),
             "speed": motion.speed,
+            "lateral_speed": motion.lateral_speed,
             "acceleration": motion.acceleration,
             "steering": motion.steering,
             "yaw_rate": motion.yaw_rate,
@@ -74,6 +77,7 @@ class Observation:
             "terminated": self.terminated,
             "truncated": self.truncated,
             "reason": self.reason,
+            "warming_up": self.warming_up,
         }
 
 

@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
-from real2sim_proto.drive import EgoSpec
+from real2sim_proto.episode import EgoSpec
 
 from .ego import Motion
 

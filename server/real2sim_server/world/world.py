@@ -5,43 +5,33 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import assert_never
-
-import numpy as np
+from dataclasses import replace
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import Control, PoseCommand, ResetSpec, SensorSpec, TrajectoryPlan
+from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
 from ..edit import EditError, EditOutcome, ScenarioState, apply_operations, compose
-from ..edit.tracks import sample
 from ..render.types import Instance
 from ..scene import Scene
+from . import scoring
 from .agents import Agents
-from .contact import begun, ego_box, touching
-from .ego import Command, drive, logged_motion, placed
+from .contact import REAR_OVERHANG
+from .ego import logged_motion
 from .episode import plan_episode
 from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
+from .impact import Deformation, Impact, Wreck
+from .judging import ego_sample, others_of, plan_note, scoring_context
+from .meeting import BACKGROUND, Met, may_meet, met, notes_of, run_bout
 from .observation import Observation
+from .obstacles import Obstacles, obstacles_of
 from .path import Float, LoggedPath, PathPoint
-from .reference import Pose, Reference
+from .pilot import Pilot, Plan, braking
 from .route import command_ahead, route_ahead
-from .tracker import Tracker, to_world
-
-Plan = TrajectoryPlan | Control | PoseCommand
-
-METRICS = {
-    "distance": "way driven since the start [m]",
-    "route_progress": "way made along the recorded path since the start [m]",
-    "lateral_offset": "distance from the recorded path, positive on its left [m]",
-    "collisions": "contacts begun since the start",
-}
-"""Metrics of every observation, and what they say."""
-
-LOG_SPACING_US = 100_000
-"""Where there is no plan, the log is followed by poses this far apart at most [us]."""
+from .scoring import ContactNote, Instant, PlanNote, Score, Tally
+from .traffic import EgoSeen, Surroundings, Traffic
 
 LEFT_LOG = 10.0
 """Beyond this distance from the recorded path an event says so [m]; images get poor there."""
@@ -50,7 +40,8 @@ LEFT_LOG = 10.0
 class World:
     """A scene in which time passes, one step at a time.
 
-    Same scene, state, spec, operations and plans: the same observations, bit for bit.
+    Same scene, state, spec, operations and plans: the same observations, bit for bit. A step
+    replaces what it changes and never writes into it, so that :meth:`light_copy` is cheap.
 
     Attributes:
         scene: shared, immutable.
@@ -60,13 +51,24 @@ class World:
         revision: edits of this session so far.
         motion: planar state of the ego.
         T_world_vehicle: [4, 4] float64, the ego standing on the ground.
-        agents: where all objects are now.
+        traffic: who drives the other objects.
         ground: height of the ground, usable for edits too.
-        terminated, truncated, reason: how the episode ended: ``collision`` or ``horizon``.
+        tally: what the scores are made of.
+        instant: the last committed one, as the scores see it.
+        impacts: of the last step.
+        deformation: dents struck objects; None leaves them rigid.
+        terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
+            ``deadline``, ``wall_clock``.
     """
 
     def __init__(
-        self, scene: Scene, state: ScenarioState, spec: ResetSpec, *, revision: int = 0
+        self,
+        scene: Scene,
+        state: ScenarioState,
+        spec: ResetSpec,
+        *,
+        revision: int = 0,
+        deformation: Deformation | None = None,
     ) -> None:
         """The world at step 0: the ego as it was recorded at the start time, on the ground.
 
@@ -78,6 +80,7 @@ class World:
         self.spec = spec
         self.steps = 0
         self.revision = revision
+        self.deformation = deformation
         self.terminated = False
         self.truncated = False
         self.reason: str | None = None
@@ -87,15 +90,22 @@ class World:
         self.motion = logged_motion(scene.ego, self.t_us, spec.ego)
         self._near: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._standing()
-        self.agents: Agents = state.tracks.at(self.t_us)
-        self._plan: Tracker | Command | PoseCommand | None = None
-        self._start_s = self._near.s
-        self._distance = 0.0
-        self._collisions = 0
-        self._left_log = False
-        self._in_contact = self._names(self._touching())
+        self._pilot = Pilot(spec, scene.ego)
+        self._obstacles: Obstacles | None = (
+            obstacles_of(scene, self._path) if spec.contact.background else None
+        )
+        seen = self._seen(state.tracks.at(self.t_us))
+        self.traffic = Traffic.begin(state, spec.agents, seen)
+        self._sliding = False
+        self._left_log = self._off_road = False
+        self._touching = self._met(frozenset()).touching
+        self._exempt = frozenset(frozenset(("", i)) for i in self._touching)
+        self.impacts: tuple[Impact, ...] = ()
         self._events: tuple[Event, ...] = ()
         self._edits: tuple[Event, ...] = ()
+        self._context = scoring_context(scene, spec, self._clock, self._path, self._near.s)
+        self.instant = self._instant((), 0, None)
+        self.tally: Tally = scoring.begin(self.instant, self._context)
 
     @property
     def t_us(self) -> int:
@@ -112,39 +122,89 @@ class World:
         """Whether the episode has ended."""
         return self.terminated or self.truncated
 
-    def step(self, plan: Plan | None = None) -> list[Event]:
+    @property
+    def agents(self) -> Agents:
+        """Where all objects are now."""
+        return self.traffic.placed
+
+    @property
+    def warming_up(self) -> bool:
+        """Whether the ego still moves as recorded."""
+        return self.t_us < self._clock.start_us + self.spec.warmup_us
+
+    @property
+    def context(self) -> scoring.ScoringContext:
+        """What stays the same for the scores."""
+        return self._context
+
+    def step(
+        self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False
+    ) -> list[Event]:
         """Move the clock by one ``dt_us``; what happened, also part of the next observation.
 
         Order: edits made since the last step are in effect, then ego, objects, contact, commit.
 
         Args:
             plan: what the ego does. None keeps the last plan; before any, the ego follows the log.
+            latency_us: measured time to make the plan; counts where the episode says so.
+            missed: whether the planner was late, and the fallback of the episode holds.
 
         Raises:
             WorldError: EPISODE_OVER, or INVALID_ACTION for a plan of another kind than the reset
                 named or with times that are over; the world is as before.
         """
-        if self.over:
-            raise WorldError(
-                ErrorCode.EPISODE_OVER,
-                f"the episode ended at step {self.steps}: {self.reason}",
-                hint="reset the session to start another",
-            )
-        self._plan = self._accepted(plan)
-        self._move_ego(self._plan)
-        self.steps += 1
-        self.agents = self.state.tracks.at(self.t_us)
-        events = [*self._edits, *self._met(), *self._strayed(), *self._ended()]
+        self._check_running()
+        pilot = self._told(plan, latency_us)
+        note = plan_note(pilot.coming[-1].plan) if plan is not None else None
+        late = [Event("deadline_missed", self.t_us)] if missed else []
+        if missed and self.spec.on_timeout == "brake":
+            fallback = braking(pilot, self.motion, self.spec.ego)
+            pilot = replace(pilot, controller=fallback, since_us=self.t_us, coming=())
+        reacted = self._reacted()
+        contacts = self._move(pilot)
+        self._near = self._path.nearest(self.motion.x, self.motion.y, near_s=self._near.s)
+        self.T_world_vehicle = self._standing()
+        met_events, notes, secondary = self._consequences(contacts)
+        self.instant = self._instant(notes, secondary, note)
+        self.tally = scoring.after(self.tally, self.instant, self._context)
+        events = [*self._edits, *late, *reacted, *met_events, *self._strayed(), *self._ended()]
         self._edits = ()
         self._events = tuple(events)
         return events
+
+    def stop(self, reason: str) -> None:
+        """End the episode where it is, without a step: ``deadline`` or ``wall_clock``.
+
+        Raises:
+            WorldError: EPISODE_OVER.
+        """
+        self._check_running()
+        self.truncated, self.reason = True, reason
+        self._events = (*self._events, Event("stopped", self.t_us))
+
+    def steer(
+        self, object_id: str, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
+    ) -> None:
+        """Give an externally driven object a plan, from the next step on.
+
+        Args:
+            object_id: whose driver is ``external``.
+            times_us: [N] absolute, increasing, after now [us].
+            poses: [N] x, y [m], yaw [rad] of its box, world.
+
+        Raises:
+            WorldError: EPISODE_OVER or INVALID_ACTION; nothing changed.
+        """
+        self._check_running()
+        self.traffic = self.traffic.told(object_id, self.t_us, times_us, poses)
 
     def apply(
         self, operations: Sequence[Operation], *, base_revision: int | None = None
     ) -> EditOutcome:
         """Edit the objects at this instant, all operations or none; time does not move.
 
-        An object put onto the ego is a collision of the next step.
+        An object put onto the ego is a collision of the next step. Objects whose trajectory is
+        edited begin to follow it anew, also those that physics had taken over.
 
         Args:
             operations: validated wire models.
@@ -161,7 +221,7 @@ class World:
             )
         outcome = apply_operations(self.state, operations, ground=self.ground)
         self.state = outcome.state
-        self.agents = self.state.tracks.at(self.t_us)
+        self.traffic = self.traffic.edited(self.state, self._seen(self.state.tracks.at(self.t_us)))
         self.revision += 1
         edited = Event("edited", self.t_us, data={"revision": float(self.revision)})
         self._edits = (*self._edits, edited)
@@ -185,20 +245,25 @@ class World:
             terminated=self.terminated,
             truncated=self.truncated,
             reason=self.reason,
+            warming_up=self.warming_up,
         )
 
     def metrics(self) -> dict[str, float]:
-        """See ``METRICS``."""
-        return {
-            "distance": self._distance,
-            "route_progress": self._near.s - self._start_s,
-            "lateral_offset": self._near.offset,
-            "collisions": float(self._collisions),
-        }
+        """Scores so far, see :func:`~.scoring.running`."""
+        return scoring.running(self.tally, self._context)
+
+    def scores(self) -> list[Score]:
+        """All scores so far, with terms and versions."""
+        return scoring.scores_of(self.tally, self._context)
 
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
-        return compose(self.scene, self.agents, self.t_us, erased=self.state.erased)
+        drawn = compose(self.scene, self.agents, self.t_us, erased=self.state.erased)
+        if self.deformation is not None:
+            # Background first, then the objects, then shadows.
+            for k, subject in enumerate(self.agents.objects, start=1):
+                drawn[k] = self.deformation.shown(subject.object_id, drawn[k])
+        return drawn
 
     def due_sensors(self) -> list[SensorSpec]:
         """Sensors of the reset that deliver a frame at this step; all of them at step 0."""
@@ -207,99 +272,149 @@ class World:
 
     def light_copy(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""
-        # A step replaces what it changes and never writes into it.
         return copy.copy(self)
 
-    def _accepted(self, plan: Plan | None) -> Tracker | Command | PoseCommand:
+    # --- one step ---------------------------------------------------------------------------
+
+    def _check_running(self) -> None:
+        if self.over:
+            raise WorldError(
+                ErrorCode.EPISODE_OVER,
+                f"the episode ended at step {self.steps}: {self.reason}",
+                hint="reset the session to start another",
+            )
+
+    def _told(self, plan: Plan | None, latency_us: int) -> Pilot:
         if plan is None:
-            return self._plan if self._plan is not None else self._follow_log()
-        if plan.kind != self.spec.action:
-            raise WorldError(
-                ErrorCode.INVALID_ACTION,
-                f"a plan of kind {plan.kind!r} in an episode that was reset for "
-                f"{self.spec.action!r}",
-                hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}",
+            return self._pilot
+        latency = self.spec.latency
+        wait = {
+            "zero": 0,
+            "fixed": latency.fixed_us,
+            "measured": min(max(latency_us, 0), latency.longest_us),
+        }[latency.model]
+        warm_us = self._clock.start_us + self.spec.warmup_us
+        return self._pilot.told(plan, self.motion, self.t_us, max(self.t_us + wait, warm_us))
+
+    def _move(self, pilot: Pilot) -> tuple[Impact, ...] | None:
+        """Ego and objects one step on; impacts, or None where bodies pass through each other."""
+        motion, t_us, dt_us = self.motion, self.t_us, self._clock.dt_us
+        old, seen = self.agents, self._seen(self.agents)
+        traffic = self.traffic.advance(self.state, seen)
+        self._old_agents = old
+        self.steps += 1
+        if t_us + dt_us <= self._clock.start_us + self.spec.warmup_us:
+            recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
+            acceleration = (recorded.speed - motion.speed) / (dt_us * 1e-6)
+            self.motion, self.traffic = recorded._replace(acceleration=acceleration), traffic
+            self._pilot = pilot
+            return None
+        if not self._physical or not self._may_meet(traffic):
+            self._pilot, moved = pilot.advance(motion, t_us, dt_us)
+            self.traffic = traffic
+            impacts = () if self._physical else None
+        else:
+            wrecks = {i: d for i, d in traffic.drivers.items() if isinstance(d, Wreck)}
+            self._pilot, outcome = run_bout(
+                pilot,
+                motion,
+                t_us,
+                spec=self.spec,
+                sliding=self._sliding,
+                ego_size=self.scene.ego_size,
+                before=old,
+                after=traffic.placed,
+                wrecks=wrecks,
+                exempt=self._exempt,
+                obstacles=self._obstacles,
+                height=self._height,
             )
-        match plan:
-            case TrajectoryPlan():
-                return self._track(plan)
-            case Control():
-                return Command(plan.acceleration, plan.steering)
-            case PoseCommand():
-                return plan
-            case _:
-                assert_never(plan)
+            moved, self._sliding = outcome.motion, outcome.sliding
+            self._exempt = outcome.exempt
+            self.traffic = traffic.with_drivers(outcome.wrecks, traffic.placed)
+            impacts = outcome.impacts
+        acceleration = (moved.speed - motion.speed) / (dt_us * 1e-6)
+        self.motion = moved._replace(acceleration=acceleration)
+        return impacts
 
-    def _track(self, plan: TrajectoryPlan) -> Tracker:
-        if plan.times_us[0] <= self.t_us:
-            raise WorldError(
-                ErrorCode.INVALID_ACTION,
-                f"the plan begins at {plan.times_us[0]} us; it is {self.t_us} us already",
-                hint="times_us are absolute simulation times after t_us of the observation",
-            )
-        poses = plan.poses if plan.frame == "world" else to_world(plan.poses, self.motion)
-        return self._tracker(plan.times_us, poses)
+    @property
+    def _physical(self) -> bool:
+        """Whether bodies push each other; one that is put somewhere by poses cannot be pushed."""
+        return self.spec.on_collision == "continue" and self.spec.action != "pose"
 
-    def _follow_log(self) -> Tracker:
-        # Even spacing: some logs have poses milliseconds apart, whose differences are noise.
-        count = -(-(self.scene.end_us - self.t_us) // LOG_SPACING_US)
-        times = np.linspace(self.t_us, self.scene.end_us, count + 1).astype(np.int64)[1:]
-        transforms, _ = sample(self.scene.ego, times)
-        yaws = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
-        poses = np.column_stack([transforms[:, :2, 3], yaws])
-        return self._tracker(times.tolist(), [(x, y, yaw) for x, y, yaw in poses.tolist()])
+    def _may_meet(self, traffic: Traffic) -> bool:
+        if self._sliding or self._obstacles is not None:
+            return True
+        if any(isinstance(d, Wreck) for d in traffic.drivers.values()):
+            return True
+        dt = self._clock.dt_us * 1e-6
+        size = self.scene.ego_size
+        ahead = size[0] / 2 - REAR_OVERHANG
+        return may_meet(self.motion, traffic.placed, ego_size=size, centre_ahead=ahead, dt=dt)
 
-    def _tracker(self, times_us: Sequence[int], poses: Sequence[Pose]) -> Tracker:
-        reference = Reference(
-            self.motion, start_us=self.t_us, times_us=times_us, poses=poses, spec=self.spec.ego
-        )
-        return Tracker(reference, self.spec.ego.wheelbase)
-
-    def _move_ego(self, plan: Tracker | Command | PoseCommand) -> None:
-        old, spec, dt_us = self.motion, self.spec.ego, self._clock.dt_us
-        match plan:
-            case Tracker():
-                since = (self.t_us - plan.reference.start_us) * 1e-6
-                self.motion = drive(old, lambda m, t: plan.command(m, since + t), spec, dt_us)
-            case Command():
-                self.motion = drive(old, lambda _m, _t: plan, spec, dt_us)
-            case PoseCommand():
-                self.motion = placed(old, (plan.x, plan.y, plan.yaw), spec, dt_us)
-            case _:
-                assert_never(plan)
-        self._distance += math.hypot(self.motion.x - old.x, self.motion.y - old.y)
-        self._near = self._path.nearest(self.motion.x, self.motion.y, near_s=self._near.s)
-        self.T_world_vehicle = self._standing()
-
-    def _standing(self) -> Float:
-        return self.ground.stand(self.motion.x, self.motion.y, self.motion.yaw, self._near)
-
-    def _touching(self) -> list[int]:
-        box = ego_box(self.T_world_vehicle, self.scene.ego_size)
-        return touching(box, self.scene.ego_size, self.agents)
-
-    def _names(self, indices: list[int]) -> frozenset[str]:
-        return frozenset(self.agents.objects[i].object_id for i in indices)
-
-    def _met(self) -> list[Event]:
-        now = self._touching()
-        velocity = self.motion.speed * self.T_world_vehicle[:3, 0]
-        contacts = begun(now, self._in_contact, self.agents, velocity)
-        self._in_contact = self._names(now)
-        self._collisions += len(contacts)
-        if contacts and self.spec.on_collision == "terminate":
-            self.terminated, self.reason = True, "collision"
-        return [
-            Event("collision", self.t_us, c.object_id, {"relative_speed": c.relative_speed})
-            for c in contacts
+    def _consequences(
+        self, impacts: tuple[Impact, ...] | None
+    ) -> tuple[list[Event], tuple[ContactNote, ...], int]:
+        """Events and notes of contacts, and the number of secondary ones between objects."""
+        if impacts is None:
+            found = self._met(self._touching)
+            self._touching = found.touching
+            if found.begun and self.spec.on_collision == "terminate":
+                self.terminated, self.reason = True, "collision"
+            events = [
+                Event(
+                    "collision", self.t_us, c.object_id, data={"relative_speed": c.relative_speed}
+                )
+                for c in found.begun
+            ]
+            self.impacts = ()
+            return events, found.notes, 0
+        notes = notes_of(impacts, touched=self._touching, agents=self._old_agents)
+        fresh = [i for i in impacts if _key(i) not in self._touching]
+        events = [
+            Event("collision", self.t_us, i.object_id, i.other_id, i.figures()) for i in fresh
         ]
+        self._touching = frozenset(_key(i) for i in impacts)
+        self.impacts = impacts
+        if self.deformation is not None:
+            for impact in impacts:
+                self.deformation = self.deformation.struck(impact)
+            self.deformation = self.deformation.advance(self._clock.dt_us)
+        return events, notes, sum(i.other_id is not None for i in fresh)
+
+    def _met(self, before: frozenset[str]) -> Met:
+        return met(
+            self.T_world_vehicle,
+            self.motion,
+            self.agents,
+            spec=self.spec,
+            ego_size=self.scene.ego_size,
+            obstacles=self._obstacles,
+            before=before,
+        )
+
+    def _reacted(self) -> list[Event]:
+        """Objects stop repeating the log once the ego is too far from where it was recorded."""
+        agents = self.spec.agents
+        if agents.ego_off_log == "replay" or self.traffic.reacting:
+            return []
+        (x, y, _), _ = self.scene.ego.pose(self.t_us)
+        distance = math.hypot(self.motion.x - x, self.motion.y - y)
+        if distance <= agents.off_log_distance:
+            return []
+        self.traffic = self.traffic.react(self.state, self._seen(self.agents))
+        return [Event("agents_react", self.t_us, data={"distance": distance})]
 
     def _strayed(self) -> list[Event]:
+        events = []
         distance = abs(self._near.offset)
         was_off, self._left_log = self._left_log, distance > LEFT_LOG
         if self._left_log and not was_off:
-            return [Event("left_log", self.t_us, data={"distance": distance})]
-        return []
+            events.append(Event("left_log", self.t_us, data={"distance": distance}))
+        if self.tally.off_road and not self._off_road:
+            events.append(Event("off_road", self.t_us, data={"distance": distance}))
+        self._off_road = self.tally.off_road
+        return events
 
     def _ended(self) -> list[Event]:
         if self.steps < self._clock.horizon:
@@ -307,3 +422,48 @@ class World:
         self.truncated = True
         self.reason = self.reason or "horizon"
         return [Event("horizon", self.t_us)]
+
+    # --- views of the instant ---------------------------------------------------------------
+
+    def _standing(self) -> Float:
+        return self.ground.stand(self.motion.x, self.motion.y, self.motion.yaw, self._near)
+
+    def _height(self, x: float, y: float) -> float:
+        return self.ground.height(x, y, self._path.nearest(x, y, near_s=self._near.s))
+
+    def _seen(self, others: Agents) -> Surroundings:
+        motion, (length, width, _) = self.motion, self.scene.ego_size
+        ahead = length / 2 - REAR_OVERHANG
+        ego = EgoSeen(
+            x=motion.x + ahead * math.cos(motion.yaw),
+            y=motion.y + ahead * math.sin(motion.yaw),
+            yaw=motion.yaw,
+            speed=motion.speed,
+            length=length,
+            width=width,
+            s=self._near.s,
+            offset=self._near.offset,
+            front=length - REAR_OVERHANG,
+        )
+        clock = self._clock
+        return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
+
+    def _instant(
+        self, notes: tuple[ContactNote, ...], secondary: int, plan: PlanNote | None
+    ) -> Instant:
+        z = float(self.T_world_vehicle[2, 3])
+        return Instant(
+            step=self.steps,
+            t_us=self.t_us,
+            ego=ego_sample(self.motion, self._near, z),
+            others=others_of(self.agents),
+            contacts=notes,
+            secondary=secondary,
+            plan=plan,
+        )
+
+
+def _key(impact: Impact) -> str:
+    """Name of a pair in contact; of the ego's, that of the object."""
+    name = impact.object_id or BACKGROUND
+    return name if impact.other_id is None else f"{name}\n{impact.other_id}"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from real2sim_proto.drive import EgoSpec
+from real2sim_proto.episode import EgoSpec
 from real2sim_server.world.ego import Command, Motion, drive, logged_motion, placed
 
 SPEC = EgoSpec()

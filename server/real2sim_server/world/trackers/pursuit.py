@@ -1,13 +1,16 @@
-"""The controller that makes the vehicle follow a planned trajectory."""
+"""Pure pursuit: aim at where the plan will be."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .ego import Command, Motion
-from .reference import Pose, Reference
+from real2sim_proto.episode import EgoSpec
+
+from ..actuators import Command
+from ..ego import Motion, drive
+from ..reference import Reference
+from ..vehicle import vehicle_of
 
 LOOKAHEAD = 0.4
 """The controller aims at where the plan is this much later [s]."""
@@ -24,21 +27,23 @@ GENTLE_BRAKING = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Tracker:
-    """Follows a reference; knows nothing of the past, so that a copied world goes on alike.
-
-    Steering is pure pursuit (Coulter 1992, CMU-RI-TR-92-01): the arc that ends at the aim. The
+class Pursuit:
+    """Steering is pure pursuit (Coulter 1992, CMU-RI-TR-92-01): the arc that ends at the aim. The
     aim lies on the plan, so the arc carries the plan's curvature. Acceleration is what brings the
     vehicle to where the plan is after the look-ahead time T, from s = v T + a T^2 / 2; with its
     two gains 2 / T^2 and 2 / T the lag behind a moving plan decays with damping 0.7.
 
     Attributes:
         reference: what to follow.
-        wheelbase: of the vehicle [m].
+        spec: of the vehicle.
     """
 
     reference: Reference
-    wheelbase: float
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later."""
+        return drive(motion, lambda m, t: self.command(m, since + t), self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
         """What to do in ``motion``, ``t`` seconds after the plan's start."""
@@ -55,7 +60,11 @@ class Tracker:
         """Road-wheel angle [rad] of the arc from the rear axle to (x, y)."""
         dx, dy = x - motion.x, y - motion.y
         left = math.cos(motion.yaw) * dy - math.sin(motion.yaw) * dx
-        return math.atan(self.wheelbase * 2 * left / (dx * dx + dy * dy))
+        curvature = 2 * left / (dx * dx + dy * dy)
+        rolling = math.atan(self.spec.wheelbase * curvature)
+        if self.spec.dynamics == "kinematic_bicycle":
+            return rolling
+        return rolling + vehicle_of(self.spec).understeer * motion.speed**2 * curvature
 
     def _farther_aim(self, motion: Motion, t: float) -> tuple[float, float]:
         """The first place of the plan after ``t`` that is far enough.
@@ -98,12 +107,3 @@ def _arc_length(ahead: float, left: float) -> float:
     angle = math.atan2(left, ahead)
     stretch = angle / math.sin(angle) if abs(angle) > 1e-4 else 1.0 + angle * angle / 6
     return math.hypot(ahead, left) * stretch
-
-
-def to_world(poses: Sequence[Pose], motion: Motion) -> list[Pose]:
-    """Poses x, y, yaw of the vehicle frame in the world."""
-    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
-    return [
-        (motion.x + cos * x - sin * y, motion.y + sin * x + cos * y, motion.yaw + yaw)
-        for x, y, yaw in poses
-    ]

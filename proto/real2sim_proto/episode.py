@@ -1,0 +1,291 @@
+"""How an episode runs: sensors, vehicle, traffic, time limits, contact, scoring."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from .base import Codec, Identifier, Microseconds, Modality, Model
+
+MAX_SENSORS = 16
+MAX_DRIVERS = 64
+
+Metre = Annotated[float, Field(ge=0, le=1e4)]
+Speed = Annotated[float, Field(ge=0, le=150)]
+Seconds = Annotated[float, Field(gt=0, le=3600)]
+
+
+class SensorSpec(Model):
+    """One camera of an observation."""
+
+    camera: Identifier
+    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=3)
+    width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
+    codec: Codec = Field(default="raw", description="of rgb; depth and instance are raw or png")
+    quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
+    period_us: int | None = Field(
+        default=None, gt=0, description="time between frames; a multiple of dt_us; default: dt_us"
+    )
+
+    @model_validator(mode="after")
+    def _modalities_differ(self) -> SensorSpec:
+        if len(set(self.modalities)) != len(self.modalities):
+            raise ValueError(f"modalities {self.modalities!r} repeat one")
+        return self
+
+
+class VehicleSpec(Model):
+    """Mass, tyres and load of the controlled vehicle; used by `dynamic_bicycle` and in contact.
+
+    Cornering coefficients are lateral force per load and slip angle. The defaults are those of a
+    mid-size car (0.2 per degree at the front, more at the rear, so that it understeers by about
+    1.2 degrees per g; Gillespie 1992, Fundamentals of Vehicle Dynamics, ch. 6).
+    """
+
+    mass: Annotated[float, Field(gt=0, le=1e5)] = Field(default=1500.0, description="[kg]")
+    yaw_inertia: Annotated[float, Field(gt=0, le=1e7)] | None = Field(
+        default=None, description="[kg m^2]; default: mass x front x rear distance of the centre"
+    )
+    front_load: Annotated[float, Field(gt=0.1, lt=0.9)] = Field(
+        default=0.56, description="share of the weight on the front axle at rest"
+    )
+    centre_height: Annotated[float, Field(ge=0, le=4)] = Field(
+        default=0.55, description="of the centre of mass above the ground [m]"
+    )
+    friction: Annotated[float, Field(gt=0, le=2)] = Field(
+        default=0.9, description="tyre on road; 0.9 is dry asphalt, 0.5 wet, 0.2 snow"
+    )
+    front_cornering: Annotated[float, Field(gt=1, le=100)] = Field(
+        default=11.5, description="cornering coefficient of the front axle [1/rad]"
+    )
+    rear_cornering: Annotated[float, Field(gt=1, le=100)] = Field(
+        default=15.0, description="cornering coefficient of the rear axle [1/rad]"
+    )
+
+
+class ActuatorSpec(Model):
+    """What lies between a command and the wheels; all zero by default."""
+
+    steering_delay_us: int = Field(default=0, ge=0, le=1_000_000, description="dead time")
+    steering_lag: Annotated[float, Field(ge=0, le=2)] = Field(
+        default=0.0, description="time constant of the first order [s]"
+    )
+    drive_delay_us: int = Field(default=0, ge=0, le=1_000_000, description="dead time")
+    drive_lag: Annotated[float, Field(ge=0, le=2)] = Field(
+        default=0.0, description="time constant of the first order [s]"
+    )
+
+
+class EgoSpec(Model):
+    """How the controlled vehicle moves."""
+
+    dynamics: Literal["kinematic_bicycle", "dynamic_bicycle"] = "kinematic_bicycle"
+    tracker: Literal["pursuit", "lqr", "ilqr", "perfect"] = Field(
+        default="pursuit", description="controller of trajectories; 'perfect' is put on the plan"
+    )
+    wheelbase: Annotated[float, Field(ge=0.5, le=20)] = Field(default=2.8, description="[m]")
+    max_steer: Annotated[float, Field(gt=0, le=1.4)] = Field(default=0.6, description="[rad]")
+    max_steer_rate: Annotated[float, Field(gt=0, le=10)] = Field(default=0.8, description="[rad/s]")
+    max_acceleration: Annotated[float, Field(gt=0, le=50)] = Field(
+        default=4.0, description="[m/s^2]"
+    )
+    max_braking: Annotated[float, Field(gt=0, le=50)] = Field(default=8.0, description="[m/s^2]")
+    max_speed: Annotated[float, Field(gt=0, le=150)] = Field(default=60.0, description="[m/s]")
+    vehicle: VehicleSpec = VehicleSpec()
+    actuators: ActuatorSpec = ActuatorSpec()
+
+
+# --- other road users -------------------------------------------------------------------------
+
+
+class ReplayDriver(Model):
+    """Moves as recorded, or as edited; sees nobody."""
+
+    kind: Literal["log"] = "log"
+
+
+class ConstantVelocityDriver(Model):
+    """Goes straight on as it moved when it began; sees nobody."""
+
+    kind: Literal["constant_velocity"] = "constant_velocity"
+
+
+class IdmDriver(Model):
+    """Follows its recorded path behind whoever is ahead (Treiber et al. 2000)."""
+
+    kind: Literal["idm"] = "idm"
+    desired_speed: Speed | None = Field(
+        default=None, description="[m/s]; default: its highest recorded speed"
+    )
+    headway: Seconds = Field(default=1.5, description="T [s]")
+    gap: Metre = Field(default=2.0, description="s0, bumper to bumper at rest [m]")
+    acceleration: Annotated[float, Field(gt=0, le=10)] = Field(default=1.5, description="[m/s^2]")
+    braking: Annotated[float, Field(gt=0, le=10)] = Field(
+        default=2.0, description="comfortable [m/s^2]"
+    )
+    lateral: Annotated[float, Field(gt=0, le=10)] = Field(
+        default=2.5, description="acceleration sideways that sets the speed in bends [m/s^2]"
+    )
+
+
+class CutInDriver(Model):
+    """Drives beside the ego's route, then moves into its lane close ahead of it."""
+
+    kind: Literal["cut_in"] = "cut_in"
+    offset: Annotated[float, Field(ge=-20, le=20)] = Field(
+        default=3.5, description="of its lane from the route, positive on the left [m]"
+    )
+    gap: Metre = Field(default=6.0, description="ego's front to its rear when it moves in [m]")
+    delay: Annotated[float, Field(ge=0, le=3600)] = Field(
+        default=1.0, description="earliest time after the start to move in [s]"
+    )
+    duration: Seconds = Field(default=1.5, description="of the change of lanes [s]")
+    speed_change: Annotated[float, Field(ge=-50, le=50)] = Field(
+        default=-2.0, description="its speed afterwards, relative to the ego's at that time [m/s]"
+    )
+
+
+class HardBrakeDriver(Model):
+    """Follows its recorded path and brakes to a stop in front of the ego."""
+
+    kind: Literal["hard_brake"] = "hard_brake"
+    delay: Annotated[float, Field(ge=0, le=3600)] = Field(
+        default=1.0, description="earliest time after the start to brake [s]"
+    )
+    gap: Metre = Field(default=15.0, description="brakes once the ego is this near [m]")
+    braking: Annotated[float, Field(gt=0, le=12)] = Field(default=7.0, description="[m/s^2]")
+
+
+class JunctionCrossingDriver(Model):
+    """Crosses the ego's route so that both arrive together."""
+
+    kind: Literal["junction_crossing"] = "junction_crossing"
+    ahead: Metre = Field(
+        default=30.0, description="crossing point along the route from the start [m]"
+    )
+    angle: Annotated[float, Field(ge=-3.2, le=3.2)] = Field(
+        default=1.57, description="its heading against the route's there [rad]"
+    )
+    speed: Annotated[float, Field(gt=0, le=50)] = Field(
+        default=8.0, description="at the start [m/s]"
+    )
+    max_speed: Annotated[float, Field(gt=0, le=60)] = Field(default=15.0, description="[m/s]")
+    acceleration: Annotated[float, Field(gt=0, le=10)] = Field(
+        default=3.0, description="to meet the ego; either way [m/s^2]"
+    )
+    commit: Seconds = Field(
+        default=1.0, description="before the crossing it no longer reacts to the ego [s]"
+    )
+
+
+class ExternalDriver(Model):
+    """Driven by another client: `agent` messages say where it goes."""
+
+    kind: Literal["external"] = "external"
+
+
+AgentDriver = Annotated[
+    ReplayDriver
+    | ConstantVelocityDriver
+    | IdmDriver
+    | CutInDriver
+    | HardBrakeDriver
+    | JunctionCrossingDriver
+    | ExternalDriver,
+    Field(discriminator="kind"),
+]
+
+
+class AgentsSpec(Model):
+    """Who drives the other road users."""
+
+    default: Literal["log", "constant_velocity", "idm"] = Field(
+        default="log", description="of objects that move and are not named in `drivers`"
+    )
+    drivers: dict[Identifier, AgentDriver] = Field(default_factory=dict, max_length=MAX_DRIVERS)
+    ego_off_log: Literal["replay", "idm"] = Field(
+        default="replay",
+        description="objects that repeat the log keep to it, or drive by IDM from the moment "
+        "that the ego is `off_log_distance` from where it was recorded at that time",
+    )
+    off_log_distance: Metre = Field(default=3.0, description="[m]")
+
+
+# --- time, contact, scoring -------------------------------------------------------------------
+
+
+class LatencySpec(Model):
+    """How long a plan takes to have effect; meanwhile the one before it holds."""
+
+    model: Literal["zero", "fixed", "measured"] = Field(
+        default="zero", description="'measured': from sending obs to receiving the action"
+    )
+    fixed_us: int = Field(default=0, ge=0, le=5_000_000, description="of 'fixed'")
+    longest_us: int = Field(default=5_000_000, ge=0, le=60_000_000, description="of 'measured'")
+
+
+class ContactSpec(Model):
+    """What happens between bodies in contact where `on_collision` is 'continue'."""
+
+    restitution: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.1, description="separation speed per approach speed along the normal"
+    )
+    friction: Annotated[float, Field(ge=0, le=2)] = Field(
+        default=0.5, description="tangential per normal impulse at most"
+    )
+    background: bool = Field(
+        default=False, description="walls, poles and other parts of the background are hit too"
+    )
+    masses: dict[Identifier, Annotated[float, Field(gt=0, le=1e6)]] = Field(
+        default_factory=dict, description="[kg] by object; default: by category and box"
+    )
+
+
+class ScoringSpec(Model):
+    """What the scores need to know beside the log."""
+
+    speed_limit: Speed | None = Field(default=None, description="[m/s]; None: no limit is known")
+    corridor: Annotated[float, Field(gt=0.5, le=50)] = Field(
+        default=3.5, description="half width of the drivable corridor along the route [m]"
+    )
+    lane: Annotated[float, Field(gt=0.5, le=10)] = Field(
+        default=1.75, description="half width of the ego's lane along the route [m]"
+    )
+
+
+class ResetSpec(Model):
+    """How an episode begins and runs."""
+
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    start_us: Microseconds | None = Field(default=None, description="default: start of the log")
+    dt_us: int = Field(default=100_000, ge=1_000, le=1_000_000, description="clock step")
+    horizon: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="steps; default and most: to the end of the log",
+    )
+    warmup_us: int = Field(
+        default=0, ge=0, description="the ego moves as recorded for so long; plans wait"
+    )
+    sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
+    ego: EgoSpec = EgoSpec()
+    action: Literal["trajectory", "control", "pose"] = "trajectory"
+    agents: AgentsSpec = AgentsSpec()
+    privileged: bool = Field(default=False, description="fill `agents` of every observation")
+    deadline_ms: int | None = Field(
+        default=None, ge=1, le=3_600_000, description="wall-clock time for a plan; None: any"
+    )
+    on_timeout: Literal["hold_plan", "brake", "pause", "fail"] = Field(
+        default="hold_plan", description="what happens when a plan misses its deadline"
+    )
+    wall_clock_s: Annotated[float, Field(gt=0, le=86_400)] | None = Field(
+        default=None, description="wall-clock time after which the episode is cut off [s]"
+    )
+    latency: LatencySpec = LatencySpec()
+    on_collision: Literal["terminate", "continue"] = Field(
+        default="terminate", description="'continue' exchanges momentum and goes on"
+    )
+    contact: ContactSpec = ContactSpec()
+    scoring: ScoringSpec = ScoringSpec()

@@ -1,0 +1,145 @@
+"""Where two boxes on the plane touch, and the impulse that they exchange there."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from .body import Body, Solid
+
+Corner = tuple[float, float]
+
+SLOW = 0.3
+"""Approach below this speed ends without rebound [m/s]."""
+
+
+class Touch(NamedTuple):
+    """Two bodies that overlap.
+
+    Attributes:
+        x, y: middle of the overlap [m].
+        nx, ny: unit normal, out of the second body into the first.
+        depth: of the overlap along the normal [m].
+    """
+
+    x: float
+    y: float
+    nx: float
+    ny: float
+    depth: float
+
+
+class Exchange(NamedTuple):
+    """An impulse on the first body [N s], and the speed at which the two approached [m/s]."""
+
+    jx: float
+    jy: float
+    approach: float
+
+
+def corners(body: Body, solid: Solid) -> list[Corner]:
+    """Corners of the body's box, counter-clockwise."""
+    cos, sin = math.cos(body.yaw), math.sin(body.yaw)
+    cx, cy = body.x + solid.box_ahead * cos, body.y + solid.box_ahead * sin
+    a, b = solid.length / 2, solid.width / 2
+    return [
+        (cx + u * cos - v * sin, cy + u * sin + v * cos)
+        for u, v in ((a, b), (-a, b), (-a, -b), (a, -b))
+    ]
+
+
+def touch(first: list[Corner], second: list[Corner]) -> Touch | None:
+    """Where two convex quadrilaterals overlap; None where they do not.
+
+    The normal is that of least penetration among the edges of both (separating axes); the point
+    is the centroid of the overlap.
+    """
+    best: tuple[float, float, float] | None = None
+    for shape, outward in ((second, 1.0), (first, -1.0)):
+        for k in range(4):
+            (ax, ay), (bx, by) = shape[k], shape[(k + 1) % 4]
+            length = math.hypot(bx - ax, by - ay)
+            nx, ny = (by - ay) / length, (ax - bx) / length
+            other = first if shape is second else second
+            depth = -min((x - ax) * nx + (y - ay) * ny for x, y in other)
+            if depth <= 0.0:
+                return None
+            if best is None or depth < best[0]:
+                best = (depth, nx * outward, ny * outward)
+    assert best is not None
+    depth, nx, ny = best
+    overlap = _clipped(first, second)
+    if not overlap:
+        return None
+    x = sum(p[0] for p in overlap) / len(overlap)
+    y = sum(p[1] for p in overlap) / len(overlap)
+    return Touch(x, y, nx, ny, depth)
+
+
+def _clipped(subject: list[Corner], clip: list[Corner]) -> list[Corner]:
+    """Corners of the overlap (Sutherland & Hodgman 1974)."""
+    shape = subject
+    for k in range(4):
+        (ax, ay), (bx, by) = clip[k], clip[(k + 1) % 4]
+        inside = [(bx - ax) * (y - ay) - (by - ay) * (x - ax) for x, y in shape]
+        kept: list[Corner] = []
+        for i, (p, d) in enumerate(zip(shape, inside, strict=True)):
+            q, e = shape[(i + 1) % len(shape)], inside[(i + 1) % len(shape)]
+            if d >= 0:
+                kept.append(p)
+            if (d >= 0) != (e >= 0):
+                t = d / (d - e)
+                kept.append((p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1])))
+        shape = kept
+        if not shape:
+            return []
+    return shape
+
+
+def exchange(
+    first: tuple[Body, Solid],
+    second: tuple[Body, Solid] | None,
+    where: Touch,
+    *,
+    restitution: float,
+    friction: float,
+) -> Exchange | None:
+    """The impulse of a planar impact; None where the bodies part already.
+
+    Newton's restitution along the normal, and along the tangent as much as ends sliding, at most
+    friction times the normal impulse (Brach & Brach 2011, Vehicle Accident Analysis and
+    Reconstruction Methods, ch. 6).
+
+    Args:
+        first, second: bodies before the impact; None for what cannot move.
+        where: point and normal.
+        restitution: separation per approach speed; 0 for slow approaches.
+        friction: tangential per normal impulse at most.
+    """
+    nx, ny, tx, ty = where.nx, where.ny, -where.ny, where.nx
+    vx, vy = first[0].velocity_at(where.x, where.y)
+    pairs = [first]
+    if second is not None:
+        wx, wy = second[0].velocity_at(where.x, where.y)
+        vx, vy = vx - wx, vy - wy
+        pairs.append(second)
+    normal, tangent = vx * nx + vy * ny, vx * tx + vy * ty
+    if normal >= 0.0:
+        return None
+    knn = knt = ktt = 0.0
+    for body, solid in pairs:
+        rx, ry = where.x - body.x, where.y - body.y
+        rn, rt = rx * ny - ry * nx, rx * ty - ry * tx
+        knn += 1 / solid.mass + rn * rn / solid.inertia
+        ktt += 1 / solid.mass + rt * rt / solid.inertia
+        knt += rn * rt / solid.inertia
+    e = restitution if -normal > SLOW else 0.0
+    wanted_n, wanted_t = -(1 + e) * normal, -tangent
+    determinant = knn * ktt - knt * knt
+    jn = (ktt * wanted_n - knt * wanted_t) / determinant
+    jt = (knn * wanted_t - knt * wanted_n) / determinant
+    if jn <= 0.0 or abs(jt) > friction * jn:
+        slide = math.copysign(friction, jt if jn > 0 else -tangent)
+        jn = wanted_n / max(knn + slide * knt, 1e-12)
+        jt = slide * jn
+    return Exchange(jn * nx + jt * tx, jn * ny + jt * ty, -normal)

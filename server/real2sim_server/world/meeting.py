@@ -1,0 +1,216 @@
+"""The ego among other bodies: whether they meet in a step, and what comes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from real2sim_proto.episode import ResetSpec
+
+from ..edit import ObjectState
+from ..scene.rotation import quaternion_yaw
+from .actuators import Command
+from .agents import Agents
+from .contact import Contact, ego_box, touching
+from .ego import Motion
+from .impact import Bout, Impact, Outcome, Wreck, ego_body, ego_solid, resolve
+from .obstacles import Obstacles
+from .path import Float
+from .pilot import Pilot
+from .scoring.boxes import side_of_contact
+from .scoring.instant import ContactNote
+
+BACKGROUND = "background"
+
+
+def may_meet(
+    motion: Motion,
+    agents: Agents,
+    *,
+    ego_size: tuple[float, float, float],
+    centre_ahead: float,
+    dt: float,
+) -> bool:
+    """Whether the ego could touch an object within the step, by boxes along its heading.
+
+    Args:
+        motion: of the ego at the start of the step.
+        agents: at its end.
+        ego_size: of its box [m].
+        centre_ahead: rear axle to the centre of the box [m].
+        dt: the step [s].
+    """
+    if not agents.objects:
+        return False
+    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
+    dx, dy = agents.positions[:, 0] - motion.x, agents.positions[:, 1] - motion.y
+    vx, vy = agents.velocities[:, 0], agents.velocities[:, 1]
+    along = np.abs(dx * cos + dy * sin - centre_ahead)
+    aside = np.abs(dy * cos - dx * sin)
+    speed = math.hypot(motion.speed, motion.lateral_speed)
+    turned = quaternion_yaw(agents.quaternions) - motion.yaw
+    c, s = np.abs(np.cos(turned)), np.abs(np.sin(turned))
+    half = agents.sizes[:, :2] / 2
+    # The ego may turn, brake or speed up within the step.
+    drift = dt * (0.15 * speed + abs(motion.lateral_speed) + abs(motion.yaw_rate) * ego_size[0])
+    slack_along = dt * (speed + np.abs(vx * cos + vy * sin) + 2.0) + 0.3
+    slack_aside = drift + dt * np.abs(vy * cos - vx * sin) + 0.3
+    near = along < ego_size[0] / 2 + half[:, 0] * c + half[:, 1] * s + slack_along
+    near &= aside < ego_size[1] / 2 + half[:, 0] * s + half[:, 1] * c + slack_aside
+    return bool(near.any())
+
+
+def run_bout(
+    pilot: Pilot,
+    motion: Motion,
+    t_us: int,
+    *,
+    spec: ResetSpec,
+    sliding: bool,
+    ego_size: tuple[float, float, float],
+    before: Agents,
+    after: Agents,
+    wrecks: Mapping[str, Wreck],
+    exempt: frozenset[frozenset[str]],
+    obstacles: Obstacles | None,
+    height: Callable[[float, float], float],
+) -> tuple[Pilot, Outcome]:
+    """The step with contact; see :func:`~.impact.resolve`."""
+    pilots = [pilot]
+
+    def roll(now: Motion, since_us: int, us: int) -> Motion:
+        pilots[0], moved = pilots[0].advance(now, t_us + since_us, us)
+        return moved
+
+    def command(now: Motion, since_us: int) -> Command:
+        pilots[0] = pilots[0].begun(now, t_us + since_us)
+        controller = pilots[0].controller
+        assert controller is not None
+        return controller.command(now, (t_us + since_us - pilots[0].since_us) * 1e-6)
+
+    outcome = resolve(
+        Bout(
+            t_us=t_us,
+            dt_us=spec.dt_us,
+            motion=motion,
+            sliding=sliding,
+            roll=roll,
+            command=command,
+            spec=spec.ego,
+            ego_size=ego_size,
+            contact=spec.contact,
+            before=before,
+            after=after,
+            wrecks=wrecks,
+            exempt=exempt,
+            background=obstacles.touch if obstacles is not None else None,
+            height=height,
+        )
+    )
+    return pilots[0], outcome
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """Contacts of the ego at an instant where no momentum is exchanged.
+
+    Attributes:
+        touching: ids of the objects whose boxes overlap the ego's, and ``background``.
+        begun: contacts that were not there one step before.
+        notes: of those, for the scores.
+    """
+
+    touching: frozenset[str]
+    begun: tuple[Contact, ...]
+    notes: tuple[ContactNote, ...]
+
+
+def met(
+    T_world_vehicle: Float,
+    motion: Motion,
+    agents: Agents,
+    *,
+    spec: ResetSpec,
+    ego_size: tuple[float, float, float],
+    obstacles: Obstacles | None,
+    before: frozenset[str],
+) -> Met:
+    """Which objects the ego box overlaps, and which of those contacts are new.
+
+    Objects that overlap the ego box when an episode starts count as being in contact already, so
+    they are reported only after they have separated once: boxes of a recording often overlap
+    slightly, and nobody drove into anybody then.
+    """
+    T_world_box = ego_box(T_world_vehicle, ego_size)
+    rows = touching(T_world_box, ego_size, agents)
+    box = (*T_world_box[:2, 3].tolist(), motion.yaw, *ego_size[:2])
+    names = [agents.objects[k].object_id for k in rows]
+    velocity = T_world_vehicle[:3, :2] @ [motion.speed, motion.lateral_speed]
+    contacts, notes = [], []
+    for k, name in zip(rows, names, strict=True):
+        if name in before:
+            continue
+        relative = velocity - agents.velocities[k]
+        speed = float(np.sqrt(relative @ relative))
+        contacts.append(Contact(name, speed))
+        notes.append(_note(box, motion.speed, agents, k, relative_speed=speed))
+    if obstacles is not None:
+        body, solid = ego_body(motion, spec.ego), ego_solid(spec.ego, ego_size)
+        if obstacles.touch(body, solid) is not None:
+            names.append(BACKGROUND)
+            if BACKGROUND not in before:
+                speed = math.hypot(motion.speed, motion.lateral_speed)
+                contacts.append(Contact(None, speed))
+                notes.append(_background_note(speed))
+    return Met(frozenset(names), tuple(contacts), tuple(notes))
+
+
+def notes_of(
+    impacts: tuple[Impact, ...], *, touched: frozenset[str], agents: Agents
+) -> tuple[ContactNote, ...]:
+    """Impacts of the ego for the scores; ``touched``: what was in contact one step before."""
+    categories = {o.object_id: o.category for o in agents.objects}
+    return tuple(
+        ContactNote(
+            object_id=impact.object_id,
+            category=categories.get(impact.object_id or "", BACKGROUND),
+            side=impact.side,
+            relative_speed=impact.relative_speed,
+            ego_speed=impact.speeds[0],
+            object_speed=impact.speeds[1],
+            impulse=impact.impulse,
+            begun=(impact.object_id or BACKGROUND) not in touched,
+        )
+        for impact in impacts
+        if impact.other_id is None
+    )
+
+
+def _note(
+    box: tuple[float, float, float, float, float],
+    ego_speed: float,
+    agents: Agents,
+    k: int,
+    *,
+    relative_speed: float,
+) -> ContactNote:
+    subject: ObjectState = agents.objects[k]
+    x, y, _ = agents.positions[k].tolist()
+    length, width, _ = agents.sizes[k].tolist()
+    speed = float(np.hypot(*agents.velocities[k, :2]))
+    other = (x, y, float(quaternion_yaw(agents.quaternions[k])), length, width)
+    return ContactNote(
+        object_id=subject.object_id,
+        category=subject.category,
+        side=side_of_contact(box, ego_speed, other, speed),
+        relative_speed=relative_speed,
+        ego_speed=ego_speed,
+        object_speed=speed,
+    )
+
+
+def _background_note(speed: float) -> ContactNote:
+    return ContactNote(None, BACKGROUND, "stopped_track", speed, speed, 0.0)

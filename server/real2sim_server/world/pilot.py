@@ -1,0 +1,216 @@
+"""From plans to motion: which plan holds when, and what holds where there is none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, assert_never
+
+import numpy as np
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.drive import Control, PoseCommand, TrajectoryPlan
+from real2sim_proto.episode import EgoSpec, ResetSpec
+
+from ..edit.tracks import sample
+from ..scene import Trajectory
+from .actuators import Command
+from .ego import Motion, drive, placed
+from .errors import WorldError
+from .reference import Pose, Reference
+from .trackers import make_tracker
+
+Plan = TrajectoryPlan | Control | PoseCommand
+
+LOG_SPACING_US = 100_000
+"""Where there is no plan, the log is followed by poses this far apart at most [us]."""
+
+EMERGENCY_BRAKING = 6.0
+"""Deceleration of the fallback ``brake``, where the vehicle can [m/s^2]."""
+
+
+class Controller(Protocol):
+    """Moves the ego until another one takes over."""
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later; ``since`` seconds after the controller began."""
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """What it would do in a motion, ``t`` seconds after it began."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """The same command all the time."""
+
+    asked: Command
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later."""
+        return drive(motion, lambda _m, _t: self.asked, self.spec, dt_us)
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """That command."""
+        return self.asked
+
+
+@dataclass(frozen=True)
+class Put:
+    """The vehicle is put somewhere and stays there."""
+
+    pose: Pose
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle at its place, with the velocity that brought it there."""
+        return placed(motion, self.pose, self.spec, dt_us)
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """Brakes: whoever is put somewhere has no driver."""
+        return Command(-EMERGENCY_BRAKING, motion.steering)
+
+
+@dataclass(frozen=True)
+class Coming:
+    """A plan that has not taken effect yet.
+
+    Attributes:
+        from_us: when it does [us].
+        plan: with its poses in the world.
+    """
+
+    from_us: int
+    plan: Plan
+
+
+@dataclass(frozen=True, eq=False)
+class Pilot:
+    """What moves the ego, and what will. Immutable.
+
+    Attributes:
+        spec: of the episode.
+        ego: as it was recorded; followed while there is no plan.
+        controller: holds now; None before the first plan.
+        since_us: when it took over [us].
+        coming: plans on their way, in the order in which they take effect.
+    """
+
+    spec: ResetSpec
+    ego: Trajectory
+    controller: Controller | None = None
+    since_us: int = 0
+    coming: tuple[Coming, ...] = ()
+
+    def told(self, plan: Plan, motion: Motion, t_us: int, from_us: int) -> Pilot:
+        """With one more plan.
+
+        Args:
+            plan: of the planner.
+            motion: that it answers.
+            t_us: of that observation [us].
+            from_us: when it takes effect [us].
+
+        Raises:
+            WorldError: INVALID_ACTION for another kind than the reset named, or times that are
+                over.
+        """
+        if plan.kind != self.spec.action:
+            raise WorldError(
+                ErrorCode.INVALID_ACTION,
+                f"a plan of kind {plan.kind!r} in an episode that was reset for "
+                f"{self.spec.action!r}",
+                hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}",
+            )
+        if isinstance(plan, TrajectoryPlan):
+            if plan.times_us[0] <= t_us:
+                raise WorldError(
+                    ErrorCode.INVALID_ACTION,
+                    f"the plan begins at {plan.times_us[0]} us; it is {t_us} us already",
+                    hint="times_us are absolute simulation times after t_us of the observation",
+                )
+            if plan.frame == "vehicle":
+                poses = to_world(plan.poses, motion)
+                plan = plan.model_copy(update={"poses": poses, "frame": "world"})
+        kept = tuple(c for c in self.coming if c.from_us < from_us)
+        return replace(self, coming=(*kept, Coming(from_us, plan)))
+
+    def advance(self, motion: Motion, t_us: int, us: int) -> tuple[Pilot, Motion]:
+        """Pilot and vehicle ``us`` later than ``t_us``."""
+        pilot, end_us = self, t_us + us
+        while t_us < end_us:
+            pilot = pilot._now(motion, t_us)
+            until = min([end_us, *(c.from_us for c in pilot.coming)])
+            since = (t_us - pilot.since_us) * 1e-6
+            assert pilot.controller is not None
+            motion = pilot.controller.advance(motion, since, until - t_us)
+            t_us = until
+        return pilot, motion
+
+    def begun(self, motion: Motion, t_us: int) -> Pilot:
+        """With whatever holds from ``t_us`` on."""
+        return self._now(motion, t_us)
+
+    def _now(self, motion: Motion, t_us: int) -> Pilot:
+        """With the newest plan that has taken effect in charge."""
+        pilot = self
+        while pilot.coming and pilot.coming[0].from_us <= t_us:
+            first, *rest = pilot.coming
+            controller = pilot._controller(first.plan, motion, t_us)
+            pilot = replace(pilot, controller=controller, since_us=t_us, coming=tuple(rest))
+        if pilot.controller is None:
+            log = pilot._follow_log(motion, t_us)
+            pilot = replace(pilot, controller=log, since_us=t_us)
+        return pilot
+
+    def _controller(self, plan: Plan, motion: Motion, t_us: int) -> Controller:
+        match plan:
+            case TrajectoryPlan():
+                ahead = [k for k, t in enumerate(plan.times_us) if t > t_us]
+                if not ahead:
+                    # All of it is over by the time it takes effect: stop where it ends.
+                    return self._tracker(motion, t_us, [t_us + 1], [plan.poses[-1]])
+                times = [plan.times_us[k] for k in ahead]
+                return self._tracker(motion, t_us, times, [plan.poses[k] for k in ahead])
+            case Control():
+                return Hold(Command(plan.acceleration, plan.steering), self.spec.ego)
+            case PoseCommand():
+                return Put((plan.x, plan.y, plan.yaw), self.spec.ego)
+            case _:
+                assert_never(plan)
+
+    def _follow_log(self, motion: Motion, t_us: int) -> Controller:
+        # Even spacing: some logs have poses milliseconds apart, whose differences are noise.
+        end_us = self.ego.end_us
+        count = max(-(-(end_us - t_us) // LOG_SPACING_US), 1)
+        times = np.linspace(t_us, max(end_us, t_us + 1), count + 1).astype(np.int64)[1:]
+        transforms, _ = sample(self.ego, times)
+        yaws = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
+        poses = np.column_stack([transforms[:, :2, 3], yaws])
+        return self._tracker(
+            motion, t_us, times.tolist(), [(x, y, yaw) for x, y, yaw in poses.tolist()]
+        )
+
+    def _tracker(
+        self, motion: Motion, t_us: int, times_us: Sequence[int], poses: Sequence[Pose]
+    ) -> Controller:
+        spec = self.spec.ego
+        reference = Reference(motion, start_us=t_us, times_us=times_us, poses=poses, spec=spec)
+        return make_tracker(reference, spec)
+
+
+def braking(pilot: Pilot, motion: Motion, spec: EgoSpec) -> Controller:
+    """The fallback of a planner that is late: brake, and keep the wheels as they are."""
+    if pilot.spec.action == "pose":
+        return Put((motion.x, motion.y, motion.yaw), spec)
+    return Hold(Command(-min(EMERGENCY_BRAKING, spec.max_braking), motion.steering), spec)
+
+
+def to_world(poses: Sequence[Pose], motion: Motion) -> list[Pose]:
+    """Poses x, y, yaw of the vehicle frame in the world."""
+    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
+    return [
+        (motion.x + cos * x - sin * y, motion.y + sin * x + cos * y, motion.yaw + yaw)
+        for x, y, yaw in poses
+    ]

@@ -1,0 +1,137 @@
+"""Comfort of what was driven, and of how plans follow one another."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import savgol_coeffs
+
+from ..path import Float
+from .instant import PlanNote
+
+WINDOW_S = 1.5
+ORDER = 3
+
+LON_ACCELERATION = (-4.05, 2.40)
+LAT_ACCELERATION = 4.89
+JERK = 8.37
+LON_JERK = 4.13
+YAW_RATE = 0.95
+YAW_ACCELERATION = 1.93
+"""Bounds of nuPlan and NAVSIM [m/s^2], [m/s^3], [rad/s], [rad/s^2]."""
+
+PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
+"""Greatest RMS difference of successive plans in acceleration, jerk, yaw rate, yaw acceleration
+(NAVSIM v2, extended comfort)."""
+
+PLAN_STEP = 0.1
+
+
+class Felt(NamedTuple):
+    """What passengers feel at one time: SI units, as the bounds."""
+
+    lon_acceleration: float
+    lat_acceleration: float
+    jerk: float
+    lon_jerk: float
+    yaw_rate: float
+    yaw_acceleration: float
+
+    @property
+    def comfortable(self) -> bool:
+        """Whether all bounds hold."""
+        low, high = LON_ACCELERATION
+        return (
+            low <= self.lon_acceleration <= high
+            and abs(self.lat_acceleration) <= LAT_ACCELERATION
+            and abs(self.jerk) <= JERK
+            and abs(self.lon_jerk) <= LON_JERK
+            and abs(self.yaw_rate) <= YAW_RATE
+            and abs(self.yaw_acceleration) <= YAW_ACCELERATION
+        )
+
+
+@dataclass(frozen=True)
+class Ride:
+    """Comfort of a drive so far.
+
+    Derivatives are those of cubics through the last 1.5 s (Savitzky & Golay 1964), taken in the
+    middle of that window; so the first and last 0.75 s of a drive are not judged.
+
+    Attributes:
+        samples: speed [m/s] and continuous yaw [rad] of the last 1.5 s.
+        comfortable: whether all bounds held so far.
+        worst: greatest magnitudes so far, in the order of :class:`Felt`.
+    """
+
+    samples: tuple[tuple[float, float], ...] = ()
+    comfortable: bool = True
+    worst: tuple[float, ...] = (0.0,) * 6
+
+    def after(self, speed: float, yaw: float, dt: float) -> Ride:
+        """The ride after one more clock step."""
+        window = window_of(dt)
+        samples = (*self.samples, (speed, yaw))[-window:]
+        if len(samples) < window:
+            return replace(self, samples=samples)
+        felt = felt_in(np.array(samples), dt)
+        worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, felt, strict=True))
+        return Ride(samples, self.comfortable and felt.comfortable, worst)
+
+
+def window_of(dt: float) -> int:
+    """Samples in a window; odd, at least five."""
+    return max(2 * round(WINDOW_S / dt / 2) - 1, 5) if dt < WINDOW_S / 4 else 5
+
+
+@lru_cache(maxsize=16)
+def _coefficients(window: int, dt: float) -> Float:
+    """Weights [3, window] of value, first and second derivative in the middle."""
+    order = min(ORDER, window - 2)
+    rows = [savgol_coeffs(window, order, deriv=k, delta=dt, use="dot") for k in range(3)]
+    return np.stack(rows)
+
+
+def felt_in(samples: Float, dt: float) -> Felt:
+    """What is felt in the middle of samples [W, 2] of speed and yaw."""
+    (speed, yaw), (acceleration, rate), (lon_jerk, yaw_acceleration) = (
+        _coefficients(len(samples), dt) @ samples
+    ).tolist()
+    del yaw
+    lateral = speed * rate
+    # d/dt of the lateral acceleration v w, by the product rule.
+    lat_jerk = acceleration * rate + speed * yaw_acceleration
+    jerk = math.hypot(lon_jerk, lat_jerk)
+    return Felt(acceleration, lateral, jerk, lon_jerk, rate, yaw_acceleration)
+
+
+def plans_agree(before: PlanNote, now: PlanNote) -> bool | None:
+    """Whether two successive plans feel alike where both say something.
+
+    RMS differences of acceleration, jerk, yaw rate and yaw acceleration over the overlap, by
+    finite differences of the plans in steps of 0.1 s. None where they overlap for less than 0.5 s.
+    """
+    first = max(before.times_us[0], now.times_us[0])
+    last = min(before.times_us[-1], now.times_us[-1])
+    count = int((last - first) * 1e-6 / PLAN_STEP + 1e-6) + 1
+    if count < 6:
+        return None
+    at = first * 1e-6 + PLAN_STEP * np.arange(count)
+    a, b = _dynamics(before, at), _dynamics(now, at)
+    return all(
+        float(np.sqrt(np.mean((p - q) ** 2))) <= bound
+        for p, q, bound in zip(a, b, PLAN_BOUNDS, strict=True)
+    )
+
+
+def _dynamics(plan: PlanNote, at: Float) -> tuple[Float, Float, Float, Float]:
+    times, poses = np.array(plan.times_us) * 1e-6, np.array(plan.poses)
+    x, y = np.interp(at, times, poses[:, 0]), np.interp(at, times, poses[:, 1])
+    yaw = np.interp(at, times, np.unwrap(poses[:, 2]))
+    speed = np.hypot(np.diff(x), np.diff(y)) / PLAN_STEP
+    acceleration, rate = np.diff(speed) / PLAN_STEP, np.diff(yaw) / PLAN_STEP
+    return acceleration, np.diff(acceleration) / PLAN_STEP, rate, np.diff(rate) / PLAN_STEP

@@ -1,0 +1,163 @@
+"""What drives another road user, and what it may know."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+
+from ...edit import ObjectState
+from ..agents import Agents
+from ..path import Float, LoggedPath
+
+
+class AgentPose(NamedTuple):
+    """Where an object is and how it moves.
+
+    Attributes:
+        position: box centre, world [m].
+        quaternion: wxyz, object to world.
+        yaw: heading [rad].
+        velocity: world [m/s].
+    """
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    yaw: float
+    velocity: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class EgoSeen:
+    """The controlled vehicle as others see it.
+
+    Attributes:
+        x, y: centre of its box [m].
+        yaw: heading [rad].
+        speed: along its heading [m/s].
+        length, width: of its box [m].
+        s: where its rear axle is along the route [m].
+        offset: of its rear axle from the route, positive on the left [m].
+        front: from the rear axle to the front end of its box [m].
+    """
+
+    x: float
+    y: float
+    yaw: float
+    speed: float
+    length: float
+    width: float
+    s: float
+    offset: float
+    front: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What an agent may know when it decides: the committed instant before the step.
+
+    Attributes:
+        t_us: now [us].
+        start_us: of the episode [us].
+        dt_us: the step to be made [us].
+        ego: the controlled vehicle.
+        others: all objects, the agent itself among them.
+        route: the recorded way of the ego.
+    """
+
+    t_us: int
+    start_us: int
+    dt_us: int
+    ego: EgoSeen
+    others: Agents
+    route: LoggedPath
+
+    @property
+    def dt(self) -> float:
+        """The step to be made [s]."""
+        return self.dt_us * 1e-6
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the episode began [s]."""
+        return (self.t_us - self.start_us) * 1e-6
+
+
+class AgentDriver(Protocol):
+    """Moves one object. Immutable: a step makes a new one, so that a copied world goes on alike.
+
+    The same surroundings always lead to the same place: drivers know no clock and no chance.
+    """
+
+    @property
+    def subject(self) -> ObjectState:
+        """The object as it was when its driver took over."""
+
+    @property
+    def pose(self) -> AgentPose:
+        """Where it is now."""
+
+    @property
+    def present(self) -> bool:
+        """Whether it is in the world; False once it has left it."""
+
+    def advance(self, seen: Surroundings) -> Self:
+        """The driver one step later."""
+
+
+def level_quaternion(yaw: float) -> tuple[float, float, float, float]:
+    """wxyz of an object that stands level with that heading; w >= 0."""
+    half = math.remainder(yaw, math.tau) / 2
+    return (math.cos(half), 0.0, 0.0, math.sin(half))
+
+
+class PlaceOnPath(NamedTuple):
+    """A point of a path: position [m], heading [rad]."""
+
+    x: float
+    y: float
+    z: float
+    yaw: float
+
+
+def on_path(path: LoggedPath, s: float) -> PlaceOnPath:
+    """The point at distance ``s`` [m]; before its start and after its end straight on."""
+    inside = min(max(s, 0.0), path.length)
+    k = min(max(int(np.searchsorted(path.s, inside, side="right")) - 1, 0), len(path.s) - 2)
+    share = (inside - path.s[k]) / (path.s[k + 1] - path.s[k])
+    x, y, z = ((1 - share) * path.positions[k] + share * path.positions[k + 1]).tolist()
+    yaw = float((1 - share) * path.yaws[k] + share * path.yaws[k + 1])
+    beyond = s - inside
+    return PlaceOnPath(x + beyond * math.cos(yaw), y + beyond * math.sin(yaw), z, yaw)
+
+
+def pose_on_path(
+    path: LoggedPath, s: float, speed: float, *, offset: float = 0.0, drift: float = 0.0
+) -> AgentPose:
+    """An object that drives along a path.
+
+    Args:
+        path: in the world.
+        s: along it [m].
+        speed: along it [m/s].
+        offset: from it, positive on the left [m].
+        drift: rate at which the offset grows [m/s].
+    """
+    x, y, z, yaw = on_path(path, s)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    heading = yaw + (math.atan2(drift, speed) if speed > 0.5 else 0.0)
+    return AgentPose(
+        (x - offset * sin, y + offset * cos, z),
+        level_quaternion(heading),
+        heading,
+        (speed * cos - drift * sin, speed * sin + drift * cos, 0.0),
+    )
+
+
+def curvature_ahead(path: LoggedPath, s: float, reach: float) -> float:
+    """Largest curvature [1/m] of the path over the next ``reach`` metres, in pieces of 4 m."""
+    at = s + np.arange(0.0, max(reach, 8.0) + 4.0, 4.0)
+    yaws: Float = np.interp(at, path.s, path.yaws)
+    return float(np.abs(np.diff(yaws)).max()) / 4.0

@@ -1,0 +1,131 @@
+"""The intelligent driver model on a recorded path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from real2sim_proto.episode import IdmDriver
+
+from ...edit import ObjectState
+from ..path import LoggedPath
+from .driver import AgentPose, Surroundings, curvature_ahead, pose_on_path
+from .leader import Leader, leader_on
+from .replay import recorded_pose
+
+HARDEST = 8.0
+"""Deceleration that brakes can bring about [m/s^2]."""
+
+BACK_TO_LANE = 2.0
+"""Time constant with which an offset from the path fades [s]."""
+
+SLOWEST_DESIRED = 3.0
+"""Desired speed of objects that hardly moved in the recording [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Idm:
+    """Keeps to its recorded path, at a desired speed or behind whoever is ahead.
+
+    a = a_max [1 - (v/v0)^4 - (s*/s)^2] with s* = s0 + max(0, v T + v dv / (2 sqrt(a_max b)))
+    (Treiber, Hennecke & Helbing 2000, Phys. Rev. E 62, eqs. 1 to 3). In bends v0 is what the
+    lateral acceleration allows. It leaves the world at the end of its path.
+
+    Attributes:
+        subject: the object.
+        spec: parameters.
+        path: recorded, of its box centre.
+        desired: speed on a free and straight road [m/s].
+        s, offset, speed: along and beside the path [m], [m/s].
+        pose, present: see :class:`~.driver.AgentDriver`.
+    """
+
+    subject: ObjectState
+    spec: IdmDriver
+    path: LoggedPath
+    desired: float
+    s: float
+    offset: float
+    speed: float
+    pose: AgentPose
+    present: bool = True
+
+    @classmethod
+    def begin(cls, subject: ObjectState, t_us: int, spec: IdmDriver) -> Idm:
+        """From where and how the object moves at ``t_us``."""
+        path = LoggedPath(subject.trajectory)
+        now = recorded_pose(subject, t_us)
+        return cls.from_pose(subject, now, spec, path)
+
+    @classmethod
+    def from_pose(
+        cls, subject: ObjectState, now: AgentPose, spec: IdmDriver, path: LoggedPath
+    ) -> Idm:
+        """From a pose beside its path."""
+        near = path.nearest(now.position[0], now.position[1])
+        vx, vy, _ = now.velocity
+        speed = max(vx * math.cos(near.yaw) + vy * math.sin(near.yaw), 0.0)
+        desired = spec.desired_speed
+        if desired is None:
+            desired = max(highest_speed(subject), SLOWEST_DESIRED)
+        return cls(subject, spec, path, desired, near.s, near.offset, speed, now)
+
+    def advance(self, seen: Surroundings) -> Self:
+        """The driver one step later."""
+        length, width, _ = self.subject.scaled_size
+        leader = leader_on(
+            self.path,
+            self.s,
+            offset=self.offset,
+            length=length,
+            width=width,
+            object_id=self.subject.object_id,
+            seen=seen,
+        )
+        bend = curvature_ahead(self.path, self.s, 2.0 * self.speed)
+        desired = min(self.desired, math.sqrt(self.spec.lateral / max(bend, 1e-4)))
+        s, speed = ahead(
+            self.s, self.speed, acceleration(self.spec, self.speed, desired, leader), seen.dt
+        )
+        offset = self.offset * math.exp(-seen.dt / BACK_TO_LANE)
+        drift = (offset - self.offset) / seen.dt
+        pose = pose_on_path(self.path, s, speed, offset=offset, drift=drift)
+        present = s < self.path.length
+        return replace(self, s=s, speed=speed, offset=offset, pose=pose, present=present)
+
+
+def acceleration(spec: IdmDriver, speed: float, desired: float, leader: Leader | None) -> float:
+    """IDM acceleration [m/s^2], no harder than brakes can."""
+    free = 1.0 - (speed / desired) ** 4
+    if leader is None:
+        return max(spec.acceleration * free, -HARDEST)
+    closing = speed - leader.speed
+    dynamic = speed * spec.headway + speed * closing / (
+        2 * math.sqrt(spec.acceleration * spec.braking)
+    )
+    wanted = spec.gap + max(0.0, dynamic)
+    interaction = (wanted / max(leader.gap, 0.1)) ** 2
+    return max(spec.acceleration * (free - interaction), -HARDEST)
+
+
+def ahead(s: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
+    """Place and speed after ``dt`` seconds; braking ends at rest."""
+    if acceleration < 0 and speed + acceleration * dt <= 0:
+        return s + speed * speed / (-2 * acceleration), 0.0
+    return s + (speed + acceleration * dt / 2) * dt, speed + acceleration * dt
+
+
+def highest_speed(subject: ObjectState) -> float:
+    """Highest recorded speed [m/s], over half a second to be deaf to noise."""
+    trajectory = subject.trajectory
+    times = trajectory.times_us * 1e-6
+    if len(times) == 1:
+        return 0.0
+    later = np.minimum(np.searchsorted(times, times + 0.5), len(times) - 1)
+    spans = np.maximum(times[later] - times, 1e-6)
+    ways = np.linalg.norm(trajectory.positions[later] - trajectory.positions, axis=1)
+    full = spans >= 0.25
+    return float((ways / spans)[full].max()) if full.any() else float((ways / spans).max())

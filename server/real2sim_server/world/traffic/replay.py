@@ -1,0 +1,67 @@
+"""Objects that repeat what was recorded, and objects that go straight on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+from ...edit import ObjectState
+from ...scene.rotation import quaternion_yaw
+from .driver import AgentPose, Surroundings
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Moves along its trajectory in time; sees nobody. In the world while its trajectory lasts."""
+
+    subject: ObjectState
+    pose: AgentPose
+    present: bool = True
+
+    @classmethod
+    def begin(cls, subject: ObjectState, t_us: int) -> Replay:
+        """From where the trajectory is at ``t_us``, which it must cover."""
+        return cls(subject, recorded_pose(subject, t_us))
+
+    def advance(self, seen: Surroundings) -> Self:
+        """The driver one step later."""
+        t_us, trajectory = seen.t_us + seen.dt_us, self.subject.trajectory
+        if not trajectory.start_us <= t_us <= trajectory.end_us:
+            return replace(self, present=False)
+        return replace(self, pose=recorded_pose(self.subject, t_us), present=True)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantVelocity:
+    """Goes on as it moved when it began, at its height and with its heading; sees nobody."""
+
+    subject: ObjectState
+    pose: AgentPose
+    present: bool = True
+
+    @classmethod
+    def begin(cls, subject: ObjectState, t_us: int) -> ConstantVelocity:
+        """From how the object moves at ``t_us``."""
+        pose = recorded_pose(subject, t_us)
+        vx, vy, _ = pose.velocity
+        return cls(subject, pose._replace(velocity=(vx, vy, 0.0)))
+
+    def advance(self, seen: Surroundings) -> Self:
+        """The driver one step later."""
+        (x, y, z), (vx, vy, _) = self.pose.position, self.pose.velocity
+        moved = (x + vx * seen.dt, y + vy * seen.dt, z)
+        return replace(self, pose=self.pose._replace(position=moved))
+
+
+def recorded_pose(subject: ObjectState, t_us: int) -> AgentPose:
+    """Where the object's trajectory is at ``t_us``, with its velocity there.
+
+    Raises:
+        TimeOutOfRangeError: outside the trajectory.
+    """
+    position, quaternion = subject.trajectory.pose(t_us)
+    x, y, z = position.tolist()
+    w, qx, qy, qz = quaternion.tolist()
+    vx, vy, vz = subject.trajectory.velocity(t_us).tolist()
+    yaw = float(quaternion_yaw(quaternion))
+    return AgentPose((x, y, z), (w, qx, qy, qz), yaw, (vx, vy, vz))
