@@ -293,6 +293,23 @@ def evaluate(
 
 
 @app.command()
+def validate(
+    backend: Annotated[str, typer.Option(help="cpu or reference")] = "cpu",
+    cases: Annotated[
+        str | None, typer.Option(help="Names with commas between them; all by default.")
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="HTML page to write; default: beside the figures.")
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Hold the physics to cases with known answers; exit code 1 when a line fails."""
+    from .commands import validate as command
+
+    _run(command.run, backend=backend, cases=cases, page=page, json_path=json)
+
+
+@app.command()
 def serve(
     host: Annotated[
         str | None, typer.Option(help="Default 127.0.0.1; others need a token.")
@@ -361,6 +378,19 @@ def bench_reconstruct(json: JsonFile = None) -> None:
     from .commands import bench_reconstruct as command
 
     _run(command.run, json_path=json)
+
+
+@bench.command("physics")
+def bench_physics(
+    peers: Annotated[
+        bool, typer.Option("--peers", help="Also measure Taichi and Warp, where installed.")
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Particle-substeps per second, and what they depend on."""
+    from .commands import bench_physics as command
+
+    _run(command.run, peers=peers, json_path=json)
 
 
 @bench.command("serve")

@@ -33,7 +33,7 @@ TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6}
 """Particle-substeps per second of 100,000 particles on two cores."""
 
 
-def run(json_path: Path | None = None) -> dict[str, Any]:
+def run(*, peers: bool = False, json_path: Path | None = None) -> dict[str, Any]:
     """Measure the solver and return the figures; written to ``json_path``, too, when given.
 
     ``rate`` is in particle-substeps per second, elapsed, the best of REPEATS runs; ``cpu_rate`` is

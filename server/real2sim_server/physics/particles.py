@@ -79,6 +79,12 @@ class Particles:
             raise ParticleError(f"T_dst_src must be a rigid [4, 4] transform, not {matrix!r}")
         return replace(self, positions=apply_transform(matrix, self.positions))
 
+    def take(self, index: NDArray[Any]) -> Particles:
+        """Those that ``index`` names: indices in any order, or a mask [N]."""
+        return Particles(
+            self.positions[index], self.volumes[index], self.masses[index], self.source[index]
+        )
+
     def with_mass(self, mass: float) -> Particles:
         """The particles with masses scaled so that they sum to ``mass`` [kg]."""
         if not (np.isfinite(mass) and mass > 0):

@@ -4,6 +4,11 @@ An elastic body on a grid bounces too well, never too badly, so taking energy aw
 nothing is ever injected. Kelvin-Voigt damping of the first mode, omega = pi c / 2L, gives
 e = e0 exp(-pi zeta / sqrt(1 - zeta^2)), zeta = eta omega / 2 (lambda + 2 mu); that is the first
 guess, and canned impacts of the body itself do the rest.
+
+How well a body bounces depends on where the wall lies between the nodes of the grid: an elastic
+block of six cells keeps 0.64 of its speed on a wall that runs through nodes and 0.88 on one just
+below them, from wherever it comes. So the canned impacts are made on the very wall the body is
+meant for, where it is given.
 """
 
 from __future__ import annotations
@@ -54,6 +59,7 @@ def fit_restitution(
     *,
     speed: float,
     normal: ArrayLike = (0.0, 0.0, 1.0),
+    wall: Plane | None = None,
     options: SolverOptions | None = None,
 ) -> RestitutionFit:
     """Fit viscosity so that ``body`` bounces off a rigid wall with ``requested``.
@@ -62,7 +68,8 @@ def fit_restitution(
         body: its velocity and place do not matter.
         requested: coefficient of restitution, in [0, 1].
         speed: approach of the canned impacts [m/s]; restitution depends on it.
-        normal: [3] out of the wall.
+        normal: [3] out of the wall, where no ``wall`` is given; it then lies just below the body.
+        wall: the one the body will hit; the body is put in front of it.
         options: of the solver the body is meant for; cells and precision matter.
 
     Returns:
@@ -73,7 +80,14 @@ def fit_restitution(
     """
     if not 0 <= requested <= 1:
         raise SolverError(f"restitution must be in [0, 1], not {requested!r}")
-    elastic = impact(body, speed=speed, normal=normal, options=options)
+    if wall is not None:
+        normal = wall.normal
+
+    def rebound(viscosity: float) -> float:
+        trial = with_viscosity(body, viscosity)
+        return impact(trial, speed=speed, normal=normal, wall=wall, options=options)
+
+    elastic = rebound(0.0)
     low, high = 0.0, math.inf
     tried, achieved, impacts = 0.0, elastic, 1
     best = (abs(elastic - requested), 0.0, elastic)
@@ -86,7 +100,7 @@ def fit_restitution(
             tried = _first_guess(body, requested / elastic, normal)
         else:
             tried = _between(low, high, tried)
-        achieved = impact(with_viscosity(body, tried), speed=speed, normal=normal, options=options)
+        achieved = rebound(tried)
         impacts += 1
         best = min(best, (abs(achieved - requested), tried, achieved))
     return RestitutionFit(
@@ -99,20 +113,24 @@ def impact(
     *,
     speed: float,
     normal: ArrayLike = (0.0, 0.0, 1.0),
+    wall: Plane | None = None,
     options: SolverOptions | None = None,
 ) -> float:
     """Coefficient of restitution of one impact on a rigid wall, without gravity.
 
-    Separation over approach speed of the centre of mass; 0 when it does not come off again.
+    Arguments are those of :func:`fit_restitution`. Separation over approach speed of the centre
+    of mass; 0 when it does not come off again.
     """
     if not (math.isfinite(speed) and speed > 0):
         raise SolverError(f"speed of an impact must be positive [m/s], not {speed!r}")
-    n = np.asarray(normal, dtype=np.float64)
-    n = n / np.linalg.norm(n)
-    heights = body.particles.positions @ n
-    gap = 0.5 * float(np.cbrt(body.particles.volumes).mean())
-    wall = Plane(name="wall", point=(heights.min() - 1.5 * gap) * n, normal=n)
-    thrown = replace(body, velocity=-speed * n, angular_velocity=np.zeros(3))
+    if wall is None:
+        wall = _wall_below(body, normal)
+    n = np.asarray(wall.normal)
+    lowest = float((body.particles.positions @ n).min()) - float(np.asarray(wall.point) @ n)
+    pose = np.eye(4)
+    pose[:3, 3] = (1.5 * _half_spacing(body) - lowest) * n
+    particles = body.particles.moved(pose)
+    thrown = replace(body, particles=particles, velocity=-speed * n, angular_velocity=np.zeros(3))
     options = replace(options or SolverOptions(), gravity=(0.0, 0.0, 0.0))
     solver = Solver([thrown], [wall], options)
     crossing = _length(body, n) / body.materials[0].wave_speed
@@ -125,6 +143,19 @@ def impact(
         if after > 0 and abs(after - before) < 1e-4 * speed * body.particles.mass:
             break
     return max(float(solver.measure.momentum[0] @ n) / (speed * body.particles.mass), 0.0)
+
+
+def _wall_below(body: Body, normal: ArrayLike) -> Plane:
+    """A wall that the body, where it is, nearly touches."""
+    n = np.asarray(normal, dtype=np.float64)
+    n = n / np.linalg.norm(n)
+    lowest = float((body.particles.positions @ n).min())
+    return Plane(name="wall", point=(lowest - 1.5 * _half_spacing(body)) * n, normal=n)
+
+
+def _half_spacing(body: Body) -> float:
+    """From the outermost particles to the surface [m]."""
+    return 0.5 * float(np.cbrt(body.particles.volumes).mean())
 
 
 def with_viscosity(body: Body, viscosity: float) -> Body:

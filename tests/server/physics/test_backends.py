@@ -5,7 +5,6 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
-import torch
 
 from real2sim_server.physics import (
     Box,
@@ -34,14 +33,6 @@ MATERIALS = [
 # Sand comes apart and closes again at a kink of its law, where rounding decides.
 AGREEMENT = {"Sand": 1e-3}
 STATE = ("positions", "velocities", "gradients", "F_elastic", "F_total", "history")
-
-
-@pytest.fixture(autouse=True)
-def one_torch_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def crash(material, backend, precision="double", **options):

@@ -5,7 +5,8 @@ Every case is a function of the backend's name and returns checks: measured, exp
 
 from collections.abc import Callable
 
-from .check import Check
+from .bending import cantilever, loaded_beam
+from .check import Check, Curve
 from .contact import (
     braking,
     collinear_cars,
@@ -14,10 +15,12 @@ from .contact import (
     oblique_impact,
     rest,
     restitution,
+    rolling_ball,
 )
-from .elasticity import bar_on_wall, bulk_modulus, cantilever, hertz, two_balls, vibrating_bar
+from .elasticity import bar_on_wall, bulk_modulus, confined_compression, vibrating_bar
 from .gradients import gradients
-from .motion import affine_patch, free_fall, invariants, scale_invariance, spin
+from .impact import hertz, stiff_discs, two_discs
+from .motion import affine_patch, free_fall, invariants, reproducibility, scale_invariance, spin
 
 CASES: dict[str, Callable[[str], list[Check]]] = {
     case.__name__: case
@@ -27,16 +30,21 @@ CASES: dict[str, Callable[[str], list[Check]]] = {
         spin,
         invariants,
         scale_invariance,
+        reproducibility,
         bulk_modulus,
         vibrating_bar,
         bar_on_wall,
-        two_balls,
+        confined_compression,
+        two_discs,
+        stiff_discs,
         hertz,
         cantilever,
+        loaded_beam,
         rest,
         incline,
         braking,
         oblique_impact,
+        rolling_ball,
         frictionless_slide,
         restitution,
         collinear_cars,
@@ -45,4 +53,4 @@ CASES: dict[str, Callable[[str], list[Check]]] = {
 }
 """All cases by name, the cheap ones first."""
 
-__all__ = ["CASES", "Check"]
+__all__ = ["CASES", "Check", "Curve"]

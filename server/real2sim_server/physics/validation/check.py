@@ -15,6 +15,22 @@ from ..solver import Solver, SolverOptions
 
 
 @dataclass(frozen=True)
+class Curve:
+    """What a case looked like on its way, for the page.
+
+    Attributes:
+        x, measured, expected: of one length; ``expected`` may hold NaN where theory is silent.
+        x_label, y_label: with units.
+    """
+
+    x: Sequence[float]
+    measured: Sequence[float]
+    expected: Sequence[float]
+    x_label: str
+    y_label: str
+
+
+@dataclass(frozen=True)
 class Check:
     """What was measured against what theory says.
 
@@ -23,6 +39,7 @@ class Check:
         measured, expected: the two numbers, in ``unit``.
         tolerance: largest allowed distance of the two, in ``unit``.
         unit: SI unit, empty for ratios.
+        curve: what led to it, where that says more than a number.
     """
 
     name: str
@@ -30,6 +47,7 @@ class Check:
     expected: float
     tolerance: float
     unit: str = ""
+    curve: Curve | None = None
 
     @property
     def passed(self) -> bool:
