@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from .base import Identifier, Model
-from .operations import Operation
+from .operations import AddCollider, EraseRegion, Operation
 from .scenes import ObjectInfo, Reply
 
 MAX_OPERATIONS_PER_REQUEST = 256
@@ -32,7 +32,18 @@ class ScenarioInfo(Reply):
     created_at: str = Field(description="UTC, ISO 8601")
     can_undo: bool
     can_redo: bool
+    start_us: int | None = Field(default=None, description="when it begins; single views only")
+    end_us: int | None = Field(default=None, description="when it ends; single views only")
     objects: list[ObjectInfo] = Field(default_factory=list)
+    erased: list[EraseRegion] = Field(default_factory=list, description="of the background")
+    colliders: list[AddCollider] = Field(default_factory=list)
+
+
+class ScenarioFork(Model):
+    """Body of `POST /v1/scenarios/{id}/fork`: a new scenario with the same history."""
+
+    name: str | None = Field(default=None, max_length=200, description="default: the same")
+    revision: int | None = Field(default=None, ge=0, description="up to this one; default: all")
 
 
 class ScenarioList(Reply):
@@ -76,6 +87,7 @@ class HistoryEntry(Reply):
         default_factory=list, description="of an edit; an undo or redo names `target` instead"
     )
     target: int | None = Field(default=None, description="revision of the edit undone or redone")
+    who: str = Field(default="", description="as the client named itself")
     created_at: str
 
 
@@ -86,3 +98,19 @@ class History(Reply):
     can_undo: bool
     can_redo: bool
     entries: list[HistoryEntry]
+
+
+class ScenarioDocument(Reply):
+    """A whole scenario in one file: `GET .../export` gives it, `POST .../import` takes it.
+
+    It names its scene by hash and its assets by id and hash; it holds no Gaussians.
+    """
+
+    format: Literal["real2sim.scenario"] = "real2sim.scenario"
+    version: Literal[1] = 1
+    name: str = Field(default="", max_length=200)
+    scene: str = Field(description="name of the scene where it was written")
+    scene_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
+    assets: dict[str, str] = Field(default_factory=dict, description="content hash by asset id")
+    entries: list[HistoryEntry] = Field(default_factory=list, max_length=100_000)
+    exported_at: str = ""

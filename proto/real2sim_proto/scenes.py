@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from .base import Track
+from .operations import SetPhysics, SetVelocity
 
 
 class Reply(BaseModel):
@@ -46,6 +47,10 @@ class ObjectInfo(Reply):
     start_us: int
     end_us: int
     trajectory: Track | None = Field(default=None, description="T_world_object; single views only")
+    recorded_id: str | None = Field(default=None, description="object of the scene that it shows")
+    asset_id: str | None = Field(default=None, description="asset that it shows instead")
+    physics: SetPhysics | None = Field(default=None, description="what an edit said of it")
+    velocity: SetVelocity | None = Field(default=None, description="with which it enters physics")
 
 
 class SceneInfo(Reply):

@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from . import drive, errors, operations, scenarios, scenes, sessions
+from . import assets, drive, errors, jobs, operations, scenarios, scenes, sessions
 
 MODELS: dict[str, type[BaseModel]] = {
     model.__name__: model
@@ -44,7 +44,16 @@ MODELS: dict[str, type[BaseModel]] = {
         scenes.SceneInfo,
         scenes.SceneList,
         scenes.SceneImport,
+        assets.AssetCut,
+        assets.AssetInfo,
+        assets.AssetList,
+        jobs.JobInfo,
+        jobs.JobList,
+        jobs.SimulateRequest,
+        jobs.ExportRequest,
         scenarios.ScenarioCreate,
+        scenarios.ScenarioFork,
+        scenarios.ScenarioDocument,
         scenarios.ScenarioInfo,
         scenarios.ScenarioList,
         scenarios.OperationBatch,

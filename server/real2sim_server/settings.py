@@ -25,9 +25,11 @@ class Settings(BaseSettings):
         host, port: where to listen; an address beyond loopback needs ``token``.
         token: bearer token that every request but ``/livez`` and ``/readyz`` must carry.
         worker_id: first part of session ids, so that a proxy can find the worker again.
-        data_dir: what the worker writes; the next three lie below it by default.
+        data_dir: what the worker writes; the next five lie below it by default.
         scenes_dir: folder of scene bundles.
         import_root: the only folder that ``POST /v1/scenes`` may read from.
+        assets_dir: folder of asset bundles.
+        jobs_dir: folder of the files that jobs leave.
         store_url: SQLAlchemy URL of scenarios and sessions.
         backend: what draws: ``auto`` chooses by the hardware at hand.
         threads: of numba and torch; 0 for one per core.
@@ -52,6 +54,8 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=_default_data_dir)
     scenes_dir: Path | None = None
     import_root: Path | None = None
+    assets_dir: Path | None = None
+    jobs_dir: Path | None = None
     store_url: str | None = None
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
     threads: int = Field(default=0, ge=0, le=1024)
@@ -77,6 +81,16 @@ class Settings(BaseSettings):
     def import_path(self) -> Path:
         """Folder that imports are read from."""
         return self.import_root or self.data_dir / "import"
+
+    @property
+    def assets_path(self) -> Path:
+        """Folder of asset bundles."""
+        return self.assets_dir or self.data_dir / "assets"
+
+    @property
+    def jobs_path(self) -> Path:
+        """Folder of the files that jobs leave."""
+        return self.jobs_dir or self.data_dir / "jobs"
 
     @property
     def database_url(self) -> str:

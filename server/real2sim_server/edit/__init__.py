@@ -1,14 +1,16 @@
 """Edits: typed operations onto objects, and scenarios as append-only logs of them."""
 
 from .apply import EditOutcome, advance, apply_operations
-from .compose import compose, instances_at
+from .compose import cloud_of, compose, instances_at
 from .errors import EditError
 from .review import GroundHeight
 from .scenario import LogEntry, Planned, Scenario
-from .state import ObjectState, ScenarioState
+from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
 from .tracks import PackedTracks, Placed
 
 __all__ = [
+    "AssetLookup",
+    "AssetSource",
     "EditError",
     "EditOutcome",
     "GroundHeight",
@@ -21,6 +23,7 @@ __all__ = [
     "ScenarioState",
     "advance",
     "apply_operations",
+    "cloud_of",
     "compose",
     "instances_at",
 ]

@@ -30,6 +30,7 @@ class LogEntry:
         operations: of an edit; empty for an undo or redo.
         target: revision of the edit that was undone or redone; None for an edit.
         created_at: UTC, ISO 8601.
+        who: as the client named itself; empty where it did not.
     """
 
     revision: int
@@ -37,6 +38,7 @@ class LogEntry:
     operations: tuple[Operation, ...]
     target: int | None
     created_at: str
+    who: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +113,7 @@ class Scenario:
         *,
         base_revision: int | None = None,
         ground: GroundHeight | None = None,
+        who: str = "",
     ) -> Planned:
         """What ``operations`` would lead to.
 
@@ -118,6 +121,7 @@ class Scenario:
             operations: applied all, or none.
             base_revision: the revision they were made for; None for any.
             ground: see :func:`~.apply.apply_operations`.
+            who: goes on record.
 
         Raises:
             EditError: STALE_REVISION when ``base_revision`` is not the current one; also as
@@ -125,9 +129,9 @@ class Scenario:
         """
         self._refuse_stale(base_revision)
         outcome = apply_operations(self.state, operations, ground=ground)
-        return Planned(self._entry("edit", tuple(operations), None), outcome)
+        return Planned(self._entry("edit", tuple(operations), None, who), outcome)
 
-    def plan_undo(self, *, base_revision: int | None = None) -> Planned:
+    def plan_undo(self, *, base_revision: int | None = None, who: str = "") -> Planned:
         """What taking back the last edit in effect would lead to.
 
         Raises:
@@ -139,10 +143,14 @@ class Scenario:
         edit = self._done[-1]
         state = self._state_after(len(self._done) - 1)
         outcome = EditOutcome(state=state, created=(), inverse=edit.operations, warnings=())
-        return Planned(self._entry("undo", (), edit.revision), outcome)
+        return Planned(self._entry("undo", (), edit.revision, who), outcome)
 
     def plan_redo(
-        self, *, base_revision: int | None = None, ground: GroundHeight | None = None
+        self,
+        *,
+        base_revision: int | None = None,
+        ground: GroundHeight | None = None,
+        who: str = "",
     ) -> Planned:
         """What bringing back the last undone edit would lead to.
 
@@ -157,7 +165,7 @@ class Scenario:
             )
         edit = self._undone[-1]
         outcome = apply_operations(self.state, edit.operations, ground=ground)
-        return Planned(self._entry("redo", (), edit.revision), outcome)
+        return Planned(self._entry("redo", (), edit.revision, who), outcome)
 
     def commit(self, planned: Planned) -> EditOutcome:
         """Let a planned entry take effect; the outcome.
@@ -198,9 +206,10 @@ class Scenario:
         kind: Literal["edit", "undo", "redo"],
         operations: tuple[Operation, ...],
         target: int | None,
+        who: str,
     ) -> LogEntry:
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        return LogEntry(self.revision + 1, kind, operations, target, now)
+        return LogEntry(self.revision + 1, kind, operations, target, now, who)
 
     def _append(self, entry: LogEntry) -> None:
         """Book an entry; states are not touched, but those of another past are forgotten."""

@@ -17,7 +17,18 @@ from ..settings import Settings
 from .auth import require_token
 from .problems import install_problem_handlers
 from .requests import BodyLimit, RequestContext
-from .routes import drive, health, scenarios, scene_imports, scenes, server, sessions
+from .routes import (
+    assets,
+    drive,
+    exports,
+    health,
+    jobs,
+    scenarios,
+    scene_imports,
+    scenes,
+    server,
+    sessions,
+)
 from .worker import Worker
 
 PROTECTED: tuple[APIRouter, ...] = (
@@ -25,6 +36,9 @@ PROTECTED: tuple[APIRouter, ...] = (
     scenes.router,
     scene_imports.router,
     scenarios.router,
+    assets.router,
+    jobs.router,
+    exports.router,
 )
 """Routers behind the worker's token."""
 
@@ -55,7 +69,8 @@ def create_app(settings: Settings) -> FastAPI:
         redoc_url=None,
     )
     app.state.worker = worker
-    uploads = dict.fromkeys(scene_imports.UPLOAD_PATHS, settings.max_upload_bytes)
+    upload_paths = (*scene_imports.UPLOAD_PATHS, assets.UPLOAD_PATH)
+    uploads = dict.fromkeys(upload_paths, settings.max_upload_bytes)
     install_problem_handlers(app)
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
     app.add_middleware(RequestContext, metrics=worker.metrics)

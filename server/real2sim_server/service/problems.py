@@ -114,9 +114,9 @@ def _of_edit(error: EditError) -> ServiceError:
     return ServiceError(error.code, str(error), hint=error.hint, errors=errors)
 
 
-def problem_response(error: ServiceError, *, path: str, request_id: str | None) -> Response:
-    """The answer that carries ``error``."""
-    problem = Problem(
+def problem_of(error: ServiceError, *, path: str, request_id: str | None) -> Problem:
+    """The problem document of ``error``."""
+    return Problem(
         type=f"urn:real2sim:problem:{error.code.value.lower().replace('_', '-')}",
         title=title_of(error.code),
         status=error.status,
@@ -129,6 +129,11 @@ def problem_response(error: ServiceError, *, path: str, request_id: str | None) 
         errors=error.errors,
         **error.extra,
     )
+
+
+def problem_response(error: ServiceError, *, path: str, request_id: str | None) -> Response:
+    """The answer that carries ``error``."""
+    problem = problem_of(error, path=path, request_id=request_id)
     return Response(
         json.dumps(problem.model_dump(mode="json", exclude_none=True)),
         status_code=error.status,

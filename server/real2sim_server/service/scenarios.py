@@ -8,7 +8,6 @@ from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any
 
 from real2sim_proto import ErrorCode
@@ -18,17 +17,32 @@ from real2sim_proto.scenarios import (
     HistoryEntry,
     OperationResult,
     ScenarioCreate,
+    ScenarioDocument,
+    ScenarioFork,
     ScenarioInfo,
 )
 
-from ..edit import LogEntry, Planned, Scenario, ScenarioState
+from ..edit import AssetLookup, Planned, Scenario
 from ..scene.io import SceneSummary
 from .idempotency import Once
+from .library import BUNDLE_SUFFIX
 from .metrics import Metrics
 from .problems import ServiceError
 from .residency import Residency
+from .scenario_replies import (
+    ScenarioView,
+    asset_hashes,
+    created_headers,
+    history_entry,
+    iso_time,
+    listed_info,
+    operation_result,
+    replayed,
+    replayed_from_store,
+    stale_revision,
+    tag,
+)
 from .store import ConflictError, ScenarioRow, Store, now_us
-from .views import edited_objects, etag
 
 KEPT_IN_MEMORY = 256
 """Scenarios kept ready; others are rebuilt from the store when they are asked for."""
@@ -48,32 +62,22 @@ class _Held:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-@dataclass(frozen=True, eq=False)
-class ScenarioView:
-    """A scenario at one revision: for answers, previews and new sessions. Never changes."""
-
-    row: ScenarioRow
-    summary: SceneSummary
-    state: ScenarioState
-    revision: int
-    can_undo: bool
-    can_redo: bool
-
-    def info(self, *, tracks: bool = True) -> ScenarioInfo:
-        """What the wire says about it; takes milliseconds where there are many trajectories."""
-        return ScenarioInfo(
-            **_head(self.row, self.revision),
-            can_undo=self.can_undo,
-            can_redo=self.can_redo,
-            objects=edited_objects(self.state.visible, self.summary, tracks=tracks),
-        )
+__all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 
 
 class Scenarios:
     """All scenarios of a worker. Belongs to the event loop."""
 
-    def __init__(self, store: Store, residency: Residency, metrics: Metrics) -> None:
+    def __init__(
+        self,
+        store: Store,
+        residency: Residency,
+        metrics: Metrics,
+        *,
+        assets: AssetLookup | None = None,
+    ) -> None:
         self._store = store
+        self._assets = assets
         self._residency = residency
         self._metrics = metrics
         self._held: OrderedDict[str, _Held] = OrderedDict()
@@ -84,20 +88,58 @@ class Scenarios:
     async def create(self, request: ScenarioCreate, *, once: Once) -> ScenarioInfo:
         """A new scenario, stored. Raises ServiceError: UNKNOWN_SCENE or SCENE_BROKEN."""
         summary = await self._residency.summary(request.scene)
-        row = ScenarioRow(
-            scenario_id=f"sc_{secrets.token_hex(8)}",
-            name=request.name,
-            scene=request.scene,
-            scene_hash=summary.content_hash,
-            created_us=now_us(),
+        return await self._create(request.name, request.scene, summary, [], once=once)
+
+    async def fork(self, scenario_id: str, request: ScenarioFork, *, once: Once) -> ScenarioInfo:
+        """A new scenario with the same history, up to a revision.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENARIO, or INVALID_REQUEST for a revision that is not there.
+        """
+        held = await self._hold(scenario_id)
+        entries = list(held.scenario.entries)
+        revision = len(entries) if request.revision is None else request.revision
+        if revision > len(entries):
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"scenario {scenario_id!r} has {len(entries)} revisions; {revision} is not there",
+                hint="leave revision out to fork what it is now",
+            )
+        name = held.row.name if request.name is None else request.name
+        log = [history_entry(e) for e in entries[:revision]]
+        return await self._create(name, held.row.scene, held.summary, log, once=once)
+
+    async def export(self, scenario_id: str) -> ScenarioDocument:
+        """The scenario as one file. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
+        held = await self._hold(scenario_id)
+        return ScenarioDocument(
+            name=held.row.name,
+            scene=held.row.scene,
+            scene_hash=held.row.scene_hash,
+            assets=asset_hashes(held.scenario.entries, self._assets),
+            entries=[history_entry(e) for e in held.scenario.entries],
+            exported_at=iso_time(now_us()),
         )
-        scenario = await asyncio.to_thread(_replay, row, summary, [])
-        held = _Held(row, scenario, summary)
-        info = _view(held).info(tracks=False)
-        reply = once.reply(info, status=201, headers=created_headers(info))
-        await self._store.create_scenario(row, reply=reply)
-        self._keep(held)
-        return info
+
+    async def import_(self, document: ScenarioDocument, *, once: Once) -> ScenarioInfo:
+        """A new scenario from a file, on the scene of its hash.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENE or UNKNOWN_ASSET where what it names is not here;
+                INVALID_OPERATION for a log that does not fit its scene.
+        """
+        summary = await self._summary_of(document)
+        for asset_id, content_hash in document.assets.items():
+            found = self._assets(asset_id) if self._assets else None
+            if found is None or getattr(found, "content_hash", "") != content_hash:
+                raise ServiceError(
+                    ErrorCode.UNKNOWN_ASSET,
+                    f"the scenario uses asset {asset_id!r} with hash {content_hash[:12]}; it is "
+                    "not in this library",
+                    hint="add it with POST /v1/assets under that id first",
+                )
+        scene = summary.path.name.removesuffix(BUNDLE_SUFFIX)
+        return await self._create(document.name, scene, summary, document.entries, once=once)
 
     async def delete(self, scenario_id: str) -> None:
         """Remove a scenario and its history. Raises ServiceError: UNKNOWN_SCENARIO."""
@@ -111,7 +153,7 @@ class Scenarios:
         """All scenarios, oldest first, without their objects; those of missing scenes too."""
         kinds = await self._store.scenario_kinds()
         rows = await self._store.scenarios()
-        return [_listed(row, kinds.get(row.scenario_id, [])) for row in rows]
+        return [listed_info(row, kinds.get(row.scenario_id, [])) for row in rows]
 
     async def view(self, scenario_id: str) -> ScenarioView:
         """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
@@ -124,7 +166,7 @@ class Scenarios:
             revision=scenario.revision,
             can_undo=scenario.can_undo,
             can_redo=scenario.can_redo,
-            entries=[_history_entry(e) for e in scenario.entries[max(0, after) :]],
+            entries=[history_entry(e) for e in scenario.entries[max(0, after) :]],
         )
 
     # --- editing ----------------------------------------------------------------------------
@@ -137,6 +179,7 @@ class Scenarios:
         expected: int | None,
         dry_run: bool,
         once: Once,
+        who: str = "",
     ) -> OperationResult:
         """Apply operations, all or none.
 
@@ -146,32 +189,81 @@ class Scenarios:
             expected: revision they were made for; None for any.
             dry_run: check and answer, change nothing.
             once: what the answer is stored under.
+            who: goes on record.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO; STALE_REVISION, with the missed entries as member
                 ``missed``; UNKNOWN_OBJECT or INVALID_OPERATION.
         """
         result = await self._change(
-            scenario_id, lambda s: s.plan_edit(operations), expected, dry_run=dry_run, once=once
+            scenario_id,
+            lambda s: s.plan_edit(operations, who=who),
+            expected,
+            dry_run=dry_run,
+            once=once,
         )
         if not dry_run:
             for op, count in Counter(o.op for o in operations).items():
                 self._metrics.edits.labels(op).inc(count)
         return result
 
-    async def undo(self, scenario_id: str, *, expected: int | None, once: Once) -> OperationResult:
+    async def undo(
+        self, scenario_id: str, *, expected: int | None, once: Once, who: str = ""
+    ) -> OperationResult:
         """Take back the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
-        result = await self._change(scenario_id, Scenario.plan_undo, expected, once=once)
+        result = await self._change(
+            scenario_id, lambda s: s.plan_undo(who=who), expected, once=once
+        )
         self._metrics.edits.labels("undo").inc()
         return result
 
-    async def redo(self, scenario_id: str, *, expected: int | None, once: Once) -> OperationResult:
+    async def redo(
+        self, scenario_id: str, *, expected: int | None, once: Once, who: str = ""
+    ) -> OperationResult:
         """Bring back the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
-        result = await self._change(scenario_id, Scenario.plan_redo, expected, once=once)
+        result = await self._change(
+            scenario_id, lambda s: s.plan_redo(who=who), expected, once=once
+        )
         self._metrics.edits.labels("redo").inc()
         return result
 
     # --- inside -----------------------------------------------------------------------------
+
+    async def _create(
+        self,
+        name: str,
+        scene: str,
+        summary: SceneSummary,
+        log: Sequence[HistoryEntry],
+        *,
+        once: Once,
+    ) -> ScenarioInfo:
+        row = ScenarioRow(
+            scenario_id=f"sc_{secrets.token_hex(8)}",
+            name=name,
+            scene=scene,
+            scene_hash=summary.content_hash,
+            created_us=now_us(),
+        )
+        scenario = await asyncio.to_thread(replayed, row, summary, log, self._assets)
+        held = _Held(row, scenario, summary)
+        info = _view(held).info(tracks=False)
+        reply = once.reply(info, status=201, headers=created_headers(info))
+        entries = [entry.model_dump(mode="json") for entry in log]
+        await self._store.create_scenario(row, entries=entries, reply=reply)
+        self._keep(held)
+        return info
+
+    async def _summary_of(self, document: ScenarioDocument) -> SceneSummary:
+        for listing in (await self._residency.refresh()).values():
+            if listing.summary and listing.summary.content_hash == document.scene_hash:
+                return listing.summary
+        raise ServiceError(
+            ErrorCode.UNKNOWN_SCENE,
+            f"the scenario was made on scene {document.scene!r} with hash "
+            f"{document.scene_hash[:12]}; no scene here has it",
+            hint="put that bundle into the scene folder, or POST /v1/scenes to import it",
+        )
 
     async def _change(
         self,
@@ -186,12 +278,12 @@ class Scenarios:
             scenario = held.scenario
             if expected is not None and expected != scenario.revision:
                 self._metrics.edit_conflicts.inc()
-                raise _stale(scenario, expected)
+                raise stale_revision(scenario, expected)
             # Overlap checks of large batches take milliseconds; they need no device.
             planned = await asyncio.to_thread(plan, scenario)
             if dry_run:
-                return _result(planned, revision=scenario.revision, dry_run=True)
-            result = _result(planned, revision=planned.entry.revision)
+                return operation_result(planned, revision=scenario.revision, dry_run=True)
+            result = operation_result(planned, revision=planned.entry.revision)
             await self._record(held, planned, once.reply(result, status=200, headers=tag(result)))
             scenario.commit(planned)
             return result
@@ -203,7 +295,7 @@ class Scenarios:
             await self._store.append_scenario_entry(
                 scenario_id,
                 entry.revision,
-                _history_entry(entry).model_dump(mode="json"),
+                history_entry(entry).model_dump(mode="json"),
                 created_us=now_us(),
                 reply=reply,
             )
@@ -259,66 +351,14 @@ class Scenarios:
                 hint="put the old bundle back, or start a new scenario",
             )
         entries = await self._store.scenario_entries(scenario_id)
-        return _Held(row, await asyncio.to_thread(_replay, row, summary, entries), summary)
+        scenario = await asyncio.to_thread(replayed_from_store, row, summary, entries, self._assets)
+        return _Held(row, scenario, summary)
 
     def _keep(self, held: _Held) -> None:
         self._held[held.row.scenario_id] = held
         if len(self._held) > KEPT_IN_MEMORY:
             for key in [k for k, h in self._held.items() if not h.lock.locked()][:-KEPT_IN_MEMORY]:
                 del self._held[key]
-
-
-def created_headers(info: ScenarioInfo) -> dict[str, str]:
-    """Headers of the answer to a creation."""
-    return {"Location": f"/v1/scenarios/{info.scenario_id}", "ETag": info.etag}
-
-
-def tag(result: OperationResult) -> dict[str, str]:
-    """Headers of the answer to a change."""
-    return {"ETag": result.etag}
-
-
-def _replay(row: ScenarioRow, summary: SceneSummary, entries: list[dict[str, Any]]) -> Scenario:
-    log = [HistoryEntry.model_validate(entry) for entry in entries]
-    return Scenario.replay(
-        ScenarioState.of(summary),
-        [LogEntry(e.revision, e.kind, tuple(e.operations), e.target, e.created_at) for e in log],
-        scene=row.scene,
-        scene_hash=row.scene_hash,
-    )
-
-
-def _history_entry(entry: LogEntry) -> HistoryEntry:
-    return HistoryEntry(
-        revision=entry.revision,
-        kind=entry.kind,
-        operations=list(entry.operations),
-        target=entry.target,
-        created_at=entry.created_at,
-    )
-
-
-def _result(planned: Planned, *, revision: int, dry_run: bool = False) -> OperationResult:
-    return OperationResult(
-        revision=revision,
-        etag=etag(revision),
-        created=list(planned.outcome.created),
-        inverse=list(planned.outcome.inverse),
-        warnings=list(planned.outcome.warnings),
-        dry_run=dry_run,
-    )
-
-
-def _stale(scenario: Scenario, expected: int) -> ServiceError:
-    entries = scenario.entries[max(0, expected) :]
-    missed = [_history_entry(e).model_dump(mode="json") for e in entries]
-    return ServiceError(
-        ErrorCode.STALE_REVISION,
-        f"the edit was made for revision {expected}; the scenario is at {scenario.revision}",
-        hint="look at the missed entries and send the edit again with the new revision",
-        extra={"revision": scenario.revision, "missed": missed},
-        headers={"ETag": etag(scenario.revision)},
-    )
 
 
 def _view(held: _Held) -> ScenarioView:
@@ -331,29 +371,3 @@ def _view(held: _Held) -> ScenarioView:
         can_undo=scenario.can_undo,
         can_redo=scenario.can_redo,
     )
-
-
-def _listed(row: ScenarioRow, kinds: Sequence[str]) -> ScenarioInfo:
-    done = undone = 0
-    for kind in kinds:
-        match kind:
-            case "edit":
-                done, undone = done + 1, 0
-            case "undo":
-                done, undone = done - 1, undone + 1
-            case _:
-                done, undone = done + 1, undone - 1
-    return ScenarioInfo(**_head(row, len(kinds)), can_undo=done > 0, can_redo=undone > 0)
-
-
-def _head(row: ScenarioRow, revision: int) -> dict[str, Any]:
-    created = datetime.fromtimestamp(row.created_us / 1e6, UTC)
-    return {
-        "scenario_id": row.scenario_id,
-        "name": row.name,
-        "scene": row.scene,
-        "scene_hash": row.scene_hash,
-        "revision": revision,
-        "etag": etag(revision),
-        "created_at": created.isoformat(timespec="milliseconds"),
-    }

@@ -16,6 +16,19 @@ from sqlalchemy.engine import Connection, make_url
 from sqlalchemy.exc import IntegrityError
 
 from . import tables as t
+from .rows import ScenarioRow, SessionEntry, SessionRow, StoredReply
+
+__all__ = [
+    "ConflictError",
+    "ScenarioRow",
+    "SessionEntry",
+    "SessionRow",
+    "Store",
+    "StoreError",
+    "StoredReply",
+    "Write",
+    "now_us",
+]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,72 +42,6 @@ class StoreError(RuntimeError):
 
 class ConflictError(StoreError):
     """A row that must be new exists already: another writer was first."""
-
-
-@dataclass(frozen=True)
-class ScenarioRow:
-    """A scenario as created; its edits are in the log."""
-
-    scenario_id: str
-    name: str
-    scene: str
-    scene_hash: str
-    created_us: int
-
-
-@dataclass(frozen=True)
-class SessionRow:
-    """A session as created.
-
-    Attributes:
-        scenario_id, scenario_revision: what it began from; None for the bare scene.
-        closed_us, reason: None while it is open.
-    """
-
-    session_id: str
-    worker_id: str
-    scene: str
-    scene_hash: str
-    scenario_id: str | None
-    scenario_revision: int | None
-    token: str
-    created_us: int
-    closed_us: int | None = None
-    reason: str | None = None
-
-
-@dataclass(frozen=True)
-class SessionEntry:
-    """One thing that happened to a session.
-
-    Attributes:
-        seq: position in the session's log, from 0.
-        kind: ``reset``, ``action`` or ``edit``.
-        step: step of the clock it belongs to.
-        payload: msgpack or JSON of the message.
-    """
-
-    seq: int
-    kind: str
-    step: int | None
-    payload: bytes
-    created_us: int
-
-
-@dataclass(frozen=True)
-class StoredReply:
-    """An answer kept for a request that may be repeated with the same Idempotency-Key.
-
-    Attributes:
-        key: the header's value together with the call it was sent to.
-        fingerprint: SHA-256 of what was asked; another one under the same key is refused.
-    """
-
-    key: str
-    fingerprint: str
-    status: int
-    headers: Mapping[str, str]
-    body: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,9 +82,18 @@ class Store:
 
     # --- scenarios --------------------------------------------------------------------------
 
-    async def create_scenario(self, row: ScenarioRow, *, reply: StoredReply | None = None) -> None:
-        """Add a scenario, and in the same transaction the answer to the request for it."""
-        await self._write(_added(t.scenarios, asdict(row)), *_keep(reply))
+    async def create_scenario(
+        self,
+        row: ScenarioRow,
+        *,
+        entries: Sequence[Mapping[str, Any]] = (),
+        reply: StoredReply | None = None,
+    ) -> None:
+        """Add a scenario with a log that it may have, and in the same transaction the answer to
+        the request for it; ``entries`` hold their revisions."""
+        rows = [_log_row(row.scenario_id, e["revision"], e, row.created_us) for e in entries]
+        log = [_added(t.scenario_log, *rows)] if rows else []
+        await self._write(_added(t.scenarios, asdict(row)), *log, *_keep(reply))
 
     async def scenario(self, scenario_id: str) -> ScenarioRow | None:
         """The scenario of that id."""
@@ -180,13 +136,7 @@ class Store:
         Raises:
             ConflictError: the revision exists, or the scenario does not.
         """
-        row = {
-            "scenario_id": scenario_id,
-            "revision": revision,
-            "kind": entry["kind"],
-            "entry": json.dumps(entry, allow_nan=False),
-            "created_us": created_us,
-        }
+        row = _log_row(scenario_id, revision, entry, created_us)
         await self._write(_added(t.scenario_log, row), *_keep(reply))
 
     async def scenario_entries(self, scenario_id: str) -> list[dict[str, Any]]:
@@ -261,6 +211,20 @@ class Store:
         row = rows[0]
         headers = json.loads(row["headers"])
         return StoredReply(key, row["fingerprint"], row["status"], headers, row["body"])
+
+    # --- whatever else is kept here ---------------------------------------------------------
+
+    async def read(self, query: sa.Select[Any]) -> list[dict[str, Any]]:
+        """Rows of a query."""
+        return await self._read(query)
+
+    async def write(self, *changes: Write, reply: StoredReply | None = None) -> list[int]:
+        """Rows changed by each statement, in one transaction, also with the answer to a request.
+
+        Raises:
+            ConflictError: a row that must be new exists.
+        """
+        return await self._write(*changes, *_keep(reply))
 
     # --- inside -----------------------------------------------------------------------------
 
@@ -359,6 +323,18 @@ def _prepare_schema(connection: Connection) -> None:
 def _delete_old_replies() -> sa.Delete:
     table = t.idempotent_replies
     return sa.delete(table).where(table.c.created_us <= now_us() - REPLY_LIFETIME_US)
+
+
+def _log_row(
+    scenario_id: str, revision: int, entry: Mapping[str, Any], created_us: int
+) -> dict[str, Any]:
+    return {
+        "scenario_id": scenario_id,
+        "revision": revision,
+        "kind": entry["kind"],
+        "entry": json.dumps(entry, allow_nan=False),
+        "created_us": created_us,
+    }
 
 
 def _added(table: sa.Table, *rows: Mapping[str, Any]) -> Write:

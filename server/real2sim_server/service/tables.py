@@ -80,6 +80,20 @@ session_log = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("job_id", String(80), primary_key=True),
+    Column("worker_id", String(16), nullable=False),
+    Column("kind", String(16), nullable=False),
+    Column("subject", String(80), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("document", Text, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+Index("ix_jobs_created", jobs.c.created_us)
+Index("ix_jobs_state", jobs.c.worker_id, jobs.c.state)
+
 idempotent_replies = Table(
     "idempotent_replies",
     metadata,

@@ -73,10 +73,14 @@ def edited_objects(
             category=o.category,
             size=o.scaled_size,
             instance_id=o.instance_id,
-            gaussians=gaussians[o.source_id],
+            gaussians=o.asset.gaussians if o.asset else gaussians[o.source_id],
             start_us=o.trajectory.start_us,
             end_us=o.trajectory.end_us,
             trajectory=track(o.trajectory) if tracks else None,
+            recorded_id=None if o.asset else o.source_id,
+            asset_id=o.asset.asset_id if o.asset else None,
+            physics=o.physics,
+            velocity=o.velocity,
         )
         for o in objects
     ]

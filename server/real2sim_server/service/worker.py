@@ -19,8 +19,11 @@ from real2sim_proto.scenes import DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
 from ..settings import Settings
+from .assets import AssetLibrary
 from .engine import Engine
 from .idempotency import Idempotency
+from .job_log import JobLog
+from .jobs import Jobs
 from .library import Library
 from .metrics import Metrics
 from .pictures import Pictures
@@ -28,6 +31,7 @@ from .residency import Residency
 from .scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.show import Show
+from .simulations import Simulations
 from .store import Store
 
 LAG_PERIOD_S = 0.1
@@ -51,6 +55,9 @@ class Worker:
     store: Store
     residency: Residency
     scenarios: Scenarios
+    assets: AssetLibrary
+    jobs: Jobs
+    simulations: Simulations
     idempotency: Idempotency
     pictures: Pictures
     sessions: Sessions
@@ -81,7 +88,9 @@ class Worker:
             on_load=metrics.scene_loads.observe,
         )
         store = Store(settings.database_url)
-        scenarios = Scenarios(store, residency, metrics)
+        assets = AssetLibrary(settings.assets_path)
+        scenarios = Scenarios(store, residency, metrics, assets=assets.find)
+        jobs = Jobs(JobLog(store, settings.worker_id), settings.jobs_path)
         pictures = Pictures(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(
             settings=settings,
@@ -90,6 +99,9 @@ class Worker:
             store=store,
             residency=residency,
             scenarios=scenarios,
+            assets=assets,
+            jobs=jobs,
+            simulations=Simulations(jobs, scenarios, residency),
             idempotency=Idempotency(store),
             pictures=pictures,
             sessions=Sessions(
@@ -127,6 +139,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
             await at_exit.enter_async_context(self.sessions.running())
+            await at_exit.enter_async_context(self.jobs.running())
             at_exit.callback(self._drain)
             yield self
 

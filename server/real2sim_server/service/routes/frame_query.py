@@ -22,7 +22,7 @@ class FrameQuery:
 
     camera: Annotated[Identifier, Query(description="camera of the rig")]
     t_us: Annotated[
-        Microseconds | None, Query(description="simulation time; default: start of the recording")
+        Microseconds | None, Query(description="simulation time; default: start of the scenario")
     ] = None
     width: Annotated[
         int | None, Query(ge=16, le=8192, description="[px]; default: as recorded")
@@ -42,7 +42,7 @@ class FrameQuery:
         Raises:
             TimeOutOfRangeError: ``t_us`` outside the recording.
         """
-        t_us = scene.start_us if self.t_us is None else self.t_us
+        t_us = state.clock[0] if self.t_us is None else self.t_us
         sensor = SensorSpec(
             camera=self.camera,
             modalities=[self.modality],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -10,16 +11,20 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.base import Identifier
 from real2sim_proto.scenarios import (
     History,
     OperationBatch,
     OperationResult,
     ScenarioCreate,
+    ScenarioDocument,
+    ScenarioFork,
     ScenarioInfo,
     ScenarioList,
 )
 
 from ..answers import FRAME_RESPONSES, frame_response, info_response, large_response
+from ..clients import ClientName
 from ..disconnects import unless_gone
 from ..idempotency import IdempotencyKey, Once
 from ..problems import ServiceError
@@ -48,6 +53,7 @@ class Change:
     request: Request
     if_match: IfMatch = None
     idempotency_key: IdempotencyKey = None
+    who: ClientName = ""
 
     @property
     def expected(self) -> int | None:
@@ -80,15 +86,33 @@ async def list_scenarios(worker: WorkerOf) -> ScenarioList:
     return ScenarioList(scenarios=await worker.scenarios.list())
 
 
+@router.post("/import", status_code=201, response_model=ScenarioInfo)
+async def import_(
+    worker: WorkerOf,
+    body: ScenarioDocument,
+    request: Request,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A new scenario from a file that `GET .../export` gave, here or elsewhere.
+
+    Its scene is found by hash. The whole history comes along, undo and redo included.
+    """
+    async with worker.idempotency.once(request, idempotency_key) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        info = await worker.scenarios.import_(body, once=once)
+        return info_response(info, status=201, headers=created_headers(info))
+
+
 @router.get("/{scenario_id}", response_model=ScenarioInfo)
-async def describe(worker: WorkerOf, scenario_id: str) -> Response:
+async def describe(worker: WorkerOf, scenario_id: Identifier) -> Response:
     """One scenario with all its objects as they are now."""
     view = await worker.scenarios.view(scenario_id)
     return await large_response(view.info, headers={"ETag": etag(view.revision)})
 
 
 @router.delete("/{scenario_id}", status_code=204, response_class=Response)
-async def delete(worker: WorkerOf, scenario_id: str) -> Response:
+async def delete(worker: WorkerOf, scenario_id: Identifier) -> Response:
     """Remove a scenario and its history. Sessions that began from it go on."""
     await worker.scenarios.delete(scenario_id)
     return Response(status_code=204)
@@ -97,7 +121,7 @@ async def delete(worker: WorkerOf, scenario_id: str) -> Response:
 @router.post("/{scenario_id}/operations", response_model=OperationResult)
 async def edit(
     worker: WorkerOf,
-    scenario_id: str,
+    scenario_id: Identifier,
     body: OperationBatch,
     change: ChangeOf,
 ) -> Response:
@@ -106,14 +130,19 @@ async def edit(
         if once.replay:
             return worker.replayed(once.replay)
         result = await worker.scenarios.edit(
-            scenario_id, body.operations, expected=change.expected, dry_run=body.dry_run, once=once
+            scenario_id,
+            body.operations,
+            expected=change.expected,
+            dry_run=body.dry_run,
+            once=once,
+            who=change.who,
         )
         return info_response(result, headers=tag(result))
 
 
 @router.get("/{scenario_id}/operations")
 async def history(
-    worker: WorkerOf, scenario_id: str, after: Annotated[int, Query(ge=0)] = 0
+    worker: WorkerOf, scenario_id: Identifier, after: Annotated[int, Query(ge=0)] = 0
 ) -> History:
     """Revisions behind ``after``, oldest first."""
     return await worker.scenarios.history(scenario_id, after=after)
@@ -122,40 +151,69 @@ async def history(
 @router.post("/{scenario_id}/undo", response_model=OperationResult)
 async def undo(
     worker: WorkerOf,
-    scenario_id: str,
+    scenario_id: Identifier,
     change: ChangeOf,
 ) -> Response:
     """Take back the last batch that is in effect."""
     async with change.once(worker) as once:
         if once.replay:
             return worker.replayed(once.replay)
-        result = await worker.scenarios.undo(scenario_id, expected=change.expected, once=once)
+        result = await worker.scenarios.undo(
+            scenario_id, expected=change.expected, once=once, who=change.who
+        )
         return info_response(result, headers=tag(result))
 
 
 @router.post("/{scenario_id}/redo", response_model=OperationResult)
 async def redo(
     worker: WorkerOf,
-    scenario_id: str,
+    scenario_id: Identifier,
     change: ChangeOf,
 ) -> Response:
     """Bring back the last batch that was undone."""
     async with change.once(worker) as once:
         if once.replay:
             return worker.replayed(once.replay)
-        result = await worker.scenarios.redo(scenario_id, expected=change.expected, once=once)
+        result = await worker.scenarios.redo(
+            scenario_id, expected=change.expected, once=once, who=change.who
+        )
         return info_response(result, headers=tag(result))
+
+
+@router.post("/{scenario_id}/fork", status_code=201, response_model=ScenarioInfo)
+async def fork(
+    worker: WorkerOf,
+    scenario_id: Identifier,
+    request: Request,
+    body: ScenarioFork | None = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A new scenario with the same history, up to a revision; the two go separate ways."""
+    async with worker.idempotency.once(request, idempotency_key) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        info = await worker.scenarios.fork(scenario_id, body or ScenarioFork(), once=once)
+        return info_response(info, status=201, headers=created_headers(info))
+
+
+@router.get("/{scenario_id}/export", response_model=ScenarioDocument)
+async def export(worker: WorkerOf, scenario_id: Identifier) -> Response:
+    """The scenario with its whole history as one JSON file that names its scene by hash."""
+    document = await worker.scenarios.export(scenario_id)
+    name = f"{scenario_id}.scenario.json"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return await large_response(lambda: document, headers=headers)
 
 
 @router.get("/{scenario_id}/preview", responses=FRAME_RESPONSES, response_class=Response)
 async def preview(
-    worker: WorkerOf, scenario_id: str, asked: FrameQueryOf, request: Request
+    worker: WorkerOf, scenario_id: Identifier, asked: FrameQueryOf, request: Request
 ) -> Response:
     """One frame of the scenario as it is now, from where the recording vehicle was at ``t_us``."""
     media_type = asked.media_type()
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.residency.get(view.row.scene)
-    shot = asked.shot(scene, view.state, media_type)
+    shot = await asyncio.to_thread(asked.shot, scene, view.state, media_type)
     pictured = await unless_gone(request, worker.pictures.take(shot))
     return frame_response(pictured, media_type, revision=view.revision)
 

@@ -1,0 +1,173 @@
+"""The asset library: upload, cut out, look."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+from starlette.datastructures import UploadFile
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
+from real2sim_proto.base import Identifier
+
+from ...render import encode_image
+from ..answers import info_response
+from ..assets import LibraryAsset, cut_out, uploaded
+from ..imports import scene_name
+from ..problems import ServiceError
+from ..thumbnails import draw_thumbnail
+from ..worker import Worker, WorkerOf
+
+UPLOAD_PATH = "/v1/assets"
+ENDINGS = (".compressed.ply", ".ply", ".spz", ".splat")
+
+_UPLOAD_SCHEMA = AssetUpload.model_json_schema()
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": AssetCut.model_json_schema(),
+                "example": {"scene": "street", "object_id": "car_3", "asset_id": "red_car"},
+            },
+            "multipart/form-data": {
+                "schema": _UPLOAD_SCHEMA
+                | {
+                    "required": ["file"],
+                    "properties": {
+                        "file": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": ".ply, .compressed.ply, .spz or .splat",
+                        }
+                    }
+                    | _UPLOAD_SCHEMA["properties"],
+                }
+            },
+        },
+    }
+}
+
+M = TypeVar("M", bound=BaseModel)
+
+router = APIRouter(prefix="/v1/assets", tags=["assets"])
+
+
+@router.post("", status_code=201, response_model=AssetInfo, openapi_extra=_BODY)
+async def add(worker: WorkerOf, request: Request) -> Response:
+    """Add an asset: an object cut out of a scene (JSON), or an uploaded splat file (form).
+
+    Assets stand upright with x forward, at a real size, and never change: an id that is taken
+    stays taken.
+    """
+    kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
+    if kind == "multipart/form-data":
+        kept = await _upload(worker, request)
+    else:
+        kept = await _cut(worker, _parsed(AssetCut, await request.body()))
+    info = kept.info()
+    headers = {"Location": f"/v1/assets/{info.asset_id}"}
+    return info_response(info, status=201, headers=headers)
+
+
+@router.get("")
+async def list_assets(worker: WorkerOf) -> AssetList:
+    """The whole library."""
+    assets = await asyncio.to_thread(worker.assets.list)
+    return AssetList(assets=[asset.info() for asset in assets])
+
+
+@router.get("/{asset_id}")
+async def describe(worker: WorkerOf, asset_id: Identifier) -> AssetInfo:
+    """One asset."""
+    return (await asyncio.to_thread(worker.assets.get, asset_id)).info()
+
+
+@router.get(
+    "/{asset_id}/thumbnail",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "picture",
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def thumbnail(
+    worker: WorkerOf, asset_id: Identifier, width: Annotated[int, Query(ge=32, le=1024)] = 256
+) -> Response:
+    """A picture of the asset from its front left, three quarters as high as it is wide."""
+    asset = (await asyncio.to_thread(worker.assets.get, asset_id)).asset
+    pixels = await worker.engine.call(
+        draw_thumbnail, asset, width=width, backend=worker.backend, label="thumbnail"
+    )
+    encoded = await asyncio.to_thread(encode_image, pixels, "rgb", "png", quality=90)
+    # The same id is the same asset for ever.
+    headers = {"Cache-Control": "public, max-age=86400, immutable"}
+    return Response(encoded.data, media_type="image/png", headers=headers)
+
+
+async def _cut(worker: Worker, asked: AssetCut) -> LibraryAsset:
+    scene = await worker.residency.get(asked.scene)
+    asset_id = asked.asset_id or asked.object_id
+
+    def work() -> LibraryAsset:
+        asset = cut_out(scene, asked.object_id, asset_id=asset_id, category=asked.category)
+        return worker.assets.add(asset)
+
+    return await worker.residency.on_disk_thread(work)
+
+
+async def _upload(worker: Worker, request: Request) -> LibraryAsset:
+    async with request.form(max_files=1, max_fields=len(AssetUpload.model_fields)) as form:
+        file = form.get("file")
+        if not isinstance(file, UploadFile):
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                "the form needs a part 'file' with the splat file",
+                hint="curl -F file=@car.ply -F category=car",
+            )
+        fields = {name: value for name, value in form.items() if name != "file"}
+        asked = _parsed(AssetUpload, fields)
+
+        def work() -> LibraryAsset:
+            asset_id = asked.asset_id or scene_name(Path(file.filename or "asset"), None)
+            stored = _stored(file, worker.assets.folder)
+            try:
+                return worker.assets.add(uploaded(stored, asked, asset_id=asset_id))
+            finally:
+                stored.unlink()
+
+        return await worker.residency.on_disk_thread(work)
+
+
+def _stored(file: UploadFile, folder: Path) -> Path:
+    """The upload as a hidden file: readers map files into memory, and know formats by endings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    given = Path(file.filename or "upload.ply").name.lower()
+    ending = next(
+        (e for e in (".compressed.ply", ".ply", ".spz", ".splat") if given.endswith(e)), ""
+    )
+    stored = folder / f".upload-{secrets.token_hex(6)}{ending or '.ply'}"
+    with stored.open("xb") as target:
+        shutil.copyfileobj(file.file, target, 1 << 20)
+    return stored
+
+
+def _parsed(model: type[M], given: bytes | Mapping[str, Any]) -> M:
+    """A model of a JSON body or of the fields of a form."""
+    try:
+        if isinstance(given, bytes):
+            return model.model_validate_json(given)
+        return model.model_validate(given)
+    except ValidationError as error:
+        found: list[Any] = [e | {"loc": ("body", *e["loc"])} for e in error.errors()]
+        raise RequestValidationError(found) from error

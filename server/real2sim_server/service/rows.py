@@ -1,0 +1,72 @@
+"""What the store keeps, row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ScenarioRow:
+    """A scenario as created; its edits are in the log."""
+
+    scenario_id: str
+    name: str
+    scene: str
+    scene_hash: str
+    created_us: int
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """A session as created.
+
+    Attributes:
+        scenario_id, scenario_revision: what it began from; None for the bare scene.
+        closed_us, reason: None while it is open.
+    """
+
+    session_id: str
+    worker_id: str
+    scene: str
+    scene_hash: str
+    scenario_id: str | None
+    scenario_revision: int | None
+    token: str
+    created_us: int
+    closed_us: int | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """One thing that happened to a session.
+
+    Attributes:
+        seq: position in the session's log, from 0.
+        kind: ``reset``, ``action`` or ``edit``.
+        step: step of the clock it belongs to.
+        payload: msgpack or JSON of the message.
+    """
+
+    seq: int
+    kind: str
+    step: int | None
+    payload: bytes
+    created_us: int
+
+
+@dataclass(frozen=True)
+class StoredReply:
+    """An answer kept for a request that may be repeated with the same Idempotency-Key.
+
+    Attributes:
+        key: the header's value together with the call it was sent to.
+        fingerprint: SHA-256 of what was asked; another one under the same key is refused.
+    """
+
+    key: str
+    fingerprint: str
+    status: int
+    headers: Mapping[str, str]
+    body: bytes

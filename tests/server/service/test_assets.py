@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.assets import AssetInfo
+from real2sim_server.scene.io import write_splats
+
+CUT = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}
+THERE = {"position": [20.0, 3.0, 5.0]}
+
+
+def create(client) -> str:
+    return client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
+
+
+def edit(client, scenario, *operations):
+    url = f"/v1/scenarios/{scenario}/operations"
+    return client.post(url, json={"operations": list(operations)})
+
+
+def objects(client, scenario) -> dict[str, dict]:
+    info = client.get(f"/v1/scenarios/{scenario}").json()
+    return {o["object_id"]: o for o in info["objects"]}
+
+
+def upload(client, path, **fields):
+    with path.open("rb") as file:
+        return client.post("/v1/assets", files={"file": (path.name, file)}, data=fields)
+
+
+@pytest.fixture(params=[".ply", ".compressed.ply", ".spz", ".splat"])
+def splat_file(request, tmp_path, tiny_scene):
+    path = tmp_path / f"thing{request.param}"
+    write_splats(tiny_scene.objects["car_red"].cloud, path)
+    return path
+
+
+def test_an_object_is_cut_out_of_a_scene_with_its_light(client):
+    answer = client.post("/v1/assets", json=CUT)
+    info = AssetInfo.model_validate(answer.json())
+    assert answer.status_code == 201
+    assert answer.headers["Location"] == "/v1/assets/red"
+    assert (info.category, info.size, info.gaussians) == ("car", (4.0, 1.8, 1.5), 60)
+    # The street of the test is grey, 0.4 throughout.
+    assert info.ambient == pytest.approx((0.4, 0.4, 0.4), abs=0.01)
+    assert client.get("/v1/assets").json()["assets"] == [answer.json()]
+    assert client.get("/v1/assets/red").json() == answer.json()
+
+
+def test_assets_never_change(client):
+    client.post("/v1/assets", json=CUT)
+    again = client.post("/v1/assets", json=CUT | {"object_id": "post"})
+    assert again.json()["code"] == ErrorCode.ALREADY_EXISTS
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"scene": "nowhere"}, ErrorCode.UNKNOWN_SCENE),
+        ({"object_id": "nobody"}, ErrorCode.UNKNOWN_OBJECT),
+        ({"asset_id": "../evil"}, ErrorCode.INVALID_REQUEST),
+        ({"colour": "red"}, ErrorCode.INVALID_REQUEST),
+    ],
+)
+def test_a_wrong_cut_is_refused(client, change, code):
+    assert client.post("/v1/assets", json=CUT | change).json()["code"] == code
+
+
+def test_every_splat_format_can_be_uploaded_at_a_real_size(client, splat_file):
+    answer = upload(client, splat_file, category="truck", up_axis="z", length="8")
+    info = AssetInfo.model_validate(answer.json())
+    assert answer.status_code == 201, answer.text
+    assert (info.asset_id, info.category) == ("thing", "truck")
+    assert info.size[0] == pytest.approx(8.0)
+    # As wide and high against its length as the file's Gaussians are.
+    assert info.size[1] / info.size[0] == pytest.approx(1.8 / 4.0, rel=0.1)
+
+
+def test_a_file_that_is_no_splat_is_refused_without_a_trace(client, tmp_path):
+    path = tmp_path / "thing.ply"
+    path.write_bytes(b"ply\nnot really")
+    answer = upload(client, path)
+    assert answer.json()["code"] == ErrorCode.IMPORT_FAILED
+    assert str(tmp_path) not in answer.text
+    assert client.get("/v1/assets").json()["assets"] == []
+
+
+def test_an_upload_without_a_file_is_refused(client):
+    answer = client.post("/v1/assets", files={"other": b"x"})
+    assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
+
+
+def test_a_thumbnail_shows_the_asset_on_a_light_floor(client):
+    client.post("/v1/assets", json=CUT)
+    answer = client.get("/v1/assets/red/thumbnail", params={"width": 128})
+    picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+    assert answer.headers["Content-Type"] == "image/png"
+    assert picture.shape == (96, 128, 3)
+    red, green, _ = picture[48, 64].astype(int)
+    assert red > 150 > 80 > green
+    assert picture[2, 2].min() > 200
+
+
+def test_an_inserted_asset_is_an_object_like_any_other(client):
+    client.post("/v1/assets", json=CUT)
+    scenario = create(client)
+    insert = {"op": "insert", "asset_id": "red", "pose": THERE}
+    result = edit(client, scenario, insert).json()
+    assert result["created"] == ["red_1"]
+    shown = objects(client, scenario)["red_1"]
+    assert (shown["asset_id"], shown["recorded_id"], shown["gaussians"]) == ("red", None, 60)
+    # It stands on the ground although it was put five metres above it.
+    assert shown["trajectory"]["positions"][0][2] == pytest.approx(0.75, abs=0.05)
+    moved = edit(client, scenario, {"op": "translate", "object_id": "red_1", "x": -4.0})
+    assert moved.status_code == 200
+
+
+def test_an_inserted_asset_is_seen_and_told_apart(client):
+    client.post("/v1/assets", json=CUT)
+    scenario = create(client)
+    edit(client, scenario, {"op": "insert", "asset_id": "red", "pose": {"position": [9, 0, 1]}})
+    answer = client.get(
+        f"/v1/scenarios/{scenario}/preview",
+        params={"camera": "front", "modality": "instance"},
+        headers={"Accept": "image/png"},
+    )
+    ids = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (ids == 4).sum() > 50
+
+
+def test_a_scenario_with_assets_survives_a_restart(run_worker):
+    with run_worker() as client:
+        client.post("/v1/assets", json=CUT)
+        scenario = create(client)
+        edit(client, scenario, {"op": "replace", "object_id": "car_blue", "asset_id": "red"})
+        before = objects(client, scenario)
+    with run_worker() as client:
+        assert objects(client, scenario) == before
+        assert before["car_blue"]["asset_id"] == "red"
+        preview = client.get(f"/v1/scenarios/{scenario}/preview", params={"camera": "front"})
+        assert preview.status_code == 200
+
+
+def test_an_unknown_asset_is_refused_with_its_place(client):
+    answer = edit(client, create(client), {"op": "insert", "asset_id": "bus", "pose": THERE})
+    assert answer.status_code == 404
+    assert answer.json()["code"] == ErrorCode.UNKNOWN_ASSET
+    assert answer.json()["errors"][0]["pointer"] == "/operations/0"
