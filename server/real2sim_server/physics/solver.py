@@ -14,7 +14,7 @@ from .backends import Measure, Model, ParticleArrays, Simulation, select_backend
 from .backends.base import Blowup
 from .body import Body
 from .colliders import Collider
-from .errors import SolverError, UnstableError
+from .errors import PhysicsError, SolverError, UnstableError
 from .laws import stress as laws
 from .model import build_model
 
@@ -205,8 +205,9 @@ class Solver:
 
         Raises:
             SolverError: for a duration that is not positive or needs too many substeps.
-            UnstableError: when it blows up and smaller substeps do not help; the solver then
-                stands at the last good state.
+            ParticleError: when particles leave the reach of the grid.
+            UnstableError: when it blows up and smaller substeps do not help. After any error the
+                solver stands at the last good state.
         """
         if not (math.isfinite(duration) and duration > 0):
             raise SolverError(f"duration of a step must be positive [s], not {duration!r}")
@@ -318,7 +319,12 @@ class Solver:
         """Make ``count`` substeps; take them back and halve the step if they went wrong."""
         before, saved = self._measure, self.simulation.save()
         work_before = self._contact_energies()[1]
-        reason = self._advance(count, report.dt)
+        try:
+            reason = self._advance(count, report.dt)
+        except PhysicsError:
+            self.simulation.restore(saved)
+            self._measure = before
+            raise
         if not reason:
             reason = self._complaint(before, self._contact_energies()[1] - work_before)
         if not reason:

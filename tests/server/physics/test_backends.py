@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-import numba
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -112,16 +116,32 @@ def test_cpu_meets_colliders_as_the_reference_does(collider):
     np.testing.assert_allclose(runs[1].contacts[0].impulse, runs[0].contacts[0].impulse, atol=1e-7)
 
 
+FINGERPRINT = """
+import hashlib
+import numba
+from tests.server.physics.test_backends import SOFT, STATE, crash
+
+run = crash(SOFT, "cpu", "single")
+run.step(0.03)
+state = b"".join(getattr(run.particles(), name).tobytes() for name in STATE)
+print(numba.get_num_threads(), hashlib.sha256(state).hexdigest())
+"""
+
+
 def test_the_number_of_threads_does_not_change_a_bit():
-    ends = []
-    before = numba.get_num_threads()
-    for threads in {1, before}:
-        numba.set_num_threads(threads)
-        run = crash(SOFT, "cpu", "single")
-        run.step(0.03)
-        ends.append([getattr(run.particles(), name).tobytes() for name in STATE])
-    numba.set_num_threads(before)
-    assert all(end == ends[0] for end in ends)
+    root = Path(__file__).parents[3]
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", FINGERPRINT],
+            env={**os.environ, "NUMBA_NUM_THREADS": str(threads), "PYTHONPATH": str(root)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for threads in (1, 2, 5)
+    ]
+    said = [run.communicate(timeout=200)[0].split() for run in runs]
+    assert [threads for threads, _ in said] == ["1", "2", "5"]
+    assert len({digest for _, digest in said}) == 1
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

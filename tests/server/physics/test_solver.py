@@ -18,6 +18,7 @@ from real2sim_server.physics import (
     Solver,
     SolverError,
     SolverOptions,
+    UnstableError,
     box_particles,
     model,
 )
@@ -131,6 +132,54 @@ def test_the_guard_takes_back_steps_that_blow_up():
     assert report.rollbacks > 0
     assert all("energy rose" in r or "finite" in r or "left" in r for r in report.reasons)
     assert run.energies().total <= start * 1.05
+
+
+def poison(run, times):
+    """Let the first substeps of a run end in NaN, as often as said."""
+    advance = run.simulation.advance
+    left = [times]
+
+    def poisoned(steps, dt, colliders):
+        advance(steps, dt, colliders)
+        if left[0]:
+            left[0] -= 1
+            run.simulation._state.v[3, 1] = np.nan
+
+    run.simulation.advance = poisoned
+
+
+def test_the_guard_takes_back_nan_and_halves_the_step():
+    run, clean = (solve([cube(velocity=(1, 0, 0))], [ground()]) for _ in range(2))
+    dt = run.time_step()
+    poison(run, 1)
+    report = run.step(4 * dt)
+    assert report.rollbacks == 1
+    assert report.reasons == ["positions, velocities or stresses are not finite"]
+    assert report.dt == pytest.approx(dt / 2, rel=0.01)
+    clean.step(4 * dt)
+    positions = run.particles().positions
+    assert np.isfinite(positions).all()
+    np.testing.assert_allclose(positions, clean.particles().positions, atol=1e-5)
+
+
+def test_where_smaller_steps_do_not_help_the_solver_stays_at_the_last_good_state():
+    run = solve([cube(velocity=(1, 0, 0))], [ground()])
+    run.step(0.01)
+    before, time = run.particles(), run.time
+    poison(run, 1000)
+    with pytest.raises(UnstableError, match="not finite"):
+        run.step(0.01)
+    assert run.time == time
+    assert np.isfinite(run.measure.kinetic).all()
+    assert run.particles().positions.tobytes() == before.positions.tobytes()
+
+
+def test_a_body_that_flies_out_of_reach_is_named_and_stays_where_it_was():
+    run = solve([cube(position=(26_200, 0, 0), velocity=(1e5, 0, 0))], gravity=(0, 0, 0))
+    with pytest.raises(ParticleError, match="stay within 26214 m"):
+        run.step(0.01)
+    assert run.measure.centre[0, 0] < 26_214
+    assert np.abs(run.particles().positions[:, 0].mean() - run.measure.centre[0, 0]) < 1e-3
 
 
 def test_impulses_are_the_change_of_momentum():
