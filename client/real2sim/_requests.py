@@ -15,13 +15,17 @@ from urllib.parse import quote
 
 from pydantic import BaseModel, ValidationError
 
-from real2sim_proto.drive import SensorSpec
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
+from real2sim_proto.episode import SensorSpec
+from real2sim_proto.jobs import ExportRequest, JobInfo, JobList, SimulateRequest
 from real2sim_proto.operations import Operation
 from real2sim_proto.scenarios import (
     History,
     OperationBatch,
     OperationResult,
     ScenarioCreate,
+    ScenarioDocument,
+    ScenarioFork,
     ScenarioInfo,
     ScenarioList,
 )
@@ -114,15 +118,8 @@ def import_scene(path: str, scene: str | None) -> Call[SceneInfo]:
 
 
 def upload_scene(path: Path, scene: str | None) -> Call[SceneInfo]:
-    key = new_key()
-    # The boundary follows from the key, so that every try sends the same bytes.
-    headers = {
-        "Idempotency-Key": key,
-        "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
-    }
     form = {} if scene is None else {"scene": scene}
-    request = Request("POST", "/v1/scenes", headers=headers, form=form, upload=path, patient=True)
-    return Call(request, model_of(SceneInfo))
+    return Call(_upload("/v1/scenes", path, form), model_of(SceneInfo))
 
 
 def render_scene(scene: str, view: ViewRequest) -> Call[Image]:
@@ -186,6 +183,75 @@ def history(scenario_id: str, after: int | None) -> Call[History]:
 
 def preview(scenario_id: str, view: ViewRequest) -> Call[Image]:
     return _image(f"{_scenario(scenario_id)}/preview", view)
+
+
+def fork_scenario(scenario_id: str, name: str | None, revision: int | None) -> Call[ScenarioInfo]:
+    body = checked(ScenarioFork, name=name, revision=revision)
+    return Call(_post(f"{_scenario(scenario_id)}/fork", body), model_of(ScenarioInfo))
+
+
+def export_scenario(scenario_id: str) -> Call[ScenarioDocument]:
+    request = Request("GET", f"{_scenario(scenario_id)}/export", patient=True)
+    return Call(request, model_of(ScenarioDocument))
+
+
+def import_scenario(document: ScenarioDocument) -> Call[ScenarioInfo]:
+    return Call(_post("/v1/scenarios/import", document, patient=True), model_of(ScenarioInfo))
+
+
+def simulate(scenario_id: str, body: SimulateRequest) -> Call[JobInfo]:
+    return Call(_post(f"{_scenario(scenario_id)}/simulate", body, patient=True), model_of(JobInfo))
+
+
+# --- jobs and exports -------------------------------------------------------------------------
+
+
+def create_export(body: ExportRequest) -> Call[JobInfo]:
+    return Call(_post("/v1/exports", body, patient=True), model_of(JobInfo))
+
+
+def list_jobs(subject: str | None) -> Call[JobList]:
+    params = {} if subject is None else {"subject": subject}
+    return Call(Request("GET", "/v1/jobs", params), model_of(JobList))
+
+
+def get_job(job_id: str) -> Call[JobInfo]:
+    return Call(Request("GET", f"/v1/jobs/{_segment(job_id)}"), model_of(JobInfo))
+
+
+def cancel_job(job_id: str) -> Call[None]:
+    return Call(Request("DELETE", f"/v1/jobs/{_segment(job_id)}"), nothing)
+
+
+def job_file(job_id: str, name: str) -> Call[bytes]:
+    path = f"/v1/jobs/{_segment(job_id)}/files/{_segment(name)}"
+    return Call(Request("GET", path, patient=True), lambda reply: reply.content)
+
+
+# --- assets -----------------------------------------------------------------------------------
+
+
+def list_assets() -> Call[AssetList]:
+    return Call(Request("GET", "/v1/assets", patient=True), model_of(AssetList))
+
+
+def get_asset(asset_id: str) -> Call[AssetInfo]:
+    return Call(Request("GET", f"/v1/assets/{_segment(asset_id)}"), model_of(AssetInfo))
+
+
+def cut_asset(body: AssetCut) -> Call[AssetInfo]:
+    return Call(_post("/v1/assets", body, patient=True), model_of(AssetInfo))
+
+
+def upload_asset(path: Path, asked: AssetUpload) -> Call[AssetInfo]:
+    form = {name: str(value) for name, value in asked if value is not None}
+    return Call(_upload("/v1/assets", path, form), model_of(AssetInfo))
+
+
+def asset_thumbnail(asset_id: str, width: int) -> Call[Image]:
+    path = f"/v1/assets/{_segment(asset_id)}/thumbnail"
+    request = Request("GET", path, {"width": str(width)}, patient=True)
+    return Call(request, lambda reply: parse_image(reply, "rgb"))
 
 
 # --- sessions ---------------------------------------------------------------------------------
@@ -283,6 +349,16 @@ def _post(
         headers["If-Match"] = if_match
     content = None if body is None else _json(body)
     return Request("POST", path, params or {}, headers, content, patient=patient)
+
+
+def _upload(path: str, file: Path, form: dict[str, str]) -> Request:
+    key = new_key()
+    # The boundary follows from the key, so that every try sends the same bytes.
+    headers = {
+        "Idempotency-Key": key,
+        "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
+    }
+    return Request("POST", path, headers=headers, form=form, upload=file, patient=True)
 
 
 def _json(body: BaseModel) -> bytes:

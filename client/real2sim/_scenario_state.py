@@ -4,22 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
-from real2sim_proto.base import Pose
-from real2sim_proto.operations import (
-    Delete,
-    Duplicate,
-    Operation,
-    Rotate,
-    Scale,
-    SetPose,
-    Translate,
-)
 from real2sim_proto.scenarios import OperationResult, ScenarioInfo
-from real2sim_proto.scenes import ObjectInfo
-
-from ._requests import checked
 
 H = TypeVar("H")
 
@@ -89,40 +76,3 @@ class Objects(Mapping[str, H], Generic[H]):
 
     def __repr__(self) -> str:
         return f"Objects({', '.join(self._handles)})"
-
-
-class ObjectOperations:
-    """Builds the operations that an object's handle applies."""
-
-    def __init__(self, info: ObjectInfo) -> None:
-        self.info = info
-
-    @property
-    def object_id(self) -> str:
-        return self.info.object_id
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.object_id!r}, category={self.info.category!r})"
-
-    def _translate(self, x: float, y: float, z: float, frame: str) -> Operation:
-        return checked(Translate, object_id=self.object_id, x=x, y=y, z=z, frame=frame)
-
-    def _rotate(self, angle: float, axis: tuple[float, float, float], frame: str) -> Operation:
-        return checked(Rotate, object_id=self.object_id, angle=angle, axis=axis, frame=frame)
-
-    def _scale(self, x: float, y: float, z: float, anchor: str) -> Operation:
-        return checked(Scale, object_id=self.object_id, x=x, y=y, z=z, anchor=anchor)
-
-    def _set_pose(
-        self,
-        position: tuple[float, float, float],
-        quaternion: tuple[float, float, float, float],
-    ) -> Operation:
-        pose = checked(Pose, position=position, quaternion=quaternion)
-        return checked(SetPose, object_id=self.object_id, pose=pose)
-
-    def _duplicate(self, options: Mapping[str, Any]) -> Operation:
-        return checked(Duplicate, object_id=self.object_id, **options)
-
-    def _delete(self) -> Operation:
-        return checked(Delete, object_id=self.object_id)

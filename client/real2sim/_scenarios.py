@@ -10,12 +10,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from real2sim_proto.jobs import SimulateRequest
 from real2sim_proto.operations import Operation
-from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
+from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
 from real2sim_proto.scenes import ObjectInfo
 
 from . import _requests
-from ._scenario_state import ObjectOperations, Objects, ScenarioState
+from ._jobs import Job
+from ._object_edits import (
+    UPRIGHT,
+    ObjectEdits,
+    Quaternion,
+    ScenarioEdits,
+    Vector,
+    insertion,
+)
+from ._scenario_state import Objects, ScenarioState
 from ._scenes import image_codec
 from ._transport import Transport
 from .images import Image
@@ -33,6 +43,12 @@ class Scenarios:
         # The answer to a creation leaves trajectories out; a handle always has them.
         return Scenario(self._transport, info).refresh()
 
+    def import_document(self, document: ScenarioDocument | Mapping[str, Any]) -> Scenario:
+        """A new scenario from what :meth:`Scenario.export` gave, here or elsewhere."""
+        checked = ScenarioDocument.model_validate(document)
+        info = self._transport.send(_requests.import_scenario(checked))
+        return Scenario(self._transport, info).refresh()
+
     def get(self, scenario_id: str) -> Scenario:
         """A handle of an existing scenario."""
         return Scenario(self._transport, self._transport.send(_requests.get_scenario(scenario_id)))
@@ -46,7 +62,7 @@ class Scenarios:
         self._transport.send(_requests.delete_scenario(scenario_id))
 
 
-class Scenario(ScenarioState):
+class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
     """One scenario as this client last saw it."""
 
     def __init__(self, transport: Transport, info: ScenarioInfo) -> None:
@@ -69,6 +85,76 @@ class Scenario(ScenarioState):
         """
         call = _requests.apply_operations(self.scenario_id, operations, self._etag, dry_run)
         return self._settle(self._transport.send(call))
+
+    def insert(
+        self,
+        asset: str,
+        *,
+        position: Vector,
+        quaternion: Quaternion = UPRIGHT,
+        size: Vector | None = None,
+        object_id: str | None = None,
+        snap: bool = True,
+    ) -> SceneObject:
+        """Add an object from the asset library, and return its handle.
+
+        Args:
+            asset: id in the library.
+            position, quaternion: where its box is, for the whole time range.
+            size: box to fit [m]; default: the asset's own.
+            object_id: default: the asset's id with a number.
+            snap: put it onto the ground, whatever z is.
+        """
+        operation = insertion(
+            asset,
+            position=position,
+            quaternion=quaternion,
+            size=size,
+            object_id=object_id,
+            snap=snap,
+        )
+        result = self.apply([operation])
+        return self.objects[result.created[0]]
+
+    def simulate(
+        self,
+        *,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        frame_us: int = 50_000,
+        objects: Sequence[str] | None = None,
+        max_particles: int = 200_000,
+        backend: str = "auto",
+    ) -> Job:
+        """Start a physics rollout of the scenario as it is now.
+
+        Args:
+            start_us, end_us: default: the scenario's span.
+            frame_us: from one kept frame to the next.
+            objects: what the physics moves; default: what has a velocity or physics of its own.
+            max_particles: of all of them together.
+            backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        """
+        body = _requests.checked(
+            SimulateRequest,
+            start_us=start_us,
+            end_us=end_us,
+            frame_us=frame_us,
+            objects=None if objects is None else list(objects),
+            max_particles=max_particles,
+            backend=backend,
+        )
+        info = self._transport.send(_requests.simulate(self.scenario_id, body))
+        return Job(self._transport, info)
+
+    def fork(self, *, name: str | None = None, revision: int | None = None) -> Scenario:
+        """A new scenario with the same history, up to a revision."""
+        call = _requests.fork_scenario(self.scenario_id, name, revision)
+        return Scenario(self._transport, self._transport.send(call)).refresh()
+
+    def export(self) -> ScenarioDocument:
+        """The whole scenario as one document; ``model_dump_json()`` makes a file of it."""
+        return self._transport.send(_requests.export_scenario(self.scenario_id))
 
     def undo(self) -> OperationResult:
         """Take the newest edit back."""
@@ -101,6 +187,9 @@ class Scenario(ScenarioState):
         view = _requests.ViewRequest(camera, t_us, width, modality, codec)
         return self._transport.send(_requests.preview(self.scenario_id, view))
 
+    def _edit(self, operation: Operation) -> OperationResult:
+        return self.apply([operation])
+
     def _settle(self, result: OperationResult) -> OperationResult:
         self._made(result)
         if not result.dry_run:
@@ -108,43 +197,12 @@ class Scenario(ScenarioState):
         return result
 
 
-class SceneObject(ObjectOperations):
+class SceneObject(ObjectEdits[OperationResult]):
     """An object of a scenario; each method is one edit. Metres, radians, wxyz."""
 
     def __init__(self, scenario: Scenario, info: ObjectInfo) -> None:
         super().__init__(info)
         self._scenario = scenario
-
-    def translate(
-        self, *, x: float = 0.0, y: float = 0.0, z: float = 0.0, frame: str = "world"
-    ) -> OperationResult:
-        """Shift the whole trajectory [m]; ``frame='object'`` counts along the object's axes."""
-        return self._scenario.apply([self._translate(x, y, z, frame)])
-
-    def rotate(
-        self,
-        *,
-        angle: float,
-        axis: tuple[float, float, float] = (0.0, 0.0, 1.0),
-        frame: str = "world",
-    ) -> OperationResult:
-        """Turn about the object's own centre [rad]."""
-        return self._scenario.apply([self._rotate(angle, axis, frame)])
-
-    def scale(
-        self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom"
-    ) -> OperationResult:
-        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays."""
-        return self._scenario.apply([self._scale(x, y, z, anchor)])
-
-    def set_pose(
-        self,
-        *,
-        position: tuple[float, float, float],
-        quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    ) -> OperationResult:
-        """Place the object in the world [m], for the whole time range."""
-        return self._scenario.apply([self._set_pose(position, quaternion)])
 
     def duplicate(
         self,
@@ -154,12 +212,11 @@ class SceneObject(ObjectOperations):
         y: float = 0.0,
         z: float = 0.0,
         frame: str = "world",
+        snap: bool = False,
     ) -> SceneObject:
-        """Add a copy, shifted [m], and return its handle."""
-        options = {"new_id": new_id, "x": x, "y": y, "z": z, "frame": frame}
-        result = self._scenario.apply([self._duplicate(options)])
+        """Add a copy, shifted [m], and return its handle; ``snap`` puts it onto the ground."""
+        result = self._scenario.apply([self._duplicate(new_id, (x, y, z), frame, snap)])
         return self._scenario.objects[result.created[0]]
 
-    def delete(self) -> OperationResult:
-        """Remove the object; undo brings it back."""
-        return self._scenario.apply([self._delete()])
+    def _edit(self, operation: Operation) -> OperationResult:
+        return self._scenario.apply([operation])

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
 from typing import Any
 
+from real2sim_proto.jobs import SimulateRequest
 from real2sim_proto.operations import Operation
-from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
+from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
 from real2sim_proto.scenes import ObjectInfo
 
 from . import _requests
-from ._scenario_state import ObjectOperations, Objects, ScenarioState
+from ._jobs import AsyncJob
+from ._object_edits import (
+    UPRIGHT,
+    ObjectEdits,
+    Quaternion,
+    ScenarioEdits,
+    Vector,
+    insertion,
+)
+from ._scenario_state import Objects, ScenarioState
 from ._scenes import image_codec
 from ._transport import AsyncTransport
 from .images import Image
@@ -25,6 +35,14 @@ class AsyncScenarios:
     async def create(self, *, scene: str, name: str = "") -> AsyncScenario:
         """A new scenario without edits on a scene."""
         info = await self._transport.send(_requests.create_scenario(scene, name))
+        return await AsyncScenario(self._transport, info).refresh()
+
+    async def import_document(
+        self, document: ScenarioDocument | Mapping[str, Any]
+    ) -> AsyncScenario:
+        """A new scenario from what :meth:`AsyncScenario.export` gave, here or elsewhere."""
+        checked = ScenarioDocument.model_validate(document)
+        info = await self._transport.send(_requests.import_scenario(checked))
         return await AsyncScenario(self._transport, info).refresh()
 
     async def get(self, scenario_id: str) -> AsyncScenario:
@@ -42,7 +60,7 @@ class AsyncScenarios:
         await self._transport.send(_requests.delete_scenario(scenario_id))
 
 
-class AsyncScenario(ScenarioState):
+class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
     """One scenario as this client last saw it."""
 
     def __init__(self, transport: AsyncTransport, info: ScenarioInfo) -> None:
@@ -65,6 +83,76 @@ class AsyncScenario(ScenarioState):
         """
         call = _requests.apply_operations(self.scenario_id, operations, self._etag, dry_run)
         return await self._settle(await self._transport.send(call))
+
+    async def insert(
+        self,
+        asset: str,
+        *,
+        position: Vector,
+        quaternion: Quaternion = UPRIGHT,
+        size: Vector | None = None,
+        object_id: str | None = None,
+        snap: bool = True,
+    ) -> AsyncSceneObject:
+        """Add an object from the asset library, and return its handle.
+
+        Args:
+            asset: id in the library.
+            position, quaternion: where its box is, for the whole time range.
+            size: box to fit [m]; default: the asset's own.
+            object_id: default: the asset's id with a number.
+            snap: put it onto the ground, whatever z is.
+        """
+        operation = insertion(
+            asset,
+            position=position,
+            quaternion=quaternion,
+            size=size,
+            object_id=object_id,
+            snap=snap,
+        )
+        result = await self.apply([operation])
+        return self.objects[result.created[0]]
+
+    async def simulate(
+        self,
+        *,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        frame_us: int = 50_000,
+        objects: Sequence[str] | None = None,
+        max_particles: int = 200_000,
+        backend: str = "auto",
+    ) -> AsyncJob:
+        """Start a physics rollout of the scenario as it is now.
+
+        Args:
+            start_us, end_us: default: the scenario's span.
+            frame_us: from one kept frame to the next.
+            objects: what the physics moves; default: what has a velocity or physics of its own.
+            max_particles: of all of them together.
+            backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        """
+        body = _requests.checked(
+            SimulateRequest,
+            start_us=start_us,
+            end_us=end_us,
+            frame_us=frame_us,
+            objects=None if objects is None else list(objects),
+            max_particles=max_particles,
+            backend=backend,
+        )
+        info = await self._transport.send(_requests.simulate(self.scenario_id, body))
+        return AsyncJob(self._transport, info)
+
+    async def fork(self, *, name: str | None = None, revision: int | None = None) -> AsyncScenario:
+        """A new scenario with the same history, up to a revision."""
+        call = _requests.fork_scenario(self.scenario_id, name, revision)
+        return await AsyncScenario(self._transport, await self._transport.send(call)).refresh()
+
+    async def export(self) -> ScenarioDocument:
+        """The whole scenario as one document; ``model_dump_json()`` makes a file of it."""
+        return await self._transport.send(_requests.export_scenario(self.scenario_id))
 
     async def undo(self) -> OperationResult:
         """Take the newest edit back."""
@@ -101,6 +189,9 @@ class AsyncScenario(ScenarioState):
         view = _requests.ViewRequest(camera, t_us, width, modality, codec)
         return await self._transport.send(_requests.preview(self.scenario_id, view))
 
+    def _edit(self, operation: Operation) -> Awaitable[OperationResult]:
+        return self.apply([operation])
+
     async def _settle(self, result: OperationResult) -> OperationResult:
         self._made(result)
         if not result.dry_run:
@@ -108,43 +199,12 @@ class AsyncScenario(ScenarioState):
         return result
 
 
-class AsyncSceneObject(ObjectOperations):
+class AsyncSceneObject(ObjectEdits[Awaitable[OperationResult]]):
     """An object of a scenario; each method is one edit. Metres, radians, wxyz."""
 
     def __init__(self, scenario: AsyncScenario, info: ObjectInfo) -> None:
         super().__init__(info)
         self._scenario = scenario
-
-    async def translate(
-        self, *, x: float = 0.0, y: float = 0.0, z: float = 0.0, frame: str = "world"
-    ) -> OperationResult:
-        """Shift the whole trajectory [m]; ``frame='object'`` counts along the object's axes."""
-        return await self._scenario.apply([self._translate(x, y, z, frame)])
-
-    async def rotate(
-        self,
-        *,
-        angle: float,
-        axis: tuple[float, float, float] = (0.0, 0.0, 1.0),
-        frame: str = "world",
-    ) -> OperationResult:
-        """Turn about the object's own centre [rad]."""
-        return await self._scenario.apply([self._rotate(angle, axis, frame)])
-
-    async def scale(
-        self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom"
-    ) -> OperationResult:
-        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays."""
-        return await self._scenario.apply([self._scale(x, y, z, anchor)])
-
-    async def set_pose(
-        self,
-        *,
-        position: tuple[float, float, float],
-        quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    ) -> OperationResult:
-        """Place the object in the world [m], for the whole time range."""
-        return await self._scenario.apply([self._set_pose(position, quaternion)])
 
     async def duplicate(
         self,
@@ -154,12 +214,11 @@ class AsyncSceneObject(ObjectOperations):
         y: float = 0.0,
         z: float = 0.0,
         frame: str = "world",
+        snap: bool = False,
     ) -> AsyncSceneObject:
-        """Add a copy, shifted [m], and return its handle."""
-        options = {"new_id": new_id, "x": x, "y": y, "z": z, "frame": frame}
-        result = await self._scenario.apply([self._duplicate(options)])
+        """Add a copy, shifted [m], and return its handle; ``snap`` puts it onto the ground."""
+        result = await self._scenario.apply([self._duplicate(new_id, (x, y, z), frame, snap)])
         return self._scenario.objects[result.created[0]]
 
-    async def delete(self) -> OperationResult:
-        """Remove the object; undo brings it back."""
-        return await self._scenario.apply([self._delete()])
+    def _edit(self, operation: Operation) -> Awaitable[OperationResult]:
+        return self._scenario.apply([operation])

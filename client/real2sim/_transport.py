@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,6 +21,8 @@ from .errors import Real2SimError, ReplyTimeoutError, StatusError, UnreachableEr
 
 T = TypeVar("T")
 
+CLIENT_HEADER = "X-Real2Sim-Client"
+
 
 @dataclass(frozen=True)
 class Target:
@@ -30,12 +33,14 @@ class Target:
         token: sent as bearer token; never shown.
         timeout: seconds that a reply may take.
         patience: seconds for the calls that may load a scene, compile kernels or run many steps.
+        name: who is calling, for the history of scenarios.
     """
 
     url: str
     token: str | None = field(default=None, repr=False)
     timeout: float = 30.0
     patience: float = 300.0
+    name: str | None = None
     policy: RetryPolicy = field(default_factory=RetryPolicy, repr=False)
 
     def __post_init__(self) -> None:
@@ -44,6 +49,8 @@ class Target:
             raise ValueError(f"url {self.url!r} is not an address like 'http://127.0.0.1:8600'")
         if parts.username or parts.password:
             raise ValueError("the url holds credentials; give a token as token=... instead")
+        if self.name is not None and not re.fullmatch(r"[ -~]{1,80}", self.name):
+            raise ValueError(f"name {self.name!r} is not 1 to 80 printable ASCII characters")
         if self.timeout <= 0:
             raise ValueError(f"timeout is {self.timeout!r}; give seconds above 0")
         object.__setattr__(self, "url", self.url.rstrip("/"))
@@ -65,7 +72,8 @@ class Target:
 
     @property
     def headers(self) -> dict[str, str]:
-        return {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
+        headers = {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
+        return headers if self.name is None else headers | {CLIENT_HEADER: self.name}
 
     def drive_url(self, session_id: str) -> str:
         """Address of a session's drive socket, by the way this client reaches the worker."""

@@ -11,6 +11,8 @@ from real2sim_proto import PROTOCOL_VERSION
 from real2sim_proto.scenes import Readiness, ServerInfo
 
 from . import _requests
+from ._assets import Assets, AsyncAssets
+from ._jobs import AsyncJobs, Jobs
 from ._retry import RetryPolicy
 from ._scenarios import Scenarios
 from ._scenarios_async import AsyncScenarios
@@ -31,6 +33,7 @@ def connect(
     url: str = DEFAULT_URL,
     *,
     token: str | None = None,
+    name: str | None = None,
     timeout: float = 30.0,
     retries: int = 2,
     transport: httpx2.BaseTransport | None = None,
@@ -40,6 +43,7 @@ def connect(
     Args:
         url: ``http://host:port`` or ``https://...``.
         token: bearer token of the worker.
+        name: who is calling; the history of scenarios names it.
         timeout: seconds that a reply may take; calls that may load a scene or
             compile kernels have at least 300.
         retries: more tries of requests that may safely be sent again.
@@ -48,7 +52,7 @@ def connect(
     Raises:
         ValueError: not such an address.
     """
-    target = Target(url, token, timeout, policy=RetryPolicy(retries))
+    target = Target(url, token, timeout, name=name, policy=RetryPolicy(retries))
     return Client(Transport(target, transport=transport))
 
 
@@ -56,12 +60,13 @@ def connect_async(
     url: str = DEFAULT_URL,
     *,
     token: str | None = None,
+    name: str | None = None,
     timeout: float = 30.0,
     retries: int = 2,
     transport: httpx2.AsyncBaseTransport | None = None,
 ) -> AsyncClient:
     """Async twin of :func:`connect`."""
-    target = Target(url, token, timeout, policy=RetryPolicy(retries))
+    target = Target(url, token, timeout, name=name, policy=RetryPolicy(retries))
     return AsyncClient(AsyncTransport(target, transport=transport))
 
 
@@ -72,6 +77,8 @@ class Client:
         self._transport = transport
         self.scenes = Scenes(transport)
         self.scenarios = Scenarios(transport)
+        self.assets = Assets(transport)
+        self.jobs = Jobs(transport)
         self.sessions = Sessions(transport)
 
     def server(self) -> ServerInfo:
@@ -152,6 +159,8 @@ class AsyncClient:
         self._transport = transport
         self.scenes = AsyncScenes(transport)
         self.scenarios = AsyncScenarios(transport)
+        self.assets = AsyncAssets(transport)
+        self.jobs = AsyncJobs(transport)
         self.sessions = AsyncSessions(transport)
 
     async def server(self) -> ServerInfo:

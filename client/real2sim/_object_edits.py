@@ -1,0 +1,295 @@
+"""The edits of a scenario and of its objects, written once for both twins.
+
+``R`` is what an edit gives: an ``OperationResult``, or for the async twin an awaitable of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Generic, TypeVar
+
+from real2sim_proto.base import Pose, Track
+from real2sim_proto.operations import (
+    AddCollider,
+    BoxShape,
+    Delete,
+    Duplicate,
+    EraseRegion,
+    GroundShape,
+    Insert,
+    Operation,
+    PlaneShape,
+    Replace,
+    Restore,
+    Retime,
+    Rotate,
+    Scale,
+    SetPhysics,
+    SetPose,
+    SetTime,
+    SetTrajectory,
+    SetVelocity,
+    TimeRange,
+    Translate,
+)
+from real2sim_proto.scenes import ObjectInfo
+
+from ._requests import checked
+
+R = TypeVar("R")
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
+UP: Vector = (0.0, 0.0, 1.0)
+
+
+class ObjectEdits(Generic[R]):
+    """An object of a scenario; each method is one edit. Metres, radians, microseconds, wxyz."""
+
+    def __init__(self, info: ObjectInfo) -> None:
+        self.info = info
+
+    @property
+    def object_id(self) -> str:
+        return self.info.object_id
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.object_id!r}, category={self.info.category!r})"
+
+    def translate(
+        self,
+        *,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        frame: str = "world",
+        start_us: int | None = None,
+        end_us: int | None = None,
+        blend_us: int | None = None,
+        snap: bool = False,
+    ) -> R:
+        """Shift the object [m].
+
+        Args:
+            x, y, z: by how much, along the axes of ``frame``.
+            frame: ``world``, or ``object``, which turns with it.
+            start_us, end_us: only in between, growing and fading smoothly; default: at all times.
+            blend_us: how long growing and fading take; default: half a second.
+            snap: put it onto the ground.
+        """
+        when = _time_range(start_us, end_us, blend_us)
+        return self._make(Translate, x=x, y=y, z=z, frame=frame, time_range=when, snap=snap)
+
+    def rotate(
+        self,
+        *,
+        angle: float,
+        axis: Vector = UP,
+        frame: str = "world",
+        start_us: int | None = None,
+        end_us: int | None = None,
+        blend_us: int | None = None,
+    ) -> R:
+        """Turn it about its own centre [rad]; times as of :meth:`translate`."""
+        when = _time_range(start_us, end_us, blend_us)
+        return self._make(Rotate, angle=angle, axis=axis, frame=frame, time_range=when)
+
+    def scale(self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom") -> R:
+        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays."""
+        return self._make(Scale, x=x, y=y, z=z, anchor=anchor)
+
+    def set_pose(
+        self, *, position: Vector, quaternion: Quaternion = UPRIGHT, snap: bool = False
+    ) -> R:
+        """Place the object in the world [m], for the whole time range."""
+        pose = checked(Pose, position=position, quaternion=quaternion)
+        return self._make(SetPose, pose=pose, snap=snap)
+
+    def set_trajectory(
+        self,
+        *,
+        times_us: Sequence[int],
+        positions: Sequence[Vector],
+        quaternions: Sequence[Quaternion],
+        snap: bool = False,
+    ) -> R:
+        """Let it follow a trajectory; it exists only within these times."""
+        track = checked(
+            Track,
+            times_us=list(times_us),
+            positions=list(positions),
+            quaternions=list(quaternions),
+        )
+        return self._make(SetTrajectory, trajectory=track, snap=snap)
+
+    def retime(self, *, delay_us: int = 0, speed: float = 1.0) -> R:
+        """Let it do the same later (or earlier), faster or slower."""
+        return self._make(Retime, delay_us=delay_us, speed=speed)
+
+    def replace(
+        self,
+        *,
+        asset: str | None = None,
+        recorded: str | None = None,
+        fit: str = "box",
+    ) -> R:
+        """Give it another look.
+
+        Args:
+            asset: id in the asset library; or
+            recorded: id of an object of the scene.
+            fit: ``box`` fills the object's box, ``length`` keeps the look's proportions.
+        """
+        return self._make(Replace, asset_id=asset, recorded_id=recorded, fit=fit)
+
+    def set_physics(
+        self,
+        *,
+        mass: float | None = None,
+        material: str | None = None,
+        friction: float | None = None,
+        restitution: float | None = None,
+    ) -> R:
+        """Say what it is for the physics; what is left out goes back to its default.
+
+        Args:
+            mass: [kg].
+            material: ``rigid``, ``metal``, ``foam``, ``rubber``, ``jelly``, ``sand`` or ``snow``.
+            friction: Coulomb coefficient.
+            restitution: 0 to 1, share of the approach speed that is left after a bounce.
+        """
+        return self._make(
+            SetPhysics, mass=mass, material=material, friction=friction, restitution=restitution
+        )
+
+    def set_velocity(
+        self,
+        *,
+        linear: Vector | None = None,
+        angular: Vector | None = None,
+        frame: str = "world",
+    ) -> R:
+        """Say how fast it enters the physics [m/s, rad/s]; left out: as on its trajectory."""
+        return self._make(SetVelocity, linear=linear, angular=angular, frame=frame)
+
+    def delete(self) -> R:
+        """Remove the object; :meth:`restore` or undo brings it back."""
+        return self._make(Delete)
+
+    def restore(self) -> R:
+        """Bring it back after :meth:`delete`."""
+        return self._make(Restore)
+
+    def _edit(self, operation: Operation) -> R:
+        raise NotImplementedError
+
+    def _make(self, model: type[Any], **fields: Any) -> R:
+        operation: Operation = checked(model, object_id=self.object_id, **fields)
+        return self._edit(operation)
+
+    def _duplicate(self, new_id: str | None, shift: Vector, frame: str, snap: bool) -> Operation:
+        x, y, z = shift
+        return checked(
+            Duplicate,
+            object_id=self.object_id,
+            new_id=new_id,
+            x=x,
+            y=y,
+            z=z,
+            frame=frame,
+            snap=snap,
+        )
+
+
+class ScenarioEdits(Generic[R]):
+    """The edits that belong to no object that is there already."""
+
+    def erase_region(
+        self,
+        *,
+        position: Vector,
+        size: Vector,
+        quaternion: Quaternion = UPRIGHT,
+        region_id: str | None = None,
+    ) -> R:
+        """Hide the background inside a box [m]; delete its id to bring it back."""
+        pose = checked(Pose, position=position, quaternion=quaternion)
+        return self._edit(checked(EraseRegion, region_id=region_id, pose=pose, size=size))
+
+    def add_box(
+        self,
+        *,
+        position: Vector,
+        size: Vector,
+        quaternion: Quaternion = UPRIGHT,
+        friction: float | None = None,
+        collider_id: str | None = None,
+    ) -> R:
+        """Add an invisible box that does not yield, for the physics."""
+        shape = checked(BoxShape, position=position, quaternion=quaternion, size=size)
+        return self._collider(shape, friction, collider_id)
+
+    def add_plane(
+        self,
+        *,
+        point: Vector,
+        normal: Vector = UP,
+        friction: float | None = None,
+        collider_id: str | None = None,
+    ) -> R:
+        """Add a plane that things stay above, for the physics."""
+        return self._collider(
+            checked(PlaneShape, point=point, normal=normal), friction, collider_id
+        )
+
+    def add_ground(
+        self, *, offset: float = 0.0, friction: float | None = None, collider_id: str | None = None
+    ) -> R:
+        """Add the recorded ground, moved up by ``offset`` [m], for the physics."""
+        return self._collider(checked(GroundShape, offset=offset), friction, collider_id)
+
+    def set_time(self, *, start_us: int | None = None, end_us: int | None = None) -> R:
+        """Set the span in which the scenario plays; left out: as recorded."""
+        return self._edit(checked(SetTime, start_us=start_us, end_us=end_us))
+
+    def remove(self, thing_id: str) -> R:
+        """Remove an object, erased region or collider by its id."""
+        return self._edit(checked(Delete, object_id=thing_id))
+
+    def restore(self, thing_id: str) -> R:
+        """Bring a removed object, region or collider back."""
+        return self._edit(checked(Restore, object_id=thing_id))
+
+    def _edit(self, operation: Operation) -> R:
+        raise NotImplementedError
+
+    def _collider(
+        self,
+        shape: PlaneShape | BoxShape | GroundShape,
+        friction: float | None,
+        collider_id: str | None,
+    ) -> R:
+        return self._edit(
+            checked(AddCollider, shape=shape, friction=friction, collider_id=collider_id)
+        )
+
+
+def insertion(
+    asset: str,
+    *,
+    position: Vector,
+    quaternion: Quaternion,
+    size: Vector | None,
+    object_id: str | None,
+    snap: bool,
+) -> Operation:
+    """The operation that puts an asset somewhere for the whole time range."""
+    pose = checked(Pose, position=position, quaternion=quaternion)
+    return checked(Insert, asset_id=asset, object_id=object_id, pose=pose, size=size, snap=snap)
+
+
+def _time_range(start_us: int | None, end_us: int | None, blend_us: int | None) -> TimeRange | None:
+    if start_us is None and end_us is None:
+        return None
+    blend = {} if blend_us is None else {"blend_us": blend_us}
+    return checked(TimeRange, start_us=start_us, end_us=end_us, **blend)
