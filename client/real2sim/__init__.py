@@ -23,10 +23,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from real2sim_proto.drive import Control, PoseCommand, SensorSpec, TrajectoryPlan
+    from real2sim_proto.drive import Control, PoseCommand, TrajectoryPlan
+    from real2sim_proto.episode import SensorSpec
 
     from .client import AsyncClient, Client, connect, connect_async
-    from .drive_session import AsyncDriveSession, DriveSession
+    from .drive_session import DriveSession
+    from .drive_session_async import AsyncDriveSession
     from .errors import (
         BadStepError,
         CapacityError,
@@ -103,7 +105,7 @@ __all__ = [
 
 _ELSEWHERE = {
     "AsyncClient": "real2sim.client",
-    "AsyncDriveSession": "real2sim.drive_session",
+    "AsyncDriveSession": "real2sim.drive_session_async",
     "Client": "real2sim.client",
     "Control": "real2sim_proto.drive",
     "DriveSession": "real2sim.drive_session",
@@ -111,7 +113,7 @@ _ELSEWHERE = {
     "Image": "real2sim.images",
     "Observation": "real2sim.observation",
     "PoseCommand": "real2sim_proto.drive",
-    "SensorSpec": "real2sim_proto.drive",
+    "SensorSpec": "real2sim_proto.episode",
     "TrajectoryPlan": "real2sim_proto.drive",
     "View": "real2sim.observation",
     "connect": "real2sim.client",

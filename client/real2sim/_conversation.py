@@ -6,6 +6,7 @@ which answer is awaited, and turns bytes into answers or exceptions.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -25,23 +26,30 @@ from real2sim_proto.drive import (
     PLAN,
     SERVER_MESSAGE,
     Action,
+    Agent,
     Bye,
+    Driven,
     Edit,
     Edited,
     Envelope,
     Error,
+    Fork,
+    Forked,
     Hello,
+    Kept,
     Obs,
     Plan,
     Progress,
     Render,
     Reset,
-    ResetSpec,
+    Restore,
     Result,
-    SensorSpec,
+    Resume,
+    Snapshot,
     View,
     Welcome,
 )
+from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
 from ._replies import describe
@@ -56,19 +64,33 @@ from .errors import (
 
 A = TypeVar("A", bound=Envelope)
 
+KEPT_UNASKED = 16
+"""Unasked observations that are kept until somebody looks; older ones are dropped."""
+
+_OVERTAKEN = {ErrorCode.STALE_STEP.value, ErrorCode.EPISODE_OVER.value}
+
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 _STATUS = {code.value: status for code, status in HTTP_STATUS.items()}
 
 
 @dataclass(frozen=True)
 class Question(Generic[A]):
-    """A message that goes out, and the answer that it waits for."""
+    """A message that goes out, and the answer that it waits for.
+
+    Attributes:
+        patient: whether the answer may take as long as loading a scene.
+        repeatable: whether it may be sent again after the connection was lost; the worker moves
+            only once.
+        only_at: revision at which alone it may be sent again.
+    """
 
     id: int
     data: bytes
     answer: type[A]
     awaited: str
     patient: bool = False
+    repeatable: bool = True
+    only_at: int | None = None
 
 
 class Conversation:
@@ -78,14 +100,20 @@ class Conversation:
         self._ids = 0
         self._step: int | None = None
         self._revision: int | None = None
+        self._unasked: deque[Obs] = deque(maxlen=KEPT_UNASKED)
 
     @property
     def step(self) -> int | None:
         """Step of the newest observation; None before reset."""
         return self._step
 
-    def hello(self, *, sdk: str, role: str, token: str | None) -> Question[Welcome]:
-        """The first message."""
+    def hello(
+        self, *, sdk: str, role: str, token: str | None, resume_token: str | None = None
+    ) -> Question[Welcome]:
+        """The first message; with a resume token it goes on where the connection was lost."""
+        resume = None
+        if resume_token is not None:
+            resume = Resume(token=resume_token, last_step=self._step)
         message = checked(
             Hello,
             id=self._next_id(),
@@ -93,13 +121,16 @@ class Conversation:
             sdk=sdk,
             role=role,
             token=token,
+            resume=resume,
         )
-        return self._question(message, Welcome, "welcome (scene loading, first render)", True)
+        return self._question(
+            message, Welcome, "welcome (scene loading, first render)", patient=True
+        )
 
     def reset(self, spec: ResetSpec) -> Question[Obs]:
         """Starts an episode."""
         message = Reset(id=self._next_id(), spec=spec)
-        return self._question(message, Obs, "observation 0 after reset", True)
+        return self._question(message, Obs, "observation 0 after reset", patient=True)
 
     def action(self, plan: Plan | Mapping[str, Any]) -> Question[Obs]:
         """Answers the newest observation.
@@ -120,16 +151,48 @@ class Conversation:
         message = checked(
             Edit, id=self._next_id(), base_rev=self._revision, operations=list(operations)
         )
-        return self._question(message, Edited, "confirmation of the edit")
+        return self._question(message, Edited, "confirmation of the edit", only_at=self._revision)
 
     def render(self, sensors: Sequence[SensorSpec]) -> Question[View]:
         """Asks for images of the current instant."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors))
         return self._question(message, View, "images")
 
+    def agent(
+        self,
+        object_id: str,
+        times_us: Sequence[int],
+        poses: Sequence[tuple[float, float, float]],
+    ) -> Question[Driven]:
+        """Says where an externally driven object goes."""
+        message = checked(
+            Agent,
+            id=self._next_id(),
+            object_id=object_id,
+            times_us=list(times_us),
+            poses=list(poses),
+        )
+        return self._question(message, Driven, "confirmation of the object's plan")
+
+    def snapshot(self, name: str) -> Question[Kept]:
+        """Keeps the present instant."""
+        message = checked(Snapshot, id=self._next_id(), name=name)
+        return self._question(message, Kept, "confirmation of the snapshot")
+
+    def restore(self, name: str) -> Question[Obs]:
+        """Goes back to a snapshot."""
+        message = checked(Restore, id=self._next_id(), name=name)
+        return self._question(message, Obs, f"observation of snapshot {name!r}", patient=True)
+
+    def fork(self) -> Question[Forked]:
+        """Makes another session at the same instant."""
+        return self._question(Fork(id=self._next_id()), Forked, "a fork", repeatable=False)
+
     def bye(self) -> Question[Result]:
         """Ends the session."""
-        return self._question(Bye(id=self._next_id()), Result, "result of the session")
+        return self._question(
+            Bye(id=self._next_id()), Result, "result of the session", repeatable=False
+        )
 
     def read(self, data: bytes | str, question: Question[A]) -> A | None:
         """The answer in ``data``; None where it is progress, or late for an older question.
@@ -141,8 +204,15 @@ class Conversation:
         """
         message = _server_message(data)
         if isinstance(message, Error):
-            if message.id in {0, question.id} or message.fatal:
-                raise _refused(message)
+            if message.id not in {0, question.id} and not message.fatal:
+                return None
+            overtaken = message.code in _OVERTAKEN and question.answer is Obs
+            if overtaken and (newest := self.unasked(newest=True)) is not None:
+                # The planner was late and the worker went on without it.
+                return newest  # type: ignore[return-value]
+            raise _refused(message)
+        if isinstance(message, Obs) and message.id == 0:
+            self._unasked.append(message)
             return None
         if isinstance(message, Progress) or 0 < message.id < question.id:
             return None
@@ -154,22 +224,44 @@ class Conversation:
         self._note(message)
         return message
 
+    def unasked(self, *, newest: bool = False) -> Obs | None:
+        """An observation that came unasked: the oldest, or the newest and forget all others."""
+        if not self._unasked:
+            return None
+        message = self._unasked.pop() if newest else self._unasked.popleft()
+        if newest:
+            self._unasked.clear()
+        self._note(message)
+        return message
+
+    def hear(self, data: bytes | str) -> None:
+        """Take in a message while nothing is awaited.
+
+        Raises:
+            StatusError: the worker ends the connection, and why.
+        """
+        message = _server_message(data)
+        if isinstance(message, Error):
+            raise _refused(message)
+        if isinstance(message, Obs):
+            self._unasked.append(message)
+
     def _note(self, message: Envelope) -> None:
         if isinstance(message, Obs):
             self._step, self._revision = message.step, message.revision
         elif isinstance(message, Edited | View):
             self._revision = message.revision
+        elif isinstance(message, Welcome) and self._step is None:
+            self._step, self._revision = message.step, message.revision
 
     def _next_id(self) -> int:
         self._ids += 1
         return self._ids
 
     @staticmethod
-    def _question(
-        message: Envelope, answer: type[A], awaited: str, patient: bool = False
-    ) -> Question[A]:
+    def _question(message: Envelope, answer: type[A], awaited: str, **how: Any) -> Question[A]:
         fields = message.model_dump(mode="python", exclude_none=True)
-        return Question(message.id, encode(fields), answer, awaited, patient)
+        return Question(message.id, encode(fields), answer, awaited, **how)
 
 
 def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:

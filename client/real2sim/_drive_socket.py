@@ -10,7 +10,7 @@ import websockets
 
 from real2sim_proto import DRIVE_SUBPROTOCOL
 
-from ._conversation import MAX_MESSAGE_BYTES, Question
+from ._conversation import MAX_MESSAGE_BYTES
 from ._replies import Reply, refusal_error
 from ._transport import Target
 from .errors import (
@@ -72,7 +72,7 @@ def handshake_errors(target: Target) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def lost_connection(target: Target, question: Question[Any]) -> Iterator[None]:
+def lost_connection(target: Target, awaited: str) -> Iterator[None]:
     """A socket that closes while an answer is awaited, as ConnectionLostError."""
     try:
         yield
@@ -82,6 +82,6 @@ def lost_connection(target: Target, question: Question[Any]) -> Iterator[None]:
         leaving = close is not None and close.code in {1001, 1012}
         raise ConnectionLostError(
             f"the worker at {target.url} closed the drive socket ({said}) while "
-            f"{question.awaited} was awaited",
+            f"{awaited} was awaited",
             hint="the worker is shutting down or restarting" if leaving else None,
         ) from error

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias, TypedDict
 
-from real2sim_proto.episode import EgoSpec, ResetSpec, SensorSpec
+from real2sim_proto.episode import (
+    AgentsSpec,
+    ContactSpec,
+    EgoSpec,
+    LatencySpec,
+    ResetSpec,
+    ScoringSpec,
+    SensorSpec,
+)
 
 from ._requests import checked
 
@@ -20,10 +28,18 @@ class ResetOptions(TypedDict, total=False):
     start_us: int | None
     dt_us: int
     horizon: int | None
+    warmup_us: int
     ego: EgoSpec | Mapping[str, Any]
     action: Literal["trajectory", "control", "pose"]
+    agents: AgentsSpec | Mapping[str, Any]
     privileged: bool
+    deadline_ms: int | None
+    on_timeout: Literal["hold_plan", "brake", "pause", "fail"]
+    wall_clock_s: float | None
+    latency: LatencySpec | Mapping[str, Any]
     on_collision: Literal["terminate", "continue"]
+    contact: ContactSpec | Mapping[str, Any]
+    scoring: ScoringSpec | Mapping[str, Any]
 
 
 def sensor_specs(sensors: Sequence[Sensor], codec: str) -> list[SensorSpec]:

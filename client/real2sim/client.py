@@ -19,7 +19,8 @@ from ._scenarios_async import AsyncScenarios
 from ._scenes import AsyncScenes, Scenes
 from ._sessions import AsyncSessions, Sessions
 from ._transport import AsyncTransport, Target, Transport
-from .drive_session import AsyncDriveSession, DriveSession, SessionPlan
+from .drive_session import DriveSession, SessionPlan
+from .drive_session_async import AsyncDriveSession
 from .errors import ProtocolMismatchError, ReplyTimeoutError, UnreachableError
 
 if TYPE_CHECKING:
@@ -107,7 +108,12 @@ class Client:
         return self.server()
 
     def session(
-        self, *, scene: str | None = None, scenario: str | None = None, codec: str = "auto"
+        self,
+        *,
+        scene: str | None = None,
+        scenario: str | None = None,
+        codec: str = "auto",
+        reconnect: float = 60.0,
     ) -> DriveSession:
         """A new session on a scene or a scenario, to be opened by ``with``.
 
@@ -116,8 +122,10 @@ class Client:
             scenario: id of a scenario.
             codec: of cameras that name none: ``auto`` (raw when the worker is on this machine,
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
+            reconnect: seconds for which a lost connection is tried again: the session goes on as
+                if nothing had happened, also after the worker was started anew. 0 gives up.
         """
-        plan = SessionPlan(scene=scene, scenario=scenario, codec=codec)
+        plan = SessionPlan(scene=scene, scenario=scenario, codec=codec, reconnect=reconnect)
         return DriveSession(self._transport, plan)
 
     def join(
@@ -181,10 +189,15 @@ class AsyncClient:
         return await self.server()
 
     def session(
-        self, *, scene: str | None = None, scenario: str | None = None, codec: str = "auto"
+        self,
+        *,
+        scene: str | None = None,
+        scenario: str | None = None,
+        codec: str = "auto",
+        reconnect: float = 60.0,
     ) -> AsyncDriveSession:
         """A new session, to be opened by ``async with``; see :meth:`Client.session`."""
-        plan = SessionPlan(scene=scene, scenario=scenario, codec=codec)
+        plan = SessionPlan(scene=scene, scenario=scenario, codec=codec, reconnect=reconnect)
         return AsyncDriveSession(self._transport, plan)
 
     def join(

@@ -5,17 +5,18 @@ A session is used by one thread or task at a time.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
+import random
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 
-from websockets.asyncio.client import connect as connect_async
+import websockets
 from websockets.sync.client import connect
 
-from real2sim_proto.drive import Edited, Envelope, Plan, Result, Welcome
+from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Plan, Result, Welcome
 from real2sim_proto.operations import Operation
 from real2sim_proto.sessions import SessionInfo
 
@@ -23,20 +24,30 @@ from . import _requests
 from ._conversation import Conversation, Question
 from ._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from ._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
-from ._transport import AsyncTransport, Target, Transport
+from ._transport import Target, Transport
 from .errors import (
+    CapacityError,
+    ConnectionLostError,
     NotOpenError,
     Real2SimError,
     ReplyTimeoutError,
+    UnreachableError,
 )
 from .observation import Observation, View, observation_from_wire, view_from_frames
 from .version import SDK
 
 if TYPE_CHECKING:
-    from websockets.asyncio.client import ClientConnection as AsyncSocket
     from websockets.sync.client import ClientConnection as Socket
 
 A = TypeVar("A", bound=Envelope)
+
+COMING_BACK = (UnreachableError, CapacityError, ReplyTimeoutError)
+"""What a worker that is being started again answers with."""
+
+
+def backoff(attempt: int) -> float:
+    """Seconds before try number ``attempt`` of a connection that was lost; with jitter."""
+    return min(0.05 * 2.0**attempt, 2.0) * (0.75 + 0.25 * random.random())
 
 
 @dataclass(frozen=True)
@@ -49,6 +60,7 @@ class SessionPlan:
         token: of the session that is joined.
         role: ``controller`` or ``observer``.
         codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
+        reconnect: seconds for which a lost connection is tried again; 0 gives up at once.
     """
 
     scene: str | None = None
@@ -57,6 +69,7 @@ class SessionPlan:
     token: str | None = None
     role: str = "controller"
     codec: str = "auto"
+    reconnect: float = 60.0
 
 
 class SessionBase:
@@ -69,6 +82,7 @@ class SessionBase:
         self._conversation = Conversation()
         self._welcome: Welcome | None = None
         self._result: Result | None = None
+        self._token = plan.token
 
     def __repr__(self) -> str:
         name = self._welcome.session_id if self._welcome else self._plan.session_id
@@ -93,6 +107,15 @@ class SessionBase:
         return self.welcome.session_id
 
     @property
+    def token(self) -> str:
+        """Authorises others to join this session: ``client.join(s.session_id, token=s.token)``."""
+        if self._token is None:
+            raise NotOpenError(
+                "the session is not open", hint="use it as `with client.session(...) as s:`"
+            )
+        return self._token
+
+    @property
     def cameras(self) -> list[str]:
         """Names of the cameras that can be sensors."""
         return [camera.name for camera in self.welcome.cameras]
@@ -102,8 +125,24 @@ class SessionBase:
         """Final scores; known after ``close``."""
         return self._result
 
-    def _hello(self, token: str | None) -> Question[Welcome]:
-        return self._conversation.hello(sdk=SDK, role=self._plan.role, token=token)
+    def _hello(self) -> Question[Welcome]:
+        resume_token = self._welcome.resume_token if self._welcome else None
+        return self._conversation.hello(
+            sdk=SDK, role=self._plan.role, token=self._token, resume_token=resume_token
+        )
+
+    def _comes_back(self, question: Question[Any]) -> bool:
+        """Whether it is worth connecting again for the sake of a question."""
+        return self._welcome is not None and self._plan.reconnect > 0 and question.repeatable
+
+    def _check_repeatable(self, question: Question[Any]) -> None:
+        """Raises ConnectionLostError when the question may have taken effect already."""
+        if question.only_at is not None and self.welcome.revision != question.only_at:
+            raise ConnectionLostError(
+                f"the connection was lost while {question.awaited} was awaited; the session is at "
+                f"revision {self.welcome.revision} now, so it took effect",
+                hint="the session goes on; look at the next observation",
+            )
 
     def _seconds(self, question: Question[Any]) -> float:
         return self._target.patience if question.patient else self._target.timeout
@@ -123,23 +162,18 @@ class DriveSession(SessionBase):
         super().__init__(transport.target, plan)
         self._transport = transport
         self._socket: Socket | None = None
-        self._stack = contextlib.ExitStack()
+        self._line = contextlib.ExitStack()
+        self._info: SessionInfo | None = None
 
     def open(self) -> Self:
         """Create or join the session and shake hands; loading is over when this returns."""
-        session_id, token = self._plan.session_id, self._plan.token
+        session_id = self._plan.session_id
         if session_id is None:
             call = _requests.create_session(self._plan.scene, self._plan.scenario, None)
-            info = self._transport.send(call)
-            session_id, token = info.session_id, info.token
-            self._stack.callback(self._delete, info)
+            self._info = self._transport.send(call)
+            session_id, self._token = self._info.session_id, self._info.token
         try:
-            with handshake_errors(self._target):
-                self._socket = self._stack.enter_context(
-                    connect(**socket_options(self._target, session_id))
-                )
-            check_subprotocol(self._socket.subprotocol)
-            self._welcome = self._ask(self._hello(token))
+            self._connect(session_id)
         except BaseException:
             self._shut()
             raise
@@ -152,8 +186,9 @@ class DriveSession(SessionBase):
 
         Args:
             sensors: camera names or specs; what every observation shows.
-            options: seed, start_us, dt_us, horizon, ego, action, privileged, on_collision; see
-                ``real2sim_proto.drive.ResetSpec``.
+            options: seed, start_us, dt_us, horizon, ego, action, agents, privileged, deadline_ms,
+                on_timeout, latency, on_collision and more; see
+                ``real2sim_proto.episode.ResetSpec``.
         """
         spec = reset_spec(sensors, self._codec, options)
         return observation_from_wire(self._ask(self._conversation.reset(spec)))
@@ -161,9 +196,31 @@ class DriveSession(SessionBase):
     def step(self, plan: Plan | Mapping[str, Any]) -> Observation:
         """Send the plan for the newest observation; returns the next one.
 
-        After a ReplyTimeoutError the same plan may be sent again: the worker moves only once.
+        After a ReplyTimeoutError the same plan may be sent again: the worker moves only once. A
+        plan that misses the episode's deadline is not applied; the observation that the worker
+        went on to is returned, with a ``deadline_missed`` event.
         """
         return observation_from_wire(self._ask(self._conversation.action(plan)))
+
+    def receive(self, timeout: float | None = None) -> Observation:
+        """The next observation that comes unasked: what an observer sees of the controller's loop.
+
+        Args:
+            timeout: seconds to wait; default: the client's.
+
+        Raises:
+            ReplyTimeoutError: none came in time.
+        """
+        seconds = self._target.timeout if timeout is None else timeout
+        until = time.monotonic() + seconds
+        while (message := self._conversation.unasked()) is None:
+            with lost_connection(self._target, "an observation"):
+                try:
+                    data = self._open_socket().recv(timeout=max(until - time.monotonic(), 0.0))
+                except TimeoutError:
+                    raise ReplyTimeoutError("observation", seconds) from None
+            self._conversation.hear(data)
+        return observation_from_wire(message)
 
     def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> Edited:
         """Change this session's world before the next step; all operations apply, or none."""
@@ -175,6 +232,34 @@ class DriveSession(SessionBase):
         return view_from_frames(
             view.frames, t_us=view.t_us, revision=view.revision, timing=view.timing
         )
+
+    def steer(
+        self,
+        object_id: str,
+        times_us: Sequence[int],
+        poses: Sequence[tuple[float, float, float]],
+    ) -> int:
+        """Drive an object whose driver is ``external``; from which step on the plan holds.
+
+        Args:
+            object_id: named as external in ``reset(agents=...)``.
+            times_us: [N] absolute simulation times after the newest observation [us].
+            poses: [N] x [m], y [m], yaw [rad] of its box, world.
+        """
+        return self._ask(self._conversation.agent(object_id, times_us, poses)).step
+
+    def snapshot(self, name: str) -> Kept:
+        """Keep the present instant under a name, to return to by :meth:`restore`."""
+        return self._ask(self._conversation.snapshot(name))
+
+    def restore(self, name: str) -> Observation:
+        """Go back to a snapshot; its observation."""
+        return observation_from_wire(self._ask(self._conversation.restore(name)))
+
+    def fork(self) -> Forked:
+        """Another session that goes on from this instant: ``client.join(f.session_id,
+        token=f.token)``."""
+        return self._ask(self._conversation.fork())
 
     def close(self) -> Result | None:
         """End a session that this handle made, or leave one that it joined; idempotent.
@@ -200,10 +285,41 @@ class DriveSession(SessionBase):
     ) -> None:
         self.close()
 
+    def _connect(self, session_id: str) -> None:
+        with handshake_errors(self._target):
+            line = connect(**socket_options(self._target, session_id))
+            self._socket = self._line.enter_context(line)
+        check_subprotocol(self._socket.subprotocol)
+        self._welcome = self._exchange(self._hello())
+
+    def _reconnect(self) -> None:
+        """Connect again, for as long as the plan says; the worker may be starting anew."""
+        session_id, until = self.session_id, time.monotonic() + self._plan.reconnect
+        for attempt in range(10_000):
+            self._hang_up()
+            try:
+                return self._connect(session_id)
+            except COMING_BACK:
+                wait = backoff(attempt)
+                if time.monotonic() + wait > until:
+                    raise
+                time.sleep(wait)
+        return None
+
     def _ask(self, question: Question[A]) -> A:
+        try:
+            return self._exchange(question)
+        except ConnectionLostError:
+            if not self._comes_back(question):
+                raise
+            self._reconnect()
+            self._check_repeatable(question)
+            return self._exchange(question)
+
+    def _exchange(self, question: Question[A]) -> A:
         socket = self._open_socket()
         seconds = self._seconds(question)
-        with lost_connection(self._target, question):
+        with lost_connection(self._target, question.awaited):
             socket.send(question.data)
             while True:
                 try:
@@ -220,115 +336,15 @@ class DriveSession(SessionBase):
             )
         return self._socket
 
+    def _hang_up(self) -> None:
+        with contextlib.suppress(OSError, websockets.exceptions.WebSocketException):
+            self._line.close()
+
     def _shut(self) -> None:
+        self._hang_up()
         self._socket = None
-        self._stack.close()
-
-    def _delete(self, info: SessionInfo) -> None:
-        if self._result is None:
-            token = self._target.token or info.token
+        if self._info is not None and self._result is None:
+            token = self._target.token or self._info.token
             with contextlib.suppress(Real2SimError):
-                self._transport.send(_requests.delete_session(info.session_id, token))
-
-
-class AsyncDriveSession(SessionBase):
-    """``async with client.session(scene=...) as s: obs = await s.reset()``; see DriveSession."""
-
-    def __init__(self, transport: AsyncTransport, plan: SessionPlan) -> None:
-        super().__init__(transport.target, plan)
-        self._transport = transport
-        self._socket: AsyncSocket | None = None
-        self._stack = contextlib.AsyncExitStack()
-
-    async def open(self) -> Self:
-        """Create or join the session and shake hands; loading is over when this returns."""
-        session_id, token = self._plan.session_id, self._plan.token
-        if session_id is None:
-            call = _requests.create_session(self._plan.scene, self._plan.scenario, None)
-            info = await self._transport.send(call)
-            session_id, token = info.session_id, info.token
-            self._stack.push_async_callback(self._delete, info)
-        try:
-            with handshake_errors(self._target):
-                self._socket = await self._stack.enter_async_context(
-                    connect_async(**socket_options(self._target, session_id))
-                )
-            check_subprotocol(self._socket.subprotocol)
-            self._welcome = await self._ask(self._hello(token))
-        except BaseException:
-            await self._shut()
-            raise
-        return self
-
-    async def reset(
-        self, *, sensors: Sequence[Sensor] = (), **options: Unpack[ResetOptions]
-    ) -> Observation:
-        """Start an episode and return its first observation; see :meth:`DriveSession.reset`."""
-        spec = reset_spec(sensors, self._codec, options)
-        return observation_from_wire(await self._ask(self._conversation.reset(spec)))
-
-    async def step(self, plan: Plan | Mapping[str, Any]) -> Observation:
-        """Send the plan for the newest observation; returns the next one."""
-        return observation_from_wire(await self._ask(self._conversation.action(plan)))
-
-    async def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> Edited:
-        """Change this session's world before the next step; all operations apply, or none."""
-        return await self._ask(self._conversation.edit(operations))
-
-    async def render(self, sensors: Sequence[Sensor]) -> View:
-        """Images of the current instant; never moves time."""
-        view = await self._ask(self._conversation.render(sensor_specs(sensors, self._codec)))
-        return view_from_frames(
-            view.frames, t_us=view.t_us, revision=view.revision, timing=view.timing
-        )
-
-    async def close(self) -> Result | None:
-        """End a session that this handle made, or leave one that it joined; idempotent."""
-        if self._socket is not None and self._plan.session_id is None:
-            # Whoever closes wants to go; a worker that is gone already must not hold them up.
-            with contextlib.suppress(Real2SimError):
-                self._result = await self._ask(self._conversation.bye())
-        await self._shut()
-        return self._result
-
-    async def __aenter__(self) -> Self:
-        return await self.open()
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        await self.close()
-
-    async def _ask(self, question: Question[A]) -> A:
-        socket = self._open_socket()
-        seconds = self._seconds(question)
-        with lost_connection(self._target, question):
-            await socket.send(question.data)
-            while True:
-                try:
-                    async with asyncio.timeout(seconds):
-                        data = await socket.recv()
-                except TimeoutError:
-                    raise self._late(question) from None
-                if (answer := self._conversation.read(data, question)) is not None:
-                    return answer
-
-    def _open_socket(self) -> AsyncSocket:
-        if self._socket is None:
-            raise NotOpenError(
-                "the session is not open", hint="use it as `async with client.session(...) as s:`"
-            )
-        return self._socket
-
-    async def _shut(self) -> None:
-        self._socket = None
-        await self._stack.aclose()
-
-    async def _delete(self, info: SessionInfo) -> None:
-        if self._result is None:
-            token = self._target.token or info.token
-            with contextlib.suppress(Real2SimError):
-                await self._transport.send(_requests.delete_session(info.session_id, token))
+                self._transport.send(_requests.delete_session(self._info.session_id, token))
+        self._info = None

@@ -66,6 +66,7 @@ class Observation(View):
         terminated: the episode ended by something that happened in it.
         truncated: the episode ended because its time was over.
         reason: why it ended.
+        warming_up: whether the vehicle still moves as recorded; plans wait.
     """
 
     step: int
@@ -78,6 +79,7 @@ class Observation(View):
     terminated: bool = False
     truncated: bool = False
     reason: str | None = None
+    warming_up: bool = False
 
     @property
     def over(self) -> bool:
@@ -110,6 +112,7 @@ def observation_from_wire(obs: Obs) -> Observation:
         terminated=obs.terminated,
         truncated=obs.truncated,
         reason=obs.reason,
+        warming_up=obs.warming_up,
         timing=obs.timing,
     )
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pydantic import Field
 
 from .base import Microseconds, Model
-from .drive import MAX_SENSORS, AgentState, EgoState, Event, Plan, ResetSpec, SensorSpec
+from .drive import AgentState, EgoState, Event, Plan
+from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .scenes import Reply
 
 MAX_STEPS_PER_REQUEST = 1000

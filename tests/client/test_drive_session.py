@@ -140,7 +140,7 @@ def test_after_a_timeout_the_same_plan_moves_the_worker_only_once(worker: FakeWo
 
 
 def test_a_worker_that_leaves_is_reported_with_its_reason(worker: FakeWorker) -> None:
-    with connect(worker) as client, client.session(scene="street") as session:
+    with connect(worker) as client, client.session(scene="street", reconnect=0) as session:
         session.reset()
         worker.mischief = "restart"
         with pytest.raises(real2sim.ConnectionLostError, match="1012 restarting") as caught:

@@ -36,6 +36,7 @@ async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
         worker.sessions,
         authorised=authorised,
         worker_token=secret.get_secret_value() if secret else None,
+        ws_base=str(socket.base_url).rstrip("/"),
     ).serve()
 
 

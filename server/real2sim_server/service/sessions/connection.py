@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from typing import Any, assert_never
 
 import structlog
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
-from real2sim_proto.drive import Action, Bye, Edit, Hello, Render, Reset
+from real2sim_proto.drive import (
+    Action,
+    Agent,
+    Bye,
+    Edit,
+    Fork,
+    Hello,
+    Render,
+    Reset,
+    Restore,
+    Snapshot,
+)
 
-from ..auth import opens, unauthorized
+from ..auth import opens, same_secret, unauthorized
 from ..problems import ServiceError, service_error
 from .describe import welcome_fields
 from .messages import BadMessageError, Incoming, bad_message, read_message, unsupported_protocol
 from .observers import Mailbox
+from .patience import Patience
 from .registry import Sessions
 from .session import Session, controller_taken
 from .wire import pack_message
@@ -27,6 +39,12 @@ PROGRESS_S = 1.0
 FAREWELL_S = 2.0
 SMALL_BYTES = 16_384
 """Messages up to this size are read on the event loop: that takes less than handing them over."""
+
+MAY_SEND: dict[str, tuple[type, ...]] = {
+    "controller": (Hello, Reset, Action, Edit, Render, Agent, Snapshot, Restore, Fork, Bye),
+    "observer": (Hello, Render, Bye),
+    "agent": (Hello, Agent, Render, Bye),
+}
 
 POLICY_VIOLATION = 1008
 NORMAL_CLOSURE = 1000
@@ -52,6 +70,7 @@ class Connection:
         sessions: the session's registry.
         authorised: whether the handshake carried the worker's token.
         worker_token: opens every session; None where the worker has none.
+        ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
     """
 
     def __init__(
@@ -62,13 +81,18 @@ class Connection:
         *,
         authorised: bool,
         worker_token: str | None,
+        ws_base: str,
     ) -> None:
         self._socket = socket
         self._session = session
         self._sessions = sessions
         self._authorised = authorised
         self._worker_token = worker_token
+        self._ws_base = ws_base
         self._sending = asyncio.Lock()
+        self._patience = Patience(
+            session, sessions.stepper, lambda message: self._send(message.with_id(0))
+        )
 
     async def serve(self) -> None:
         """Talk until one of both leaves. A client that vanishes disturbs nobody."""
@@ -78,8 +102,9 @@ class Connection:
             session.check_open()
             session.hangups.add(self._hang_up)
             if hello.role == "controller":
-                with self._as_controller(hello):
+                async with self._as_controller(hello):
                     await self._welcome(hello)
+                    await self._catch_up(hello)
                     await self._converse(hello.role)
             else:
                 await self._welcome(hello)
@@ -99,7 +124,6 @@ class Connection:
 
     async def _greeting(self) -> Hello:
         """The client's hello. Raises FatalError when there is no talking to it."""
-        session = self._session
         try:
             async with asyncio.timeout(GREETING_S):
                 message = (await self._receive()).message
@@ -113,11 +137,19 @@ class Connection:
             raise FatalError(refusal, message_id=message.id)
         if not set(message.protocols) & set(SUPPORTED_SUBPROTOCOLS):
             raise FatalError(unsupported_protocol(message.protocols), message_id=message.id)
-        if not (self._authorised or opens(message.token, session.row.token, self._worker_token)):
+        if not (self._authorised or self._resumes(message) or self._opens(message)):
             refusal = unauthorized("hello carries neither the session's token nor the worker's")
             refusal.hint = "the answer to POST /v1/sessions has the session's token"
             raise FatalError(refusal, message_id=message.id)
         return message
+
+    def _opens(self, hello: Hello) -> bool:
+        return opens(hello.token, self._session.row.token, self._worker_token)
+
+    def _resumes(self, hello: Hello) -> bool:
+        """Whether this is the session's controller who comes back."""
+        resume = hello.resume
+        return resume is not None and same_secret(resume.token, self._session.resume_token)
 
     async def _welcome(self, hello: Hello) -> None:
         """Have everything warm, saying so meanwhile, and tell the client what there is."""
@@ -134,16 +166,38 @@ class Connection:
         fields = await asyncio.to_thread(welcome_fields, self._session, hello.role)
         await self._send(pack_message("welcome", fields).with_id(hello.id))
 
-    @contextlib.contextmanager
-    def _as_controller(self, hello: Hello) -> Iterator[None]:
+    @contextlib.asynccontextmanager
+    async def _as_controller(self, hello: Hello) -> AsyncIterator[None]:
         session = self._session
-        if session.controller is not None:
+        old = session.controller
+        if old is not None and not self._resumes(hello):
             raise FatalError(controller_taken(session.session_id), message_id=hello.id)
         session.controller = self
+        if isinstance(old, Connection):
+            # Its client has come back by another way; the old one may never notice.
+            await old.give_way()
         try:
             yield
         finally:
-            session.controller = None
+            self._patience.end()
+            if session.controller is self:
+                session.controller = None
+
+    async def give_way(self) -> None:
+        """Leave the session to the connection that has resumed it."""
+        self._session.hangups.discard(self._hang_up)
+        self._patience.end()
+        await self._hang_up(controller_taken(self._session.session_id))
+
+    async def _catch_up(self, hello: Hello) -> None:
+        """Send a controller that comes back the present observation, unless it has it."""
+        session = self._session
+        async with session.lock:
+            newest, step = session.newest, session.lockstep.step
+            missing = hello.resume is not None and hello.resume.last_step != step
+            if missing and newest is not None:
+                await self._send(newest.with_id(0))
+        self._patience.begin()
 
     @contextlib.asynccontextmanager
     async def _as_observer(self) -> AsyncIterator[None]:
@@ -173,6 +227,8 @@ class Connection:
             try:
                 incoming = await self._receive()
                 await self._send(await self._answer(incoming, role))
+                if role == "controller" and not self._patience.waiting:
+                    self._patience.begin()
             except BadMessageError as error:
                 if error.fatal:
                     raise FatalError(error.refusal, message_id=error.message_id) from error
@@ -184,10 +240,12 @@ class Connection:
 
     async def _answer(self, incoming: Incoming, role: str) -> bytes:
         message = incoming.message
-        if role == "observer" and isinstance(message, Reset | Action | Edit):
+        allowed = MAY_SEND[role]
+        if not isinstance(message, allowed):
             refusal = ServiceError(
                 ErrorCode.NOT_CONTROLLER,
-                f"an observer sent {message.type}; observers may send render and bye",
+                f"{'an' if role[0] in 'ao' else 'a'} {role} sent {message.type}; such clients may "
+                f"send {', '.join(kind.__name__.lower() for kind in allowed)}",
                 hint="connect with role 'controller' to drive",
             )
             return self._error(refusal, message.id)
@@ -202,6 +260,7 @@ class Connection:
             case Action():
                 return await self._act(message, incoming.content)
             case Reset():
+                self._patience.end()
                 async with session.lock:
                     session.check_open()
                     return await stepper.reset(session, message.spec, reply_to=message.id)
@@ -212,6 +271,10 @@ class Connection:
                 show = self._sessions.show
                 world = session.running_world()
                 return (await show.view(world, message.sensors, reply_to=message.id)).wire
+            case Agent() | Snapshot() | Restore() | Fork():
+                async with session.lock:
+                    session.check_open()
+                    return await self._change(message)
             case Bye():
                 return await self._leave(message, role)
             case Hello():
@@ -221,13 +284,41 @@ class Connection:
 
     async def _act(self, action: Action, content: bytes) -> bytes:
         session = self._session
+        waited_us = self._patience.waited_us
+        if action.step == session.lockstep.step:
+            self._patience.end()
         async with session.lock:
             session.check_open()
             cached = session.lockstep.cached_answer(action.step, content)
             if cached is None:
                 stepper = self._sessions.stepper
-                return await stepper.act(session, action.plan, content, reply_to=action.id)
+                return await stepper.act(
+                    session, action.plan, content, reply_to=action.id, latency_us=waited_us
+                )
         return await self._sessions.show.on_world_thread(cached.with_id, action.id)
+
+    async def _change(self, asked: Agent | Snapshot | Restore | Fork) -> bytes:
+        """Everything that is rare, for whoever holds the session's lock."""
+        session, stepper = self._session, self._sessions.stepper
+        match asked:
+            case Agent():
+                await stepper.steer(session, asked)
+                fields = {"object_id": asked.object_id, "step": session.running_world().steps}
+                return pack_message("driven", fields).with_id(asked.id)
+            case Snapshot():
+                kept = await stepper.snapshot(session, asked.name)
+                fields = {"name": asked.name, "step": kept.steps, "t_us": kept.t_us}
+                return pack_message("kept", fields).with_id(asked.id)
+            case Restore():
+                self._patience.end()
+                return await stepper.restore(session, asked.name, reply_to=asked.id)
+            case Fork():
+                info = await self._sessions.fork(session, ws_base=self._ws_base)
+                fields = info.model_dump(include={"session_id", "token", "ws_url"})
+                fields["step"] = session.running_world().steps
+                return pack_message("forked", fields).with_id(asked.id)
+            case _:
+                assert_never(asked)
 
     async def _edit(self, edit: Edit) -> bytes:
         session = self._session
@@ -247,7 +338,9 @@ class Connection:
     async def _leave(self, bye: Bye, role: str) -> bytes:
         """The result; a controller that says bye ends the session."""
         session = self._session
+        scores = await self._sessions.scores(session)
         if role == "controller":
+            self._patience.end()
             session.hangups.discard(self._hang_up)
             await self._sessions.close(session, reason="its controller said bye")
         world = session.world
@@ -256,6 +349,7 @@ class Connection:
             "t_us": world.t_us if world else None,
             "reason": world.reason if world else None,
             "metrics": world.metrics() if world else {},
+            "scores": [score.fields() for score in scores],
         }
         return pack_message("result", fields).with_id(bye.id)
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
-from real2sim_proto.drive import MAX_SENSORS
+from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionInfo, SessionState
 
-from ...world import Event, World, agent_fields
+from ...world import Event, World, agent_fields, metrics_version
 from ..views import camera_infos, edited_objects
 from .session import Session
 
@@ -65,7 +65,11 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
         "protocol": DRIVE_SUBPROTOCOL,
         "session_id": session.session_id,
         "role": role,
-        "versions": {"server": version("real2sim"), "scene_hash": session.row.scene_hash},
+        "versions": {
+            "server": version("real2sim"),
+            "scene_hash": session.row.scene_hash,
+            "metrics": metrics_version(),
+        },
         "limits": {
             "max_message_bytes": MAX_CLIENT_MESSAGE_BYTES,
             "max_operations_per_request": MAX_OPERATIONS_PER_REQUEST,
@@ -76,4 +80,6 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
         "start_us": start.scene.start_us,
         "end_us": start.scene.end_us,
         "step": world.steps if world else None,
+        "revision": world.revision if world else 0,
+        "resume_token": session.resume_token if role == "controller" else None,
     }

@@ -28,9 +28,17 @@ class LockStep(Generic[A]):
         self.over = False
         self._last: tuple[bytes, A] | None = None
 
-    def reset(self) -> None:
-        """An episode begins at step 0."""
-        self.step, self.over, self._last = 0, False, None
+    def reset(self, step: int = 0, *, over: bool = False) -> None:
+        """An episode begins at step 0, or is returned to at another."""
+        self.step, self.over, self._last = step, over, None
+
+    def end(self) -> None:
+        """The episode ends without a step; the last answer can still be had again."""
+        self.over = True
+
+    def taken(self, content: bytes, answer: A) -> None:
+        """Say what the last step was answered with, after it was lived through again."""
+        self._last = (content, answer)
 
     def cached_answer(self, step: int, content: bytes) -> A | None:
         """The answer already given to this action; None when it is the one that is due.

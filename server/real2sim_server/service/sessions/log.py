@@ -1,27 +1,13 @@
-"""What a session's log holds: msgpack of exactly what was asked for."""
+"""What a session's log holds, between the store and the world."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
-from real2sim_proto import encode
-from real2sim_proto.drive import Plan, ResetSpec
-from real2sim_proto.operations import Operation
-
-KEPT_PLAN = encode({"plan": None})
-"""Payload of an action that goes on with the plan before it."""
+from ...world.history import Entry
+from ..store import SessionEntry
 
 
-def reset_payload(spec: ResetSpec) -> bytes:
-    """Of the beginning of an episode."""
-    return encode({"spec": spec.model_dump(mode="json")})
-
-
-def plan_payload(plan: Plan) -> bytes:
-    """Of an action. Equal plans have equal bytes, whichever way they came over the wire."""
-    return encode({"plan": plan.model_dump()})
-
-
-def edit_payload(operations: Sequence[Operation]) -> bytes:
-    """Of an edit."""
-    return encode({"operations": [operation.model_dump(mode="json") for operation in operations]})
+def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
+    """Entries of a stored log, for the world to live through again."""
+    return [Entry(row.kind, row.step or 0, row.payload) for row in rows]

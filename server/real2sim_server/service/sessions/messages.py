@@ -17,11 +17,11 @@ from real2sim_proto import (
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage
 
+from ...world.history import plan_payload
 from ..problems import ServiceError
-from .log import plan_payload
 
 MAX_PROBLEMS = 4
-TYPES = "hello, reset, action, edit, render, bye"
+TYPES = "hello, reset, action, edit, render, agent, snapshot, restore, fork, bye"
 
 
 @dataclass(frozen=True)

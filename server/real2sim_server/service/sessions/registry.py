@@ -8,17 +8,20 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary, WeakSet
 
 import structlog
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import ResetSpec
+from real2sim_proto.episode import ResetSpec
 from real2sim_proto.sessions import SessionInfo
 
 from ...edit import ScenarioState
 from ...scene import Scene
+from ...world import Score
+from ...world.history import Entry, Retold, last_episode, no_action_impact
+from ...world.scoring import scores_of
 from ..idempotency import Once
 from ..metrics import Metrics
 from ..problems import ServiceError
@@ -26,6 +29,8 @@ from ..residency import Residency
 from ..scenarios import Scenarios
 from ..store import SessionRow, Store, now_us
 from .describe import session_info
+from .log import entries_of
+from .recovery import check_scene, rebuild, state_at
 from .session import Session, Start
 from .show import Show
 from .step import Stepper
@@ -82,6 +87,7 @@ class Sessions:
         self._scenarios = scenarios
         self._open: dict[str, Session] = {}
         self._in_creation = 0
+        self._rebuilding: dict[str, asyncio.Task[Session]] = {}
         self._farewells: set[asyncio.Future[None]] = set()
         # Objects of a bare scene are the same for all sessions on it.
         self._bare_states: WeakKeyDictionary[Scene, ScenarioState] = WeakKeyDictionary()
@@ -161,21 +167,77 @@ class Sessions:
         return info
 
     async def find(self, session_id: str) -> Session:
-        """The open session of that id.
+        """The open session of that id; one that an earlier run left open is rebuilt first.
 
         Raises:
-            ServiceError: SESSION_CLOSED when it is over, else UNKNOWN_SESSION.
+            ServiceError: SESSION_CLOSED when it is over, UNKNOWN_SESSION, or what is in the way
+                of rebuilding it.
         """
         if (session := self._open.get(session_id)) is not None:
             return session
         row = await self._store.session(session_id)
         if row is not None and row.closed_us is not None:
             raise _closed(session_id, row.reason or "closed")
-        detail, hint = f"no session {session_id!r}", "GET /v1/sessions lists them"
-        if row is not None:
-            detail = f"session {session_id!r} belongs to an earlier run of this worker"
-            hint = "make a new one: POST /v1/sessions"
-        raise ServiceError(ErrorCode.UNKNOWN_SESSION, detail, hint=hint)
+        if row is not None and row.worker_id == self._limits.worker_id:
+            return await self._rebuilt(row)
+        hint = "GET /v1/sessions lists them"
+        raise ServiceError(ErrorCode.UNKNOWN_SESSION, f"no session {session_id!r}", hint=hint)
+
+    async def fork(self, session: Session, *, ws_base: str) -> SessionInfo:
+        """A new session that goes on from the present instant of another, held by its lock.
+
+        Its log begins with a copy of the other's, so that it can be rebuilt on its own.
+
+        Raises:
+            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET.
+        """
+        world = session.running_world()
+        with self._place():
+            row = replace(
+                session.row,
+                session_id=f"{self._limits.worker_id}.{secrets.token_hex(8)}",
+                token=secrets.token_urlsafe(24),
+                created_us=now_us(),
+            )
+            await self._residency.pin(row.scene)
+            try:
+                await self._store.create_session(row)
+                entries = await self._store.session_entries(session.session_id)
+                await self._store.append_session_entries(row.session_id, entries)
+            except BaseException:
+                self._residency.unpin(row.scene)
+                raise
+            forked = Session(row, session.start)
+            forked.begin(world, session.cameras)
+            forked.lockstep.reset(world.steps, over=world.over)
+            forked.next_seq, forked.snapshots = len(entries), dict(session.snapshots)
+            self._open[row.session_id] = forked
+        log.info("session forked", session_id=row.session_id, parent=session.session_id)
+        return session_info(forked, ws_base=ws_base, token=row.token)
+
+    async def entries(self, session: Session) -> list[Entry]:
+        """Everything that has happened to a session, oldest first."""
+        return entries_of(await self._store.session_entries(session.session_id))
+
+    async def scores(self, session: Session) -> list[Score]:
+        """Final scores of the running episode; empty before the first reset.
+
+        After a collision the same episode is run once more without reactions of the ego, for the
+        impact speed that NeuroNCAP compares with.
+        """
+        world = session.world
+        if world is None:
+            return []
+        entries = last_episode(await self.entries(session))
+
+        def score() -> list[Score]:
+            context = world.context
+            if world.tally.first_impact is not None:
+                retold = Retold.on(session.start.scene, session.start.state)
+                context = replace(context, no_action_impact=no_action_impact(retold, entries))
+            return scores_of(world.tally, context)
+
+        return await self.show.on_world_thread(score)
 
     async def close(self, session: Session, *, reason: str) -> None:
         """End a session once its step under way is done; a second time changes nothing."""
@@ -219,6 +281,34 @@ class Sessions:
             yield
         finally:
             self._in_creation -= 1
+
+    async def _rebuilt(self, row: SessionRow) -> Session:
+        """The session of a row; whoever asks while it is being rebuilt waits for the same."""
+        task = self._rebuilding.get(row.session_id)
+        if task is None:
+            task = asyncio.create_task(self._rebuild(row))
+            self._rebuilding[row.session_id] = task
+            task.add_done_callback(lambda _: self._rebuilding.pop(row.session_id, None))
+        return await asyncio.shield(task)
+
+    async def _rebuild(self, row: SessionRow) -> Session:
+        with self._place():
+            pinned = await self._residency.pin(row.scene)
+            try:
+                summary = await self._residency.summary(row.scene)
+                check_scene(row, summary.content_hash)
+                if row.scenario_id is not None and row.scenario_revision is not None:
+                    state = await state_at(self._scenarios, row.scenario_id, row.scenario_revision)
+                else:
+                    state = await self._bare_state(pinned)
+                start = Start(pinned, summary, state)
+                session = await rebuild(row, start, store=self._store, show=self.show)
+            except BaseException:
+                self._residency.unpin(row.scene)
+                raise
+            self._open[row.session_id] = session
+        log.info("session rebuilt", session_id=row.session_id, entries=session.next_seq)
+        return session
 
     async def _start(self, scene: str | None, scenario: str | None) -> tuple[SessionRow, Start]:
         """What the new session is and begins from; its scene is pinned."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -52,6 +53,10 @@ class Session:
         lockstep: which action is due.
         events: since the last answer to a REST step.
         next_seq: of the session's log.
+        snapshots: instants to return to, by name.
+        newest: observation of the present instant, where it has been shown.
+        late: whether the planner has missed the deadline of the due action, and the clock waits.
+        expires_at: monotonic time at which the episode is cut off [s]; None for never.
         controller: the connection that drives, if there is one.
         observers: what the connections that look on still have to be sent.
         hangups: one for each open connection.
@@ -66,6 +71,10 @@ class Session:
     lockstep: LockStep[Message] = field(default_factory=LockStep)
     events: list[Event] = field(default_factory=list)
     next_seq: int = 0
+    snapshots: dict[str, World] = field(default_factory=dict)
+    newest: Message | None = None
+    late: bool = False
+    expires_at: float | None = None
     controller: object | None = None
     observers: set[Mailbox] = field(default_factory=set)
     hangups: set[Hangup] = field(default_factory=set)
@@ -101,7 +110,19 @@ class Session:
         """An episode begins."""
         self.world, self.cameras = world, cameras
         self.lockstep.reset()
-        self.events = []
+        self.events, self.newest, self.late = [], None, False
+        cap = world.spec.wall_clock_s
+        self.expires_at = None if cap is None else time.monotonic() + cap
+
+    @property
+    def resume_token(self) -> str:
+        """Lets a controller come back; the same in every run of the worker."""
+        return hashlib.sha256(b"resume:" + self.row.token.encode()).hexdigest()
+
+    @property
+    def expired(self) -> bool:
+        """Whether the episode has used up its wall-clock time."""
+        return self.expires_at is not None and time.monotonic() >= self.expires_at
 
     def take_events(self) -> list[Event]:
         """Events since this was called last."""
@@ -119,7 +140,8 @@ class Session:
             raise controller_taken(self.session_id)
 
     def publish(self, message: Message) -> None:
-        """Give an observation to all observers; never waits."""
+        """The newest observation, for all observers; never waits."""
+        self.newest = message
         for mailbox in self.observers:
             mailbox.put(message)
 

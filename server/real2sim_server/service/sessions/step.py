@@ -9,15 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from real2sim_proto.drive import ResetSpec
+from real2sim_proto import ErrorCode
+from real2sim_proto.drive import Agent
+from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation
 
 from ...edit import EditOutcome
 from ...world import Event, Plan, World
+from ...world.history import (
+    KEPT_PLAN,
+    action_payload,
+    agent_payload,
+    edit_payload,
+    name_payload,
+    reset_payload,
+    stop_payload,
+)
+from ..problems import ServiceError
 from ..store import SessionEntry, Store, now_us
-from .log import KEPT_PLAN, edit_payload, plan_payload, reset_payload
 from .session import Session
-from .show import Show
+from .show import Show, Shown
+from .wire import Message
+
+MAX_SNAPSHOTS = 32
 
 STEPS_AT_ONCE = 20
 """Steps of a REST request that are computed in one go; other sessions get their turn between."""
@@ -66,7 +80,15 @@ class Stepper:
         if session.world is not None:
             await self._record(session, [("reset", 0, reset_payload(session.spec))])
 
-    async def act(self, session: Session, plan: Plan, payload: bytes, *, reply_to: int) -> bytes:
+    async def act(
+        self,
+        session: Session,
+        plan: Plan | None,
+        payload: bytes,
+        *,
+        reply_to: int,
+        latency_us: int = 0,
+    ) -> bytes:
         """Take the action that is due; the next observation, ready to be sent.
 
         Args:
@@ -74,24 +96,59 @@ class Stepper:
             plan: what the ego does.
             payload: canonical bytes of the plan.
             reply_to: id of the message that is answered.
+            latency_us: wall-clock time from the observation to this action.
 
         Raises:
             WorldError: the plan is refused.
             QueueFullError: too much waits for the engine; the same action may be sent again.
         """
+        measured = session.spec.latency.model == "measured"
+        latency_us = latency_us if measured else 0
+        shown = await self._step(session, plan, latency_us, session.late, reply_to=reply_to)
+        session.lockstep.advance(payload, shown.message, over=shown.world.over)
+        return shown.wire
+
+    async def miss(self, session: Session) -> Message:
+        """Go on without the action that is due, by the episode's fallback; what to tell.
+
+        Whoever sends that action later is told that it is stale.
+        """
+        shown = await self._step(session, None, 0, True, reply_to=0)
+        session.lockstep.skip(1, over=shown.world.over)
+        return shown.message
+
+    async def stop(self, session: Session, reason: str) -> Message:
+        """End the episode where it is; the present observation with the reason."""
+        now = session.running_world()
+
+        def stopped() -> World:
+            world = now.light_copy()
+            world.stop(reason)
+            return world
+
+        shown = await self._show.observe(stopped, session.cameras, reply_to=0)
+        await self._record(session, [("stop", now.steps, stop_payload(reason))])
+        session.world = shown.world
+        session.lockstep.end()
+        session.publish(shown.message)
+        return shown.message
+
+    async def _step(
+        self, session: Session, plan: Plan | None, latency_us: int, missed: bool, *, reply_to: int
+    ) -> Shown:
         now = session.running_world()
 
         def moved() -> World:
             world = now.light_copy()
-            world.step(plan)
+            world.step(plan, latency_us=latency_us, missed=missed)
             return world
 
         shown = await self._show.observe(moved, session.cameras, reply_to=reply_to)
+        payload = action_payload(plan, latency_us=latency_us, missed=missed)
         await self._record(session, [("action", now.steps, payload)])
-        session.world = shown.world
-        session.lockstep.advance(payload, shown.message, over=shown.world.over)
+        session.world, session.late = shown.world, False
         session.publish(shown.message)
-        return shown.wire
+        return shown
 
     async def step(self, session: Session, n: int, plan: Plan | None) -> None:
         """Move the clock ``n`` times under one plan, or to the end; nothing is drawn.
@@ -105,7 +162,7 @@ class Stepper:
             count = min(STEPS_AT_ONCE, left)
             world, events = await self._show.on_world_thread(_moved_on(now, count, given))
             done = world.steps - now.steps
-            payloads = [plan_payload(given) if given else KEPT_PLAN, *[KEPT_PLAN] * (done - 1)]
+            payloads = [action_payload(given), *[KEPT_PLAN] * (done - 1)]
             entries = [("action", now.steps + k, p) for k, p in enumerate(payloads)]
             await self._record(session, entries)
             session.world = world
@@ -127,6 +184,55 @@ class Stepper:
         await self._record(session, [("edit", now.steps, edit_payload(operations))])
         session.world = world
         return outcome
+
+    async def steer(self, session: Session, asked: Agent) -> None:
+        """Give an externally driven object a plan. Raises WorldError."""
+        now = session.running_world()
+
+        def steered() -> World:
+            world = now.light_copy()
+            world.steer(asked.object_id, asked.times_us, asked.poses)
+            return world
+
+        world = await self._show.on_world_thread(steered)
+        payload = agent_payload(asked.object_id, asked.times_us, asked.poses)
+        await self._record(session, [("agent", now.steps, payload)])
+        session.world = world
+
+    async def snapshot(self, session: Session, name: str) -> World:
+        """Keep the present instant under a name. Raises ServiceError: INVALID_REQUEST."""
+        now = session.running_world()
+        if name not in session.snapshots and len(session.snapshots) >= MAX_SNAPSHOTS:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"the session keeps {MAX_SNAPSHOTS} snapshots already",
+                hint="use one of their names again",
+            )
+        await self._record(session, [("snapshot", now.steps, name_payload(name))])
+        session.snapshots[name] = now
+        return now
+
+    async def restore(self, session: Session, name: str, *, reply_to: int) -> bytes:
+        """Go back to a snapshot; its observation, ready to be sent.
+
+        Raises:
+            ServiceError: NOT_FOUND.
+        """
+        kept = session.snapshots.get(name)
+        if kept is None:
+            named = ", ".join(sorted(session.snapshots)) or "none"
+            raise ServiceError(
+                ErrorCode.NOT_FOUND,
+                f"the session has no snapshot {name!r}",
+                hint=f"snapshots of this session: {named}",
+            )
+        cameras = self._show.cameras(kept.scene, kept.spec.sensors)
+        shown = await self._show.observe(lambda: kept, cameras, reply_to=reply_to)
+        await self._record(session, [("restore", kept.steps, name_payload(name))])
+        session.begin(kept, cameras)
+        session.lockstep.reset(kept.steps, over=kept.over)
+        session.publish(shown.message)
+        return shown.wire
 
     async def _record(self, session: Session, things: Sequence[tuple[str, int, bytes]]) -> None:
         created_us = now_us()

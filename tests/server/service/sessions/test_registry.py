@@ -49,13 +49,16 @@ def test_sessions_that_nobody_uses_end_and_connected_ones_stay(own_site, join):
     assert planner.reset()["step"] == 0
 
 
-def test_sessions_of_an_earlier_run_are_unknown_with_a_hint(own_site, tmp_path):
+def test_sessions_of_an_earlier_run_are_rebuilt_when_they_are_asked_for(own_site, tmp_path):
     url = f"sqlite:///{tmp_path / 'store.db'}"
-    info = own_site(store_url=url).create()
-    answer = own_site(store_url=url).call("GET", info)
-    assert (answer.status_code, answer.json()["code"]) == (404, "UNKNOWN_SESSION")
-    assert "earlier run" in answer.json()["detail"]
-    assert "POST /v1/sessions" in answer.json()["hint"]
+    before = own_site(store_url=url)
+    info = before.create({"action": "control"})
+    plan = {"kind": "control", "acceleration": 1.0, "steering": 0.02}
+    state = before.call("POST", info, "/step", json={"n": 5, "plan": plan}).json()
+    after = own_site(store_url=url)
+    again = after.call("GET", info, "/state").json()
+    assert {k: again[k] for k in ("ego", "step")} == {k: state[k] for k in ("ego", "step")}
+    assert after.call("POST", info, "/step", json={}).json()["step"] == 6
 
 
 def test_the_workers_token_opens_every_session(own_site, join):

@@ -152,7 +152,7 @@ def test_events_are_told_until_the_next_step_answer(site):
     info = site.create({"action": "pose", "on_collision": "continue"})
     plan = {"kind": "pose", "x": 12.0, "y": -3.0, "yaw": 0.0}
     first = site.call("POST", info, "/step", json={"plan": plan}).json()
-    assert [e["object_id"] for e in first["events"]] == ["car_red"]
+    assert "car_red" in {e["object_id"] for e in first["events"]}
     again = site.call("POST", info, "/step", json={}).json()
     assert again["events"] == []
 

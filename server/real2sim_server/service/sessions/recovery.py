@@ -1,0 +1,107 @@
+"""Sessions that an earlier run of the worker left open, rebuilt from their logs."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+
+from real2sim_proto import ErrorCode, decode, encode
+
+from ...edit import LogEntry, Scenario, ScenarioState
+from ...world import World
+from ...world.history import Entry, Retold
+from ..problems import ServiceError
+from ..scenarios import Scenarios
+from ..store import SessionRow, Store
+from .log import entries_of
+from .session import Session, Start
+from .show import Show
+
+
+async def rebuild(row: SessionRow, start: Start, *, store: Store, show: Show) -> Session:
+    """The session as it was when its last entry took effect.
+
+    Everything is lived through again without rendering but the last step, whose answer its client
+    may never have got: it is drawn, so that asking once more gets it.
+
+    Args:
+        row: of the session.
+        start: its scene, pinned, and the objects it began from.
+        store: has its log.
+        show: moves worlds and draws.
+    """
+    session = Session(row, start)
+    rows = await store.session_entries(row.session_id)
+    session.next_seq = rows[-1].seq + 1 if rows else 0
+    entries = entries_of(rows)
+    if not entries:
+        return session
+    retold = Retold.on(start.scene, start.state)
+    *before, last = entries
+    await show.on_world_thread(_tell_all, retold, before)
+    session.snapshots = retold.snapshots
+    if last.kind == "action":
+        cameras = show.cameras(start.scene, _world(retold).spec.sensors)
+        shown = await show.observe(lambda: retold.tell(last), cameras, reply_to=0)
+        session.begin(shown.world, cameras)
+        session.lockstep.reset(shown.world.steps, over=shown.world.over)
+        if not decode(last.payload).get("missed"):
+            session.lockstep.taken(_content(last), shown.message)
+        session.newest = shown.message
+        return session
+    world = await show.on_world_thread(retold.tell, last)
+    session.begin(world, show.cameras(start.scene, world.spec.sensors))
+    session.lockstep.reset(world.steps, over=world.over)
+    return session
+
+
+async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> ScenarioState:
+    """Objects of a scenario as they were at a revision.
+
+    Raises:
+        ServiceError: UNKNOWN_SCENARIO when it is gone.
+    """
+    view = await scenarios.view(scenario_id)
+    if view.revision == revision:
+        return view.state
+    history = await scenarios.history(scenario_id)
+
+    def replayed() -> ScenarioState:
+        scenario = Scenario.replay(
+            ScenarioState.of(view.summary, assets=view.state.assets),
+            [
+                LogEntry(e.revision, e.kind, tuple(e.operations), e.target, e.created_at, e.who)
+                for e in history.entries[:revision]
+            ],
+            scene=view.row.scene,
+            scene_hash=view.row.scene_hash,
+        )
+        return scenario.state
+
+    return await asyncio.to_thread(replayed)
+
+
+def check_scene(row: SessionRow, scene_hash: str) -> None:
+    """Raises ServiceError: SCENE_BROKEN when the scene is not the one the session ran on."""
+    if row.scene_hash != scene_hash:
+        raise ServiceError(
+            ErrorCode.SCENE_BROKEN,
+            f"session {row.session_id!r} ran on scene {row.scene!r} with hash "
+            f"{row.scene_hash[:12]}; it has {scene_hash[:12]} now",
+            hint="put the old bundle back, or make a new session",
+        )
+
+
+def _tell_all(retold: Retold, entries: Sequence[Entry]) -> None:
+    for entry in entries:
+        retold.tell(entry)
+
+
+def _world(retold: Retold) -> World:
+    assert retold.world is not None
+    return retold.world
+
+
+def _content(entry: Entry) -> bytes:
+    """What an action is compared by: its plan alone."""
+    return encode({"plan": decode(entry.payload)["plan"]})

@@ -1,0 +1,228 @@
+"""A lost connection, a worker that is killed: the episode goes on as if nothing had happened."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import real2sim
+from real2sim_server.scene.io import save_scene
+
+pytestmark = pytest.mark.network
+
+STEPS = 12
+SENSORS = [{"camera": "front", "modalities": ["rgb", "depth"], "codec": "raw"}]
+PLAN = {"kind": "control", "acceleration": 0.5, "steering": 0.02}
+
+
+# --- connections that are lost ----------------------------------------------------------------
+
+
+def test_a_controller_comes_back_with_its_resume_token_and_takes_its_place(site, join):
+    info = site.create()
+    first = join(info, None)
+    token = first.hello()["resume_token"]
+    first.reset()
+    first.act(0)
+    second = join(info, None)
+    welcome = second.hello(resume={"token": token, "last_step": 1})
+    assert (welcome["type"], welcome["step"]) == ("welcome", 1)
+    assert second.act(1)["step"] == 2
+    assert first.wait_closed() == 1008
+
+
+def test_a_resume_token_needs_no_other(site, join):
+    info = site.create()
+    token = join(info, None).hello()["resume_token"]
+    answer = join(info, None).hello(token=None, resume={"token": token})
+    assert answer["type"] == "welcome"
+
+
+def test_a_wrong_resume_token_displaces_nobody(site, join):
+    info = site.create()
+    planner = join(info)
+    planner.reset()
+    other = join(info, None)
+    assert other.hello(resume={"token": "guess"})["code"] == "CONTROLLER_TAKEN"
+    assert planner.act(0)["step"] == 1
+
+
+def test_whoever_missed_an_observation_gets_it_again(site, join):
+    info = site.create()
+    first = join(info, None)
+    token = first.hello()["resume_token"]
+    first.reset(sensors=SENSORS)
+    lost = first.act(0)
+    second = join(info, None)
+    second.hello(resume={"token": token, "last_step": 0})
+    unasked = second.receive()
+    assert (unasked["id"], unasked["step"]) == (0, 1)
+    again = second.act(0)
+    assert again["frames"][0]["data"] == lost["frames"][0]["data"]
+    assert second.act(1)["step"] == 2
+
+
+def test_the_sdk_comes_back_by_itself(site):
+    with (
+        real2sim.connect(site.url) as client,
+        client.session(scene="tiny") as session,
+    ):
+        session.reset(action="control")
+        assert session.step(PLAN).step == 1
+        session._socket.socket.shutdown(socket.SHUT_RDWR)
+        assert session.step(PLAN).step == 2
+
+
+def test_an_observer_hears_what_the_controller_sees(site):
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as driver:
+        driver.reset(action="control")
+        with client.join(driver.session_id, token=driver.token, role="observer") as observer:
+            driver.step(PLAN)
+            driver.step(PLAN)
+            view = observer.render(["front"])
+            assert [observer.receive(timeout=10).step for _ in range(2)] == [1, 2]
+            assert view.image("front").shape == (64, 96, 3)
+            with pytest.raises(real2sim.ReplyTimeoutError):
+                observer.receive(timeout=0.1)
+
+
+# --- snapshots and forks ----------------------------------------------------------------------
+
+
+def test_a_snapshot_is_an_instant_to_return_to(site):
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        session.reset(action="control")
+        session.step(PLAN)
+        assert session.snapshot("here").step == 1
+        first = [session.step(PLAN) for _ in range(3)]
+        assert session.restore("here").step == 1
+        again = [session.step(PLAN) for _ in range(3)]
+    assert [o.ego for o in again] == [o.ego for o in first]
+
+
+def test_a_fork_goes_on_alike_and_on_its_own(site):
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        session.reset(action="control", sensors=SENSORS)
+        session.step(PLAN)
+        forked = session.fork()
+        with client.join(forked.session_id, token=forked.token) as other:
+            theirs = other.step(PLAN | {"acceleration": -3.0})
+            mine = session.step(PLAN)
+            assert theirs.step == mine.step == 2
+            assert theirs.ego.speed < mine.ego.speed
+    site.made.append({"session_id": forked.session_id, "token": forked.token})
+
+
+def test_a_fork_counts_as_a_session(own_site):
+    site = own_site(max_sessions=1)
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        session.reset(action="control")
+        with pytest.raises(real2sim.CapacityError):
+            session.fork()
+        assert session.step(PLAN).step == 1
+
+
+def test_an_unknown_snapshot_is_refused(site):
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        session.reset(action="control")
+        with pytest.raises(real2sim.NotFoundError, match="no snapshot 'there'"):
+            session.restore("there")
+
+
+# --- a worker that is killed ------------------------------------------------------------------
+
+
+class Killable:
+    """A worker in a process of its own, that can be killed and started again."""
+
+    def __init__(self, root: Path) -> None:
+        with contextlib.closing(socket.socket()) as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.root, self.process = root, None
+        self.url = f"http://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "real2sim", "serve", "--port", str(self.port)]
+        command += ["--scenes", str(self.root / "scenes"), "--data", str(self.root / "data")]
+        environment = os.environ | {"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"}
+        with (self.root / "worker.log").open("ab") as log:
+            self.process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(timeout=30)
+
+
+@pytest.fixture(scope="module")
+def killable(tmp_path_factory, tiny_scene) -> Iterator[Killable]:
+    root = tmp_path_factory.mktemp("killable")
+    save_scene(tiny_scene, root / "scenes" / "tiny.r2s")
+    worker = Killable(root)
+    worker.start()
+    with real2sim.connect(worker.url) as client:
+        client.wait_ready(120)
+    yield worker
+    worker.kill()
+
+
+def drive(worker: Killable, *, kill_at: tuple[int, ...] = (), delay: float = 0.0) -> list[str]:
+    """Hashes of all observations of an episode with an edit in it."""
+    with real2sim.connect(worker.url) as client, client.session(scene="tiny") as session:
+        seen = [hashed(session.reset(seed=5, sensors=SENSORS, privileged=True))]
+        for step in range(STEPS):
+            if step == 4:
+                session.edit([{"op": "translate", "object_id": "post", "y": -1.0}])
+            if step in kill_at:
+                time.sleep(delay)
+                worker.kill()
+                worker.start()
+            seen.append(hashed(session.step(plan(step))))
+    return seen
+
+
+def plan(step: int) -> dict:
+    times = [100_000 * (step + k + 1) for k in range(5)]
+    poses = [(0.5 * (k + 1), 0.01 * step * k, 0.0) for k in range(5)]
+    return {"kind": "trajectory", "times_us": times, "poses": poses}
+
+
+def hashed(obs: real2sim.Observation) -> str:
+    digest = hashlib.sha256(obs.image("front").tobytes())
+    digest.update(obs.image("front", "depth").tobytes() + np.ascontiguousarray(obs.route).tobytes())
+    digest.update(obs.ego.model_dump_json().encode())
+    digest.update(json.dumps([a.model_dump() for a in obs.agents]).encode())
+    digest.update(json.dumps([e.model_dump() for e in obs.events]).encode())
+    digest.update(json.dumps(dict(obs.metrics), sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(killable) -> list[str]:
+    return drive(killable)
+
+
+def test_after_kills_the_rest_of_the_episode_is_the_same(killable, undisturbed):
+    assert drive(killable, kill_at=(2, 9)) == undisturbed
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_after_fifty_kills_at_random_the_rest_is_the_same(killable, undisturbed):
+    chance = random.Random(7)
+    for _ in range(50):
+        kill_at = (chance.randrange(STEPS),)
+        assert drive(killable, kill_at=kill_at, delay=chance.uniform(0, 0.02)) == undisturbed
