@@ -15,8 +15,6 @@ from numba import njit
 
 NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
-FACING = np.float32(0.1)
-"""Least cosine between an object's outward normal and the way to a camera that sees it."""
 """Half-width of the largest footprint in the depth image [px]."""
 
 
@@ -128,8 +126,7 @@ def gather_samples(
     """Keep the best colours of each Gaussian that this view sees.
 
     Args:
-        in_camera, turned: from :func:`to_camera`; normals of objects point outwards, for through
-            the gaps of a near side a camera would see the inner face of the far one.
+        in_camera, turned: from :func:`to_camera`.
         footprints: [N] float32, tangent size of the Gaussians [m].
         instance: [N] uint16.
         K: [4] float32 of the image; the depth image is ``shrink`` times smaller.
@@ -159,10 +156,7 @@ def gather_samples(
         weight = visible_weight(x, y, z, nx, ny, nz, px, py, small, depth)
         if weight == 0:
             continue
-        facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
-        if instance[i] > 0 and facing < FACING:
-            continue
-        cosine = abs(facing)
+        cosine = abs(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
         size = K[0] * footprints[i] / z
         weight *= (np.float32(0.05) + cosine) * size * size
         worst = 0

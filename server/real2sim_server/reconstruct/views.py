@@ -75,7 +75,7 @@ class ColourSamples:
         n = len(placed.surfels)
         self._placed = placed
         self._means = np.ascontiguousarray(placed.surfels.points, dtype=np.float32)
-        self._normals = _outward_normals(placed)
+        self._normals = np.ascontiguousarray(placed.surfels.normals, dtype=np.float32)
         tangents = placed.surfels.scales[:, :2]
         self._radii = (1.4 * tangents.max(axis=1)).astype(np.float32)
         self._footprints = np.sqrt(tangents[:, 0] * tangents[:, 1]).astype(np.float32)
@@ -239,14 +239,6 @@ def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, N
 def _instance_poses(log: DrivingLog, t_us: int) -> list[Float | None]:
     """``T_world_instance``, first the background, then the tracks; None where there is none."""
     return [np.eye(4), *(track.transform_near(t_us) for track in log.tracks)]
-
-
-def _outward_normals(placed: Placed) -> NDArray[np.float32]:
-    """Normals [N, 3] of which those of objects point away from the middle of their box."""
-    points, normals = placed.surfels.points, placed.surfels.normals
-    inwards = (placed.instance > 0) & ((points * normals).sum(axis=1) < 0)
-    turned = np.where(inwards[:, None], -normals, normals)
-    return np.ascontiguousarray(turned, dtype=np.float32)
 
 
 def nearest_objects(
