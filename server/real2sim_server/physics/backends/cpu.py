@@ -13,8 +13,9 @@ from ..colliders import Box, Collider
 from ..laws.stress import KIND, VON_MISES
 from . import cpu_measure as columns
 from .base import TOTALS, Blowup, Measure, Model, ParticleArrays, pack_colliders
+from .cpu_deform import SCRATCH
 from .cpu_kernels import NODES, TILE, Rules, State, Work, advance
-from .cpu_layout import BLOCK, COLLIDER_MARGIN, Int, Layout, arrange
+from .cpu_layout import BLOCK, CHUNKS, COLLIDER_MARGIN, Int, Layout, arrange
 from .cpu_measure import measure_homes
 
 
@@ -204,6 +205,7 @@ class CpuSimulation:
             moments=self._array("moments", (moments, TILE, 4)),
             velocity=self._array("velocity", (fields, NODES, 4)),
             offset=self._array("offset", (fields, NODES, 4)),
+            scratch=self._array("scratch", (CHUNKS, SCRATCH)),
             strayed=np.zeros(homes, np.bool_),
             by_collider=np.zeros((len(layout.touch_collider), TOTALS)),
             by_body=np.zeros((pairs, bodies, TOTALS)),

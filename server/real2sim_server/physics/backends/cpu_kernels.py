@@ -12,11 +12,10 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from ..laws.matrices import det
 from ..laws.shared import F32, FOUR, HALF, ONE, ZERO
-from ..laws.stress import KIND, VISCOSITY, VON_MISES, add_viscosity, advance_gradient, respond
 from ..laws.weights import spline_weights
 from .cpu_contact import meet_bodies, meet_colliders
+from .cpu_deform import deform_all
 from .cpu_layout import BLOCK, CHUNKS, Layout
 from .cpu_simd import LANES, SIDE, gather, scatter
 from .kernel import entry, inner
@@ -64,6 +63,7 @@ class Work(NamedTuple):
         moments: [Q, 512, 4] first moment of volume about the nodes [m^3 cells], and volume [m^3].
         velocity: [M, 64, 4] velocity and mass of the fields.
         offset: [M, 64, 4] first moments of the fields.
+        scratch: [CHUNKS, SCRATCH], see ``cpu_deform``.
         strayed: [P] bool, whether a particle left its home's reach.
         by_collider: [T, TOTALS] float64, of each touch.
         by_body: [M, B, TOTALS] float64, on a field from each body; [0, B, TOTALS] for one body.
@@ -73,6 +73,7 @@ class Work(NamedTuple):
     moments: NDArray[Any]
     velocity: NDArray[Any]
     offset: NDArray[Any]
+    scratch: NDArray[Any]
     strayed: NDArray[np.bool_]
     by_collider: NDArray[np.float64]
     by_body: NDArray[np.float64]
@@ -266,9 +267,8 @@ def gather_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving
             for o in range(27):
                 copy_field(work.velocity[layout.home_fields[home, o]], o, tile)
             begin, end = layout.home_start[home], layout.home_start[home + 1]
-            gone = gather_particles(
-                begin, end, dt, rules.dx, state, rules.table, tile.reshape(-1), moving
-            )
+            gone = gather_particles(begin, end, dt, rules.dx, state, tile.reshape(-1), moving)
+            deform_all(begin, end, dt, state, rules.table, work.scratch[chunk])
             note(work.strayed, home, gone)
 
 
@@ -295,13 +295,13 @@ def copy_field(field: Any, o: Any, tile: Any) -> None:
 
 @inner()
 def gather_particles(
-    begin: Any, end: Any, dt: Any, dx: Any, state: Any, table: Any, tile: Any, moving: Any
+    begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any, moving: Any
 ) -> Any:
-    """Move and deform the particles of one home; returns whether one strayed off its tile."""
+    """Move the particles of one home; returns whether one strayed off its tile."""
     stride = dt / dx
     strayed = False
-    for p in range(begin, end):
-        if moving:
+    if moving:
+        for p in range(begin, end):
             v, L = pick_up(p, dx, state.xi, tile)
             for axis in range(3):
                 state.v[p, axis] = v[axis]
@@ -313,7 +313,6 @@ def gather_particles(
                 strayed = True
             for c in range(9):
                 state.L[p, c] = L[c]
-        deform(p, dt, state, table[state.material[p]])
     return strayed
 
 
@@ -328,34 +327,6 @@ def pick_up(p: Any, dx: Any, xi: Any, tile: Any) -> Any:
         scale * (g[4] - fx * g[1]), scale * (g[7] - fy * g[1]), scale * (g[10] - fz * g[1]),
         scale * (g[5] - fx * g[2]), scale * (g[8] - fy * g[2]), scale * (g[11] - fz * g[2]),
     )  # fmt: skip
-
-
-@inner()
-def nine(a: Any, p: Any) -> Any:
-    """Row p of a [N, 9] array as a tuple."""
-    return (
-        a[p, 0], a[p, 1], a[p, 2], a[p, 3], a[p, 4], a[p, 5], a[p, 6], a[p, 7], a[p, 8],
-    )  # fmt: skip
-
-
-@inner()
-def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
-    """Advance one particle's deformation by its velocity gradient and find its stress."""
-    L = nine(state.L, p)
-    trial = advance_gradient(nine(state.F, p), L, dt)
-    F, tau, energy, history = respond(trial, state.history[p], row, dt)
-    if row[VISCOSITY] > ZERO:
-        tau = add_viscosity(tau, L, det(F), row[VISCOSITY])
-    for c in range(9):
-        state.F[p, c] = F[c]
-    for c in range(6):
-        state.tau[p, c] = tau[c]
-    state.energy[p] = energy
-    if row[KIND] >= F32(VON_MISES):
-        state.history[p] = history
-        F = advance_gradient(nine(state.F_total, p), L, dt)
-        for c in range(9):
-            state.F_total[p, c] = F[c]
 
 
 __all__ = ["Layout", "Rules", "State", "Work", "advance"]

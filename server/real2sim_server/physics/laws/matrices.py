@@ -73,32 +73,41 @@ def symmetric_times(s: Any, a: Any) -> Any:
 
 
 @law
+def rotation_step(r: Any, determinant: Any) -> Any:
+    """One of Newton's steps towards the rotation of a matrix, and how much it changed.
+
+    r' = (r + r^-T) / 2 (Higham 1986).
+    """
+    half_inverse = HALF / determinant
+    c = cofactors(r)
+    n = (
+        HALF * r[0] + half_inverse * c[0],
+        HALF * r[1] + half_inverse * c[1],
+        HALF * r[2] + half_inverse * c[2],
+        HALF * r[3] + half_inverse * c[3],
+        HALF * r[4] + half_inverse * c[4],
+        HALF * r[5] + half_inverse * c[5],
+        HALF * r[6] + half_inverse * c[6],
+        HALF * r[7] + half_inverse * c[7],
+        HALF * r[8] + half_inverse * c[8],
+    )
+    change = (
+        abs(n[0] - r[0]) + abs(n[4] - r[4]) + abs(n[8] - r[8])
+        + abs(n[1] - r[1]) + abs(n[2] - r[2]) + abs(n[5] - r[5])
+    )  # fmt: skip
+    return n, change
+
+
+@law
 def polar_rotation(a: Any, determinant: Any) -> Any:
-    """Rotation R of the polar decomposition a = R S, by Newton's iteration (Higham 1986).
+    """Rotation R of the polar decomposition a = R S, by Newton's iteration.
 
     Needs det(a) > 0: the caller sees to inverted particles.
     """
     r = a
     d = determinant
     for _ in range(POLAR_STEPS):
-        half_inverse = HALF / d
-        c = cofactors(r)
-        n = (
-            HALF * r[0] + half_inverse * c[0],
-            HALF * r[1] + half_inverse * c[1],
-            HALF * r[2] + half_inverse * c[2],
-            HALF * r[3] + half_inverse * c[3],
-            HALF * r[4] + half_inverse * c[4],
-            HALF * r[5] + half_inverse * c[5],
-            HALF * r[6] + half_inverse * c[6],
-            HALF * r[7] + half_inverse * c[7],
-            HALF * r[8] + half_inverse * c[8],
-        )
-        change = (
-            abs(n[0] - r[0]) + abs(n[4] - r[4]) + abs(n[8] - r[8])
-            + abs(n[1] - r[1]) + abs(n[2] - r[2]) + abs(n[5] - r[5])
-        )  # fmt: skip
-        r = n
+        r, change = rotation_step(r, d)
         d = det(r)
         # The error squares at each step, so this one is below what the numbers resolve.
         if ONE + change * change == ONE:

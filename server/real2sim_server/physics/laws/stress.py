@@ -73,7 +73,12 @@ def stretch_of(square: Any) -> Any:
 def corotated(F: Any, mu: Any, lam: Any) -> Any:
     """Fixed corotated: tau = 2 mu (F - R) F^T + lambda J (J - 1) I (Stomakhin et al. 2012)."""
     volume = max(det(F), VOLUME_MIN)
-    R = polar_rotation(F, volume)
+    return corotated_about(F, polar_rotation(F, volume), volume, mu, lam)
+
+
+@law
+def corotated_about(F: Any, R: Any, volume: Any, mu: Any, lam: Any) -> Any:
+    """The same where rotation R and volume ratio are known."""
     d = (
         F[0] - R[0], F[1] - R[1], F[2] - R[2],
         F[3] - R[3], F[4] - R[4], F[5] - R[5],
@@ -100,7 +105,12 @@ def corotated(F: Any, mu: Any, lam: Any) -> Any:
 @law
 def neo_hookean(F: Any, mu: Any, lam: Any) -> Any:
     """Compressible neo-Hookean: tau = mu (F F^T - I) + lambda ln J I (Bonet and Wood, 6.4)."""
-    log_volume = math.log(max(det(F), VOLUME_MIN))
+    return neo_hookean_at(F, math.log(max(det(F), VOLUME_MIN)), mu, lam)
+
+
+@law
+def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
+    """The same where ln J is known."""
     b = gram(F)
     pressure = lam * log_volume - mu
     tau = (
