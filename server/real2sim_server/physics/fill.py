@@ -1,8 +1,8 @@
 """An object's Gaussians as particles, with the inside filled.
 
-Voxels that Gaussians cover are the shell. Everything that can be reached from outside without
-crossing the shell is outside, the rest is inside. Where cameras saw next to nothing of a side,
-typically the underside, the tracked box closes it.
+Voxels that Gaussians cover are the shell. What can be reached from outside along an axis without
+crossing the shell is outside, the rest is inside. Where next to nothing of a side was seen,
+typically the underside, the side across or the tracked box closes it.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ OPACITY_MIN = 0.05
 BOX_SLACK = 0.1
 """Gaussians further outside the box than this share of its size are not matter of the object."""
 SEEN_SHARE = 0.5
-"""A side is seen when this share of the silhouette has matter within SEEN_DEPTH of the side."""
-SEEN_DEPTH = 0.35
+"""A side is seen when this share of its silhouette shows matter of that side."""
 SAMPLES_MAX = 7
 """A Gaussian's extent is sampled by at most this many points along each of its axes."""
 
@@ -52,6 +51,28 @@ class Filling:
     origin: Float
     spacing: float
     sealed: tuple[str, ...]
+
+    def lattice(self, *, above: float = -np.inf) -> Particles:
+        """One particle at the centre of each voxel of the largest connected piece.
+
+        Even particles make a smoother solid than Gaussians do, and fewer of them; Gaussians then
+        follow by :class:`~.coupling.Embedding`. Masses sum to those of ``particles``.
+
+        Args:
+            above: voxels with centres below this height in the object's frame are left out [m].
+        """
+        solid = self.shell | self.inside
+        heights = self.origin[2] + (np.arange(solid.shape[2]) + 0.5) * self.spacing
+        solid = solid & (heights >= above)
+        pieces, count = ndimage.label(solid)
+        if count == 0:
+            raise ParticleError(f"no matter lies above {above:.2f} m in the object's frame")
+        largest = 1 + int(np.bincount(pieces[pieces > 0])[1:].argmax())
+        index = np.argwhere(pieces == largest)
+        volumes = np.full(len(index), self.spacing**3)
+        positions = self.origin + (index + 0.5) * self.spacing
+        source = np.full(len(index), -1)
+        return Particles(positions, volumes, volumes, source).with_mass(self.particles.mass)
 
 
 def fill_object(
@@ -125,55 +146,77 @@ def _covered_points(cloud: GaussianCloud, index: NDArray[np.int64], spacing: flo
     return np.concatenate(points)
 
 
+@dataclass(frozen=True)
+class _Side:
+    """A side of the box: how deep below it matter still counts as that side's own."""
+
+    axis: int
+    sign: int
+    depth: float
+
+    @property
+    def name(self) -> str:
+        return f"{'-+'[self.sign > 0]}{'xyz'[self.axis]}"
+
+
+# A bonnet lies far below the roof line and a windscreen far behind the bumper.
+SIDES = (
+    _Side(0, -1, 0.45), _Side(0, 1, 0.45),
+    _Side(1, -1, 0.35), _Side(1, 1, 0.35),
+    _Side(2, -1, 0.35), _Side(2, 1, 0.7),
+)  # fmt: skip
+
+
 def _inside(
     shell: Mask, size: Float, origin: Float, spacing: float
 ) -> tuple[Mask, tuple[str, ...]]:
-    """Voxels that cannot be reached from outside, and the sides that the box closed."""
-    # Gaussians lie apart: gaps of up to two voxels count as closed.
-    closed = np.pad(shell, 3)
-    closed = ndimage.binary_closing(closed, ndimage.generate_binary_structure(3, 2), iterations=2)
-    closed |= np.pad(shell, 3)
+    """Voxels that cannot be reached straight from outside, and the sides that the box closed.
+
+    From each side everything before the first matter is carved away. Holes in what a side shows
+    are closed from around them; a side hardly seen takes the depths of the side across where that
+    was seen (things on a street are alike left and right), or the face of the box.
+    """
+    solid = np.ones(shell.shape, dtype=bool)
     sealed = []
-    for axis in range(3):
-        for sign in (-1, 1):
-            if not _seen(shell, axis, sign):
-                face = (sign * size[axis] / 2 - origin[axis]) / spacing
-                layer = int(np.clip(np.floor(face - 0.5 * (sign > 0)), 0, shell.shape[axis] - 1))
-                _seal(closed, shell, axis, layer + 3)
-                sealed.append(f"{'-+'[sign > 0]}{'xyz'[axis]}")
-    outside, _ = ndimage.label(~closed)
-    inside = (outside != outside[0, 0, 0])[3:-3, 3:-3, 3:-3]
-    return inside & ~shell, tuple(sealed)
+    for side in SIDES:
+        depth, seen = _depth(shell, side)
+        if not seen:
+            sealed.append(side.name)
+            face = (size[side.axis] / 2 + origin[side.axis]) / spacing
+            opposite = _Side(side.axis, -side.sign, side.depth)
+            other, other_seen = _depth(shell, opposite) if side.axis == 1 else (depth, False)
+            rim = np.full_like(depth, max(round(-face), 0))
+            depth = np.where(depth < len_along(shell, side), other if other_seen else rim, depth)
+        along = _facing(solid, side)
+        along &= np.arange(len(along))[:, None, None] >= depth
+    return solid & ~shell, tuple(sealed)
 
 
-def _seen(shell: Mask, axis: int, sign: int) -> bool:
-    """Whether the side of the object facing ``sign`` along ``axis`` has enough matter near it."""
-    along = np.moveaxis(shell, axis, 0)
-    along = along if sign < 0 else along[::-1]
-    silhouette = along.any(axis=0)
-    depth = max(int(SEEN_DEPTH * len(along)), 1)
-    return bool(along[:depth].any(axis=0).sum() >= SEEN_SHARE * silhouette.sum())
+def _facing(mask: Mask, side: _Side) -> Mask:
+    """A view with the side's layer first."""
+    along = np.moveaxis(mask, side.axis, 0)
+    return along if side.sign < 0 else along[::-1]
 
 
-def _seal(closed: Mask, shell: Mask, axis: int, layer: int) -> None:
-    """Close a layer of voxels across the object's silhouette, holes in it included."""
-    silhouette = ndimage.binary_closing(np.pad(shell.any(axis=axis), 3), iterations=3)
+def len_along(mask: Mask, side: _Side) -> int:
+    """Voxels across the box, from that side to the one across."""
+    return int(mask.shape[side.axis])
+
+
+def _depth(shell: Mask, side: _Side) -> tuple[NDArray[np.int64], bool]:
+    """Layers [A, B] before the first matter, all of them beside the silhouette; was it seen."""
+    along = _facing(shell, side)
+    hit = along.any(axis=0)
+    silhouette = ndimage.binary_closing(np.pad(hit, 4), iterations=4)[4:-4, 4:-4]
     silhouette = ndimage.binary_fill_holes(silhouette)
-    # Walls reach down to the lid, so that nothing creeps in between.
-    lid = [slice(None)] * 3
-    lid[axis] = layer
-    closed[tuple(lid)] |= silhouette
-    rim = silhouette & ~ndimage.binary_erosion(silhouette, iterations=2)
-    line = np.moveaxis(closed, axis, 0)
-    first, last = _extent(shell, axis)
-    low, high = sorted((layer, (first if layer <= first + 3 else last) + 3))
-    line[low : high + 1] |= rim
-
-
-def _extent(shell: Mask, axis: int) -> tuple[int, int]:
-    """First and last layer with matter."""
-    layers = np.flatnonzero(np.moveaxis(shell, axis, 0).any(axis=(1, 2)))
-    return int(layers[0]), int(layers[-1])
+    first = np.where(hit, along.argmax(axis=0), len(along))
+    own = hit & (first <= side.depth * len(along))
+    seen = bool(own.sum() >= SEEN_SHARE * silhouette.sum())
+    if own.any():
+        nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
+        first = first[tuple(nearest)]
+        first = ndimage.median_filter(first, size=3, mode="nearest")
+    return np.where(silhouette, first, len(along)), seen
 
 
 def _particles(
