@@ -18,6 +18,9 @@ Vector = tuple[float, float]
 MOVING = 0.5
 """Below this speed the direction between plan poses is mostly noise [m/s]."""
 
+DENSE = 0.25
+"""Plans that begin within this time say where they come from, too [s]."""
+
 TRUSTED_YAW = 0.5
 """A planned heading that differs more from the planned way is not used as its tangent [rad]."""
 
@@ -80,18 +83,28 @@ class Reference:
         y, vy = _hermite((ay, avy), (by, bvy), h, since)
         return x, y, vx, vy
 
+    def planned(self, t: float) -> tuple[float, float, float, float]:
+        """Like :meth:`at`, but where the plan itself would be before its first pose: on the arc
+        that leads there. The vehicle's distance from it is its error, which :meth:`at` hides.
+
+        A plan that begins late says nothing about the way to it; there the two are the same.
+        """
+        first = self._times[1]
+        if t >= first or first > DENSE:
+            return self.at(t)
+        rate = self._turn_rate
+        if len(self._poses) > 2:
+            span = self._times[2] - first
+            rate = math.remainder(self._poses[2][2] - self._poses[1][2], math.tau) / span
+        return _along_arc(self._poses[1], self._tangent(1), rate, t - first)
+
     def heading(self, t: float) -> float:
         """Planned heading [rad] at the first pose not before ``t``, or at the last one."""
         return self._poses[min(bisect_left(self._times, t), len(self._poses) - 1)][2]
 
     def _beyond(self, since: float) -> tuple[float, float, float, float]:
-        (x, y, _), (vx, vy) = self.last_pose, self._tangent(len(self._poses) - 1)
-        half = self._turn_rate * since / 2
-        cos, sin = math.cos(half), math.sin(half)
-        chord = since * (sin / half if abs(half) > 1e-6 else 1.0)
-        x, y = x + chord * (cos * vx - sin * vy), y + chord * (sin * vx + cos * vy)
-        cos, sin = math.cos(2 * half), math.sin(2 * half)
-        return x, y, cos * vx - sin * vy, sin * vx + cos * vy
+        tangent = self._tangent(len(self._poses) - 1)
+        return _along_arc(self.last_pose, tangent, self._turn_rate, since)
 
     def _tangent(self, i: int) -> Vector:
         """Velocity [m/s] at a pose: the slope there of the parabola through three neighbours.
@@ -135,6 +148,19 @@ class Reference:
         speed = math.hypot(*self._tangent(len(self._poses) - 1))
         most = speed * math.tan(spec.max_steer) / spec.wheelbase
         return min(max(rate, -most), most)
+
+
+def _along_arc(
+    pose: Pose, velocity: Vector, rate: float, since: float
+) -> tuple[float, float, float, float]:
+    """Place and velocity on an arc, ``since`` seconds after a pose; before it where negative."""
+    (x, y, _), (vx, vy) = pose, velocity
+    half = rate * since / 2
+    cos, sin = math.cos(half), math.sin(half)
+    chord = since * (sin / half if abs(half) > 1e-6 else 1.0)
+    x, y = x + chord * (cos * vx - sin * vy), y + chord * (sin * vx + cos * vy)
+    cos, sin = math.cos(2 * half), math.sin(2 * half)
+    return x, y, cos * vx - sin * vy, sin * vx + cos * vy
 
 
 def _far_slope(chord: Vector, slope: Vector) -> Vector:

@@ -61,10 +61,13 @@ def test_a_curved_drive_is_followed_within_30_cm(make_world, frame, poses, spaci
     assert errors(world, poses=poses, spacing_us=spacing_us, frame=frame).max() < 0.3
 
 
-def test_single_pose_plans_are_followed_within_half_a_metre(make_world):
-    world = make_world(s_curve(speed=9.0, curvature=0.05))
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
+@pytest.mark.parametrize(("speed", "curvature"), [(9.0, 0.05), (14.0, 0.04), (20.0, 0.012)])
+def test_single_pose_plans_are_followed_within_5_cm(make_world, tracker, speed, curvature):
+    ego = s_curve(speed=speed, curvature=curvature)
+    world = make_world(ego, spec={"ego": {"tracker": tracker}})
 
-    assert errors(world, poses=1, spacing_us=100_000, frame="vehicle").max() < 0.5
+    assert errors(world, poses=1, spacing_us=100_000, frame="vehicle").max() < 0.05
 
 
 def test_without_a_plan_the_log_is_followed(make_world):

@@ -14,7 +14,7 @@ from ..ego import Motion, drive
 from ..path import Float
 from ..reference import Reference
 from ..vehicle import vehicle_of
-from .lqr import GENTLE_BRAKING, Lqr, point_at
+from .lqr import Lqr, point_at
 
 STEP = 0.1
 STEPS = 15
@@ -81,20 +81,10 @@ def _wanted(reference: Reference, motion: Motion, since: float) -> Float:
     wanted = np.zeros((STEPS + 1, 5))
     yaw = motion.yaw
     for k in range(STEPS + 1):
-        t = since + k * STEP
-        point = point_at(reference, min(t, reference.end))
-        beyond = max(t - reference.end, 0.0)
-        # After its end the plan brakes gently to a stop.
-        until = min(beyond, point.speed / GENTLE_BRAKING)
-        way = point.speed * until - GENTLE_BRAKING * until**2 / 2
+        # After its end the plan is taken to go on; the vehicle brakes once it gets there.
+        point = point_at(reference, since + k * STEP)
         yaw += math.remainder(point.yaw - yaw, math.tau)
-        wanted[k] = (
-            point.x + way * math.cos(point.yaw),
-            point.y + way * math.sin(point.yaw),
-            yaw,
-            point.speed - GENTLE_BRAKING * until,
-            0.0,
-        )
+        wanted[k] = point.x, point.y, yaw, point.speed, 0.0
     return wanted
 
 

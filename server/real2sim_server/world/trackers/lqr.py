@@ -74,8 +74,8 @@ class Point:
 
 def point_at(reference: Reference, t: float, *, step: float = 0.05) -> Point:
     """The reference ``t`` seconds after its start, with derivatives over ``step`` seconds."""
-    x, y, vx, vy = reference.at(t)
-    _, _, wx, wy = reference.at(t + step)
+    x, y, vx, vy = reference.planned(t)
+    _, _, wx, wy = reference.planned(t + step)
     speed, later = math.hypot(vx, vy), math.hypot(wx, wy)
     if speed < MOVING:
         return Point(x, y, reference.heading(t), speed, (later - speed) / step, 0.0)

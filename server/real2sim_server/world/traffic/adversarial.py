@@ -127,9 +127,11 @@ class HardBrake:
         ego, (x, y, _), yaw = seen.ego, self.pose.position, self.pose.yaw
         dx, dy = x - ego.x, y - ego.y
         ahead_of = dx * math.cos(yaw) + dy * math.sin(yaw)
-        aside = self.path.nearest(ego.x, ego.y).offset
+        # Beside its path, or beside the line straight back from it: the path may begin here.
+        on_line = abs(dy * math.cos(yaw) - dx * math.sin(yaw))
+        aside = min(abs(self.path.nearest(ego.x, ego.y).offset), on_line)
         gap = ahead_of - (self.subject.scaled_size[0] + ego.length) / 2
-        return abs(aside) < 3.0 and 0.0 <= gap <= self.spec.gap
+        return aside < 3.0 and 0.0 <= gap <= self.spec.gap
 
 
 @dataclass(frozen=True, eq=False)

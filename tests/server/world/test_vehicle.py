@@ -1,0 +1,220 @@
+"""The vehicle models against textbook cases."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from real2sim_proto.drive import TrajectoryPlan
+from real2sim_proto.episode import EgoSpec
+from real2sim_server.world.actuators import Command
+from real2sim_server.world.dynamic import axle_forces, fiala
+from real2sim_server.world.ego import Motion, drive
+from real2sim_server.world.reference import Reference
+from real2sim_server.world.trackers import make_tracker
+from real2sim_server.world.vehicle import GRAVITY, vehicle_of
+
+DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
+
+
+def driven(spec: EgoSpec, motion: Motion, seconds: float, driver) -> list[Motion]:
+    motions = []
+    for _ in range(round(seconds * 10)):
+        motion = drive(motion, driver, spec, 100_000)
+        motions.append(motion)
+    return motions
+
+
+def cornering(spec: EgoSpec, speed: float, steering: float) -> Motion:
+    """Steady state at a speed that the driver keeps."""
+
+    def keep(motion: Motion, _t: float) -> Command:
+        return Command(5.0 * (speed - motion.speed), steering)
+
+    return driven(spec, Motion(0, 0, 0, speed), 10.0, keep)[-1]
+
+
+@pytest.mark.parametrize("speed", [5.0, 10.0, 20.0, 30.0])
+def test_steady_cornering_needs_ackermann_plus_the_understeer_gradient(speed):
+    # delta = L/R + K a_y (Gillespie 1992, eq. 6-15), at 2 m/s^2, where tyres are linear.
+    radius = speed**2 / 2.0
+    vehicle = vehicle_of(DYNAMIC)
+    steering = vehicle.wheelbase / radius + vehicle.understeer * 2.0
+    motion = cornering(DYNAMIC, speed, steering)
+
+    assert motion.speed / motion.yaw_rate == pytest.approx(radius, rel=0.05)
+
+
+def test_the_understeer_gradient_is_that_of_a_mid_size_car():
+    degrees_per_g = math.degrees(vehicle_of(DYNAMIC).understeer * GRAVITY)
+
+    assert degrees_per_g == pytest.approx(1.16, abs=0.01)
+
+
+def test_equal_tyres_steer_neutrally():
+    spec = EgoSpec(
+        dynamics="dynamic_bicycle", vehicle={"front_cornering": 12.0, "rear_cornering": 12.0}
+    )
+    slow, fast = (cornering(spec, v, 0.02) for v in (8.0, 16.0))
+
+    assert slow.speed / slow.yaw_rate == pytest.approx(fast.speed / fast.yaw_rate, rel=0.03)
+
+
+def test_oversteer_loses_the_car_above_its_critical_speed():
+    # v_crit = sqrt(-L/K) (Gillespie 1992, eq. 6-16).
+    spec = EgoSpec(
+        dynamics="dynamic_bicycle", vehicle={"front_cornering": 15.0, "rear_cornering": 9.0}
+    )
+    vehicle = vehicle_of(spec)
+    critical = math.sqrt(-vehicle.wheelbase / vehicle.understeer)
+    assert 15 < critical < 40
+
+    def yaw_after(speed: float) -> float:
+        nudged = Motion(0, 0, 0, speed, yaw_rate=0.01)
+        straight = driven(spec, nudged, 4.0, lambda m, _t: Command(5 * (speed - m.speed), 0.0))
+        return abs(straight[-1].yaw_rate)
+
+    assert yaw_after(0.8 * critical) < 0.002
+    assert yaw_after(1.3 * critical) > 0.05
+
+
+def test_lateral_acceleration_ends_at_the_friction_limit():
+    motion = cornering(DYNAMIC, 25.0, 0.3)
+
+    assert abs(motion.speed * motion.yaw_rate) < 1.05 * 0.9 * GRAVITY
+
+
+@pytest.mark.parametrize(("friction", "expected"), [(0.9, 8.0), (0.5, 0.5 * GRAVITY)])
+def test_braking_distance_is_that_of_brakes_or_of_friction(friction, expected):
+    spec = EgoSpec(dynamics="dynamic_bicycle", vehicle={"friction": friction})
+    motions = driven(spec, Motion(0, 0, 0, 20.0), 6.0, lambda _m, _t: Command(-50.0, 0.0))
+
+    assert motions[-1].speed == 0.0
+    assert motions[-1].x == pytest.approx(20.0**2 / (2 * expected), rel=0.01)
+
+
+def test_slow_dynamic_cars_are_kinematic_ones():
+    kinematic = driven(EgoSpec(), Motion(0, 0, 0, 1.5), 5.0, lambda _m, _t: Command(0.0, 0.3))
+    dynamic = driven(DYNAMIC, Motion(0, 0, 0, 1.5), 5.0, lambda _m, _t: Command(0.0, 0.3))
+
+    assert dynamic[-1] == kinematic[-1]
+
+
+def test_the_model_is_smooth_through_walking_pace():
+    motions = driven(DYNAMIC, Motion(0, 0, 0, 8.0), 6.0, lambda _m, _t: Command(-1.5, 0.1))
+    rates = np.array([m.yaw_rate for m in motions[5:]])
+
+    assert np.abs(np.diff(rates)).max() < 0.05
+
+
+def test_a_tyre_is_linear_for_small_slip_and_slides_at_its_limit():
+    assert fiala(1e-4, 50e3, 4e3) == pytest.approx(5.0, rel=1e-3)
+    assert fiala(0.5, 50e3, 4e3) == 4e3
+    assert fiala(-0.5, 50e3, 4e3) == -4e3
+    assert fiala(0.1, 50e3, 0.0) == 0.0
+    # At the edge of sliding the force arrives with slope zero.
+    edge = math.atan(3 * 4e3 / 50e3)
+    assert fiala(edge - 1e-4, 50e3, 4e3) == pytest.approx(4e3, rel=1e-5)
+
+
+def test_braking_in_a_bend_takes_cornering_force():
+    vehicle = vehicle_of(DYNAMIC)
+    free, braked = (
+        axle_forces(vehicle, (20.0, 0.0, 0.0), steering=0.2, acceleration=a) for a in (0.0, -8.0)
+    )
+    load = vehicle.mass * (GRAVITY * vehicle.rear + 8.0 * vehicle.height) / vehicle.wheelbase
+
+    assert free[0] == pytest.approx(0.9 * vehicle.mass * GRAVITY * 0.56, rel=0.02)
+    assert braked[0] == pytest.approx(load * math.sqrt(0.9**2 - (8 / GRAVITY) ** 2), rel=1e-3)
+
+
+# --- actuators --------------------------------------------------------------------------------
+
+
+def test_a_delayed_brake_acts_after_its_dead_time():
+    spec = EgoSpec(actuators={"drive_delay_us": 250_000})
+    motions = driven(spec, Motion(0, 0, 0, 10.0), 1.0, lambda _m, _t: Command(-4.0, 0.0))
+
+    assert [m.speed for m in motions[:2]] == [10.0, 10.0]
+    assert motions[-1].speed == pytest.approx(10.0 - 4.0 * 0.75)
+
+
+def test_a_lagging_steering_gear_approaches_its_command():
+    spec = EgoSpec(actuators={"steering_lag": 0.2}, max_steer_rate=10.0)
+    motions = driven(spec, Motion(0, 0, 0, 5.0), 0.4, lambda _m, _t: Command(0.0, 0.1))
+
+    assert motions[1].steering == pytest.approx(0.1 * (1 - math.exp(-1)), rel=0.01)
+    assert motions[3].steering == pytest.approx(0.1 * (1 - math.exp(-2)), rel=0.01)
+
+
+# --- tracking ---------------------------------------------------------------------------------
+
+
+def lane_change(speed: float) -> tuple[list[int], list[tuple[float, float, float]]]:
+    """3.5 m to the left in 60 m, as smoothly as a fifth-order polynomial."""
+    times, poses = [], []
+    for k in range(1, 81):
+        x = speed * k * 0.1
+        u = min(max((x - 20.0) / 60.0, 0.0), 1.0)
+        slope = 3.5 * 30 * u * u * (1 - u) ** 2 / 60.0
+        poses.append((x, 3.5 * u**3 * (10 - 15 * u + 6 * u * u), math.atan(slope)))
+        times.append(k * 100_000)
+    return times, poses
+
+
+def worst_offset(spec: EgoSpec, speed: float) -> float:
+    times, poses = lane_change(speed)
+    motion = Motion(0, 0, 0, speed)
+    errors = []
+    for k in range(70):
+        reference = Reference(
+            motion, start_us=k * 100_000, times_us=times[k:], poses=poses[k:], spec=spec
+        )
+        motion = make_tracker(reference, spec).advance(motion, 0.0, 100_000)
+        x, y, yaw = poses[k]
+        errors.append(abs((motion.y - y) * math.cos(yaw) - (motion.x - x) * math.sin(yaw)))
+    assert abs(errors[-1]) < 0.1
+    return max(errors)
+
+
+@pytest.mark.parametrize("dynamics", ["kinematic_bicycle", "dynamic_bicycle"])
+@pytest.mark.parametrize(
+    ("tracker", "tolerance"), [("pursuit", 0.25), ("lqr", 0.2), ("ilqr", 0.2), ("perfect", 1e-3)]
+)
+def test_a_lane_change_at_15_metres_a_second_is_tracked(dynamics, tracker, tolerance):
+    spec = EgoSpec(dynamics=dynamics, tracker=tracker)
+
+    assert worst_offset(spec, 15.0) < tolerance
+
+
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr", "perfect"])
+def test_every_tracker_drives_an_episode(make_world, tracker):
+    world = make_world(spec={"ego": {"tracker": tracker}, "horizon": 30})
+    while not world.over:
+        times = [world.t_us + 100_000 * (k + 1) for k in range(20)]
+        poses = [(1.0 * (k + 1), 0.0, 0.0) for k in range(20)]
+        world.step(TrajectoryPlan(times_us=times, poses=poses))
+
+    assert world.motion.x == pytest.approx(30.0, abs=0.3)
+    assert abs(world.motion.y) < 1e-6
+
+
+@pytest.mark.parametrize("tracker", ["lqr", "ilqr"])
+def test_trackers_obey_the_limits_of_the_vehicle(tracker):
+    spec = EgoSpec(tracker=tracker)
+    motion = Motion(0, 0, 0, 10.0)
+    reference = Reference(
+        motion,
+        start_us=0,
+        times_us=[500_000, 1_000_000],
+        poses=[(-20.0, 30.0, 2.0), (60.0, -50.0, -2.0)],
+        spec=spec,
+    )
+    tracker_ = make_tracker(reference, spec)
+    for k in range(8):
+        after = tracker_.advance(motion, 0.1 * k, 100_000)
+        assert -8.0 - 1e-9 <= after.acceleration <= 4.0 + 1e-9
+        assert abs(after.steering - motion.steering) <= 0.08 + 1e-9
+        motion = after
