@@ -1,0 +1,283 @@
+"""Packed scenes: one small file for sending and shipping, about a third of a bundle's bytes.
+
+A packed scene is quantised: centres to 1/65535 of their cloud's extent, axes to 1/3276 of a power
+of e, rotations to 1/127, opacities to 1/255, colours to half precision and the rest of the
+spherical harmonics to 1/127 of their largest. To work with it, unpack it into a bundle.
+Format: docs/scene_format.md.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from os import PathLike
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from ..camera import CameraRig
+from ..cloud import GaussianCloud
+from ..colour import TimeColour
+from ..errors import BundleError, SceneError
+from ..scene import Scene, SceneObject
+from ..sky import Sky
+from .atomic import atomic_file
+from .document import CameraPart, TrajectoryPart
+
+FORMAT, VERSION = "real2sim-packed", 1
+DOCUMENT = "scene.json"
+MAX_BYTES = 1 << 32
+"""Of one array when unpacked; a small file cannot ask for more memory than this."""
+MEAN_STEPS, QUAT_STEPS, OPACITY_STEPS, SH_STEPS = 65535, 127, 255, 127
+LOG_SCALE_STEPS, LOWEST_LOG_SCALE = 3276, -13.0
+"""Of an axis: 16 bits from 2 micrometres to a kilometre."""
+
+Arrays = dict[str, NDArray[Any]]
+Vector3 = tuple[float, float, float]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _PackedCloud(_Part):
+    low: Vector3
+    extent: Vector3
+    sh_range: Annotated[float, Field(ge=0)]
+
+
+class _PackedColour(_Part):
+    basis: Literal["cosine", "real_dft"]
+    start_us: int
+    end_us: int
+
+
+class _PackedObject(_Part):
+    object_id: str
+    category: str
+    size: Vector3
+    trajectory: TrajectoryPart
+    cloud: _PackedCloud
+    colour: _PackedColour | None
+
+
+class _PackedDocument(_Part):
+    format: str
+    version: int
+    name: str
+    cameras: list[CameraPart]
+    ego: TrajectoryPart
+    ego_size: Vector3
+    frame_times_us: list[int]
+    background: _PackedCloud
+    objects: list[_PackedObject]
+    provenance: dict[str, Any]
+
+
+def write_packed(scene: Scene, path: str | PathLike[str]) -> None:
+    """Write ``scene`` to the file ``path``, by custom ``<name>.r2s.zip``; whole or not at all.
+
+    Raises:
+        SceneError: values that are not finite or out of range.
+        OSError: the file cannot be written.
+    """
+    arrays: Arrays = {}
+    document = _PackedDocument(
+        format=FORMAT,
+        version=VERSION,
+        name=scene.name,
+        cameras=[CameraPart.of(camera) for camera in scene.rig],
+        ego=TrajectoryPart.of(scene.ego),
+        ego_size=scene.ego_size,
+        frame_times_us=scene.frame_times_us.tolist(),
+        background=_pack_cloud(scene.background, "background", arrays),
+        objects=[_pack_object(o, f"{i}", arrays) for i, o in enumerate(scene.objects.values())],
+        provenance=json.loads(json.dumps(dict(scene.provenance), allow_nan=False)),
+    )
+    if scene.sky is not None:
+        faces = (scene.sky.faces.detach().cpu().clamp(0, 1) * 255).round()
+        arrays["sky"] = faces.to(torch.uint8).numpy()
+    with (
+        atomic_file(Path(path)) as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+    ):
+        _put(archive, DOCUMENT, document.model_dump_json().encode())
+        for name, array in arrays.items():
+            data = io.BytesIO()
+            np.save(data, array, allow_pickle=False)
+            _put(archive, f"{name}.npy", data.getvalue())
+
+
+def read_packed(path: str | PathLike[str]) -> Scene:
+    """Read a packed scene.
+
+    Raises:
+        BundleError: with the file and the reason: missing, cut short, of a newer version.
+    """
+    file = Path(path)
+    try:
+        with zipfile.ZipFile(file) as archive:
+            document = _document(archive.read(DOCUMENT), file)
+            arrays = {name[:-4]: _array(archive, name) for name in _array_names(archive)}
+        return _scene(document, arrays)
+    except BundleError:
+        raise
+    except FileNotFoundError as error:
+        raise BundleError(f"{file}: there is no such file") from error
+    except (zipfile.BadZipFile, OSError, KeyError, ValueError, SceneError) as error:
+        raise BundleError(f"{file}: not a packed scene, or a damaged one ({error})") from error
+
+
+def _put(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    # A fixed time stamp, so that the same scene gives the same bytes.
+    entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    archive.writestr(entry, data)
+
+
+def _document(data: bytes, file: Path) -> _PackedDocument:
+    values = json.loads(data)
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        raise BundleError(f"{file}: holds no packed scene; its format must be {FORMAT!r}")
+    if values.get("version") != VERSION:
+        raise BundleError(
+            f"{file}: version {values.get('version')!r} of {FORMAT}; this program reads {VERSION}"
+        )
+    try:
+        return _PackedDocument.model_validate(values)
+    except ValidationError as error:
+        raise BundleError(f"{file}: {DOCUMENT} is damaged: {error.errors()[0]['msg']}") from error
+
+
+def _array_names(archive: zipfile.ZipFile) -> list[str]:
+    return [name for name in archive.namelist() if name.endswith(".npy")]
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    size = archive.getinfo(name).file_size
+    if size > MAX_BYTES:
+        raise ValueError(f"{name} has {size} bytes, more than {MAX_BYTES}")
+    array: NDArray[Any] = np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
+    return array
+
+
+def _pack_object(item: SceneObject, key: str, arrays: Arrays) -> _PackedObject:
+    colour = item.colour
+    if colour is not None:
+        arrays[f"{key}.fourier"] = colour.coefficients.detach().cpu().numpy().astype(np.float16)
+    return _PackedObject(
+        object_id=item.object_id,
+        category=item.category,
+        size=item.size,
+        trajectory=TrajectoryPart.of(item.trajectory),
+        cloud=_pack_cloud(item.cloud, key, arrays),
+        colour=colour
+        and _PackedColour(basis=colour.basis, start_us=colour.start_us, end_us=colour.end_us),
+    )
+
+
+def _pack_cloud(cloud: GaussianCloud, key: str, arrays: Arrays) -> _PackedCloud:
+    """Quantise; Gaussians go along a space-filling curve, so that neighbours compress well."""
+    cloud.check_values(key)
+    cloud = cloud.to("cpu")
+    low, extent = np.zeros(3), np.ones(3)
+    if len(cloud):
+        low = cloud.means.amin(0).double().numpy()
+        extent = np.maximum(cloud.means.amax(0).double().numpy() - low, 1e-6)
+    share = (cloud.means.double().numpy() - low) / extent
+    means = (share * MEAN_STEPS).round().astype(np.uint16)
+    order = np.argsort(_curve(means), kind="stable")
+    quats = torch.nn.functional.normalize(cloud.quats, dim=1)
+    log_scales = (cloud.scales.log() - LOWEST_LOG_SCALE) * LOG_SCALE_STEPS
+    rest = cloud.sh[:, 1:].numpy()
+    sh_range = float(np.abs(rest).max()) if rest.size else 0.0
+    packed: Arrays = {
+        "means": means,
+        "quats": (quats.numpy() * QUAT_STEPS).round().astype(np.int8),
+        "log_scales": log_scales.clamp(0, 65535).round().numpy().astype(np.uint16),
+        "opacities": (cloud.opacities.numpy() * OPACITY_STEPS).round().astype(np.uint8),
+        "colours": cloud.sh[:, 0].numpy().astype(np.float16),
+        "sh": (rest / max(sh_range, 1e-12) * SH_STEPS).round().astype(np.int8),
+    }
+    for name, values in packed.items():
+        arrays[f"{key}.{name}"] = np.ascontiguousarray(values[order])
+    if f"{key}.fourier" in arrays:
+        arrays[f"{key}.fourier"] = arrays[f"{key}.fourier"][order]
+    return _PackedCloud(low=_vector(low), extent=_vector(extent), sh_range=sh_range)
+
+
+def _curve(means: NDArray[np.uint16]) -> NDArray[np.int64]:
+    """Place of quantised centres [N, 3] along a Morton curve, ten bits an axis."""
+    code = np.zeros(len(means), np.int64)
+    coarse = (means >> 6).astype(np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((coarse[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code
+
+
+def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
+    objects = {}
+    for index, part in enumerate(document.objects):
+        colour = None
+        if part.colour is not None:
+            fourier = torch.from_numpy(arrays[f"{index}.fourier"].astype(np.float32))
+            colour = TimeColour(
+                fourier, part.colour.basis, part.colour.start_us, part.colour.end_us
+            )
+        objects[part.object_id] = SceneObject(
+            object_id=part.object_id,
+            category=part.category,
+            size=part.size,
+            cloud=_cloud(part.cloud, f"{index}", arrays),
+            trajectory=part.trajectory.build(),
+            colour=colour,
+        )
+    sky = arrays.get("sky")
+    return Scene(
+        name=document.name,
+        background=_cloud(document.background, "background", arrays),
+        objects=objects,
+        sky=None if sky is None else Sky(torch.from_numpy(sky.astype(np.float32) / 255)),
+        rig=CameraRig(tuple(camera.build() for camera in document.cameras)),
+        ego=document.ego.build(),
+        frame_times_us=np.array(document.frame_times_us, dtype=np.int64),
+        ego_size=document.ego_size,
+        provenance=document.provenance,
+    )
+
+
+def _cloud(part: _PackedCloud, key: str, arrays: Arrays) -> GaussianCloud:
+    held = {
+        name: arrays[f"{key}.{name}"]
+        for name in ("means", "quats", "log_scales", "opacities", "colours", "sh")
+    }
+    means = held["means"] / MEAN_STEPS * np.array(part.extent) + np.array(part.low)
+    log_scales = held["log_scales"] / LOG_SCALE_STEPS + LOWEST_LOG_SCALE
+    sh = np.concatenate(
+        [held["colours"][:, None].astype(np.float32), held["sh"] / SH_STEPS * part.sh_range], axis=1
+    )
+    cloud = GaussianCloud(
+        means=_tensor(means),
+        quats=torch.nn.functional.normalize(_tensor(held["quats"]), dim=1),
+        scales=_tensor(np.exp(log_scales)),
+        opacities=_tensor(held["opacities"] / OPACITY_STEPS),
+        sh=_tensor(sh),
+    )
+    cloud.check_values(key)
+    return cloud
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def _vector(values: NDArray[np.float64]) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z
