@@ -56,6 +56,9 @@ def reconstruct(
     preset: Annotated[
         str, typer.Option(help="Of training: cpu-small, standard or paper.")
     ] = "cpu-small",
+    width: Annotated[
+        int | None, typer.Option(min=32, max=8192, help="Of training images [px].")
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where training was broken off.")
     ] = False,
@@ -72,7 +75,7 @@ def reconstruct(
         log=log,
         out=out,
         iterations=iterations,
-        training=command.Training(preset=preset, resume=resume),
+        training=command.Training(preset=preset, resume=resume, width=width),
         log_format=log_format,
         sequence=sequence,
         overwrite=overwrite,
@@ -310,6 +313,88 @@ def validate(
 
 
 @app.command()
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for film, curves, result.")],
+    experiment: Annotated[
+        str | None, typer.Option(help="Of the paper: wall, pair or drop.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="paper (soft) or vehicle (kilograms, crush, tyres).")
+    ] = None,
+    speed: Annotated[
+        float | None, typer.Option(min=0.01, max=100, help="Of an experiment [m/s].")
+    ] = None,
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="What takes part; repeat it.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option(min=0.01, max=600, help="[s]")] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
+    backend: Annotated[str, typer.Option(help="Of the solver.")] = "auto",
+    film: Annotated[bool, typer.Option(help="Draw film and stills.")] = True,
+    json: JsonFile = None,
+) -> None:
+    """Let objects of a scene collide, deform and come to rest; leave film and curves."""
+    from .commands import simulate as command
+
+    _run(
+        command.run,
+        scene=scene,
+        out=out,
+        asked=command.Asked(
+            experiment=experiment,
+            preset=preset,
+            speed=speed,
+            objects=tuple(objects or ()),
+            duration=duration,
+            frame=frame,
+            backend=backend,
+            film=film,
+        ),
+        json_path=json,
+    )
+
+
+@app.command()
+def ground(
+    scene: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    log: Annotated[Path | None, typer.Option(help="Its driving log, for LiDAR.")] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Whose boxes are projected down.")] = 0,
+    picture: Annotated[Path | None, typer.Option(help="PNG with inliers in red.")] = None,
+    json: JsonFile = None,
+) -> None:
+    """Find the road surface under a scene's objects, from LiDAR and from Gaussians."""
+    from .commands import ground as command
+
+    _run(command.run, scene=scene, log=log, frame=frame, picture=picture, json_path=json)
+
+
+@app.command()
+def replay(
+    episode: Annotated[Path, typer.Argument(help="Recording of an episode (.r2e).")],
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="Its scene bundle: live through it again.")
+    ] = None,
+    video: Annotated[Path | None, typer.Option("--video", help="MP4 to draw.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Of the video; default: the first.")] = None,
+    width: Annotated[int, typer.Option(min=64, max=4096, help="Of the video [px].")] = 640,
+    json: JsonFile = None,
+) -> None:
+    """Score a recorded episode; with its scene, check that it comes out the same, and film it."""
+    from .commands import replay as command
+
+    _run(
+        command.run,
+        episode=episode,
+        scene=scene,
+        video=video,
+        camera=camera,
+        width=width,
+        json_path=json,
+    )
+
+
+@app.command()
 def serve(
     host: Annotated[
         str | None, typer.Option(help="Default 127.0.0.1; others need a token.")
@@ -399,6 +484,16 @@ def bench_serve(json: JsonFile = None) -> None:
     from .commands import bench_serve as command
 
     _run(command.run, json_path=json)
+
+
+@bench.command("edit")
+def bench_edit(
+    operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000, json: JsonFile = None
+) -> None:
+    """Time of an edit, and of opening a scenario that has had many."""
+    from .commands import bench_edit as command
+
+    _run(command.run, operations=operations, json_path=json)
 
 
 def _run(command: Any, **arguments: Any) -> None:

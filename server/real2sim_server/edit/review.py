@@ -27,6 +27,9 @@ OUTSIDE_MAP = 100.0
 
 NAMED_OVERLAPS = 5
 
+AT_ONCE = 64
+"""Instants at which boxes are compared in one go; most pairs that overlap do so early."""
+
 
 def review(
     state: ScenarioState, touched: Sequence[str], *, ground: GroundHeight | None = None
@@ -62,13 +65,9 @@ def _overlaps(
 ) -> Iterator[EditWarning]:
     hit: dict[str, float] = {}
     for other in _within_reach(subject, state, own):
-        theirs, covered = sample(other.trajectory, times)
-        if not covered.any():
-            continue
-        size_a, size_b = subject.scaled_size, other.scaled_size
-        overlapping = boxes_overlap(own[covered], size_a, theirs[covered], size_b)
-        if overlapping.any():
-            hit[other.object_id] = int(times[covered][np.argmax(overlapping)]) * 1e-6
+        first = _first_overlap(subject, other, times, own)
+        if first is not None:
+            hit[other.object_id] = first * 1e-6
     if hit:
         named = [f"{i!r} from t={t:.2f} s" for i, t in list(hit.items())[:NAMED_OVERLAPS]]
         more = f" and {len(hit) - len(named)} more" if len(hit) > len(named) else ""
@@ -79,16 +78,34 @@ def _overlaps(
         )
 
 
+def _first_overlap(
+    subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
+) -> int | None:
+    """First of ``times`` at which the two boxes overlap; None where they never do."""
+    theirs, covered = sample(other.trajectory, times)
+    apart = np.linalg.norm(own[:, :3, 3] - theirs[:, :3, 3], axis=1)
+    near = np.flatnonzero(covered & (apart <= subject.radius + other.radius))
+    if subject.standing and other.standing:
+        near = near[:1]
+    for start in range(0, len(near), AT_ONCE):
+        some = near[start : start + AT_ONCE]
+        overlapping = boxes_overlap(own[some], subject.scaled_size, theirs[some], other.scaled_size)
+        if overlapping.any():
+            return int(times[some][np.argmax(overlapping)])
+    return None
+
+
 def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
     """Visible objects whose path, as a box around it, comes near that of ``subject``."""
-    tracks = state.tracks
-    radii = np.linalg.norm(tracks.sizes, axis=1) / 2
-    reach = (radii + np.linalg.norm(subject.scaled_size) / 2)[:, None]
-    at = own[:, :3, 3]
-    apart = (tracks.lower - reach > at.max(axis=0)) | (tracks.upper + reach < at.min(axis=0))
+    others = [o for o in state.objects.values() if not o.deleted and o is not subject]
+    if not others:
+        return
+    bounds = np.stack([o.bounds for o in others])
+    at, radius = own[:, :3, 3], subject.radius
+    low, high = at.min(axis=0) - radius, at.max(axis=0) + radius
+    apart = (bounds[:, 0] > high) | (bounds[:, 1] < low)
     for i in np.flatnonzero(~apart.any(axis=1)):
-        if tracks.objects[i].object_id != subject.object_id:
-            yield tracks.objects[i]
+        yield others[i]
 
 
 def _off_ground(
@@ -111,7 +128,8 @@ def _off_ground(
 
 
 def _clearance(transforms: Float, subject: ObjectState, ground: GroundHeight | None) -> Float:
-    sparse = transforms[:: -(-len(transforms) // MAX_GROUND_SAMPLES)]
+    count = 1 if subject.standing else MAX_GROUND_SAMPLES
+    sparse = transforms[:: -(-len(transforms) // count)]
     lowest: Float = box_corners(sparse, subject.scaled_size)[..., 2].min(axis=-1)
     return lowest - ground(sparse[:, :2, 3]) if ground else lowest
 

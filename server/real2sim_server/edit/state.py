@@ -99,6 +99,24 @@ class ObjectState:
         (length, width, height), (x, y, z) = self.size, self.scale
         return (length * x, width * y, height * z)
 
+    @cached_property
+    def radius(self) -> float:
+        """Half the diagonal of the box [m]."""
+        return sum(side * side for side in self.scaled_size) ** 0.5 / 2
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """[2, 3] lowest and highest point that the box may reach on its way [m]."""
+        positions = self.trajectory.positions
+        low, high = positions.min(axis=0) - self.radius, positions.max(axis=0) + self.radius
+        return np.stack([low, high])
+
+    @cached_property
+    def standing(self) -> bool:
+        """Whether all its poses are the same."""
+        p, q = self.trajectory.positions, self.trajectory.quaternions
+        return bool((p == p[0]).all() and (q == q[0]).all())
+
 
 @dataclass(frozen=True, eq=False)
 class ScenarioState:

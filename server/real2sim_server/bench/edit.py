@@ -1,0 +1,155 @@
+"""``real2sim bench edit``: what an edit costs, and what a thousand of them cost later.
+
+Measured from outside over loopback, with a worker in a process of its own. Between writing and
+opening that process is killed, so that what is opened comes from the disk.
+"""
+
+from __future__ import annotations
+
+import random
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx2
+from rich.console import Console
+from rich.table import Table
+
+import real2sim
+from real2sim_proto.operations import (
+    OPERATION,
+    Delete,
+    Duplicate,
+    Operation,
+    Restore,
+    Rotate,
+    SetPhysics,
+    SetVelocity,
+    TimeRange,
+    Translate,
+)
+
+from ..demo.worker import own_worker
+from ..scene.io import save_scene
+from .serve import percentiles
+from .street import street
+
+SCENE = "street"
+OPENINGS = 5
+
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured: edits on one scenario, and Gaussians of its scene."""
+
+    operations: int = 1000
+    gaussians: int = 100_000
+
+
+def run(effort: Effort | None = None) -> Figures:
+    """Edit one scenario many times, kill the worker, and open it again; figures in milliseconds.
+
+    ``append`` is the time from sending an edit to its answer, which is on disk by then; ``open``
+    that of the first answer about the scenario from a new process, ``describe`` that of later ones.
+    """
+    effort = effort or Effort()
+    console = Console()
+    with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder:
+        root = Path(folder)
+        scene = street(SCENE, gaussians=effort.gaussians, width=320, height=214)
+        save_scene(scene, root / "scenes" / f"{SCENE}.r2s")
+        places = {"scenes": root / "scenes", "data": root}
+        with (
+            console.status(f"{effort.operations} edits"),
+            own_worker(**places, log_file=root / "writing.log") as worker,
+        ):
+            scenario_id, append = _append(worker.url, effort.operations)
+            worker.process.kill()
+        opened, described = [], []
+        for n in range(OPENINGS):
+            with own_worker(**places, log_file=root / f"opening_{n}.log") as worker:
+                times = _open(worker.url, scenario_id, revision=effort.operations)
+                opened.append(times[0])
+                described += times[1:]
+                worker.process.kill()
+    figures = {
+        "operations": effort.operations,
+        "append_ms": percentiles(append),
+        "append_last_hundred_ms": percentiles(append[-100:]),
+        "open_ms": percentiles(opened),
+        "describe_ms": percentiles(described),
+    }
+    _print(console, figures)
+    return figures
+
+
+def _append(url: str, count: int) -> tuple[str, list[float]]:
+    with real2sim.connect(url) as client:
+        client.wait_ready()
+        scenario = client.scenarios.create(scene=SCENE)
+    cars = [o.object_id for o in scenario.info.objects]
+    path = f"/v1/scenarios/{scenario.scenario_id}/operations"
+    times = []
+    with httpx2.Client(base_url=url, trust_env=False) as http:
+        for operation in _edits(cars, count):
+            body = {"operations": [OPERATION.dump_python(operation, mode="json")]}
+            started = time.perf_counter()
+            http.post(path, json=body).raise_for_status()
+            times.append((time.perf_counter() - started) * 1e3)
+    return scenario.scenario_id, times
+
+
+def _edits(cars: list[str], count: int) -> list[Operation]:
+    """All kinds that an author uses, most of them small moves, as of a drag in the browser."""
+    choose = random.Random(0)
+    edits: list[Operation] = []
+    while len(edits) < count:
+        car = choose.choice(cars)
+        kind = len(edits) % 20
+        if kind == 0 and len(cars) < 30:
+            new_id = f"copy_{len(edits)}"
+            edits.append(Duplicate(object_id=car, new_id=new_id, y=3.5))
+            cars.append(new_id)
+        elif kind == 5:
+            edits += [Delete(object_id=car), Restore(object_id=car)]
+        elif kind == 9:
+            when = TimeRange(start_us=2_000_000, end_us=6_000_000)
+            edits.append(Translate(object_id=car, y=0.1, time_range=when))
+        elif kind == 12:
+            edits.append(SetPhysics(object_id=car, mass=1500.0, friction=0.6))
+        elif kind == 15:
+            edits.append(SetVelocity(object_id=car, linear=(5.0, 0.0, 0.0)))
+        elif kind % 2:
+            edits.append(Rotate(object_id=car, angle=choose.uniform(-0.1, 0.1)))
+        else:
+            edits.append(Translate(object_id=car, x=choose.uniform(-1, 1), snap=kind == 18))
+    return edits[:count]
+
+
+def _open(url: str, scenario_id: str, *, revision: int) -> list[float]:
+    times = []
+    with real2sim.connect(url) as client:
+        client.wait_ready()
+        client.scenes.list()
+    with httpx2.Client(base_url=url, trust_env=False) as http:
+        for _ in range(4):
+            started = time.perf_counter()
+            answer = http.get(f"/v1/scenarios/{scenario_id}").raise_for_status()
+            times.append((time.perf_counter() - started) * 1e3)
+            found = answer.json()["revision"]
+            if found != revision:
+                raise RuntimeError(f"{revision} edits were acknowledged, {found} were found again")
+    return times
+
+
+def _print(console: Console, figures: Figures) -> None:
+    table = Table("[ms]", "p50", "p95", "p99", "max", "n", title="edits", title_justify="left")
+    for name in ("append_ms", "append_last_hundred_ms", "open_ms", "describe_ms"):
+        row = figures[name]
+        numbers = [f"{row[column]:.2f}" for column in ("p50", "p95", "p99", "max")]
+        table.add_row(name.removesuffix("_ms").replace("_", " "), *numbers, str(row["count"]))
+    console.print(table)
