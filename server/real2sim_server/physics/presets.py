@@ -118,10 +118,10 @@ PRESETS = {
     ),
     "vehicle": Preset(
         name="vehicle",
-        spacing=0.075,
+        spacing=0.1,
         friction=0.4,
         wheels=True,
-        clearance=0.18,
+        clearance=0.12,
         by_density=False,
         build=_vehicle,
     ),

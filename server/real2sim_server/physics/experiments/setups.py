@@ -1,0 +1,226 @@
+"""The paper's three experiments, set up on the vehicles of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...scene import Scene
+from ...scene.rotation import Float
+from ..colliders import Collider, HeightField, Plane
+from ..errors import PhysicsError
+from ..ground import find_road
+from ..playback import PlacedObject, PlacedObjects
+from ..presets import VEHICLES, ObjectPhysics
+from ..simulation import SimulateOptions
+
+WALL_GAP = 0.5
+"""Between the vehicle and the wall at the start [m]: contact after 1 s at 0.5 m/s."""
+DROP_HEIGHT = 1.225
+"""Free fall of 0.5 s [m]."""
+PAIR_GAP = 1.5
+"""Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
+DEPTH_RANGE = (4.0, 45.0)
+OPAQUE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A simulation and where to look.
+
+    Attributes:
+        name: ``wall``, ``pair`` or ``drop``.
+        options: what to simulate.
+        subjects: objects to look at.
+        focus: [3] point of the world to look at from near by [m].
+        side: [3] direction from the focus to a near-by viewer, unit.
+        distance: of that viewer [m].
+    """
+
+    name: str
+    options: SimulateOptions
+    subjects: tuple[str, ...]
+    focus: Float
+    side: Float
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    scene: Scene
+    state: PlacedObjects
+    chosen: tuple[PlacedObject, ...]
+    start_us: int
+    preset: str
+    speed: float | None
+
+
+def set_up(
+    name: str,
+    scene: Scene,
+    state: PlacedObjects,
+    *,
+    preset: str = "paper",
+    speed: float | None = None,
+    objects: tuple[str, ...] = (),
+) -> Experiment:
+    """An experiment of the paper on a scene.
+
+    Args:
+        name: ``wall``: one vehicle against a virtual wall; ``pair``: two vehicles into standing
+            ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground.
+        preset: of the materials.
+        speed: [m/s]; the paper's 2.5 and 3.5 by default.
+        objects: ids to take; the most visible vehicles by default.
+
+    Raises:
+        PhysicsError: unknown name or objects, or no vehicles in view.
+    """
+    builders = {"wall": _wall, "pair": _pair, "drop": _drop}
+    if name not in builders:
+        raise PhysicsError(f"unknown experiment {name!r}; allowed are {', '.join(builders)}")
+    there = {o.object_id: o for o in state.visible}
+    unknown = [o for o in objects if o not in there]
+    if unknown:
+        raise PhysicsError(f"no objects {unknown}; there are {sorted(there)}")
+    start_us = int(scene.frame_times_us[0])
+    chosen = [there[o] for o in objects] or most_visible(scene, state, start_us)
+    if not chosen:
+        raise PhysicsError(f"no vehicles in view at {start_us} us; name some with objects")
+    return builders[name](_Asked(scene, state, tuple(chosen), start_us, preset, speed))
+
+
+def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedObject]:
+    """Vehicles before the first camera, the largest on its image first."""
+    camera = scene.rig.cameras[0]
+    T_camera_world = camera.viewmat(scene.ego.transform(t_us))
+    found = []
+    for subject in state.visible:
+        if subject.category not in VEHICLES or not subject.trajectory.covers(t_us):
+            continue
+        place = subject.trajectory.transform(t_us)[:3, 3]
+        x, y, z = T_camera_world[:3, :3] @ place + T_camera_world[:3, 3]
+        if not DEPTH_RANGE[0] < z < DEPTH_RANGE[1]:
+            continue
+        u = camera.K[0, 0] * x / z + camera.K[0, 2]
+        v = camera.K[1, 1] * y / z + camera.K[1, 2]
+        if 0 < u < camera.width and 0 < v < camera.height:
+            found.append((z / subject.scaled_size[2], subject.object_id, subject))
+    return [subject for _, _, subject in sorted(found, key=lambda f: f[:2])]
+
+
+def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
+    """The road as the background's Gaussians have it, under all boxes there at ``t_us``."""
+    boxes = [
+        (o.trajectory.transform(t_us), o.scaled_size)
+        for o in state.visible
+        if o.trajectory.covers(t_us)
+    ]
+    cloud = scene.background
+    solid = cloud.opacities.detach().cpu().numpy() > OPAQUE
+    means = cloud.means.detach().cpu().numpy()[solid].astype(np.float64)
+    return find_road(means, boxes).field
+
+
+def _wall(asked: _Asked) -> Experiment:
+    subject, start_us = asked.chosen[0], asked.start_us
+    speed = 2.5 if asked.speed is None else asked.speed
+    pose = subject.trajectory.transform(start_us)
+    forward, length = _level(pose[:3, 0]), subject.scaled_size[0]
+    front = pose[:3, 3] + (length / 2) * forward
+    wall = Plane(name="wall", point=front + WALL_GAP * forward, normal=-forward, friction=0.3)
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects={subject.object_id: ObjectPhysics(velocity=speed * forward, friction=_ROLLS)},
+        colliders=[_standing_road(asked, subject), wall],
+        start_us=start_us,
+        duration=WALL_GAP / speed + 1.0,
+    )
+    side = _level(np.cross([0, 0, 1], forward)) * _towards(asked.scene, pose, forward, start_us)
+    view = _level(0.55 * side + 0.6 * forward) + np.array([0, 0, 0.35])
+    return Experiment(
+        "wall", options, (subject.object_id,), front - 0.3 * length * forward, view, 6.5
+    )
+
+
+_ROLLS = 0.0
+"""In the paper's preset a vehicle has no wheels; that it rolls means it slides freely."""
+
+
+def _standing_road(asked: _Asked, subject: PlacedObject) -> Collider:
+    """The road; without wheels it must not reach into the vehicle's underside."""
+    if asked.preset != "paper":
+        return scene_road(asked.scene, asked.state, asked.start_us)
+    pose, height = subject.trajectory.transform(asked.start_us), subject.scaled_size[2]
+    return Plane(
+        name="ground",
+        point=pose[:3, 3] - (height / 2 + 0.05) * pose[:3, 2],
+        normal=pose[:3, 2],
+        friction=0.0,
+    )
+
+
+def _pair(asked: _Asked) -> Experiment:
+    """Two vehicles start behind standing ones, half a width off centre, as traffic hits."""
+    speed, start_us = 3.5 if asked.speed is None else asked.speed, asked.start_us
+    chosen = asked.chosen
+    if len(chosen) < 2:
+        raise PhysicsError("two vehicles in view are needed; name four or two with objects")
+    count = min(len(chosen) // 2, 2)
+    runners, standing = chosen[:count], chosen[count : 2 * count]
+    objects: dict[str, ObjectPhysics] = {}
+    meeting = []
+    for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
+        own = runner.trajectory.transform(start_us)
+        forward = _level(own[:3, 0])
+        away = runner.scaled_size[0] / 2 + PAIR_GAP + hit.scaled_size[0] / 2
+        target = np.array(own)
+        target[:3, 3] += away * forward
+        target[:3, 3] += (0.25 - 0.5 * k) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
+        target[2, 3] += (hit.scaled_size[2] - runner.scaled_size[2]) / 2
+        objects[runner.object_id] = ObjectPhysics(velocity=speed * forward, T_world_object=own)
+        objects[hit.object_id] = ObjectPhysics(velocity=(0, 0, 0), T_world_object=target)
+        meeting.append((own[:3, 3] + target[:3, 3]) / 2)
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects=objects,
+        start_us=start_us,
+        duration=PAIR_GAP / speed + 1.2,
+        gravity=(0.0, 0.0, 0.0),
+    )
+    forward = _level(runners[0].trajectory.transform(start_us)[:3, 0])
+    view = np.cross([0, 0, 1], forward) - 0.5 * forward + np.array([0, 0, 0.5])
+    return Experiment("pair", options, tuple(objects), meeting[0], view, 9.0)
+
+
+def _drop(asked: _Asked) -> Experiment:
+    subjects, start_us = asked.chosen[:3], asked.start_us
+    objects = {}
+    for subject in subjects:
+        pose = subject.trajectory.transform(start_us)
+        pose[2, 3] += DROP_HEIGHT
+        down = (0.0, 0.0, -(asked.speed or 0.0))
+        objects[subject.object_id] = ObjectPhysics(T_world_object=pose, velocity=down)
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects=objects,
+        colliders=[scene_road(asked.scene, asked.state, start_us)],
+        start_us=start_us,
+        duration=2.0,
+    )
+    pose = subjects[0].trajectory.transform(start_us)
+    side = np.cross([0, 0, 1], _level(pose[:3, 0]))
+    view = side - 0.6 * pose[:3, 0] + np.array([0, 0, 0.15])
+    return Experiment("drop", options, tuple(objects), pose[:3, 3], view, 8.0)
+
+
+def _level(direction: Float) -> Float:
+    flat = np.array([direction[0], direction[1], 0.0])
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def _towards(scene: Scene, pose: Float, forward: Float, t_us: int) -> float:
+    """The side of a vehicle, left 1 or right -1, that the recording vehicle is on."""
+    offset = scene.ego.transform(t_us)[:3, 3] - pose[:3, 3]
+    return 1.0 if float(np.cross([0, 0, 1], forward) @ offset) >= 0 else -1.0
