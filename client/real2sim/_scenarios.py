@@ -123,7 +123,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
         end_us: int | None = None,
         frame_us: int = 50_000,
         objects: Sequence[str] | None = None,
-        max_particles: int = 200_000,
+        preset: str = "vehicle",
         backend: str = "auto",
     ) -> Job:
         """Start a physics rollout of the scenario as it is now.
@@ -132,7 +132,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             start_us, end_us: default: the scenario's span.
             frame_us: from one kept frame to the next.
             objects: what the physics moves; default: what has a velocity or physics of its own.
-            max_particles: of all of them together.
+            preset: how objects become bodies: ``vehicle`` or ``paper``.
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         """
         body = _requests.checked(
@@ -141,7 +141,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             end_us=end_us,
             frame_us=frame_us,
             objects=None if objects is None else list(objects),
-            max_particles=max_particles,
+            preset=preset,
             backend=backend,
         )
         info = self._transport.send(_requests.simulate(self.scenario_id, body))

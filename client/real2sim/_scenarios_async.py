@@ -121,7 +121,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         end_us: int | None = None,
         frame_us: int = 50_000,
         objects: Sequence[str] | None = None,
-        max_particles: int = 200_000,
+        preset: str = "vehicle",
         backend: str = "auto",
     ) -> AsyncJob:
         """Start a physics rollout of the scenario as it is now.
@@ -130,7 +130,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             start_us, end_us: default: the scenario's span.
             frame_us: from one kept frame to the next.
             objects: what the physics moves; default: what has a velocity or physics of its own.
-            max_particles: of all of them together.
+            preset: how objects become bodies: ``vehicle`` or ``paper``.
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         """
         body = _requests.checked(
@@ -139,7 +139,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             end_us=end_us,
             frame_us=frame_us,
             objects=None if objects is None else list(objects),
-            max_particles=max_particles,
+            preset=preset,
             backend=backend,
         )
         info = await self._transport.send(_requests.simulate(self.scenario_id, body))

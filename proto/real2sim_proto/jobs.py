@@ -75,7 +75,7 @@ class SimulateRequest(Model):
     start_us: Microseconds | None = Field(default=None, description="default: of the scenario")
     end_us: Microseconds | None = Field(default=None, description="default: of the scenario")
     frame_us: int = Field(
-        default=50_000, ge=1_000, le=1_000_000, description="time from one kept frame to the next"
+        default=50_000, ge=5_000, le=1_000_000, description="time from one kept frame to the next"
     )
     objects: list[Identifier] | None = Field(
         default=None,
@@ -83,8 +83,8 @@ class SimulateRequest(Model):
         description="what the physics moves; default: what has a velocity or physics of its own, "
         "and whatever that touches",
     )
-    max_particles: int = Field(
-        default=200_000, ge=1_000, le=5_000_000, description="of all moved objects together"
+    preset: Literal["vehicle", "paper"] = Field(
+        default="vehicle", description="how objects become bodies: crumpling cars, or soft ones"
     )
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
 

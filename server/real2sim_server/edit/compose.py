@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 from typing import TypeVar
 from weakref import WeakKeyDictionary
@@ -15,7 +15,7 @@ from real2sim_proto.operations import EraseRegion
 
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene
-from ..scene.rotation import invert_transform, transform_from
+from ..scene.rotation import Float, invert_transform, transform_from
 from .ground import RecordedGround
 from .shadow import shadow_under
 from .state import ObjectState, ScenarioState
@@ -51,15 +51,27 @@ def compose(
 ) -> list[Instance]:
     """The same for objects already looked up. Raises like :func:`instances_at`."""
     instances = [Instance(background_without(scene, erased))]
-    shadows = []
+    edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         cloud = cloud_of(scene, subject, t_us)
         instances.append(Instance(cloud, transform, subject.instance_id, subject.scale))
-        if subject.placed and not _as_recorded(scene, subject, transform, t_us):
-            ground = _kept(scene, "ground", lambda: _ground(scene))
-            device = scene.background.device
-            shadows.append(shadow_under(transform, subject.scaled_size, ground, device=device))
-    return instances + [s for s in shadows if s is not None]
+        if subject.placed:
+            edited.append((subject, transform))
+    return instances + shadows_of(scene, edited, t_us)
+
+
+def shadows_of(
+    scene: Scene, placed: Iterable[tuple[ObjectState, Float]], t_us: int
+) -> list[Instance]:
+    """Soft shadows under the objects (each with its ``T_world_object``) that are not where the
+    recording, and so their shadow in the background, has them at ``t_us``."""
+    ground = _kept(scene, "ground", lambda: _ground(scene))
+    shadows = [
+        shadow_under(transform, subject.scaled_size, ground, device=scene.background.device)
+        for subject, transform in placed
+        if not _as_recorded(scene, subject, transform, t_us)
+    ]
+    return [shadow for shadow in shadows if shadow is not None]
 
 
 def cloud_of(scene: Scene, subject: ObjectState, t_us: int) -> GaussianCloud:
@@ -93,8 +105,7 @@ def _hidden(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> Gauss
     return replace(background, opacities=opacities)
 
 
-def _as_recorded(scene: Scene, subject: ObjectState, transform: object, t_us: int) -> bool:
-    """Whether the object is where the recording, and so its shadow in the background, has it."""
+def _as_recorded(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> bool:
     if subject.asset is not None or subject.object_id != subject.source_id:
         return False
     recorded = scene.object(subject.source_id).trajectory

@@ -21,6 +21,7 @@ from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode
 from real2sim_proto.errors import ProblemDetail, title_of
 
 from ..edit import EditError
+from ..physics.errors import PhysicsError
 from ..render import RenderError
 from ..scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from ..world import WorldError
@@ -79,6 +80,7 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (BundleError, ErrorCode.SCENE_BROKEN, None),
     (RenderError, ErrorCode.INVALID_REQUEST, None),
     (SceneError, ErrorCode.INVALID_OPERATION, None),
+    (PhysicsError, ErrorCode.INVALID_REQUEST, None),
 )
 """Errors of other rooms that a client is told in their own words; the first that fits counts."""
 

@@ -22,7 +22,7 @@ from real2sim_proto.scenarios import (
     ScenarioInfo,
 )
 
-from ..edit import AssetLookup, Planned, Scenario
+from ..edit import AssetLookup, Planned, Scenario, ScenarioState
 from ..scene.io import SceneSummary
 from .idempotency import Once
 from .library import BUNDLE_SUFFIX
@@ -158,6 +158,15 @@ class Scenarios:
     async def view(self, scenario_id: str) -> ScenarioView:
         """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
         return _view(await self._hold(scenario_id))
+
+    async def state_at(self, scenario_id: str, revision: int) -> ScenarioState:
+        """What the scenario was at a revision. Raises ServiceError: UNKNOWN_SCENARIO."""
+        held = await self._hold(scenario_id)
+        if revision == held.scenario.revision:
+            return held.scenario.state
+        log = [history_entry(e) for e in held.scenario.entries[:revision]]
+        earlier = await asyncio.to_thread(replayed, held.row, held.summary, log, self._assets)
+        return earlier.state
 
     async def history(self, scenario_id: str, *, after: int = 0) -> History:
         """Revisions behind ``after``, oldest first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from real2sim_proto.base import Identifier, Microseconds, Modality
 from real2sim_proto.drive import SensorSpec
 
 from ...edit import ScenarioState, instances_at
+from ...render import Instance
 from ...scene import Scene
 from ..answers import CODEC_OF, choose_media_type
 from ..pictures import Shot
@@ -43,6 +45,12 @@ class FrameQuery:
             TimeOutOfRangeError: ``t_us`` outside the recording.
         """
         t_us = state.clock[0] if self.t_us is None else self.t_us
+        return self.shot_of(scene, instances_at(scene, state, t_us), t_us, media_type)
+
+    def shot_of(
+        self, scene: Scene, instances: Sequence[Instance], t_us: int, media_type: str
+    ) -> Shot:
+        """The same for instances that are there already."""
         sensor = SensorSpec(
             camera=self.camera,
             modalities=[self.modality],
@@ -51,7 +59,7 @@ class FrameQuery:
         )
         return Shot(
             scene=scene,
-            instances=instances_at(scene, state, t_us),
+            instances=instances,
             T_world_vehicle=scene.ego.transform(t_us),
             t_us=t_us,
             sensors=(sensor,),

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo, JobList
 
-from ..answers import info_response
+from ..answers import FRAME_RESPONSES, frame_response, info_response
+from ..disconnects import unless_gone
 from ..events import event_stream
 from ..jobs import Jobs
+from ..pictures import Shot
 from ..worker import WorkerOf
+from .frame_query import FrameQueryOf
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -82,6 +86,23 @@ async def events(
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
+
+
+@router.get("/{job_id}/preview", responses=FRAME_RESPONSES, response_class=Response)
+async def preview(
+    worker: WorkerOf, job_id: Identifier, asked: FrameQueryOf, request: Request
+) -> Response:
+    """One frame of a finished simulation, from where the recording vehicle was at ``t_us``."""
+    media_type = asked.media_type()
+    film = await worker.simulations.film(job_id)
+    t_us = film.span[0] if asked.t_us is None else asked.t_us
+
+    def shot() -> Shot:
+        return asked.shot_of(film.scene, film.instances(t_us), t_us, media_type)
+
+    taken = await asyncio.to_thread(shot)
+    pictured = await unless_gone(request, worker.pictures.take(taken))
+    return frame_response(pictured, media_type)
 
 
 @router.get(

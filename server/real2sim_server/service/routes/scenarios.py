@@ -12,6 +12,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
+from real2sim_proto.jobs import JobInfo, SimulateRequest
 from real2sim_proto.scenarios import (
     History,
     OperationBatch,
@@ -27,6 +28,7 @@ from ..answers import FRAME_RESPONSES, frame_response, info_response, large_resp
 from ..clients import ClientName
 from ..disconnects import unless_gone
 from ..idempotency import IdempotencyKey, Once
+from ..jobs import accepted_headers
 from ..problems import ServiceError
 from ..scenarios import created_headers, tag
 from ..views import etag
@@ -194,6 +196,28 @@ async def fork(
             return worker.replayed(once.replay)
         info = await worker.scenarios.fork(scenario_id, body or ScenarioFork(), once=once)
         return info_response(info, status=201, headers=created_headers(info))
+
+
+@router.post("/{scenario_id}/simulate", status_code=202, response_model=JobInfo)
+async def simulate(  # noqa: PLR0917, one parameter for each part of the request
+    worker: WorkerOf,
+    scenario_id: Identifier,
+    request: Request,
+    body: SimulateRequest | None = None,
+    idempotency_key: IdempotencyKey = None,
+    who: ClientName = "",
+) -> Response:
+    """Let physics move the scenario as it is now; the answer is a job.
+
+    Once it has succeeded, its result has contacts and figures, its file `playback.json` poses and
+    energies of every frame; `GET /v1/jobs/{id}/preview` shows it, `POST /v1/exports` films it.
+    """
+    async with worker.idempotency.once(request, idempotency_key) as once:
+        if once.replay:
+            return worker.replayed(once.replay)
+        asked = body or SimulateRequest()
+        info = await worker.simulations.start(scenario_id, asked, who=who, once=once)
+        return info_response(info, status=202, headers=accepted_headers(info))
 
 
 @router.get("/{scenario_id}/export", response_model=ScenarioDocument)

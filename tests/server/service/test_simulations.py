@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.jobs import JobInfo
+
+PUSH = {"op": "set_velocity", "object_id": "car_red", "linear": [6.0, 0.0, 0.0]}
+SHORT = {"end_us": 300_000, "frame_us": 100_000, "objects": ["car_red"]}
+
+
+@pytest.fixture
+def scenario(client) -> str:
+    made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()
+    return f"/v1/scenarios/{made['scenario_id']}"
+
+
+def edit(client, url, *operations) -> None:
+    answer = client.post(f"{url}/operations", json={"operations": list(operations)})
+    assert answer.status_code == 200, answer.text
+
+
+def finished(client, answer) -> dict:
+    assert answer.status_code == 202, answer.text
+    deadline = time.monotonic() + 120
+    while not JobInfo.model_validate(job := client.get(answer.headers["Location"]).json()).over:
+        assert time.monotonic() < deadline, job
+        time.sleep(0.05)
+    return job
+
+
+def test_a_pushed_car_rolls_on_and_can_be_looked_at(client, scenario):
+    edit(client, scenario, PUSH)
+    job = finished(client, client.post(f"{scenario}/simulate", json=SHORT))
+    assert job["state"] == "succeeded", job
+    assert (job["result"]["frames"], job["result"]["objects"]) == (4, ["car_red"])
+
+    url = f"/v1/jobs/{job['job_id']}"
+    playback = client.get(f"{url}/files/playback.json").json()
+    way = np.array(playback["tracks"]["car_red"]["positions"])
+    assert 0.8 < way[-1, 0] - way[0, 0] < 1.9
+    assert playback["times_us"] == [0, 100_000, 200_000, 300_000]
+    assert len(playback["energies"][0]) == len(playback["energy_names"])
+
+    ids = []
+    for t_us in (0, 300_000):
+        asked = {"camera": "front", "modality": "instance", "t_us": t_us}
+        answer = client.get(f"{url}/preview", params=asked, headers={"Accept": "image/png"})
+        ids.append(cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED))
+    assert (ids[0] == 1).any()
+    assert (ids[0] != ids[1]).any()
+
+    asked = {"simulation": job["job_id"], "camera": "front", "width": 64}
+    film = finished(client, client.post("/v1/exports", json=asked))
+    assert film["result"]["frames"] == 4
+
+
+def test_without_anything_set_in_motion_nothing_is_simulated(client, scenario):
+    answer = client.post(f"{scenario}/simulate")
+    assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
+    assert "set_velocity" in answer.json()["hint"]
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"objects": ["nobody"]}, ErrorCode.UNKNOWN_OBJECT),
+        ({"end_us": 9_000_000}, ErrorCode.TIME_OUT_OF_RANGE),
+        ({"preset": "magic"}, ErrorCode.INVALID_REQUEST),
+    ],
+)
+def test_a_wrong_rollout_is_refused_at_once(client, scenario, change, code):
+    answer = client.post(f"{scenario}/simulate", json=SHORT | change)
+    assert answer.json()["code"] == code
+
+
+def test_a_job_of_another_kind_is_no_film(client):
+    video = {"scene": "tiny", "camera": "front", "width": 64, "end_us": 100_000}
+    job = finished(client, client.post("/v1/exports", json=video))
+    answer = client.get(f"/v1/jobs/{job['job_id']}/preview", params={"camera": "front"})
+    assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
