@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 
 from ...scene.rotation import Float
@@ -17,6 +19,9 @@ from .cpu_deform import SCRATCH
 from .cpu_kernels import NODES, TILE, Rules, State, Work, advance
 from .cpu_layout import BLOCK, CHUNKS, COLLIDER_MARGIN, Int, Layout, arrange
 from .cpu_measure import measure_homes
+
+PARTICLES_PER_THREAD = 5000
+"""With fewer, threads gain little, and wait long for each other where others compute as well."""
 
 
 class CpuBackend:
@@ -58,7 +63,8 @@ class CpuSimulation:
         self._set_rules(colliders)
         self._load(model.start)
         self._arrange(colliders)
-        advance(0, self._dtype(0), self._state, self._layout, self._work, self._rules)
+        with self._threads():
+            advance(0, self._dtype(0), self._state, self._layout, self._work, self._rules)
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
         """Make ``steps`` substeps; sorts particles whenever one has left its home's reach."""
@@ -72,9 +78,22 @@ class CpuSimulation:
     def _run(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
         step = self._dtype(dt)
         while steps > 0:
-            steps -= advance(steps, step, self._state, self._layout, self._work, self._rules)
+            with self._threads():
+                done = advance(steps, step, self._state, self._layout, self._work, self._rules)
+            steps -= done
             if self._work.strayed.any():
                 self._arrange(colliders)
+
+    @contextmanager
+    def _threads(self) -> Iterator[None]:
+        """No more threads than there is work for; the bits do not depend on it."""
+        before = numba.get_num_threads()
+        wanted = len(self._state.mass) // PARTICLES_PER_THREAD
+        numba.set_num_threads(min(max(wanted, 1), before))
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
 
     def _follow(self, colliders: Sequence[Collider], dt: float) -> None:
         """Take over new poses; arrange anew before a collider is out of the margin."""
@@ -87,7 +106,8 @@ class CpuSimulation:
         """Sums in float64, added up in the order of homes."""
         layout, bodies = self._layout, self._model.bodies
         rows = np.empty((len(layout.home_block), columns.COLUMNS))
-        measure_homes(self._state, layout, self._rules, rows)
+        with self._threads():
+            measure_homes(self._state, layout, self._rules, rows)
         # The middle one of the fields around a home is its own.
         body = layout.field_body[layout.home_fields[:, 13]]
         sums = np.zeros((bodies, columns.SUMS))
