@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
-from typing import Any
 
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
@@ -15,6 +14,7 @@ from real2sim_proto import Problem
 
 from ..settings import Settings
 from .auth import require_token
+from .openapi import published
 from .problems import install_problem_handlers
 from .requests import BodyLimit, RequestContext
 from .routes import (
@@ -57,7 +57,7 @@ def create_app(settings: Settings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         async with worker.running():
-            app.openapi_schema = await asyncio.to_thread(_openapi, app)
+            app.openapi_schema = await asyncio.to_thread(published, app)
             yield
 
     app = FastAPI(
@@ -79,19 +79,6 @@ def create_app(settings: Settings) -> FastAPI:
     for router in PROTECTED:
         app.include_router(router, dependencies=[Depends(require_token)])
     return app
-
-
-_published: dict[str, Any] = {}
-
-
-def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document, made once a process: it is the same for all settings.
-
-    Made on demand it would keep the event loop busy for tenths of a second.
-    """
-    if not _published:
-        _published.update(app.openapi())
-    return _published
 
 
 def operation_id(route: APIRoute) -> str:

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, make_url
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from . import tables as t
 from .rows import ScenarioRow, SessionEntry, SessionRow, StoredReply
@@ -248,8 +248,10 @@ class Store:
             try:
                 with self._connected().begin() as connection:
                     return [connection.execute(c.statement, c.rows).rowcount for c in changes]
-            except IntegrityError as error:
-                raise ConflictError(f"not stored: {error.orig}") from error
+            except DBAPIError as error:
+                if _is_conflict(error):
+                    raise ConflictError(f"not stored: {error.orig}") from error
+                raise
 
         return await self._run(write)
 
@@ -272,6 +274,14 @@ class Store:
         if self._engine is not None:
             self._engine.dispose()
             self._engine = None
+
+
+def _is_conflict(error: DBAPIError) -> bool:
+    """Whether a row contradicts others (SQLSTATE class 23), in whatever words of the driver."""
+    if isinstance(error, IntegrityError):
+        return True
+    first = error.orig.args[0] if error.orig is not None and error.orig.args else None
+    return isinstance(first, dict) and str(first.get("C", "")).startswith("23")
 
 
 def now_us() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +15,8 @@ from fastapi.testclient import TestClient
 
 from real2sim_server.service.app import create_app
 from real2sim_server.settings import Settings
+
+from .postgres import Postgres, running_postgres
 
 
 @pytest.fixture
@@ -56,6 +59,17 @@ def start_worker(run_worker) -> Iterator[Callable[..., TestClient]]:
 @pytest.fixture
 def client(start_worker) -> TestClient:
     return start_worker()
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A PostgreSQL server for the whole run; skips where there is none."""
+    # Not below pytest's own folder, which other users cannot enter.
+    with (
+        tempfile.TemporaryDirectory(prefix="real2sim-pg-") as folder,
+        running_postgres(Path(folder)) as server,
+    ):
+        yield server
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from real2sim_proto.jobs import JobInfo, JobState
+from real2sim_server.service.job_log import JobLog
 from real2sim_server.service.store import (
     ConflictError,
     ScenarioRow,
@@ -17,14 +19,25 @@ from real2sim_server.service.store import (
     now_us,
 )
 
+from .postgres import Postgres
+
 SCENARIO = ScenarioRow("sc_1", "first", "tiny", "0" * 64, 1)
 SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "secret", 1)
 REPLY = StoredReply("key", "f" * 64, 201, {"ETag": '"r1"'}, b'{"a": 1}')
 
 
 @pytest.fixture
-def url(tmp_path) -> str:
+def sqlite_url(tmp_path) -> str:
     return f"sqlite:///{tmp_path / 'deep' / 'store.db'}"
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request, sqlite_url) -> str:
+    """An empty database of each kind; what holds for one holds for the other."""
+    if request.param == "sqlite":
+        return sqlite_url
+    server: Postgres = request.getfixturevalue("postgres")
+    return server.new_database()
 
 
 def run(url: str, work):
@@ -151,28 +164,28 @@ def test_open_sessions_are_those_of_the_worker_that_were_not_closed(url):
     assert closed.closed_us is not None
 
 
-def test_a_write_ahead_log_is_used(url, tmp_path):
+def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
     async def work(store):
         await store.create_scenario(SCENARIO)
         return (tmp_path / "deep" / "store.db-wal").exists()
 
-    assert run(url, work)
+    assert run(sqlite_url, work)
 
 
-def test_a_newer_store_is_refused_with_both_versions(url, tmp_path):
+def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
     async def nothing(store):
         pass
 
-    run(url, nothing)
+    run(sqlite_url, nothing)
     connection = sqlite3.connect(tmp_path / "deep" / "store.db")
     connection.execute("UPDATE schema_version SET version = 99")
     connection.commit()
     connection.close()
     with pytest.raises(StoreError, match="schema version 99, this worker reads 1"):
-        run(url, nothing)
+        run(sqlite_url, nothing)
 
 
-def test_a_file_that_is_no_database_is_refused(url, tmp_path):
+def test_a_file_that_is_no_database_is_refused(sqlite_url, tmp_path):
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "store.db").write_bytes(b"not a database at all" * 100)
 
@@ -180,7 +193,7 @@ def test_a_file_that_is_no_database_is_refused(url, tmp_path):
         pass
 
     with pytest.raises(StoreError, match="cannot open the store"):
-        run(url, nothing)
+        run(sqlite_url, nothing)
 
 
 def test_a_password_in_the_url_is_not_shown():
@@ -221,3 +234,36 @@ def test_appending_nothing_is_allowed(url):
         return await store.session_entries("w0.1")
 
     assert run(url, work) == []
+
+
+def test_jobs_survive_closing_and_are_found_by_state_and_subject(url):
+    done = JobInfo(job_id="job_1", kind="export", subject="a", state="succeeded", created_at="then")
+    stuck = JobInfo(job_id="job_2", kind="simulate", subject="b", state="running", created_at="now")
+
+    async def write(store):
+        log = JobLog(store, "w0")
+        await log.add(done, reply=None)
+        await log.add(stuck.model_copy(update={"state": JobState.QUEUED}), reply=None)
+        await log.update(stuck)
+
+    async def read(store):
+        log = JobLog(store, "w0")
+        other = await JobLog(store, "w1").unfinished()
+        by_subject = await log.newest(subject="a", limit=5)
+        return await log.get("job_2"), await log.unfinished(), other, by_subject
+
+    run(url, write)
+    assert run(url, read) == (stuck, [stuck], [], [done])
+
+
+def test_a_scenario_is_created_with_its_log_or_not_at_all(url):
+    log = [entry("a") | {"revision": 1}, entry("b") | {"revision": 2}]
+
+    async def work(store):
+        await store.create_scenario(SCENARIO, entries=log)
+        twice = replace(SCENARIO, scenario_id="sc_2")
+        with pytest.raises(ConflictError):
+            await store.create_scenario(twice, entries=[log[0], log[0]])
+        return await store.scenario_entries("sc_1"), await store.scenario("sc_2")
+
+    assert run(url, work) == (log, None)

@@ -1,0 +1,79 @@
+"""A PostgreSQL server of the test's own, from the system's package."""
+
+from __future__ import annotations
+
+import getpass
+import shutil
+import socket
+import subprocess
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+USER = "real2sim"
+
+
+@dataclass(frozen=True)
+class Postgres:
+    """A running server."""
+
+    port: int
+
+    def url(self, database: str) -> str:
+        return f"postgresql+pg8000://{USER}@127.0.0.1:{self.port}/{database}"
+
+    def new_database(self) -> str:
+        """SQLAlchemy URL of a new, empty database."""
+        name = f"test_{uuid.uuid4().hex}"
+        engine = sa.create_engine(self.url("postgres"), isolation_level="AUTOCOMMIT")
+        with engine.connect() as connection:
+            connection.execute(sa.text(f"CREATE DATABASE {name}"))
+        engine.dispose()
+        return self.url(name)
+
+
+@contextmanager
+def running_postgres(folder: Path) -> Iterator[Postgres]:
+    """A server in ``folder`` on a free port of this machine; skips where there is none."""
+    programs = _programs()
+    data = folder / "data"
+    unprivileged: list[str] = []
+    if getpass.getuser() == "root":
+        # The server refuses to run as root.
+        if shutil.which("runuser") is None:
+            pytest.skip("PostgreSQL does not run as root, and there is no runuser")
+        shutil.chown(folder, "nobody")
+        unprivileged = ["runuser", "-u", "nobody", "--"]
+
+    def call(*command: str | Path) -> None:
+        done = subprocess.run(
+            [*unprivileged, *map(str, command)], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            pytest.skip(f"PostgreSQL does not start here: {done.stderr.strip()[-300:]}")
+
+    call(programs / "initdb", "-D", data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    options = f"-p {port} -h 127.0.0.1 -k {folder} -F"
+    call(programs / "pg_ctl", "-D", data, "-l", folder / "log", "-w", "-o", options, "start")
+    try:
+        yield Postgres(port)
+    finally:
+        call(programs / "pg_ctl", "-D", data, "-m", "immediate", "stop")
+
+
+def _programs() -> Path:
+    pytest.importorskip("pg8000", reason="the driver is not installed: pip install 'real2sim[dev]'")
+    found = shutil.which("initdb")
+    places = [Path(found).resolve().parent] if found else []
+    places += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    for place in places:
+        if (place / "initdb").is_file() and (place / "pg_ctl").is_file():
+            return place
+    pytest.skip("no PostgreSQL here: apt-get install postgresql")
