@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,17 @@ from .console import console, print_figures, refuse_existing, staged_progress, w
 
 @dataclass(frozen=True)
 class Training:
-    """How to train: a preset's name, and whether a run that was broken off goes on."""
+    """How to train.
+
+    Attributes:
+        preset: its name.
+        resume: whether a run that was broken off goes on.
+        width: of the training images [px]; by the preset where None.
+    """
 
     preset: str
     resume: bool
+    width: int | None = None
 
 
 def run(
@@ -35,6 +42,8 @@ def run(
     """Reconstruct the log in folder ``log`` into the bundle ``out``."""
     refuse_existing(out, overwrite=overwrite)
     options = training_preset(training.preset)
+    if training.width is not None:
+        options = replace(options, width=training.width, max_width=training.width)
     with _told() as told:
         result = reconstruct(
             log,
