@@ -15,6 +15,8 @@ from .materials import Foam, Jelly, Material, Snow
 VEHICLES = ("car", "vehicle", "van", "truck", "bus")
 CRUMPLE_SHARE = 0.26
 """Share of the length that is crumple zone, at each end."""
+BUMPER = 0.35
+"""Its outermost part [m]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -73,36 +75,46 @@ def _paper(category: str, length: float) -> tuple[Sequence[Material], Callable[[
 
 
 def _vehicle(category: str, length: float) -> tuple[Sequence[Material], Callable[[Float], NDArray]]:
-    """Crumple zones at both ends about a stiff cabin; people and other things are soft foam."""
+    """Bumpers and crumple zones at both ends of a stiff cabin; other things are soft foam."""
     if category not in VEHICLES:
         foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
         return (foam,), lambda x: np.zeros(len(x), dtype=np.int64)
-    zone = CRUMPLE_SHARE * length
+    cabin, crumple = (0.5 - CRUMPLE_SHARE) * length, length / 2 - BUMPER
 
     def regions(x: Float) -> NDArray[np.int64]:
-        return (np.abs(x) < length / 2 - zone).astype(np.int64)
+        return np.searchsorted([cabin, crumple], np.abs(x))
 
-    return (CRUMPLE, CABIN), regions
+    return (CABIN, CRUMPLE, BUMPER_FOAM), regions
 
 
+BUMPER_FOAM = Snow(
+    young=4e6,
+    poisson=0.0,
+    density=150.0,
+    critical_compression=0.005,
+    critical_stretch=0.05,
+    hardening=7.0,
+    viscosity=3e3,
+)
+"""Gives way first, so that even a slow touch costs energy."""
 CRUMPLE = Snow(
-    young=1.2e7,
+    young=2.4e7,
     poisson=0.1,
     density=150.0,
-    critical_compression=0.02,
-    critical_stretch=0.04,
-    hardening=3.5,
-    viscosity=3e3,
+    critical_compression=0.0055,
+    critical_stretch=0.05,
+    hardening=4.0,
+    viscosity=6e3,
 )
 """Crushes at a stress that grows as it packs, like the fitted force over crush of real fronts."""
 CABIN = Snow(
-    young=6e7,
+    young=1.2e8,
     poisson=0.2,
     density=150.0,
     critical_compression=0.03,
     critical_stretch=0.06,
     hardening=4.0,
-    viscosity=6e3,
+    viscosity=1e4,
 )
 """Five times as stiff, and strong enough to stay whole while the ends give way."""
 

@@ -1,0 +1,14 @@
+"""The vehicle preset against published crash figures."""
+
+from __future__ import annotations
+
+import pytest
+
+from real2sim_server.physics.experiments.published import PUBLISHED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_figures_are_met(name):
+    for check in PUBLISHED[name]():
+        assert check.passed, check
