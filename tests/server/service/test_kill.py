@@ -1,0 +1,83 @@
+"""What was acknowledged is there after the worker was killed."""
+
+from __future__ import annotations
+
+import random
+from contextlib import ExitStack
+
+import httpx2
+import pytest
+
+from real2sim_server.demo.worker import own_worker
+
+pytestmark = pytest.mark.network
+
+KILLS = 2
+MOST_BETWEEN = 6
+
+
+@pytest.fixture
+def start(scenes_dir, tmp_path):
+    """Starts workers in processes of their own on the same store; the next kills the one before."""
+    with ExitStack() as stack:
+        runs = []
+
+        def another() -> httpx2.Client:
+            if runs:
+                runs[-1].process.kill()
+                runs[-1].process.wait()
+            log_file = tmp_path / f"worker_{len(runs)}.log"
+            worker = own_worker(scenes=scenes_dir, data=tmp_path / "data", log_file=log_file)
+            runs.append(stack.enter_context(worker))
+            runs[-1].wait_until_it_answers(60)
+            client = httpx2.Client(base_url=runs[-1].url, trust_env=False, timeout=60)
+            return stack.enter_context(client)
+
+        yield another
+
+
+def test_nothing_acknowledged_is_lost_between_any_two_requests(start):
+    choose = random.Random(7)
+    client = start()
+    url = client.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
+    acknowledged: list[dict] = []
+    asset = {"scene": "tiny", "object_id": "car_red", "asset_id": "kept"}
+    assert client.post("/v1/assets", json=asset).status_code == 201
+
+    for round_ in range(KILLS + 1):
+        history = client.get(f"{url}/operations").json()
+        assert [e["revision"] for e in history["entries"]] == [a["revision"] for a in acknowledged]
+        assert client.get(url).json()["revision"] == len(acknowledged)
+        assert client.get("/v1/assets/kept").status_code == 200
+        if acknowledged:
+            # The answer that was lost with the process can be asked for again.
+            last = acknowledged[-1]
+            again = client.post(
+                last["url"], json=last["json"], headers={"Idempotency-Key": last["key"]}
+            )
+            assert again.headers["Idempotent-Replayed"] == "true"
+            assert again.json()["revision"] == last["revision"]
+        if round_ == KILLS:
+            break
+        for n in range(choose.randint(1, MOST_BETWEEN)):
+            key = f"{round_}-{n}"
+            json = {"operations": [{"op": "translate", "object_id": "post", "x": 0.5}]}
+            target = f"{url}/operations"
+            if acknowledged and choose.random() < 0.4:
+                target, json = f"{url}/undo", None
+            answer = client.post(target, json=json, headers={"Idempotency-Key": key})
+            if answer.status_code == 200:
+                revision = answer.json()["revision"]
+                done = {"revision": revision, "url": target, "json": json, "key": key}
+                acknowledged.append(done)
+        client = start()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_leaves_its_jobs_interrupted(start):
+    client = start()
+    video = {"scene": "tiny", "camera": "front", "width": 2048, "fps": 60}
+    job = client.post("/v1/exports", json=video).headers["Location"]
+    client = start()
+
+    assert client.get(job).json()["state"] == "interrupted"
