@@ -29,6 +29,7 @@ CALM = 0.06
 """A body at unrest below this [m/s], or below CALM_SHARE of its speed, may become rigid again."""
 CALM_SHARE = 0.03
 CALM_TIME = 0.05
+STILL_TIME = 0.08
 REST_SPEED = 0.06
 """And when it hardly moves at all, it is laid to rest [m/s]."""
 
@@ -289,9 +290,12 @@ class Stage:
             turning = float(np.linalg.norm(actor.motion.angular_velocity))
             calm = actor.unrest() < max(CALM, CALM_SHARE * speed)
             actor.calm_for = actor.calm_for + duration if calm else 0.0
+            # At the top of a bounce everything is slow for a moment, too.
+            still = speed + turning < REST_SPEED
+            actor.still_for = actor.still_for + duration if still else 0.0
             if actor.calm_for < CALM_TIME or actor.deforming_for < 2 * CALM_TIME:
                 continue
-            if speed + turning < REST_SPEED:
+            if actor.still_for > STILL_TIME:
                 actor.stiffen(RESTING)
             elif self._is_free(actor):
                 actor.stiffen(RIGID)

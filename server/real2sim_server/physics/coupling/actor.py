@@ -95,7 +95,7 @@ class Actor:
         self._sample = _outer_points(particles.positions)
         self.mode = RIGID
         self.deforming_for = 0.0
-        self.calm_for = 0.0
+        self.calm_for = self.still_for = 0.0
         self.hit = False
         self.state: BodyState | None = None
         self.stored = 0.0
@@ -182,7 +182,8 @@ class Actor:
 
     def loosen(self) -> None:
         """Turn into deforming matter; the next ``body`` goes into a solver."""
-        self.mode, self.deforming_for, self.calm_for = DEFORMING, 0.0, 0.0
+        self.mode, self.deforming_for = DEFORMING, 0.0
+        self.calm_for = self.still_for = 0.0
 
     def take(self, state: BodyState) -> None:
         """The solver's state of this body; the motion becomes its rigid part."""

@@ -1,0 +1,135 @@
+"""Rollouts: bodies fall, collide and come to rest; results keep what happened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_server.physics import Jelly, PhysicsError, Plane, box_particles
+from real2sim_server.physics.coupling.actor import DEFORMING, RESTING, RIGID, Actor
+from real2sim_server.physics.presets import ObjectPhysics
+from real2sim_server.physics.result import SimulationResult
+from real2sim_server.physics.simulation import SimulateOptions, roll
+
+from .scenes import at
+
+SOFT = Jelly(young=2e5, poisson=0.3, viscosity=150.0)
+
+
+def box(name="box", position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 0.0)) -> Actor:
+    particles = box_particles((0.6, 0.6, 0.6), spacing=0.1, density=200.0)
+    return Actor(
+        name,
+        particles,
+        [SOFT],
+        np.zeros(len(particles), dtype=np.int64),
+        friction=0.5,
+        cell=0.2,
+        T_world_object=at(*position),
+        velocity=np.array(velocity),
+        angular_velocity=np.zeros(3),
+    )
+
+
+def options(*actors, **changes) -> SimulateOptions:
+    objects = {a.name: ObjectPhysics() for a in actors}
+    return SimulateOptions(**{"objects": objects, "duration": 0.5, **changes})
+
+
+@pytest.fixture(scope="module")
+def fall() -> SimulationResult:
+    body = box(position=(0, 0, 1.5))
+    ground = Plane(name="ground", friction=0.7)
+    return roll([body], options(body, colliders=[ground], duration=2.5))
+
+
+def test_it_falls_freely_then_deforms_then_rests(fall):
+    modes = fall.objects["box"].modes
+    assert modes[1] == RIGID
+    assert DEFORMING in modes
+    assert modes[-1] == RESTING
+    assert fall.objects["box"].positions[-1, 2] == pytest.approx(0.3, abs=0.06)
+
+
+def test_first_contact_is_when_a_free_fall_gets_there(fall):
+    [contact] = fall.contacts
+    assert contact.other == "ground"
+    assert contact.first_s == pytest.approx(np.sqrt(2 * 1.2 / 9.81), abs=0.06)
+
+
+def test_the_ground_gives_back_the_momentum_of_the_whole_fall(fall):
+    own = fall.objects["box"]
+    wanted = own.mass * 9.81 * fall.times_s[-1]
+    # Once laid to rest no more is booked: the ground then carries the weight without an impulse.
+    lying = fall.times_s[np.argmax(own.modes == RESTING)]
+    given = fall.impulses[-1, 0, 2] + own.mass * 9.81 * (fall.times_s[-1] - lying)
+    assert given == pytest.approx(wanted, rel=0.03)
+
+
+def test_no_frame_has_more_energy_than_the_first(fall):
+    total = fall.energies[:, :3].sum(axis=1)
+    assert total.max() <= total[0] * (1 + 1e-6)
+
+
+def test_a_result_comes_back_from_disk_as_it_was(fall, tmp_path):
+    fall.save(tmp_path / "run")
+    again = SimulationResult.load(tmp_path / "run")
+    assert again.contacts == fall.contacts
+    assert again.figures == dict(fall.figures)
+    a, b = again.objects["box"], fall.objects["box"]
+    for name in ("rest", "positions", "quaternions", "modes", "shape_index", "shapes"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    with pytest.raises(PhysicsError, match="no readable simulation"):
+        SimulationResult.load(tmp_path / "nothing")
+
+
+def test_a_moving_body_hits_a_standing_one_and_both_part():
+    striker = box("striker", (0, 0, 0), (2.0, 0, 0))
+    struck = box("struck", (0.9, 0, 0))
+    result = roll([striker, struck], options(striker, struck, gravity=(0, 0, 0), duration=0.8))
+    after = {k: o.velocities[-1, 0] for k, o in result.objects.items()}
+    assert after["striker"] + after["struck"] == pytest.approx(2.0, abs=1e-3)
+    assert after["struck"] > 1.0 > after["striker"]
+    assert result.objects["struck"].modes[0] == RESTING
+    assert result.objects["struck"].modes[-1] == RIGID
+    delta = {c.object_id: c.delta_v for c in result.contacts}
+    assert delta["struck"] == pytest.approx(after["struck"], abs=1e-3)
+
+
+def test_a_cancelled_rollout_keeps_what_was_made():
+    body = box(position=(0, 0, 9))
+    calls = []
+    result = roll(
+        [body],
+        options(body, frame_rate=20.0),
+        on_progress=lambda done, total: calls.append((done, total)),
+        cancelled=lambda: len(calls) >= 3,
+    )
+    assert result.stopped == "cancelled"
+    assert result.frames == 4
+    assert calls == [(1, 10), (2, 10), (3, 10)]
+
+
+def test_the_same_rollout_gives_the_same_bits():
+    def run():
+        body = box(position=(0, 0, 0.5), velocity=(1.0, 0, -2.0))
+        ground = Plane(name="ground", friction=0.7)
+        return roll([body], options(body, colliders=[ground], duration=0.2)).objects["box"]
+
+    a, b = run(), run()
+    assert np.array_equal(a.positions, b.positions)
+    assert np.array_equal(a.shapes, b.shapes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"objects": {}}, "no objects"),
+        ({"duration": 0.0}, "duration must be positive"),
+        ({"preset": "jam"}, "unknown preset 'jam'"),
+        ({"brake_after_hit": 2.0}, "brake_after_hit"),
+    ],
+)
+def test_nonsense_is_refused(changes, message):
+    with pytest.raises(PhysicsError, match=message):
+        SimulateOptions(**{"objects": {"box": ObjectPhysics()}, **changes})
