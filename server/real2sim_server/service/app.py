@@ -28,6 +28,8 @@ from .routes import (
     scenes,
     server,
     sessions,
+    ui,
+    view,
 )
 from .worker import Worker
 
@@ -42,7 +44,13 @@ PROTECTED: tuple[APIRouter, ...] = (
 )
 """Routers behind the worker's token."""
 
-OPEN: tuple[APIRouter, ...] = (health.router, sessions.router, drive.router)
+OPEN: tuple[APIRouter, ...] = (
+    health.router,
+    sessions.router,
+    drive.router,
+    view.router,
+    ui.router,
+)
 """Routers that ask for a token themselves, where they want one."""
 
 

@@ -1,0 +1,56 @@
+// Calls of the worker's REST interface. Problems become sentences.
+const KEY = "real2sim-token";
+export const token = () => sessionStorage.getItem(KEY) ?? "";
+
+export class Refused extends Error {
+  constructor(problem, status) {
+    const detail = problem.detail ?? `the worker answered with status ${status}`;
+    super(sentence(problem.hint ? `${detail}: ${problem.hint}` : detail));
+    this.code = problem.code;
+    this.status = status;
+  }
+}
+
+export const sentence = (text) => {
+  const trimmed = text.trim();
+  const end = /[.!?]$/.test(trimmed) ? "" : ".";
+  return trimmed.charAt(0).toUpperCase() + trimmed.slice(1) + end;
+};
+
+export async function call(method, path, { body, headers = {}, accept = "application/json" } = {}) {
+  const given = { Accept: accept, "X-Real2Sim-Client": "studio", ...headers };
+  if (token()) given.Authorization = `Bearer ${token()}`;
+  if (body !== undefined) given["Content-Type"] = "application/json";
+  let answer;
+  try {
+    const content = body === undefined ? undefined : JSON.stringify(body);
+    answer = await fetch(path, { method, headers: given, body: content });
+  } catch {
+    throw new Error("The worker does not answer. Is it still running?");
+  }
+  if (answer.status === 401) {
+    await askForToken();
+    return call(method, path, { body, headers, accept });
+  }
+  if (!answer.ok) throw new Refused(await answer.json().catch(() => ({})), answer.status);
+  return answer;
+}
+
+export const get = async (path) => (await call("GET", path)).json();
+export const post = async (path, body, headers) => (await call("POST", path, { body, headers })).json();
+export const picture = async (path, accept = "image/jpeg") =>
+  URL.createObjectURL(await (await call("GET", path, { accept })).blob());
+
+let asking = null;
+export function askForToken() {
+  asking ??= new Promise((done) => {
+    const dialog = document.getElementById("token");
+    dialog.showModal();
+    dialog.addEventListener("close", () => {
+      sessionStorage.setItem(KEY, dialog.querySelector("input").value);
+      asking = null;
+      done();
+    }, { once: true });
+  });
+  return asking;
+}

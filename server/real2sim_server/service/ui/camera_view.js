@@ -1,0 +1,139 @@
+// The camera picture: asks for frames, selects on a click, outlines the selection, flies freely.
+import { model, on, tell, object, poseOf, draftOperations, select, refresh } from "./model.js";
+import { ViewSocket } from "./view_socket.js";
+import { project, rotate, present } from "./poses.js";
+import { attempt, say } from "./messages.js";
+
+const $ = (id) => document.getElementById(id);
+const MOVING_WIDTH = 640, STILL_AFTER_MS = 180;
+let socket, header, url, still, arrivals = [];
+
+export function startView() {
+  socket = new ViewSocket(model.scenario.scenario_id, {
+    onFrame: show, onPick: select, onChanged: attempt(refresh), onError: (text) => say(text, "bad") });
+  on("time draft camera", () => look(true));
+  on("scenario run", () => look(false));
+  on("selection draft scenario", outline);
+  new ResizeObserver(outline).observe($("stage"));
+  fly($("stage"));
+  look(false);
+}
+
+function question(width) {
+  return { camera: model.camera, t_us: model.t, width, job: model.job,
+    T_world_camera: model.free, operations: model.job ? [] : draftOperations() };
+}
+
+// Small pictures while something moves, a full one as soon as it rests.
+function look(moving) {
+  if (model.mosaic) return;
+  clearTimeout(still);
+  if (moving) socket.look(question(MOVING_WIDTH));
+  still = setTimeout(() => socket.look(question(fullWidth())), moving ? STILL_AFTER_MS : 0);
+}
+function fullWidth() {
+  const camera = model.scene.cameras.find((c) => c.name === model.camera);
+  return Math.max(16, Math.min(camera.width, 1920, Math.round($("stage").clientWidth * devicePixelRatio)));
+}
+
+function show(head, blob) {
+  header = head;
+  const old = url;
+  url = URL.createObjectURL(blob);
+  $("picture").onload = () => old && URL.revokeObjectURL(old);
+  $("picture").src = url;
+  $("picture").dataset.seq = head.seq;
+  const now = performance.now();
+  arrivals = [...arrivals.filter((t) => now - t < 1000), now];
+  $("rate").textContent = arrivals.length > 2 ? `${arrivals.length} fps · ${head.width}×${head.height}` : `${head.width}×${head.height}`;
+  outline();
+}
+
+// Place of the picture inside the stage: it is fitted with its own proportions.
+function frameBox() {
+  const { clientWidth: w, clientHeight: h } = $("stage");
+  const scale = Math.min(w / header.width, h / header.height);
+  return { scale, left: (w - header.width * scale) / 2, top: (h - header.height * scale) / 2 };
+}
+
+function outline() {
+  const canvas = $("overlay");
+  canvas.width = canvas.clientWidth * devicePixelRatio;
+  canvas.height = canvas.clientHeight * devicePixelRatio;
+  const subject = object(model.selected);
+  $("stage-hint").textContent = subject ? subject.object_id : model.free ? "" : "Click an object to select it";
+  if (!header || !subject || !present(subject, model.t)) return;
+  const { scale, left, top } = frameBox();
+  const pen = canvas.getContext("2d");
+  pen.scale(devicePixelRatio, devicePixelRatio);
+  const { position, quaternion } = poseOf(subject);
+  const corners = [...Array(8).keys()].map((i) => {
+    const offset = subject.size.map((s, axis) => ((i >> axis) & 1 ? s : -s) / 2);
+    const pixel = project(rotate(quaternion, offset).map((v, k) => v + position[k]), header.T_world_camera, header.K);
+    return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
+  });
+  pen.strokeStyle = "#ffb454";
+  pen.lineWidth = 1.6;
+  for (let a = 0; a < 8; a++) for (const bit of [1, 2, 4]) {
+    const b = a | bit;
+    if (b === a || !corners[a] || !corners[b]) continue;
+    pen.beginPath(); pen.moveTo(...corners[a]); pen.lineTo(...corners[b]); pen.stroke();
+  }
+}
+
+export function toggleFree() {
+  model.free = model.free ? null : header?.T_world_camera?.slice() ?? null;
+  $("free").classList.toggle("on", !!model.free);
+  $("stage").classList.toggle("free", !!model.free);
+  tell("camera");
+}
+
+function fly(stage) {
+  let from = null, moved = 0;
+  stage.addEventListener("contextmenu", (e) => e.preventDefault());
+  stage.addEventListener("pointerdown", (e) => { from = e; moved = 0; if (model.free) stage.setPointerCapture(e.pointerId); });
+  stage.addEventListener("pointermove", (e) => {
+    if (!from) return;
+    const dx = e.clientX - from.clientX, dy = e.clientY - from.clientY;
+    moved += Math.abs(dx) + Math.abs(dy);
+    if (model.free) { from.button === 2 ? shift(-dx * 0.02, -dy * 0.02, 0) : turn(dx * 0.004, dy * 0.004); from = keep(e, from.button); }
+  });
+  stage.addEventListener("pointerup", (e) => {
+    if (from && moved < 4 && from.button === 0 && !model.mosaic) pickAt(e);
+    from = null;
+  });
+  stage.addEventListener("wheel", (e) => { if (model.free) { e.preventDefault(); shift(0, 0, -e.deltaY * 0.01); } }, { passive: false });
+}
+const keep = ({ clientX, clientY }, button) => ({ clientX, clientY, button });
+
+function pickAt(e) {
+  if (!header) return;
+  const { scale, left, top } = frameBox();
+  const box = $("stage").getBoundingClientRect();
+  const pick = [(e.clientX - box.left - left) / scale / header.width, (e.clientY - box.top - top) / scale / header.height];
+  if (pick.every((v) => v >= 0 && v <= 1)) socket.pick({ ...question(MOVING_WIDTH), pick });
+}
+
+// Camera axes are the columns of T: right, down, forward.
+export function shift(right, down, forward) {
+  const T = model.free.slice();
+  for (let i = 0; i < 3; i++) T[4 * i + 3] += T[4 * i] * right + T[4 * i + 1] * down + T[4 * i + 2] * forward;
+  model.free = T;
+  tell("camera");
+}
+function turn(yaw, pitch) {
+  const T = model.free.slice();
+  const [c, s] = [Math.cos(yaw), Math.sin(yaw)], [d, e] = [Math.cos(pitch), Math.sin(pitch)];
+  for (let column = 0; column < 3; column++) {
+    const [x, y] = [T[column], T[4 + column]];
+    T[column] = c * x - s * y;
+    T[4 + column] = s * x + c * y;
+  }
+  for (let i = 0; i < 3; i++) {
+    const [down, forward] = [T[4 * i + 1], T[4 * i + 2]];
+    T[4 * i + 1] = d * down + e * forward;
+    T[4 * i + 2] = d * forward - e * down;
+  }
+  model.free = T;
+  tell("camera");
+}

@@ -1,0 +1,74 @@
+// Opens what the address names, or the first page.
+import { asked, startAddress } from "./address.js";
+import { model, open, on, undo, redo, fork, exportFile, select } from "./model.js";
+import { attempt, say } from "./messages.js";
+import { startPage } from "./start.js";
+import { startView, toggleFree } from "./camera_view.js";
+import { startMosaic } from "./mosaic.js";
+import { startMap, fit, centre } from "./map.js";
+import { startProperties } from "./properties.js";
+import { startLog } from "./log.js";
+import { startAssets } from "./assets.js";
+import { startPhysics, show } from "./physics.js";
+import { startTimeline } from "./timeline.js";
+import { startShortcuts } from "./shortcuts.js";
+
+const $ = (id) => document.getElementById(id);
+
+async function main() {
+  const address = asked();
+  if (!address.scenario) return startPage();
+  await open(address.scenario);
+  const names = model.scene.cameras.map((c) => c.name), { start_us: start, end_us: end } = model.scenario;
+  model.camera = names.includes(address.camera) ? address.camera : names[0];
+  model.mosaic = address.camera === "*";
+  model.t = Math.min(end, Math.max(start, Number(address.t ?? start)));
+  $("studio").hidden = false;
+  [startMap, startTimeline, startProperties, startLog, startAssets, startPhysics, startMosaic, startView, startShortcuts].forEach((start) => start());
+  bar();
+  tabs();
+  if (model.scenario.objects.some((o) => o.object_id === address.selected)) select(address.selected);
+  if (address.run) await attempt(show)(address.run);
+  startAddress();
+  document.body.dataset.ready = "yes";
+  return null;
+}
+function bar() {
+  const draw = () => {
+    const s = model.scenario;
+    $("name").textContent = document.title = s.name || s.scenario_id;
+    $("subtitle").textContent = `on ${s.scene} · ${s.objects.length} objects`;
+    $("saved").textContent = `kept · r${s.revision}`;
+    $("undo").disabled = !s.can_undo;
+    $("redo").disabled = !s.can_redo;
+  };
+  on("scenario", draw);
+  draw();
+  $("undo").onclick = undo;
+  $("redo").onclick = redo;
+  $("free").onclick = toggleFree;
+  $("fit").onclick = fit;
+  $("centre").onclick = centre;
+  $("fork").onclick = attempt(() => copyAs(`${model.scenario.name} (fork)`));
+  $("save").onclick = attempt(async () => { const name = prompt("Name", model.scenario.name); if (name) await copyAs(name); });
+  $("download").onclick = attempt(download);
+}
+async function copyAs(name) {
+  const made = await fork(name);
+  location.assign(`?scenario=${encodeURIComponent(made.scenario_id)}`);
+}
+async function download() {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(await exportFile());
+  link.download = `${model.scenario.scenario_id}.scenario.json`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+function tabs() {
+  $("side-tabs").onclick = ({ target }) => {
+    if (!target.dataset.tab) return;
+    for (const b of $("side-tabs").children) b.classList.toggle("on", b === target);
+    for (const page of document.querySelectorAll("[data-page]")) page.hidden = page.dataset.page !== target.dataset.tab;
+  };
+}
+main().catch((error) => say(error.message, "bad"));

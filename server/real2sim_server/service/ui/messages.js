@@ -1,0 +1,14 @@
+// Sentences for the person, shown for a while.
+import { sentence } from "./api.js";
+export function say(text, kind = "") {
+  const box = document.createElement("div");
+  box.className = `message ${kind}`;
+  box.textContent = sentence(text);
+  const list = document.getElementById("messages");
+  list.append(box);
+  while (list.children.length > 4) list.firstChild.remove();
+  setTimeout(() => box.remove(), kind === "bad" ? 9000 : 5000);
+}
+export const attempt = (fn) => async (...given) => {
+  try { return await fn(...given); } catch (error) { say(error.message, "bad"); return null; }
+};
