@@ -83,6 +83,7 @@ def test_a_result_comes_back_from_disk_as_it_was(fall, tmp_path):
         SimulationResult.load(tmp_path / "nothing")
 
 
+@pytest.mark.slow
 def test_a_moving_body_hits_a_standing_one_and_both_part():
     striker = box("striker", (0, 0, 0), (2.0, 0, 0))
     struck = box("struck", (0.9, 0, 0))
