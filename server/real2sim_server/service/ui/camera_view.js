@@ -56,6 +56,13 @@ function frameBox() {
   return { scale, left: (w - header.width * scale) / 2, top: (h - header.height * scale) / 2 };
 }
 
+// Where the centre of an object is inside the stage [CSS px]; null when it is out of sight.
+export function stagePlace(id) {
+  const pixel = project(poseOf(object(id)).position, header.T_world_camera, header.K);
+  const { scale, left, top } = frameBox();
+  return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
+}
+
 function outline() {
   const canvas = $("overlay");
   canvas.width = canvas.clientWidth * devicePixelRatio;
