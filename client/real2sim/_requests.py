@@ -301,6 +301,18 @@ def session_state(session_id: str, token: str | None) -> Call[SessionState]:
     return Call(request, model_of(SessionState))
 
 
+def record_session(session_id: str, token: str | None, frames: bool) -> Call[bytes]:
+    """The recording of the running episode."""
+    request = Request(
+        "GET",
+        f"{_session(session_id)}/recording",
+        params={"frames": "true"} if frames else {},
+        headers=_bearer(token),
+        patient=True,
+    )
+    return Call(request, lambda reply: reply.content)
+
+
 def render_session(session_id: str, token: str | None, sensors: Sequence[SensorSpec]) -> Call[View]:
     """Never moves time, so it may be sent again."""
     body = checked(SessionRender, sensors=list(sensors))

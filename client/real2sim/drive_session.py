@@ -10,6 +10,7 @@ import random
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 
@@ -33,6 +34,7 @@ from .errors import (
     ReplyTimeoutError,
     UnreachableError,
 )
+from .images import write_atomically
 from .observation import Observation, View, observation_from_wire, view_from_frames
 from .version import SDK
 
@@ -260,6 +262,17 @@ class DriveSession(SessionBase):
         """Another session that goes on from this instant: ``client.join(f.session_id,
         token=f.token)``."""
         return self._ask(self._conversation.fork())
+
+    def save_recording(self, path: Path | str, *, frames: bool = False) -> Path:
+        """Write the running episode to a file, to be replayed and scored again.
+
+        Args:
+            path: for example ``drive.r2e``.
+            frames: whether the images of its sensors are drawn once more and kept too.
+        """
+        call = _requests.record_session(self.session_id, self._token, frames)
+        write_atomically(Path(path), self._transport.send(call))
+        return Path(path)
 
     def close(self) -> Result | None:
         """End a session that this handle made, or leave one that it joined; idempotent.

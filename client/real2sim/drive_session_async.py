@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 
@@ -23,6 +24,7 @@ from ._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
 from ._transport import AsyncTransport
 from .drive_session import COMING_BACK, SessionBase, SessionPlan, backoff
 from .errors import ConnectionLostError, NotOpenError, Real2SimError, ReplyTimeoutError
+from .images import write_atomically
 from .observation import Observation, View, observation_from_wire, view_from_frames
 
 if TYPE_CHECKING:
@@ -111,6 +113,12 @@ class AsyncDriveSession(SessionBase):
     async def fork(self) -> Forked:
         """Another session that goes on from this instant; see :meth:`DriveSession.fork`."""
         return await self._ask(self._conversation.fork())
+
+    async def save_recording(self, path: Path | str, *, frames: bool = False) -> Path:
+        """Write the running episode to a file; see :meth:`DriveSession.save_recording`."""
+        call = _requests.record_session(self.session_id, self._token, frames)
+        write_atomically(Path(path), await self._transport.send(call))
+        return Path(path)
 
     async def close(self) -> Result | None:
         """End a session that this handle made, or leave one that it joined; idempotent."""

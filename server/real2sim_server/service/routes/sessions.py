@@ -9,7 +9,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
-from real2sim_proto.drive import ResetSpec
+from real2sim_proto.episode import ResetSpec
 from real2sim_proto.sessions import (
     SessionCreate,
     SessionInfo,
@@ -24,6 +24,7 @@ from ..auth import opens, require_token, unauthorized
 from ..idempotency import IdempotencyKey
 from ..problems import ServiceError
 from ..sessions.describe import session_info, session_state
+from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import created_headers
 from ..sessions.session import Session
 from ..sessions.views import view_response
@@ -134,6 +135,31 @@ async def state(session: SessionOf) -> Response:
     """Where everything is now."""
     world, events = session.running_world(), tuple(session.events)
     return await large_response(lambda: session_state(session.session_id, world, events))
+
+
+@router.post("/{session_id}/fork", status_code=201)
+async def fork(worker: WorkerOf, session: SessionOf, request: Request) -> SessionInfo:
+    """A new session that goes on from the present instant of this one."""
+    async with session.lock:
+        session.check_open()
+        return await worker.sessions.fork(session, ws_base=_ws_base(request))
+
+
+@router.get(
+    "/{session_id}/recording",
+    response_class=Response,
+    responses={200: {"content": {RECORDING: {"schema": {"type": "string", "format": "binary"}}}}},
+)
+async def recording(
+    worker: WorkerOf,
+    session: SessionOf,
+    frames: Annotated[bool, Query(description="draw and keep the images too")] = False,
+) -> Response:
+    """The running episode as a file, to be replayed and scored again: `real2sim replay`."""
+    made = await recording_of(worker.sessions, session, frames=frames)
+    name = f"{session.session_id}.r2e"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(made, media_type=RECORDING, headers=headers)
 
 
 @router.post(

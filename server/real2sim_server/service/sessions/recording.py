@@ -1,0 +1,91 @@
+"""A session's episode as a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from real2sim_proto import ErrorCode
+
+from ...world import World
+from ...world.history import Entry, Retold, last_episode, no_action_impact
+from ...world.recording import Recording, record, to_bytes
+from ..problems import ServiceError
+from .registry import Sessions
+from .session import Session, Start
+from .show import Show
+from .wire import EncodedFrame
+
+RECORDING = "application/vnd.real2sim.episode"
+
+MAX_FRAMES_BYTES = 512 * 1024 * 1024
+
+
+async def recording_of(sessions: Sessions, session: Session, *, frames: bool) -> bytes:
+    """The recording of the running episode: lived through again from the session's log.
+
+    Args:
+        sessions: has the log.
+        session: whose episode.
+        frames: whether its sensors are drawn once more; raw images are kept as png.
+
+    Raises:
+        ServiceError: NOT_RESET, or PAYLOAD_TOO_LARGE for more than 512 MiB of images.
+    """
+    session.running_world()
+    entries = last_episode(await sessions.entries(session))
+    start, row = session.start, session.row
+
+    def made() -> Recording:
+        world = session.running_world()
+        impact = None
+        if world.tally.first_impact is not None:
+            impact = no_action_impact(Retold.on(start.scene, start.state), entries)
+        scenario = (
+            (row.scenario_id, row.scenario_revision)
+            if row.scenario_id is not None and row.scenario_revision is not None
+            else None
+        )
+        return record(
+            Retold.on(start.scene, start.state),
+            entries,
+            scene_hash=row.scene_hash,
+            scenario=scenario,
+            no_action_impact=impact,
+        )
+
+    recording = await sessions.show.on_world_thread(made)
+    if frames:
+        recording = replace(recording, frames=await _frames(sessions.show, start, entries))
+    return await sessions.show.on_world_thread(to_bytes, recording)
+
+
+async def _frames(show: Show, start: Start, entries: Iterable[Entry]) -> Mapping[str, bytes]:
+    retold, kept, total = Retold.on(start.scene, start.state), dict[str, bytes](), 0
+    for entry in entries:
+        world = await show.on_world_thread(retold.tell, entry)
+        if entry.kind not in {"reset", "action"}:
+            continue
+        for frame in await _drawn(show, world):
+            kept[_name(frame, world.steps)] = bytes(frame.data)
+            total += len(frame.data)
+        if total > MAX_FRAMES_BYTES:
+            raise ServiceError(
+                ErrorCode.PAYLOAD_TOO_LARGE,
+                f"the images of {world.steps} steps take more than {MAX_FRAMES_BYTES} bytes",
+                hint="record without frames and draw them later: real2sim replay --frames",
+            )
+    return kept
+
+
+async def _drawn(show: Show, world: World) -> list[EncodedFrame]:
+    sensors = [
+        s.model_copy(update={"codec": "png"}) if s.codec == "raw" else s
+        for s in world.due_sensors()
+    ]
+    return list((await show.view(world, sensors)).frames) if sensors else []
+
+
+def _name(frame: EncodedFrame, step: int) -> str:
+    suffix = "jpg" if frame.codec == "jpeg" else "png"
+    return f"frames/{frame.fields['sensor']}/{frame.fields['modality']}/{step:06d}.{suffix}"

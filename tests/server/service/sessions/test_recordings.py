@@ -1,0 +1,69 @@
+"""Recordings fetched from a worker, and replayed by the command."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+import real2sim
+from real2sim.cli import build_app
+from real2sim_server.world.recording import load_recording
+
+pytestmark = pytest.mark.network
+
+PLAN = {"kind": "control", "acceleration": 0.5, "steering": 0.0}
+runner = CliRunner()
+
+
+@pytest.fixture
+def recorded(site, tmp_path):
+    """A file of an episode with a missed deadline, an edit and images, and its last observation."""
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        session.reset(
+            action="control",
+            sensors=[{"camera": "front", "codec": "jpeg"}],
+            on_collision="continue",
+        )
+        for _ in range(4):
+            obs = session.step(PLAN)
+        session.edit([{"op": "translate", "object_id": "post", "y": -1.0}])
+        obs = session.step(PLAN)
+        path = session.save_recording(tmp_path / "drive.r2e", frames=True)
+    return path, obs, session.result
+
+
+def test_a_recording_holds_the_episode_its_images_and_its_scores(recorded):
+    path, obs, result = recorded
+    recording = load_recording(path)
+    assert len(recording.instants) == 6
+    assert recording.instants[-1].t_us == obs.t_us
+    assert len(recording.frames) == 6
+    assert [s.fields() for s in recording.rescore()] == [s.model_dump() for s in result.scores]
+
+
+def test_result_names_the_version_of_every_score(recorded):
+    _, _, result = recorded
+    assert {s.name for s in result.scores} >= {"pdms", "nuplan_cls", "hugsim_hd", "neuroncap"}
+    assert all(s.version for s in result.scores)
+
+
+def test_replay_scores_without_the_scene(recorded, tmp_path):
+    out = tmp_path / "out.json"
+    done = runner.invoke(build_app(), ["replay", str(recorded[0]), "--json", str(out)])
+    assert done.exit_code == 0, done.output
+    assert json.loads(out.read_text())["steps"] == 5
+
+
+def test_replay_finds_the_same_bits_and_films_them(recorded, site, tmp_path):
+    out, video = tmp_path / "out.json", tmp_path / "drive.mp4"
+    scene = site.worker.settings.scenes_path / "tiny.r2s"
+    arguments = ["replay", str(recorded[0]), "--scene", str(scene), "--json", str(out)]
+    done = runner.invoke(build_app(), [*arguments, "--video", str(video), "--width", "96"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(out.read_text())["bit_identical"] is True
+    film = cv2.VideoCapture(str(video))
+    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 6
+    film.release()

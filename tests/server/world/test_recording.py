@@ -1,0 +1,150 @@
+"""Episodes as files: read back, lived through again, scored again."""
+
+from __future__ import annotations
+
+import zipfile
+
+import pytest
+
+from real2sim_proto.drive import TrajectoryPlan
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.operations import Translate
+from real2sim_server.edit import ScenarioState
+from real2sim_server.world.history import (
+    Entry,
+    Retold,
+    action_payload,
+    agent_payload,
+    edit_payload,
+    last_episode,
+    name_payload,
+    no_action_impact,
+    reset_payload,
+    stop_payload,
+)
+from real2sim_server.world.recording import (
+    RecordingError,
+    first_difference,
+    load_recording,
+    record,
+    save_recording,
+    to_bytes,
+)
+
+DRIVERS = {"car": {"kind": "external"}, "other": {"kind": "idm"}}
+
+
+@pytest.fixture(scope="module")
+def scene(make_scene, moving):
+    return make_scene(
+        car=moving(40, 3.5, z=0.8, speed=5.0),
+        other=moving(12, 0, z=0.8, speed=8.0),
+        parked=moving(70, 0.5, z=0.8),
+    )
+
+
+def plan_at(step: int) -> TrajectoryPlan:
+    times = [5_000_000 + 100_000 * (step + k + 1) for k in range(10)]
+    return TrajectoryPlan(times_us=times, poses=[(1.0 * (k + 1), 0.0, 0.0) for k in range(10)])
+
+
+def entries(steps: int = 40, **spec) -> list[Entry]:
+    """An episode with everything in it: plans kept, missed and late, an edit, another client, a
+    crash, a return to a snapshot, an end by the clock on the wall."""
+    fields = {
+        "on_collision": "continue",
+        "agents": {"drivers": DRIVERS},
+        "latency": {"model": "measured"},
+    }
+    log = [Entry("reset", 0, reset_payload(ResetSpec(**fields | spec)))]
+    for step in range(steps):
+        if step == 5:
+            log.append(Entry("edit", step, edit_payload([Translate(object_id="parked", y=-0.5)])))
+        if step == 8:
+            told = agent_payload("car", [6_500_000, 8_000_000], [(45, 3.5, 0), (50, 1.5, -0.2)])
+            log.append(Entry("agent", step, told))
+        if step == 20:
+            log.append(Entry("snapshot", step, name_payload("here")))
+        plan = None if step % 7 == 3 else plan_at(step)
+        payload = action_payload(plan, latency_us=30_000 * (step % 3), missed=step == 17)
+        log.append(Entry("action", step, payload))
+    log.append(Entry("restore", 20, name_payload("here")))
+    log += [Entry("action", 20 + k, action_payload(None)) for k in range(15)]
+    log.append(Entry("stop", 35, stop_payload("wall_clock")))
+    return log
+
+
+def fresh(scene) -> Retold:
+    return Retold.on(scene, ScenarioState.of(scene))
+
+
+@pytest.fixture(scope="module")
+def recording(scene):
+    return record(fresh(scene), entries(), scene_hash="abc", scenario=("sc_1", 3))
+
+
+def test_a_recording_holds_every_instant_that_was_not_undone(recording):
+    assert [i.step for i in recording.instants] == list(range(36))
+    assert (recording.scenario_id, recording.scenario_revision) == ("sc_1", 3)
+
+
+def test_reading_back_gives_the_same(recording, tmp_path):
+    path = save_recording(recording, tmp_path / "a" / "episode.r2e")
+    again = load_recording(path)
+    assert to_bytes(again) == to_bytes(recording)
+    assert again.entries == recording.entries
+
+
+def test_living_through_it_again_gives_the_same_bits(recording, scene):
+    assert first_difference(recording, fresh(scene)) is None
+
+
+def test_another_street_differs_from_the_first_step_on_that_shows_it(recording, make_scene, moving):
+    other = make_scene(
+        car=moving(40, 3.5, z=0.8, speed=5.0),
+        other=moving(12, 0, z=0.8, speed=8.1),
+        parked=moving(70, 0.5, z=0.8),
+    )
+    assert first_difference(recording, fresh(other)) == 0
+
+
+def test_scores_from_the_file_are_those_of_the_drive(recording, tmp_path):
+    loaded = load_recording(save_recording(recording, tmp_path / "episode.r2e"))
+    assert [s.fields() for s in loaded.rescore()] == list(recording.scores)
+    assert len({s["name"] for s in recording.scores}) == len(recording.scores) >= 9
+
+
+def test_the_same_episode_is_the_same_file(recording, scene):
+    again = record(fresh(scene), entries(), scene_hash="abc", scenario=("sc_1", 3))
+    assert to_bytes(again) == to_bytes(recording)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", None])
+def test_files_that_are_no_recording_are_refused(tmp_path, content):
+    path = tmp_path / "episode.r2e"
+    if content is None:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("episode.json", '{"format": "real2sim-episode", "version": 99}')
+    else:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"recording|version 99"):
+        load_recording(path)
+
+
+def test_the_last_episode_begins_at_the_last_reset():
+    log = entries(3)
+    assert last_episode([*log, *log]) == log
+    assert last_episode([]) == []
+
+
+def test_without_action_the_ego_hits_what_stands_in_its_lane(make_scene, moving):
+    scene = make_scene(car=moving(60, 0, z=0.8))
+    log = [Entry("reset", 0, reset_payload(ResetSpec(action="control")))]
+    assert no_action_impact(fresh(scene), log) == pytest.approx(10.0, rel=0.01)
+    log.append(Entry("edit", 0, edit_payload([Translate(object_id="car", y=8.0)])))
+    assert no_action_impact(fresh(scene), log) == 0.0
+
+
+def test_a_log_cannot_begin_without_a_reset(scene):
+    with pytest.raises(ValueError, match="a reset comes first"):
+        fresh(scene).tell(Entry("action", 0, action_payload(None)))
