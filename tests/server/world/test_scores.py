@@ -1,0 +1,360 @@
+"""Scores against episodes worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from real2sim_server.world import scoring
+from real2sim_server.world.scoring import (
+    ContactNote,
+    EgoSample,
+    Instant,
+    Others,
+    PlanNote,
+    ScoringContext,
+)
+from real2sim_server.world.scoring.boxes import side_of_contact
+from real2sim_server.world.scoring.comfort import felt_in, window_of
+
+DT = 0.1
+NOBODY = Others((), (), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 2)))
+
+
+def context(steps: int, **changes) -> ScoringContext:
+    """A straight street along x; the recorded drive goes at 10 m/s."""
+    made = ScoringContext(
+        dt=DT,
+        horizon=steps,
+        ego_size=(4.6, 1.85, 1.6),
+        rear_overhang=0.95,
+        ego_mass=1500.0,
+        route=np.stack([np.arange(0.0, 201.0), np.zeros(201)], axis=1),
+        lanes=(),
+        corridor=3.5,
+        lane=1.75,
+        speed_limit=None,
+        start_s=0.0,
+        route_end_s=10.0 * DT * steps,
+        expert_s=tuple(10.0 * DT * k for k in range(steps + 1)),
+        history=(),
+    )
+    return replace(made, **changes)
+
+
+def ego(x: float, y: float = 0.0, *, speed: float = 10.0, yaw: float = 0.0) -> EgoSample:
+    return EgoSample(x, y, yaw, speed, 0.0, 0.0, 0.0, 0.0, x, y, 0.0, 0.0)
+
+
+def car(x: float, y: float = 0.0, *, speed: float = 0.0, category: str = "car") -> Others:
+    return Others(
+        ("car",),
+        (category,),
+        np.array([[x, y, 0.8]]),
+        np.zeros(1),
+        np.array([[4.0, 2.0, 1.6]]),
+        np.array([[speed, 0.0]]),
+    )
+
+
+def drive(speeds: list[float], *, y: float = 0.0, others=None) -> list[Instant]:
+    """Instants of a drive along y; ``others`` gives everybody else by step."""
+    x, instants = 0.0, []
+    for k, speed in enumerate(speeds):
+        x += speed * DT if k else 0.0
+        who = others(k) if others else NOBODY
+        instants.append(Instant(k, k * 100_000, ego(x, y, speed=speed), who))
+    return instants
+
+
+def scores(instants: list[Instant], given: ScoringContext) -> dict[str, scoring.Score]:
+    tally = scoring.begin(instants[0], given)
+    for instant in instants[1:]:
+        tally = scoring.after(tally, instant, given)
+    return {s.name: s for s in scoring.scores_of(tally, given)}
+
+
+def hit(instants: list[Instant], step: int, **note) -> list[Instant]:
+    fields = {
+        "object_id": "car",
+        "category": "car",
+        "side": "front",
+        "relative_speed": 10.0,
+        "ego_speed": 10.0,
+        "object_speed": 0.0,
+    }
+    contact = ContactNote(**fields | note)
+    return [replace(i, contacts=(contact,)) if i.step == step else i for i in instants]
+
+
+# --- a drive without fault --------------------------------------------------------------------
+
+
+def test_the_recorded_drive_itself_is_perfect():
+    found = scores(drive([10.0] * 41), context(40))
+    assert found["pdms"].value == 1.0
+    assert found["nuplan_cls"].value == 1.0
+    assert found["hugsim_hd"].value == pytest.approx(1.0)
+    assert found["neuroncap"].value == 5.0
+    assert found["carla_ds"].value == pytest.approx(100.0)
+    assert found["alpasim"].value == 1.0
+    assert found["kinematic_infeasibility"].value == 0.0
+    assert found["delta_v"].value == 0.0
+
+
+def test_every_score_has_a_version_that_the_published_string_names():
+    published = scoring.metrics_version().split()
+    found = scores(drive([10.0] * 3), context(2))
+    assert published == [f"{s.name}@{s.version}" for s in found.values()]
+
+
+# --- progress ---------------------------------------------------------------------------------
+
+
+def test_half_the_way_is_half_the_progress():
+    # 20 of 40 m: PDMS (5/2 + 5 + 2)/12, CLS (5/2 + 5 + 4 + 2)/16, HD route 20/36.
+    found = scores(drive([5.0] * 41), context(40))
+    assert found["pdms"].value == pytest.approx(9.5 / 12)
+    assert found["nuplan_cls"].value == pytest.approx(13.5 / 16)
+    assert found["hugsim_hd"].value == pytest.approx(20 / 36)
+    assert found["carla_ds"].value == pytest.approx(50.0)
+    assert found["alpasim"].value == pytest.approx(0.5 / 0.8)
+
+
+def test_making_no_way_is_worth_nothing_to_nuplan():
+    # 4 of 40 m is less than a fifth.
+    assert scores(drive([1.0] * 41), context(40))["nuplan_cls"].value == 0.0
+
+
+def test_ways_up_to_5_metres_are_no_measure_of_progress():
+    given = context(40, expert_s=tuple(0.1 * k for k in range(41)), route_end_s=4.0)
+    assert scores(drive([0.1] * 41), given)["pdms"].terms["EP"] == 1.0
+
+
+def test_speeding_costs_by_how_much_for_how_long():
+    # 3 m/s too fast all the time: 1 - 3/2.23 is below 0; 1 m/s: 1 - 1/2.23.
+    assert scores(drive([10.0] * 41), context(40, speed_limit=7.0))["nuplan_cls"].terms["SL"] == 0.0
+    limited = scores(drive([10.0] * 41), context(40, speed_limit=9.0))["nuplan_cls"]
+    assert limited.terms["SL"] == pytest.approx(1 - 1 / 2.23)
+    assert limited.value == pytest.approx((5 + 5 + 4 * (1 - 1 / 2.23) + 2) / 16)
+
+
+# --- collisions and fault ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("category", "nc", "carla"),
+    [("car", 0.0, 60.0), ("pedestrian", 0.0, 50.0), ("pole", 0.5, 65.0)],
+)
+def test_a_hit_costs_by_what_was_hit(category, nc, carla):
+    found = scores(hit(drive([10.0] * 41), 20, category=category), context(40))
+    assert found["pdms"].terms["NC"] == nc
+    assert found["pdms"].value == pytest.approx(nc)
+    assert found["nuplan_cls"].terms["NC"] == nc
+    assert found["carla_ds"].value == pytest.approx(carla)
+
+
+@pytest.mark.parametrize("side", ["rear", "stopped_ego", "lateral"])
+def test_being_hit_in_its_own_lane_is_not_the_egos_fault(side):
+    found = scores(hit(drive([10.0] * 41), 20, side=side), context(40))
+    assert found["pdms"].value == 1.0
+    assert found["carla_ds"].value == pytest.approx(60.0)
+    assert found["neuroncap"].value is None
+
+
+def test_a_lateral_hit_across_the_lane_line_is_the_egos_fault():
+    # 0.925 + 0.9 m reach out of a lane of 1.75 m.
+    found = scores(hit(drive([10.0] * 41, y=0.9), 20, side="lateral"), context(40))
+    assert found["pdms"].value == 0.0
+
+
+def test_an_object_counts_once_however_often_it_is_touched():
+    twice = hit(hit(drive([10.0] * 41), 20, category="pole"), 30, category="pole")
+    found = scores(twice, context(40))
+    assert found["nuplan_cls"].terms["NC"] == 0.5
+    assert found["delta_v"].terms["secondary_collisions"] == 1.0
+
+
+def test_neuroncap_compares_with_the_impact_without_action():
+    instants = hit(drive([10.0] * 41), 20, relative_speed=4.0)
+    found = scores(instants, context(40, no_action_impact=10.0))["neuroncap"]
+    assert found.value == pytest.approx(4 * (1 - 0.4))
+    assert scores(instants, context(40, no_action_impact=3.0))["neuroncap"].value == 0.0
+
+
+def test_hugsim_gives_nothing_for_steps_in_contact():
+    found = scores(hit(drive([10.0] * 41), 20), context(40))
+    assert found["hugsim_hd"].terms["mean"] == pytest.approx(39 / 40)
+
+
+def test_delta_v_is_impulse_by_mass_summed_over_steps():
+    instants = hit(drive([10.0] * 41), 20, impulse=(-6000.0, 0.0))
+    instants = hit(instants, 21, impulse=(-1500.0, 0.0), begun=False)
+    found = scores(instants, context(40))["delta_v"]
+    assert found.value == pytest.approx(5.0)
+    assert found.terms["impulse"] == pytest.approx(7500.0)
+    assert found.terms["post_impact_displacement"] == pytest.approx(20.0)
+
+
+HERE = (0.0, 0.0, 0.0, 4.6, 1.85)
+
+
+@pytest.mark.parametrize(
+    ("box", "ego_speed", "speed", "side"),
+    [
+        ((4.2, 0.0, 0.0, 4.0, 2.0), 10.0, 3.0, "front"),
+        ((4.2, 0.0, 0.0, 4.0, 2.0), 10.0, 0.0, "stopped_track"),
+        ((4.2, 0.0, 0.0, 4.0, 2.0), 0.0, 3.0, "stopped_ego"),
+        ((-4.2, 0.0, 0.0, 4.0, 2.0), 5.0, 9.0, "rear"),
+        ((-0.5, 1.9, 0.0, 3.0, 2.0), 10.0, 9.0, "lateral"),
+        ((3.4, 2.0, 1.57, 4.0, 2.4), 10.0, 9.0, "front"),
+    ],
+)
+def test_sides_of_a_contact_are_those_of_nuplan(box, ego_speed, speed, side):
+    assert side_of_contact(HERE, ego_speed, box, speed) == side
+
+
+# --- time to collision ------------------------------------------------------------------------
+
+
+def ttc_of(others: Others, *, y: float = 0.0, speed: float = 10.0) -> float:
+    instants = drive([speed] * 2, y=y, others=lambda _k: others)
+    tally = scoring.after(scoring.begin(instants[0], context(2)), instants[1], context(2))
+    return tally.ttc
+
+
+def test_time_to_collision_is_gap_by_closing_speed():
+    # Front bumper at 1 + 3.65 m, rear end at 30 - 2 m: 23.35 m at 10 m/s, and at 4 m/s.
+    assert ttc_of(car(30.0)) == pytest.approx(2.4)
+    assert ttc_of(car(18.0, speed=6.0)) == pytest.approx(2.9)
+
+
+@pytest.mark.parametrize(
+    "others",
+    [car(30.0, speed=10.0), car(-8.0, speed=30.0), car(30.0, 3.0), car(60.0)],
+    ids=["as fast", "behind", "beside", "far"],
+)
+def test_there_is_no_time_to_collision_without_collision(others):
+    assert ttc_of(others) == math.inf
+
+
+def test_a_standing_ego_collides_with_nobody():
+    assert ttc_of(car(8.0, speed=-5.0), speed=0.0) == math.inf
+
+
+def test_coming_too_near_costs_the_ttc_term():
+    # 0.8 s from a car that is there for a moment.
+    near = drive([10.0] * 41, others=lambda k: car(14.0 + k) if k == 20 else NOBODY)
+    moved = [
+        replace(i, others=car(i.ego.x + 3.65 + 2.0 + 7.5)) if i.step == 20 else i for i in near
+    ]
+    found = scores(moved, context(40))
+    assert found["pdms"].value == pytest.approx(7 / 12)
+    assert found["nuplan_cls"].value == pytest.approx(11 / 16)
+    assert found["hugsim_hd"].terms["mean"] == pytest.approx((39 + 2 / 7) / 40)
+
+
+# --- the road ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("y", "dac", "nuplan_dac"), [(2.5, 1.0, 1.0), (2.7, 0.0, 1.0), (2.95, 0.0, 0.0)]
+)
+def test_leaving_the_corridor_with_a_corner_counts(y, dac, nuplan_dac):
+    # A corner is 0.925 m beside the ego; the corridor ends at 3.5 m, nuPlan tolerates 0.3 m.
+    found = scores(drive([10.0] * 41, y=y), context(40))
+    assert found["pdms"].terms["DAC"] == dac
+    assert found["nuplan_cls"].terms["DAC"] == nuplan_dac
+
+
+def test_recorded_lanes_of_others_are_drivable_too():
+    lane = np.stack([np.arange(0.0, 100.0), np.full(100, 3.5)], axis=1)
+    found = scores(drive([10.0] * 41, y=3.5), context(40, lanes=(lane,)))
+    assert found["pdms"].terms["DAC"] == 1.0
+
+
+@pytest.mark.parametrize(("speed", "ddc"), [(-1.5, 1.0), (-4.0, 0.5), (-7.0, 0.0)])
+def test_driving_against_the_route_counts_by_the_way_within_a_second(speed, ddc):
+    instants = [
+        replace(i, ego=ego(100.0 + speed * DT * i.step, speed=speed)) for i in drive([0.0] * 41)
+    ]
+    assert scores(instants, context(40))["nuplan_cls"].terms["DDC"] == ddc
+
+
+# --- comfort ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "comfortable"), [(2.3, True), (2.5, False), (-4.0, True), (-4.2, False)]
+)
+def test_longitudinal_bounds_hold_for_steady_acceleration(acceleration, comfortable):
+    speeds = [20.0 + acceleration * DT * k for k in range(31)]
+    found = scores(drive(speeds), context(30))
+    assert found["pdms"].terms["C"] == float(comfortable)
+
+
+def test_derivatives_are_exact_for_cubics():
+    window = window_of(DT)
+    t = (np.arange(window) - window // 2) * DT
+    speed, yaw = 8.0 + 0.5 * t + 0.2 * t**2, 0.3 * t + 0.1 * t**2 + 0.05 * t**3
+    felt = felt_in(np.stack([speed, yaw], axis=1), DT)
+    assert felt.lon_acceleration == pytest.approx(0.5)
+    assert felt.lon_jerk == pytest.approx(0.4)
+    assert felt.yaw_rate == pytest.approx(0.3)
+    assert felt.yaw_acceleration == pytest.approx(0.2)
+    assert felt.lat_acceleration == pytest.approx(8.0 * 0.3)
+    assert felt.jerk == pytest.approx(math.hypot(0.4, 0.5 * 0.3 + 8.0 * 0.2))
+
+
+def test_a_stop_no_car_can_make_is_infeasible():
+    found = scores(drive([10.0] * 10 + [8.0] * 10), context(19))
+    assert found["kinematic_infeasibility"].value == 1.0
+
+
+# --- EPDMS ------------------------------------------------------------------------------------
+
+
+def with_plans(instants: list[Instant], speed_of) -> list[Instant]:
+    planned = []
+    for i in instants:
+        times = tuple(i.t_us + 100_000 * (k + 1) for k in range(20))
+        poses = tuple((i.ego.x + speed_of(i.step) * DT * (k + 1), 0.0, 0.0) for k in range(20))
+        planned.append(replace(i, plan=PlanNote(times, poses)))
+    return planned
+
+
+def test_epdms_needs_successive_plans():
+    found = scores(drive([10.0] * 41), context(40))["epdms"]
+    assert found.value is None
+    assert found.missing
+
+
+def test_epdms_is_1_for_a_drive_without_fault():
+    steady = with_plans(drive([10.0] * 41), lambda _k: 10.0)
+    assert scores(steady, context(40))["epdms"].value == pytest.approx(1.0)
+
+
+def test_plans_that_jump_cost_extended_comfort():
+    def braking(step: int) -> float:
+        return 10.0
+
+    instants = with_plans(drive([10.0] * 41), braking)
+    plan = instants[20].plan
+    poses = tuple(
+        (instants[20].ego.x + 10.0 * t - 1.5 * t * t, 0.0, 0.0)
+        for t in (DT * (k + 1) for k in range(20))
+    )
+    instants[20] = replace(instants[20], plan=replace(plan, poses=poses))
+    found = scores(instants, context(40))["epdms"]
+    assert found.terms["EC"] == 0.0
+    assert found.value == pytest.approx(14 / 16)
+
+
+def test_two_seconds_beside_the_lane_cost_lane_keeping():
+    short = with_plans(drive([10.0] * 20, y=0.6), lambda _k: 10.0)
+    assert scores(short, context(19))["epdms"].terms["LK"] == 1.0
+    long = with_plans(drive([10.0] * 22, y=0.6), lambda _k: 10.0)
+    assert scores(long, context(21))["epdms"].terms["LK"] == 0.0
