@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .client import AsyncClient, Client, connect, connect_async
     from .drive_session import DriveSession
     from .drive_session_async import AsyncDriveSession
+    from .env import DriveEnv
     from .errors import (
         BadStepError,
         CapacityError,
@@ -101,6 +102,7 @@ __all__ = [
     "__version__",
     "connect",
     "connect_async",
+    "make_env",
 ]
 
 _ELSEWHERE = {
@@ -119,6 +121,19 @@ _ELSEWHERE = {
     "connect": "real2sim.client",
     "connect_async": "real2sim.client",
 }
+
+
+def make_env(**options: Any) -> DriveEnv:
+    """A session as a ``gymnasium.Env``; see :class:`real2sim.env.DriveEnv` for the options.
+
+    Raises:
+        ImportError: gymnasium is missing.
+    """
+    try:
+        from .env import DriveEnv
+    except ImportError as error:
+        raise ImportError("make_env needs gymnasium: pip install 'real2sim[gym]'") from error
+    return DriveEnv(**options)
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,63 @@
+"""The Gymnasium environment, and the example of the README, against a worker as it is."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import real2sim
+
+gymnasium = pytest.importorskip("gymnasium")
+pytestmark = pytest.mark.network
+
+README = Path(__file__).resolve().parents[4] / "README.md"
+
+
+@pytest.fixture
+def env(site):
+    made = real2sim.make_env(url=site.url, scene="tiny", sensors=["front"], render_mode="rgb_array")
+    yield made
+    made.close()
+
+
+def test_check_env_passes(env):
+    from gymnasium.utils.env_checker import check_env
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(unwrapped|render modes|infinity).*")
+        check_env(env, skip_render_check=True)
+
+
+def test_an_episode_by_random_actions_ends(env):
+    env.action_space.seed(0)
+    obs, _ = env.reset(seed=1)
+    assert env.observation_space.contains(obs)
+    over, steps = False, 0
+    while not over:
+        obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        over, steps = terminated or truncated, steps + 1
+        assert np.isfinite(reward)
+        assert env.observation_space.contains(obs)
+    assert steps <= 20
+    assert "pdms" in info["metrics"]
+    assert env.render().shape == (64, 96, 3)
+
+
+def test_the_way_made_is_the_reward(env):
+    env.reset(seed=1)
+    _, reward, *_ = env.step(np.zeros(2, np.float32))
+    assert reward == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_planner_example_of_the_readme_is_short_and_works(site, monkeypatch, capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+    (example,) = (b for b in blocks if "session.step(" in b)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 15
+    connect = real2sim.connect
+    monkeypatch.setattr(real2sim, "connect", lambda *_a, **_k: connect(site.url))
+    exec(example.replace('"street"', '"tiny"'), {})
+    assert "pdms" in capsys.readouterr().out
