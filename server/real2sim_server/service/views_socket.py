@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from real2sim_proto.base import Identifier, Microseconds, Model
-from real2sim_proto.drive import SensorSpec
+from real2sim_proto.episode import SensorSpec
 from real2sim_proto.operations import Operation
 
 from ..edit import EditError, advance, instances_at

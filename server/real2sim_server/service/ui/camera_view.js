@@ -5,7 +5,7 @@ import { project, rotate, present } from "./poses.js";
 import { attempt, say } from "./messages.js";
 
 const $ = (id) => document.getElementById(id);
-const MOVING_WIDTH = 640, STILL_AFTER_MS = 180;
+const MOVING_WIDTH = 640, STILL_WIDTH = 1600, STILL_AFTER_MS = 180;
 let socket, header, url, still, arrivals = [];
 
 export function startView() {
@@ -28,12 +28,15 @@ function question(width) {
 function look(moving) {
   if (model.mosaic) return;
   clearTimeout(still);
-  if (moving) socket.look(question(MOVING_WIDTH));
+  if (moving) socket.look(question(Math.min(MOVING_WIDTH, fullWidth())));
   still = setTimeout(() => socket.look(question(fullWidth())), moving ? STILL_AFTER_MS : 0);
 }
+// Gaussians have no pixels of their own: the picture at rest is as fine as the stage shows it.
 function fullWidth() {
-  const camera = model.scene.cameras.find((c) => c.name === model.camera);
-  return Math.max(16, Math.min(camera.width, 1920, Math.round($("stage").clientWidth * devicePixelRatio)));
+  const { width, height } = model.scene.cameras.find((c) => c.name === model.camera);
+  const { clientWidth, clientHeight } = $("stage");
+  const fitting = Math.min(clientWidth, (clientHeight * width) / height) * devicePixelRatio;
+  return Math.round(Math.max(64, Math.min(fitting, STILL_WIDTH)));
 }
 
 function show(head, blob) {

@@ -1,6 +1,6 @@
 // Opens what the address names, or the first page.
 import { asked, startAddress } from "./address.js";
-import { model, open, on, undo, redo, fork, exportFile, select } from "./model.js";
+import { model, open, on, undo, redo, fork, exportFile, select, setTime } from "./model.js";
 import { attempt, say } from "./messages.js";
 import { startPage } from "./start.js";
 import { startView, toggleFree } from "./camera_view.js";
@@ -28,7 +28,11 @@ async function main() {
   bar();
   tabs();
   if (model.scenario.objects.some((o) => o.object_id === address.selected)) select(address.selected);
-  if (address.run) await attempt(show)(address.run);
+  if (address.run) {
+    const t = model.t;
+    await attempt(show)(address.run);
+    setTime(t);
+  }
   startAddress();
   document.body.dataset.ready = "yes";
   return null;

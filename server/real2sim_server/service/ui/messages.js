@@ -5,8 +5,9 @@ export function say(text, kind = "") {
   box.className = `message ${kind}`;
   box.textContent = sentence(text);
   const list = document.getElementById("messages");
+  for (const other of [...list.children]) if (other.textContent === box.textContent) other.remove();
   list.append(box);
-  while (list.children.length > 4) list.firstChild.remove();
+  while (list.children.length > 3) list.firstChild.remove();
   setTimeout(() => box.remove(), kind === "bad" ? 9000 : 5000);
 }
 export const attempt = (fn) => async (...given) => {
