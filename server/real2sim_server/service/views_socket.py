@@ -82,11 +82,12 @@ class View:
         finally:
             for task in tasks:
                 task.cancel()
-            results = await asyncio.gather(*tasks, return_exceptions=True)
-        for result in results:
-            gone = isinstance(result, (WebSocketDisconnect, asyncio.CancelledError))
-            if isinstance(result, BaseException) and not gone:
-                raise result
+            # Not gather(): cancelled itself, it would pass on the cancellation of its tasks.
+            await asyncio.wait(tasks)
+        for task in tasks:
+            error = None if task.cancelled() else task.exception()
+            if error is not None and not isinstance(error, WebSocketDisconnect):
+                raise error
 
     async def _read(self) -> None:
         while True:
