@@ -425,12 +425,15 @@ def serve(
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Where results go.")] = Path("out/demo"),
     steps: Annotated[int, typer.Option(min=1, max=10_000)] = 100,
+    from_log: Annotated[
+        bool, typer.Option("--from-log", help="Record and reconstruct the street first.")
+    ] = False,
     serve: Annotated[bool, typer.Option("--serve", help="Leave the worker up afterwards.")] = False,
 ) -> None:
-    """Build a street, edit it over REST, drive it over WebSocket, leave video and figures."""
+    """Serve a street, edit it over REST, drive it over WebSocket, leave video and figures."""
     from .demo import run as command
 
-    _run(command.run, out=out, steps=steps, leave_serving=serve)
+    _run(command.run, out=out, steps=steps, from_log=from_log, leave_serving=serve)
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""``real2sim demo``: make a street, serve it, edit it over REST, drive it over WebSocket."""
+"""``real2sim demo``: take a street, serve it, edit it over REST, drive it over WebSocket."""
 
 from __future__ import annotations
 
@@ -8,37 +8,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-import numpy as np
-
 from real2sim import connect
 from real2sim.planners import FollowRoute
 
-from ..commands.console import console, print_figures, staged_progress, write_json
-from ..logs.synthetic import SyntheticConfig, synthesize
-from ..reconstruct import InitialiseOptions, reconstruct
+from ..commands.console import console, print_figures, write_json
 from .drive import Drive, drive_through
 from .edits import Edits, make_room
 from .pictures import draw_map, write_png
+from .street import UNTRAINED_HZ, build_street, record_street, unpack_street
 from .worker import own_worker
 
 SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
-LOG_HZ = 2.0
 STEP_US = 100_000
-SMALL = InitialiseOptions(max_background=250_000, max_object=12_000)
-"""A third of the usual number of Gaussians: enough for images of this size, and fast to draw."""
 
 
-def run(*, out: Path, steps: int, leave_serving: bool) -> None:
+def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
     """Run the whole demo; results lie below ``out`` afterwards.
 
     Args:
         out: folder; what an earlier demo left there is replaced.
-        steps: clock steps of 0.1 s to drive.
+        steps: clock steps of 0.1 s to drive; the shipped street ends after 100.
+        from_log: record a drive and reconstruct it without training, rather than unpack the
+            trained street that is shipped.
         leave_serving: keep the worker up until Ctrl-C, and print what to try next.
     """
     clock = Clock()
-    scenes = _build_street(out, steps, clock)
+    scenes = _prepare_street(out, steps, clock, from_log=from_log)
     with own_worker(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
         with connect(worker.url) as client:
             with clock("start the worker"):
@@ -81,20 +77,18 @@ class Clock:
         self.seconds[stage] = time.perf_counter() - start
 
 
-def _build_street(out: Path, steps: int, clock: Clock) -> Path:
+def _prepare_street(out: Path, steps: int, clock: Clock, *, from_log: bool) -> Path:
     log, scenes = out / "log", out / "scenes"
     for stale in (log, scenes, out / "worker"):
         shutil.rmtree(stale, ignore_errors=True)
-    duration_s = (steps + 2) * STEP_US * 1e-6
-    frames = int(np.ceil(duration_s * LOG_HZ)) + 1
-    config = SyntheticConfig(frames=frames, hz=LOG_HZ, width=480, height=320)
-    with staged_progress() as report:
-        begun = time.perf_counter()
-        synthesize(config, log, on_progress=lambda done, total: report("record", done, total))
-        clock.seconds["record a synthetic drive"] = time.perf_counter() - begun
-        begun = time.perf_counter()
-        reconstruct(log, scenes / SCENE, options=SMALL, on_progress=report)
-        clock.seconds["reconstruct it"] = time.perf_counter() - begun
+    if not from_log:
+        with clock("unpack the street"):
+            unpack_street(scenes, SCENE)
+        return scenes
+    with clock("record a synthetic drive"):
+        record_street(log, duration_s=(steps + 2) * STEP_US * 1e-6, hz=UNTRAINED_HZ)
+    with clock("reconstruct it"):
+        build_street(log, scenes, SCENE)
     return scenes
 
 

@@ -1,0 +1,66 @@
+"""The street that the demo shows: shipped trained, or made anew from a synthetic drive.
+
+``python -m real2sim_server.demo.street FILE`` records and trains it again, in about a quarter of
+an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from ..commands.console import staged_progress
+from ..logs.synthetic import SyntheticConfig, synthesize
+from ..reconstruct import InitialiseOptions, reconstruct
+from ..reconstruct.training.schedule import preset
+from ..scene.io import load_scene, read_packed, save_scene, write_packed
+
+SHIPPED = Path(__file__).with_name("street.r2s.zip")
+DURATION_S = 10.4
+"""Of the shipped drive: 100 steps of 0.1 s and a little to spare."""
+TRAINING_HZ, UNTRAINED_HZ = 5.0, 2.0
+SMALL = InitialiseOptions(max_background=250_000, max_object=12_000)
+"""A third of the usual number of Gaussians: enough for images of this size, and fast to draw."""
+
+
+def unpack_street(scenes: Path, name: str) -> None:
+    """Write the shipped street as the bundle ``name`` in the folder ``scenes``."""
+    save_scene(read_packed(SHIPPED), scenes / name)
+
+
+def record_street(log: Path, *, duration_s: float, hz: float) -> None:
+    """Write a synthetic drive of the demo's street to the folder ``log``."""
+    config = SyntheticConfig(frames=int(duration_s * hz) + 2, hz=hz, width=480, height=320)
+    with staged_progress() as report:
+        synthesize(config, log, on_progress=lambda done, total: report("record", done, total))
+
+
+def build_street(log: Path, scenes: Path, name: str) -> None:
+    """Make the bundle ``name`` from the log without training."""
+    with staged_progress() as report:
+        reconstruct(log, scenes / name, options=SMALL, on_progress=report)
+
+
+def train_street(out: Path) -> None:
+    """Record and train the street, and pack it into the file ``out``."""
+    folder = Path(tempfile.mkdtemp(prefix="real2sim-street-"))
+    try:
+        record_street(folder / "log", duration_s=DURATION_S, hz=TRAINING_HZ)
+        options = preset("cpu-small")
+        with staged_progress() as report:
+            reconstruct(
+                folder / "log",
+                folder / "demo_street",
+                iterations=options.iterations,
+                training=options,
+                on_progress=report,
+            )
+        write_packed(load_scene(folder / "demo_street"), out)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    train_street(Path(sys.argv[1]))
