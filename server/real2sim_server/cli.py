@@ -62,6 +62,9 @@ def reconstruct(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where training was broken off.")
     ] = False,
+    box_noise: Annotated[
+        float, typer.Option(min=0, max=1, help="Scatter added to boxes, a share of their size.")
+    ] = 0.0,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
@@ -75,7 +78,7 @@ def reconstruct(
         log=log,
         out=out,
         iterations=iterations,
-        training=command.Training(preset=preset, resume=resume, width=width),
+        training=command.Training(preset=preset, resume=resume, width=width, box_noise=box_noise),
         log_format=log_format,
         sequence=sequence,
         overwrite=overwrite,

@@ -92,14 +92,20 @@ def staged_progress() -> Iterator[Callable[..., None]]:
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """A two-column table of figures; those within a mapping get rows of their own."""
+    """A two-column table of figures; those within mappings get rows of their own."""
     table = Table(title=title, show_header=False, title_justify="left")
-    for name, value in figures.items():
-        parts = value if isinstance(value, Mapping) else {"": value}
-        for part, figure in parts.items():
-            text = f"{figure:.4g}" if isinstance(figure, float) else str(figure)
-            table.add_row(escape(f"{name} {part}".strip()), escape(text))
+    for name, figure in _flat(figures):
+        text = f"{figure:.4g}" if isinstance(figure, float) else str(figure)
+        table.add_row(escape(name), escape(text))
     console.print(table)
+
+
+def _flat(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in figures.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name} {part}", figure) for part, figure in _flat(value))
+        else:
+            yield name, value
 
 
 def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:

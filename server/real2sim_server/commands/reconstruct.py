@@ -21,11 +21,13 @@ class Training:
         preset: its name.
         resume: whether a run that was broken off goes on.
         width: of the training images [px]; by the preset where None.
+        box_noise: scatter added to boxes, a share of their size.
     """
 
     preset: str
     resume: bool
     width: int | None = None
+    box_noise: float = 0.0
 
 
 def run(
@@ -51,6 +53,7 @@ def run(
             iterations=iterations,
             training=options if iterations else None,
             resume=training.resume,
+            box_noise=training.box_noise,
             log_format=log_format,
             sequence=sequence,
             overwrite=overwrite,

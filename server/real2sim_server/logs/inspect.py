@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.rotation import Float, apply_transform
-from .driving_log import DrivingLog, LidarSweep, ObjectTrack
+from .driving_log import DrivingLog, LidarSweep
 from .images import write_image
 from .overlay import draw_frame, points_in_box
 from .top_view import draw_top_view
@@ -20,9 +20,6 @@ from .top_view import draw_top_view
 LOOKS = 3
 GAP = 1.6
 """A frame is missing where the time step is this many times the usual one."""
-
-MOVING_DISTANCE, MOVING_SPREAD = 2.0, 0.5
-"""An object moves if it goes this far from end to end, or spreads this much along an axis [m]."""
 
 FASTEST = 70.0
 NEAR_BOXES = 30.0
@@ -124,7 +121,7 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
     """
     chosen = sorted({round(i) for i in np.linspace(0, log.frame_count - 1, LOOKS).tolist()})
     sweeps = {frame: log.lidar(frame) for frame in chosen}
-    moving = [t for t in log.tracks if is_moving(t)]
+    moving = [t for t in log.tracks if t.trajectory.moves]
     counts = [len(s.points) for s in sweeps.values()]
     far = [np.linalg.norm(s.points - s.origin, axis=1) for s in sweeps.values() if len(s.points)]
     steps = np.diff(log.frame_times_us) * 1e-6
@@ -148,13 +145,6 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
         problems=tuple(_problems(log, sweeps, steps)),
         drawings=() if out is None else tuple(_draw(log, sweeps, Path(out))),
     )
-
-
-def is_moving(track: ObjectTrack) -> bool:
-    """Whether an object moves at all, by the distances of MOVING_DISTANCE and MOVING_SPREAD."""
-    positions = track.trajectory.positions
-    gone = np.linalg.norm(positions[-1] - positions[0])
-    return bool(gone > MOVING_DISTANCE or (positions.std(axis=0) > MOVING_SPREAD).any())
 
 
 def _cameras(log: DrivingLog) -> tuple[CameraReport, ...]:

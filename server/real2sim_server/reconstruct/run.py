@@ -15,7 +15,14 @@ from .evaluation import evaluate_views, render_logged_view
 from .initialise import initialise_scene
 from .options import InitialiseOptions, ReconstructError
 from .stages import OnProgress, Stages
-from .training import OnTraining, TrainOptions, held_out_frames, preset, train
+from .training import (
+    OnTraining,
+    TrainOptions,
+    held_out_frames,
+    preset,
+    train,
+    with_box_noise,
+)
 from .views import chosen_frames
 
 EVALUATED_FRAMES = 4
@@ -93,6 +100,7 @@ def reconstruct(
     options: InitialiseOptions | None = None,
     training: TrainOptions | None = None,
     resume: bool = False,
+    box_noise: float = 0.0,
     log_format: str | None = None,
     sequence: str | None = None,
     overwrite: bool = False,
@@ -111,6 +119,8 @@ def reconstruct(
         options: of stage 0; by default those of ``training``.
         training: its options, the preset ``cpu-small`` by default; ``iterations`` counts.
         resume: go on from the checkpoint of a run of the same arguments that was broken off.
+        box_noise: scatter added to the boxes of the log, to see how much training mends; see
+            ``with_box_noise``.
         log_format, sequence: passed to ``open_log``.
         overwrite: replace an existing bundle.
         on_progress: told the stage and how far it is.
@@ -129,6 +139,8 @@ def reconstruct(
     stages = Stages(on_progress, timing_s)
     with stages("open"):
         log = open_log(Path(log_path), format=log_format, sequence=sequence)
+        if box_noise > 0:
+            log = with_box_noise(log, box_noise)
     figures = None
     if iterations == 0:
         scene = initialise_scene(log, options=options, on_progress=on_progress, timing_s=timing_s)

@@ -18,6 +18,16 @@ from .rotation import (
     transform_from,
 )
 
+MOVING_DISTANCE, MOVING_SPREAD = 2.0, 0.5
+
+
+def leads_anywhere(positions: Float) -> bool:
+    """Whether positions [T, 3] end more than 2 m from their start, or spread by more than 0.5 m
+    along an axis (standard deviation). Source: Street Gaussians.
+    """
+    gone = np.linalg.norm(positions[-1] - positions[0])
+    return bool(gone > MOVING_DISTANCE or (positions.std(axis=0) > MOVING_SPREAD).any())
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
@@ -90,6 +100,11 @@ class Trajectory:
     def end_us(self) -> int:
         """Last time stamp [us]."""
         return int(self.times_us[-1])
+
+    @property
+    def moves(self) -> bool:
+        """Whether it leads anywhere, see :func:`leads_anywhere`."""
+        return leads_anywhere(self.positions)
 
     def covers(self, t_us: int) -> bool:
         """Whether a pose is known at ``t_us``."""

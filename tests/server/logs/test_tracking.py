@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from real2sim_server.logs import DrivingLog, LidarSweep, ObjectTrack, open_log
-from real2sim_server.logs.inspect import is_moving
 from real2sim_server.logs.overlay import points_in_box
 from real2sim_server.logs.synthetic import SyntheticConfig, generate_log
 from real2sim_server.logs.tracking import TrackingOptions, track_moving_objects
@@ -58,7 +57,7 @@ def _score(log: DrivingLog, tracks: tuple[ObjectTrack, ...], *, near: float = NE
         points = apply_transform(here, log.lidar(frame).points.astype(np.float64))
         placed = [(t, t.trajectory.transform(t_us)) for t in tracks if t.trajectory.covers(t_us)]
         for truth in log.tracks:
-            if not is_moving(truth) or not truth.trajectory.covers(t_us):
+            if not truth.trajectory.moves or not truth.trajectory.covers(t_us):
                 continue
             pose = truth.trajectory.transform(t_us)
             too_far = np.hypot(*(pose[:2, 3] - here[:2, 3])) > near

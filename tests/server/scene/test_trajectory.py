@@ -125,3 +125,12 @@ def test_bad_input_is_refused(times, positions, quaternions, reason):
 def test_poses_that_are_no_rotations_are_refused_with_their_index(bad):
     with pytest.raises(SceneError, match="index 1"):
         Trajectory.from_transforms([0, 1], np.stack([np.eye(4), bad]))
+
+
+@pytest.mark.parametrize(
+    ("x", "leads"), [([0, 1, 2.1], True), ([0, 0.1, 0], False), ([0, 1.9, 0], True)]
+)
+def test_a_trajectory_moves_when_it_ends_elsewhere_or_spreads(x, leads):
+    positions = np.stack([x, np.zeros(3), np.zeros(3)], axis=1)
+    trajectory = Trajectory([0, 1, 2], positions, np.tile([1.0, 0, 0, 0], (3, 1)))
+    assert trajectory.moves is leads

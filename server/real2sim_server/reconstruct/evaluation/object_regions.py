@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...logs import DrivingLog, ObjectTrack
-from ...logs.inspect import is_moving
 from ...scene import Camera
 from ...scene.box import box_corners
 from ...scene.rotation import Float, apply_transform, invert_transform
@@ -18,10 +17,8 @@ EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a &
 
 
 def moving_tracks(log: DrivingLog) -> tuple[ObjectTrack, ...]:
-    """Tracks that end more than 2 m from where they began, or whose positions spread more than
-    0.5 m along any axis (standard deviation), as Street Gaussians selects them.
-    """
-    return tuple(track for track in log.tracks if is_moving(track))
+    """Tracks that lead anywhere, see ``Trajectory.moves``."""
+    return tuple(track for track in log.tracks if track.trajectory.moves)
 
 
 def moving_mask(

@@ -16,6 +16,7 @@ from ..options import ReconstructError
 from ..stages import OnProgress, Stages, Tell
 from ..training.data import image_time, resized
 from .around import AroundScore, evaluate_around
+from .box_error import box_error
 from .choice import choose_frames, compared_cameras
 from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
 from .lidar_depth import depth_errors, median_error, points_in_camera
@@ -112,6 +113,8 @@ class Evaluation:
         psnr, ssim: means over views, all pixels [dB], [1].
         psnr_objects: mean over the views that show moving objects, within their boxes [dB].
         depth_error_m: median over all compared LiDAR points of all views [m].
+        box_error_m: median over moving objects and their times of how far their centres are from
+            those of the log's boxes [m]; nan where the log has none of the scene's objects.
         frames_per_second: camera images drawn per second, see :class:`.rendering.RenderRate`.
         width, height: of the first camera's compared image [px].
         by_camera: the same by camera.
@@ -130,6 +133,7 @@ class Evaluation:
     ssim: float
     psnr_objects: float
     depth_error_m: float
+    box_error_m: float
     frames_per_second: float
     width: int
     height: int
@@ -192,6 +196,7 @@ def evaluate_scene(
         frames=chosen.frames,
         frames_unseen=chosen.unseen,
         gaussians=scene.gaussian_count,
+        box_error_m=box_error(scene, log),
         frames_per_second=rate.frames_per_second,
         width=cameras[0].width,
         height=cameras[0].height,

@@ -16,16 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.rotation import Float, apply_transform
+from ...scene.trajectory import leads_anywhere
 from .checkpoint import CheckpointError
 from .dataset_files import read_json
 from .street_folder import StreetFolder
 
 IGNORED_CLASSES = ("sign", "misc")
 EMPTY = -1
-
-MOVING_DEVIATION = 0.5
-MOVING_DISTANCE = 2.0
-"""A track moves if its positions deviate more than this along an axis [m], or from end to end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +152,7 @@ def _moves(ids: NDArray[np.int64], positions: Float, ego: Float, track: int) -> 
     if not len(frame):
         return False
     world = apply_transform(ego[frame], positions[frame, column][:, None])[:, 0]
-    distance = np.linalg.norm(world[0] - world[-1])
-    return bool((world.std(axis=0) > MOVING_DEVIATION).any() or distance > MOVING_DISTANCE)
+    return leads_anywhere(world)
 
 
 def _close_gaps(

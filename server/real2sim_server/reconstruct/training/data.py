@@ -125,6 +125,14 @@ class Views:
         """Stop reading ahead."""
         self._pool.shutdown(cancel_futures=True)
 
+    def looks(self) -> list[tuple[Camera, int]]:
+        """Camera at full training size and time of every view."""
+        rig, found = self._log.rig, []
+        for name, frame in self._keys:
+            camera = rig[name].resized(max(16, self._width(rig[name])))
+            found.append((camera, image_time(self._log, name, frame)))
+        return found
+
     def order(self, iteration: int) -> int:
         """Index of the view of ``iteration``: all in random order, then all in another."""
         epoch, place = divmod(iteration, len(self))

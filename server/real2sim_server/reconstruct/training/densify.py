@@ -63,6 +63,7 @@ class Densifier:
         self._seed = seed
         self._first = round(options.start * iterations)
         self._last = round(options.stop * iterations)
+        self._hidden_rounds = {round(share * iterations) for share in options.hidden_rounds}
 
     def is_due(self, iteration: int) -> bool:
         """Whether a round follows the step ``iteration``."""
@@ -78,6 +79,10 @@ class Densifier:
         every = self.options.reset_every
         gradient = self.options.method == "gradient"
         return gradient and 0 < every <= iteration + 1 < self._last and (iteration + 1) % every == 0
+
+    def drops_hidden(self, iteration: int) -> bool:
+        """Whether Gaussians that images hardly show go after the step ``iteration``."""
+        return iteration + 1 in self._hidden_rounds
 
     @torch.no_grad()
     def round(

@@ -98,6 +98,20 @@ class Gaussians:
         return clouds
 
 
+def joined(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]:
+    """Both together, sorted by owner, and [N] bool: which of them are ``second``'s."""
+    fields = {}
+    for name in FIELDS:
+        start = 1 if name in OBJECT_FIELDS else 0
+        parts = [g.tensors()[name].detach().split(g.counts[start:]) for g in (first, second)]
+        pieces = [part for pair in zip(*parts, strict=True) for part in pair]
+        fields[name] = leaf(torch.cat(pieces) if pieces else first.tensors()[name])
+    pairs = list(zip(first.counts, second.counts, strict=True))
+    counts = torch.tensor([n for pair in pairs for n in pair])
+    of_second = torch.tensor([False, True] * len(pairs)).repeat_interleave(counts)
+    return Gaussians(**fields, counts=tuple(a + b for a, b in pairs)), of_second
+
+
 def mirror(cloud: GaussianCloud) -> GaussianCloud:
     """The cloud reflected at its x z plane, as a vehicle looks from its other side."""
     sign = cloud.means.new_tensor

@@ -12,7 +12,7 @@ from ...logs import DrivingLog
 from . import losses
 from .data import Views, held_out_frames
 from .model import SceneModel
-from .object_masks import box_mask, is_moving
+from .object_masks import box_mask
 from .schedule import TrainOptions
 
 MIN_PIXELS = 50
@@ -54,7 +54,7 @@ def score_held_out(
     if not frames:
         return HeldOutScore(float("nan"), float("nan"), float("nan"), 0)
     views = Views(log, frames, options)
-    moving = [k for k, o in model.scene.objects.items() if is_moving(o.trajectory)]
+    moving = [k for k, o in model.scene.objects.items() if o.trajectory.moves]
     scores = []
     for index in range(len(views)):
         view = views.view(index)

@@ -106,7 +106,7 @@ class SceneModel:
         """
         degree = self.options.sh_degree if degree is None else degree
         clouds = self.gaussians.clouds(degree=degree, tones=self._tones(t_us), mirrored=mirrored)
-        instances, drawn = self._instances(clouds, t_us)
+        instances, drawn = self.instances(clouds, t_us)
         options = RasterOptions(depth=depth, instance=False, track_screen=True)
         output = rasterize(
             instances,
@@ -127,7 +127,7 @@ class SceneModel:
     def objects_alpha(self, camera: Camera, t_us: int) -> Tensor:
         """[H, W] accumulated opacity of the objects alone; carries gradients."""
         clouds = self.gaussians.clouds(degree=0)
-        instances, _ = self._instances(clouds, t_us)
+        instances, _ = self.instances(clouds, t_us)
         output = rasterize(
             instances[1:],
             self.viewmat(camera, t_us).detach()[None],
@@ -139,9 +139,8 @@ class SceneModel:
         )
         return output.alpha[0]
 
-    def _instances(
-        self, clouds: list[GaussianCloud], t_us: int
-    ) -> tuple[list[Instance], list[int]]:
+    def instances(self, clouds: list[GaussianCloud], t_us: int) -> tuple[list[Instance], list[int]]:
+        """Clouds of background and objects where they are at ``t_us``, and which are there."""
         instances, drawn = [Instance(clouds[0])], [0]
         for index, key in enumerate(self.poses.keys):
             if key.covers(t_us) and len(clouds[index + 1]):

@@ -7,22 +7,12 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene import Camera, Scene, Trajectory
+from ...scene import Camera, Scene
 
 NEAR = 0.2
 """Boxes that reach behind this depth are cut there [m]."""
-MOVING_SPREAD, MOVING_DISTANCE = 0.5, 2.0
-"""Street Gaussians: a track moves when its positions spread or lie so far apart [m]."""
 STEPS = 9
 """Points along each edge of a box, so that cut boxes keep their outline."""
-
-
-def is_moving(trajectory: Trajectory) -> bool:
-    """Whether an object drives at all."""
-    positions = trajectory.positions
-    spread = float(np.linalg.norm(positions.std(axis=0)))
-    far = float(np.linalg.norm(positions - positions[0], axis=1).max())
-    return spread > MOVING_SPREAD or far > MOVING_DISTANCE
 
 
 def box_mask(

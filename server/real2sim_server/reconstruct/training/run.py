@@ -24,6 +24,7 @@ from .model import SceneModel
 from .schedule import TrainOptions
 from .threads import one_torch_thread
 from .trainer import CHECKPOINT, OnTraining, Trainer, TrainingProgress
+from .visibility import put_back_guesses
 
 INITIAL = "initial.r2s"
 PREVIEWS = "previews"
@@ -97,6 +98,8 @@ def train(
             on_preview=_previewer(log, options, folder / PREVIEWS),
         )
     seconds = time.perf_counter() - start
+    with stages("fill what no image shows"), one_torch_thread():
+        _put_back(trainer, scene, options)
     trainer.views.close()
     with stages("score"):
         score = score_held_out(trainer.model, log, options)
@@ -132,6 +135,15 @@ def _first_scene(
     )
     scene = replace(scene, frame_times_us=log.frame_times_us)
     return save_scene(scene, folder / INITIAL, overwrite=True)
+
+
+def _put_back(trainer: Trainer, scene: Scene, options: TrainOptions) -> None:
+    """Give the model stage 0's guesses for what no training image shows, as opaque as they were."""
+    times = np.array([scene.start_us, scene.end_us])
+    opaque = replace(options, initial_opacity=0.99, refine_poses=False)
+    first = SceneModel(scene, opaque, times, backend=trainer.model.backend)
+    limit = options.densify.hidden_share
+    put_back_guesses(trainer.model, first, trainer.views.looks(), limit=limit)
 
 
 def _both(on_training: OnTraining | None, tell: Callable[[int, int], None]) -> OnTraining:

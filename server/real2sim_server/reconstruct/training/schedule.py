@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from ..options import InitialiseOptions, ReconstructError
 from .losses import LossWeights
 
 DENSIFY_METHODS = ("none", "gradient", "mcmc")
 COLOUR_BASES = ("cosine", "real_dft")
+REST_OF_HARMONICS = 1 / 20
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,9 @@ class DensifyOptions:
         reset_every: iterations between resets of opacity; 0 for never.
         noise: of ``mcmc``: factor on the learning rate of means.
         growth: of ``mcmc``: share by which the number grows in a round.
+        hidden_rounds: shares of all iterations at which Gaussians go that images hardly show.
+        hidden_share: visible share up to which those of the background go.
+        hidden_object_share: likewise of objects, whose inside shows a little through the glass.
     """
 
     method: str = "gradient"
@@ -76,6 +83,9 @@ class DensifyOptions:
     reset_every: int = 3000
     noise: float = 5e5
     growth: float = 0.05
+    hidden_rounds: tuple[float, ...] = (0.35, 0.6)
+    hidden_share: float = 0.005
+    hidden_object_share: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -235,6 +245,31 @@ def falling(span: tuple[float, float], share: float) -> float:
     """From the first to the second value of ``span``, exponentially, as ``share`` goes 0 to 1."""
     first, last = span
     return float(first * (last / first) ** min(max(share, 0.0), 1.0)) if first > 0 else 0.0
+
+
+def rates_at(options: TrainOptions, share: float, *, functions: int) -> dict[str, float | Tensor]:
+    """Step sizes by name of parameter after ``share`` of the iterations.
+
+    Args:
+        functions: number of spherical harmonics, whose rates differ.
+    """
+    rates = options.rates
+    columns = torch.full((functions, 3), rates.colour * REST_OF_HARMONICS)
+    columns[0] = rates.colour
+    poses_move = float(options.refine_poses and share >= options.pose_start)
+    return {
+        "means": falling(rates.means, share),
+        "log_scales": rates.scales,
+        "quats": rates.quats,
+        "logits": rates.opacities,
+        "sh": columns.reshape(-1),
+        "fourier": rates.fourier,
+        "sky": falling(rates.sky, share),
+        "pose_translation": poses_move * falling(rates.pose_translation, share),
+        "pose_yaw": poses_move * falling(rates.pose_yaw, share),
+        "exposure": rates.exposure,
+        "camera": rates.camera,
+    }
 
 
 def from_values(kind: type, values: dict[str, Any]) -> Any:

@@ -24,11 +24,11 @@ from .metrics import MetricsFile
 from .model import MIRRORED, Rendered, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
-from .schedule import TrainOptions, falling, from_values
+from .schedule import TrainOptions, from_values, rates_at
+from .visibility import drop_hidden, visible_shares
 
 SMOOTHING = 0.98
 """Share of the past in the running loss and PSNR."""
-REST_OF_HARMONICS = 1 / 20
 CHECKPOINT = "checkpoint"
 
 
@@ -254,7 +254,8 @@ class Trainer:
             gradient = parameters[name].grad
             if gradient is not None:
                 masks[name] = gradient.reshape(len(gradient), -1).any(1)
-        rates = self._rates()
+        share = self.iteration / self.options.iterations
+        rates = rates_at(self.options, share, functions=int(gaussians.sh.shape[1]))
         self.optimizer.step(parameters, rates, masks)
         self.densifier.jitter(gaussians, float(rates["means"]), self.iteration)
         for parameter in parameters.values():
@@ -264,31 +265,20 @@ class Trainer:
         starts = np.concatenate([[0], np.cumsum(self.model.gaussians.counts)])
         return [slice(int(starts[k]), int(starts[k + 1])) for k in drawn]
 
-    def _rates(self) -> dict[str, float | Tensor]:
-        rates, share = self.options.rates, self.iteration / self.options.iterations
-        k = int(self.model.gaussians.sh.shape[1])
-        columns = torch.full((k, 3), rates.colour * REST_OF_HARMONICS)
-        columns[0] = rates.colour
-        poses_move = float(self.options.refine_poses and share >= self.options.pose_start)
-        return {
-            "means": falling(rates.means, share),
-            "log_scales": rates.scales,
-            "quats": rates.quats,
-            "logits": rates.opacities,
-            "sh": columns.reshape(-1),
-            "fourier": rates.fourier,
-            "sky": falling(rates.sky, share),
-            "pose_translation": poses_move * falling(rates.pose_translation, share),
-            "pose_yaw": poses_move * falling(rates.pose_yaw, share),
-            "exposure": rates.exposure,
-            "camera": rates.camera,
-        }
-
     def _change(self, i: int) -> None:
         """Add, remove and reset Gaussians where it is time to."""
         if self.densifier.is_due(i):
             self.model.gaussians = self.densifier.round(
                 self.model.gaussians, self.optimizer, self.sums, i
+            )
+            self.sums = ScreenSums.zeros(len(self.model.gaussians))
+        if self.densifier.drops_hidden(i):
+            densify = self.options.densify
+            self.model.gaussians = drop_hidden(
+                self.model.gaussians,
+                self.optimizer,
+                visible_shares(self.model, self.views.looks()),
+                limits=(densify.hidden_share, densify.hidden_object_share),
             )
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
         if self.densifier.resets_opacity(i):

@@ -15,6 +15,7 @@ from real2sim_server.logs import open_log, write_native_log
 from real2sim_server.logs.synthetic import CameraSpec, SyntheticConfig, generate_log
 from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
 from real2sim_server.reconstruct.evaluation import EvaluateOptions, evaluate_scene
+from real2sim_server.reconstruct.evaluation.box_error import box_error
 from real2sim_server.reconstruct.evaluation.choice import choose_frames
 from real2sim_server.reconstruct.evaluation.scores import logged_mask
 from real2sim_server.reconstruct.evaluation.shifted import evaluate_shifts, true_view
@@ -203,3 +204,23 @@ def test_figures_without_truth_say_why_and_hold_no_shifted_views():
 def test_options_out_of_range_are_refused(changes, message):
     with pytest.raises(ReconstructError, match=message):
         EvaluateOptions(**changes)
+
+
+def test_boxes_of_the_log_itself_have_no_error(street, street_scene):
+    assert box_error(street_scene, street) == pytest.approx(0, abs=1e-9)
+
+
+def test_the_box_error_is_the_distance_of_the_centres(street, street_scene):
+    shift = np.eye(4)
+    shift[:2, 3] = 0.3, 0.4
+    objects = {
+        key: replace(item, trajectory=item.trajectory.moved(shift))
+        for key, item in street_scene.objects.items()
+    }
+    moved = replace(street_scene, objects=objects, content_hash="")
+    assert box_error(moved, street) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_scene_without_the_objects_of_the_log_has_no_box_error(street, street_scene):
+    bare = replace(street_scene, objects={}, content_hash="")
+    assert np.isnan(box_error(bare, street))

@@ -1,0 +1,142 @@
+"""Which Gaussians the training images show, and what becomes of those that none shows.
+
+A Gaussian behind a surface gets gradients only through the thin gaps in that surface, and Adam
+takes full steps along them: it drifts into a shred that a turned or moved object reveals. Such
+Gaussians are dropped, and what stage 0 guessed for places that nobody saw (mirrored sides, paint,
+ground under cars) is put back at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ...render import Instance, RasterOptions, rasterize
+from ...scene import Camera
+from ...scene.harmonics import SH_C0
+from .densify import rearrange, rotations
+from .gaussians import Gaussians, joined
+from .model import SceneModel
+from .optimizer import SelectiveAdam
+
+NEAR = 0.2
+"""Gaussians nearer to the camera are not counted [m]."""
+EPS2D = RasterOptions().eps2d
+
+Look = tuple[Camera, int]
+"""A camera at the size of its training images, and when it looks [us]."""
+
+
+@torch.no_grad()
+def visible_shares(model: SceneModel, looks: Iterable[Look]) -> Tensor:
+    """[N] float32: of each Gaussian, how much reaches the images of what would without the others.
+
+    The sum of its blending weights over all pixels, by what it would be over the whole image plane
+    if nothing stood before it; 0 for what is never before a camera.
+    """
+    gaussians = model.gaussians
+    starts = [0]
+    for count in gaussians.counts:
+        starts.append(starts[-1] + count)
+    shown, bare = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    for camera, t_us in looks:
+        viewmat = model.viewmat(camera, t_us).detach()
+        instances, drawn = model.instances(gaussians.clouds(degree=0), t_us)
+        weights = blending_weights(instances, viewmat, camera, model)
+        for index, instance, weight in zip(drawn, instances, weights, strict=True):
+            rows = slice(starts[index], starts[index + 1])
+            alone = unhindered_weights(instance, viewmat, camera)
+            shown[rows] += torch.where(alone > 0, weight, 0)
+            bare[rows] += alone
+    return shown / bare.clamp(min=1e-9)
+
+
+def blending_weights(
+    instances: list[Instance], viewmat: Tensor, camera: Camera, model: SceneModel
+) -> list[Tensor]:
+    """[N] sums over pixels of each Gaussian's blending weight, by instance [px].
+
+    An image is linear in the constant colours, so that its sum's gradient by them is what is
+    looked for.
+    """
+    colours, coloured = [], []
+    for item in instances:
+        colour = torch.zeros(len(item.cloud), 1, 3, requires_grad=True)
+        colours.append(colour)
+        coloured.append(replace(item, cloud=replace(item.cloud, sh=colour)))
+    with torch.enable_grad():
+        output = rasterize(
+            coloured,
+            viewmat[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            options=RasterOptions(depth=False, instance=False),
+            backend=model.backend,
+        )
+        output.rgb[..., 0].sum().backward()
+    nothing = torch.zeros(0, 1, 3)
+    gradients = [nothing if c.grad is None else c.grad for c in colours]
+    return [
+        g[:, 0, 0].cpu() / SH_C0 if len(g) else torch.zeros(len(c))
+        for g, c in zip(gradients, colours, strict=True)
+    ]
+
+
+def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> Tensor:
+    """[N] integral over the image plane of each Gaussian's opacity [px].
+
+    0 for Gaussians whose centre is not on the image.
+    """
+    pose = torch.eye(4, dtype=torch.float64)
+    if instance.T_world_object is not None:
+        pose = torch.as_tensor(instance.T_world_object, dtype=torch.float64).detach()
+    to_camera = (viewmat.double() @ pose).float()
+    turn, cloud = to_camera[:3, :3], instance.cloud
+    x, y, z = (cloud.means @ turn.T + to_camera[:3, 3]).unbind(-1)
+    ahead = z > NEAR
+    z = z.clamp(min=NEAR)
+    fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    u, v = fx * x / z + cx, fy * y / z + cy
+    inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    axes = (turn @ rotations(cloud.quats)) * cloud.scales[:, None]
+    across = (fx / z)[:, None] * (axes[:, 0] - (x / z)[:, None] * axes[:, 2])
+    down = (fy / z)[:, None] * (axes[:, 1] - (y / z)[:, None] * axes[:, 2])
+    a, c = across.square().sum(-1) + EPS2D, down.square().sum(-1) + EPS2D
+    b = (across * down).sum(-1)
+    area = 2 * math.pi * (a * c - b * b).clamp(min=0).sqrt()
+    return torch.where(inside, area * cloud.opacities, 0)
+
+
+def drop_hidden(
+    gaussians: Gaussians, optimizer: SelectiveAdam, shares: Tensor, *, limits: tuple[float, float]
+) -> Gaussians:
+    """Without those whose visible share does not exceed the limit of background or objects."""
+    limit = torch.full((len(gaussians),), limits[1])
+    limit[: gaussians.counts[0]] = limits[0]
+    kept = (shares > limit).nonzero()[:, 0]
+    return rearrange(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
+
+
+def put_back_guesses(
+    model: SceneModel, first: SceneModel, looks: list[Look], *, limit: float
+) -> int:
+    """Add to ``model`` what stage 0 guessed for places no image shows; how many these are.
+
+    Args:
+        model: trained; changed.
+        first: of stage 0, with the same objects.
+        looks: all training views.
+        limit: visible share up to which a Gaussian counts as shown by no image.
+    """
+    hidden = (visible_shares(first, looks) <= limit).nonzero()[:, 0]
+    guesses, trained = first.gaussians.take(hidden), model.gaussians
+    # What training has cleared away must not come back before what it shows.
+    model.gaussians, is_guess = joined(trained, guesses)
+    shows = visible_shares(model, looks) > limit
+    model.gaussians = model.gaussians.take((~(is_guess & shows)).nonzero()[:, 0])
+    return len(model.gaussians) - len(trained)

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.reconstruct.training import SceneModel, Trainer
+from real2sim_server.reconstruct.training.gaussians import joined
+from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+from real2sim_server.reconstruct.training.visibility import (
+    drop_hidden,
+    put_back_guesses,
+    unhindered_weights,
+    visible_shares,
+)
+from real2sim_server.render import Instance
+from real2sim_server.scene import Camera, GaussianCloud
+
+from .conftest import TINY
+from .test_densify import COUNTS, marked, some_gaussians
+
+
+@pytest.fixture
+def model(tiny_scene) -> SceneModel:
+    times = np.array([tiny_scene.start_us, tiny_scene.end_us])
+    return SceneModel(tiny_scene, replace(TINY, refine_poses=False), times, backend="cpu")
+
+
+@pytest.fixture
+def looks(tiny_scene) -> list[tuple[Camera, int]]:
+    return [(camera, tiny_scene.start_us) for camera in tiny_scene.rig]
+
+
+def ahead(model: SceneModel, depth: float, scale: float, opacity: float) -> GaussianCloud:
+    """One round Gaussian on the axis of the first camera when the drive begins."""
+    scene = model.scene
+    T = np.linalg.inv(scene.rig.cameras[0].viewmat(scene.ego.transform(scene.start_us)))
+    mean = torch.from_numpy(T @ [0, 0, depth, 1])[:3].float()
+    return GaussianCloud(
+        means=mean[None],
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), scale),
+        opacities=torch.tensor([opacity]),
+        sh=torch.zeros(1, 1, 3),
+    )
+
+
+def model_of(model: SceneModel, clouds: list[GaussianCloud]) -> SceneModel:
+    scene = replace(
+        model.scene, background=GaussianCloud.concatenate(clouds), objects={}, content_hash=""
+    )
+    opaque = replace(model.options, initial_opacity=0.99)
+    return SceneModel(scene, opaque, np.zeros(0, np.int64), backend="cpu")
+
+
+def test_a_gaussian_alone_is_all_visible(model, looks):
+    [share] = visible_shares(model_of(model, [ahead(model, 5, 0.2, 0.7)]), looks)
+    assert share == pytest.approx(1, abs=0.02)
+
+
+def test_one_behind_an_opaque_wall_is_hidden_and_the_wall_is_not(model, looks):
+    wall = [ahead(model, 4 + 0.01 * k, 1.0, 0.99) for k in range(4)]
+    shares = visible_shares(model_of(model, [*wall, ahead(model, 8, 0.05, 0.7)]), looks)
+    assert shares[0] > 0.8
+    assert shares[-1] < 1e-3
+
+
+def test_half_of_what_stands_behind_a_half_transparent_wall_is_visible(model, looks):
+    shares = visible_shares(
+        model_of(model, [ahead(model, 4, 5.0, 0.5), ahead(model, 8, 0.1, 0.7)]), looks
+    )
+    assert shares[1] == pytest.approx(0.5, abs=0.03)
+
+
+def test_what_is_never_before_a_camera_has_no_share(model, looks):
+    [share] = visible_shares(model_of(model, [ahead(model, -5, 0.2, 0.7)]), looks)
+    assert share == 0
+
+
+def test_the_unhindered_weight_is_the_area_of_the_ellipse_on_the_image(model):
+    camera = model.scene.rig.cameras[0]
+    viewmat = torch.from_numpy(camera.viewmat(model.scene.ego.transform(model.scene.start_us)))
+    [weight] = unhindered_weights(Instance(ahead(model, 5, 0.2, 0.7)), viewmat, camera)
+    squared = (camera.K[0, 0] * 0.2 / 5) ** 2 + 0.3
+    assert weight == pytest.approx(0.7 * 2 * math.pi * squared, rel=1e-3)
+
+
+def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
+    gaussians = some_gaussians()
+    optimizer: SelectiveAdam = marked(gaussians)
+    shares = torch.full((len(gaussians),), 0.03)
+    shares[:5] = 0.001
+    left = drop_hidden(gaussians, optimizer, shares, limits=(0.005, 0.05))
+    assert left.counts == (COUNTS[0] - 5, 0, 0)
+    torch.testing.assert_close(optimizer.first["means"], left.means.detach())
+    torch.testing.assert_close(left.means, gaussians.means[5 : COUNTS[0]])
+
+
+def test_two_packs_are_joined_owner_by_owner():
+    a, b = some_gaussians(), some_gaussians()
+    both, of_b = joined(a, b)
+    assert both.counts == tuple(2 * n for n in COUNTS)
+    torch.testing.assert_close(both.take((~of_b).nonzero()[:, 0]).fourier, a.fourier)
+    torch.testing.assert_close(both.take(of_b.nonzero()[:, 0]).means, b.means)
+
+
+def test_guesses_come_back_where_nothing_shows_them_and_nowhere_else(model, looks):
+    wall = [ahead(model, 4, 3.0, 0.99)]
+    behind, beside = ahead(model, 8, 0.2, 0.7), ahead(model, 3, 0.2, 0.7)
+    trained, first = model_of(model, wall), model_of(model, [*wall, behind, beside])
+    assert put_back_guesses(trained, first, looks, limit=0.05) == 1
+    torch.testing.assert_close(trained.gaussians.means[-1], behind.means[0])
+
+
+def test_guesses_that_training_has_laid_open_stay_away(model, looks):
+    wall = [ahead(model, 4, 3.0, 0.99)]
+    trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
+    first = model_of(model, [*wall, ahead(model, 8, 0.2, 0.7)])
+    assert put_back_guesses(trained, first, looks, limit=0.05) == 0
+
+
+def test_training_drops_what_is_hidden_at_its_rounds(tiny_log, tiny_scene):
+    densify = replace(TINY.densify, method="none", hidden_rounds=(0.05,))
+    trainer = Trainer(tiny_log, tiny_scene, replace(TINY, densify=densify), backend="cpu")
+    before = len(trainer.model.gaussians)
+    trainer.run(until=2)
+    assert len(trainer.model.gaussians) == before
+    trainer.run(until=3)
+    assert len(trainer.model.gaussians) < before
+    trainer.run(until=5)
+    trainer.views.close()
