@@ -240,6 +240,9 @@ class ContactSpec(Model):
     masses: dict[Identifier, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         default_factory=dict, description="[kg] by object; default: by category and box"
     )
+    dents: bool = Field(
+        default=True, description="images show what was struck deformed, by matter of particles"
+    )
 
 
 class ScoringSpec(Model):

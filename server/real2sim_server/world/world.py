@@ -22,7 +22,7 @@ from .episode import plan_episode
 from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
-from .impact import Deformation, Impact, Wreck
+from .impact import Deformation, Dents, Impact, Wreck
 from .judging import ego_sample, others_of, plan_note, scoring_context
 from .meeting import BACKGROUND, Met, may_meet, met, notes_of, run_bout
 from .observation import Observation
@@ -56,7 +56,7 @@ class World:
         tally: what the scores are made of.
         instant: the last committed one, as the scores see it.
         impacts: of the last step.
-        deformation: dents struck objects; None leaves them rigid.
+        deformation: dents struck objects; None where nothing can be.
         terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
             ``deadline``, ``wall_clock``.
     """
@@ -81,6 +81,8 @@ class World:
         self.steps = 0
         self.revision = revision
         self.deformation = deformation
+        if deformation is None and self._physical and spec.contact.dents:
+            self.deformation = Dents(scene)
         self.terminated = False
         self.truncated = False
         self.reason: str | None = None
@@ -262,7 +264,7 @@ class World:
         if self.deformation is not None:
             # Background first, then the objects, then shadows.
             for k, subject in enumerate(self.agents.objects, start=1):
-                drawn[k] = self.deformation.shown(subject.object_id, drawn[k])
+                drawn[k] = self.deformation.shown(subject.object_id, drawn[k], self.t_us)
         return drawn
 
     def due_sensors(self) -> list[SensorSpec]:
@@ -377,9 +379,9 @@ class World:
         self._touching = frozenset(_key(i) for i in impacts)
         self.impacts = impacts
         if self.deformation is not None:
+            subjects = {o.object_id: o for o in self.agents.objects}
             for impact in impacts:
-                self.deformation = self.deformation.struck(impact)
-            self.deformation = self.deformation.advance(self._clock.dt_us)
+                self.deformation = self.deformation.struck(impact, subjects)
         return events, notes, sum(i.other_id is not None for i in fresh)
 
     def _met(self, before: frozenset[str]) -> Met:

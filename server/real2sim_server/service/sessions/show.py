@@ -126,6 +126,9 @@ class Show:
             fields = world.observe().obs_fields()
             watch.stage("world")
             sensors = world.due_sensors()
+            if sensors and world.deformation is not None:
+                world.deformation.work_out()
+                watch.stage("physics")
             images = self._images(world, sensors, [cameras[s.camera] for s in sensors])
             watch.stage("render")
             drawn = Drawn(world, images, "obs", fields, reply_to, watch)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
@@ -26,6 +27,15 @@ MUTUAL_STIFFNESS = 405e3
 """Of two cars in series, for the estimate of crush: 405 +- 139 kN/m (Bonugli et al. 2017)."""
 
 
+class Party(NamedTuple):
+    """A body as it was when an impact began; ``low``, ``high``: of its box [m]."""
+
+    solid: Solid
+    body: Body
+    low: float
+    high: float
+
+
 @dataclass(frozen=True)
 class Impact:
     """What two bodies did to each other in one step of the clock.
@@ -44,6 +54,8 @@ class Impact:
         energy: kinetic energy lost [J].
         side: how ego and object met.
         speeds: of the first body and of the object when they met [m/s].
+        began_us: when they met in this step [us].
+        parties: the ego (or ``other_id``) and the object when they met; None for the background.
     """
 
     object_id: str | None
@@ -59,6 +71,8 @@ class Impact:
     energy: float
     side: Side = "lateral"
     speeds: tuple[float, float] = (0.0, 0.0)
+    began_us: int = 0
+    parties: tuple[Party, Party | None] | None = None
 
     @property
     def crush(self) -> float:
@@ -81,17 +95,17 @@ class Impact:
 class Deformation(Protocol):
     """Dents struck bodies. Immutable: what happens makes a new one, so that worlds can fork.
 
-    The world moves struck objects as rigid bodies; whoever deforms them is told of every impact
-    and of the time that passes, and says what is drawn instead of the object's own Gaussians.
+    The world moves struck objects as rigid bodies; whoever deforms them is told of every impact,
+    and says what is drawn instead of an object's own Gaussians.
     """
 
-    def struck(self, impact: Impact) -> Self:
-        """After an impact."""
+    def struck(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
+        """After an impact; ``subjects``: all objects by id."""
 
-    def advance(self, dt_us: int) -> Self:
-        """``dt_us`` later."""
+    def work_out(self) -> None:
+        """Find the shapes that are not known yet, so that ``shown`` does not have to."""
 
-    def shown(self, object_id: str, instance: Instance) -> Instance:
+    def shown(self, object_id: str, instance: Instance, t_us: int) -> Instance:
         """What is drawn of an object; the given instance where it is not deformed."""
 
 

@@ -21,6 +21,7 @@ from ..traffic.driver import AgentPose
 from .body import Body, Solid, slid
 from .model import (
     Impact,
+    Party,
     Wreck,
     ego_body,
     ego_motion,
@@ -93,6 +94,8 @@ class _Account:
     relative: float
     side: Side
     speeds: tuple[float, float]
+    began_us: int
+    parties: tuple[Party, Party | None]
     jx: float = 0.0
     jy: float = 0.0
     energy: float = 0.0
@@ -108,6 +111,7 @@ class _Run:
     boxes: dict[str, tuple[float, float]]
     accounts: dict[tuple[str, str], _Account] = field(default_factory=dict)
     exempt: set[frozenset[str]] = field(default_factory=set)
+    now_us: int = 0
 
 
 def resolve(bout: Bout) -> Outcome:
@@ -124,6 +128,7 @@ def resolve(bout: Bout) -> Outcome:
         begin, end = bout.dt_us * k // substeps, bout.dt_us * (k + 1) // substeps
         motion = _move_ego(run, motion, sliding, begin, end)
         _move_objects(run, begin, end)
+        run.now_us = end
         if _collide(run):
             sliding = True
         if sliding:
@@ -275,9 +280,16 @@ def _note(run: _Run, pair: tuple[str, str], where: Touch, *, approach: float) ->
             speeds = (speeds[0], math.hypot(second[0].vx, second[0].vy))
             vx, vy = vx - second[0].vx, vy - second[0].vy
             side = _side(first, second, speeds)
-        account = _Account(where, approach, math.hypot(vx, vy), side, speeds)
+        parties = _party(run, pair[0]), None if pair[1] == BACKGROUND else _party(run, pair[1])
+        began_us = run.bout.t_us + run.now_us
+        relative = math.hypot(vx, vy)
+        account = _Account(where, approach, relative, side, speeds, began_us, parties)
         run.accounts[pair] = account
     return account
+
+
+def _party(run: _Run, i: str) -> Party:
+    return Party(run.solids[i], run.bodies[i], *run.boxes[i])
 
 
 def _free(run: _Run, struck: set[str]) -> None:
@@ -352,6 +364,8 @@ def _impacts(run: _Run) -> tuple[Impact, ...]:
                 energy=account.energy,
                 side=account.side,
                 speeds=account.speeds,
+                began_us=account.began_us,
+                parties=account.parties,
             )
         )
     return tuple(impacts)

@@ -1,0 +1,193 @@
+"""What impacts leave behind: struck bodies are drawn deformed, and always alike."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_proto.drive import Control
+from real2sim_proto.episode import ResetSpec
+from real2sim_server.edit import ScenarioState
+from real2sim_server.physics import crash
+from real2sim_server.scene import GaussianCloud, SceneObject
+from real2sim_server.scene.rotation import transform_from, yaw_quaternion
+from real2sim_server.world import World
+from real2sim_server.world.history import Entry, Retold, action_payload, reset_payload
+
+SIZE = (4.2, 1.8, 1.5)
+MASS = 1500.0
+COAST = Control(acceleration=0.0, steering=0.0)
+GO_ON = {"action": "control", "on_collision": "continue", "contact": {"masses": {"car": MASS}}}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_matter():
+    """Every crash of these tests in a fraction of the usual time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(crash, "PARTICLES", 500)
+        yield
+
+
+def shell(size: tuple[float, float, float] = SIZE) -> GaussianCloud:
+    """Gaussians all over the surface of a box."""
+    axes = [torch.linspace(-s / 2, s / 2, round(s / 0.1) + 1) for s in size]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
+    means = grid[((grid.abs() - torch.tensor(size) / 2).abs() < 1e-4).any(dim=1)]
+    count = len(means)
+    return GaussianCloud(
+        means=means,
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        scales=torch.full((count, 3), 0.05),
+        opacities=torch.full((count,), 0.9),
+        sh=torch.rand(count, 4, 3, generator=torch.Generator().manual_seed(0)),
+    )
+
+
+@pytest.fixture
+def crash_scene(make_scene, moving):
+    """``crash_scene(car=trajectory, ...)``: objects with bodywork to be dented."""
+
+    def make(category: str = "car", *, speed: float = 10.0, **paths):
+        scene = make_scene(moving(speed=speed), **paths)
+        objects = {k: SceneObject(k, category, SIZE, shell(), v) for k, v in paths.items()}
+        return replace(scene, objects=objects)
+
+    return make
+
+
+def world_of(scene, **spec) -> World:
+    return World(scene, ScenarioState.of(scene), ResetSpec(**(GO_ON | spec)))
+
+
+def drive_until_contact(world: World) -> list:
+    for _ in range(60):
+        if events := [e for e in world.step(COAST) if e.type == "collision"]:
+            return events
+    raise AssertionError("no contact")
+
+
+def cloud_of(world: World, object_id: str = "car") -> GaussianCloud:
+    ids = {o.object_id: k for k, o in enumerate(world.agents.objects, start=1)}
+    return world.instances()[ids[object_id]].cloud
+
+
+def bits(cloud: GaussianCloud) -> str:
+    parts = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    return hashlib.sha256(b"".join(p.numpy().tobytes() for p in parts)).hexdigest()
+
+
+# --- in the world -----------------------------------------------------------------------------
+
+
+def test_a_struck_car_is_drawn_dented_where_it_was_struck(crash_scene, moving):
+    scene = crash_scene(car=moving(20, 0, z=0.75), other=moving(20, 5, z=0.75))
+    world = world_of(scene)
+    drive_until_contact(world)
+    for _ in range(3):
+        world.step(COAST)
+    before, after = scene.objects["car"].cloud.means, cloud_of(world).means
+    pushed = (after - before)[:, 0]
+    rear, front = before[:, 0] < -SIZE[0] / 2 + 0.1, before[:, 0] > 0.5
+    low = before[:, 2] < 0.0
+    assert pushed[rear & low].mean() > 0.05
+    assert pushed[front].abs().max() < 0.02
+    assert torch.equal(cloud_of(world, "other").means, before)
+
+
+def test_a_dent_grows_for_a_tenth_of_a_second_and_then_stays(crash_scene, moving):
+    world = world_of(crash_scene(car=moving(20, 0, z=0.75)), dt_us=20_000, horizon=400)
+    while not world.impacts:
+        world.step(COAST)
+    rear = world.scene.objects["car"].cloud.means[:, 0] < -2.05
+    depths, kept = [], []
+    for _ in range(18):
+        world.step(COAST)
+        cloud = cloud_of(world)
+        shift = (cloud.means - world.scene.objects["car"].cloud.means)[:, 0]
+        depths.append(float(shift[rear].max()))
+        kept.append(bits(cloud))
+    assert 0 < depths[0] < 0.7 * depths[-1]
+    assert len(set(kept[-5:])) == 1
+
+
+def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_scene, moving):
+    scene, spec = crash_scene(car=moving(20, 0.4, z=0.75)), ResetSpec(**GO_ON)
+    entries = [Entry("reset", 0, reset_payload(spec))]
+    entries += [Entry("action", k, action_payload(COAST)) for k in range(25)]
+    told = Retold.on(scene, ScenarioState.of(scene))
+    for entry in entries:
+        world = told.tell(entry)
+    fork = world.light_copy()
+    again = Retold.on(scene, ScenarioState.of(scene))
+    for entry in entries:
+        other = again.tell(entry)
+        other.instances()
+    assert bits(cloud_of(world)) == bits(cloud_of(other))
+    fork.step(COAST)
+    assert bits(cloud_of(fork)) == bits(cloud_of(world))
+    assert bits(cloud_of(world)) != bits(scene.objects["car"].cloud)
+
+
+@pytest.mark.parametrize(
+    ("category", "speed", "spec"),
+    [
+        ("car", 10.0, {"contact": {"dents": False}}),
+        ("pedestrian", 10.0, {}),
+        ("car", 1.0, {}),
+    ],
+)
+def test_what_is_switched_off_alive_or_struck_slowly_is_not_dented(
+    crash_scene, moving, category, speed, spec
+):
+    scene = crash_scene(category, speed=speed, car=moving(5.5 + 1.5 * speed, 0, z=0.75))
+    world = world_of(scene, **spec)
+    drive_until_contact(world)
+    world.step(COAST)
+    assert torch.equal(cloud_of(world).means, scene.objects["car"].cloud.means)
+
+
+def test_a_car_pushed_into_the_next_is_dented_at_both_ends(crash_scene, moving):
+    scene = crash_scene(car=moving(20, 0, z=0.75), next=moving(24.8, 0, z=0.75))
+    world = world_of(scene)
+    for _ in range(40):
+        world.step(COAST)
+    rest = scene.objects["car"].cloud.means
+    pushed = (cloud_of(world).means - rest)[:, 0]
+    assert pushed[rest[:, 0] < -2.05].max() > 0.05
+    assert pushed[rest[:, 0] > 2.05].min() < -0.02
+    assert (cloud_of(world, "next").means - rest)[rest[:, 0] < -2.05, 0].max() > 0.02
+
+
+# --- the crash itself -------------------------------------------------------------------------
+
+
+def crasher(x: float, y: float, vx: float, *, yaw: float = 0.0, mass: float = MASS):
+    body = crash.vehicle_body(SIZE, mass=mass, friction=0.4)
+    pose = transform_from(np.array([x, y, SIZE[2] / 2]), yaw_quaternion(yaw))
+    return crash.Crasher(body, pose, np.array([vx, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("mass", "y"), [(1500.0, 0.0), (3000.0, 0.0), (1500.0, 0.7)])
+def test_momentum_of_both_stays_and_delta_v_is_that_of_the_rigid_exchange(mass, y):
+    first, second = crasher(-4.15, y, 10.0), crasher(0.0, 0.0, 0.0, mass=mass)
+    struck, hit = crash.crash(first, second)
+    total = MASS * struck.delta_v + mass * hit.delta_v
+    np.testing.assert_allclose(total, 0.0, atol=1e-3 * MASS * 10)
+    if y == 0.0:
+        rigid = 1.1 * mass / (MASS + mass) * 10.0
+        assert -struck.delta_v[0] == pytest.approx(rigid, rel=0.12)
+
+
+def test_both_dents_together_are_as_deep_as_the_mutual_stiffness_says():
+    first, second = crasher(-4.15, 0.0, 10.0), crasher(0.0, 0.0, 0.0)
+    depth = sum(dent.depth for dent in crash.crash(first, second))
+    energy = 0.25 * MASS * 10.0**2
+    assert depth == pytest.approx((2 * energy / 405e3) ** 0.5, rel=0.35)
+
+
+def test_bodies_that_pass_each_other_leave_no_dents():
+    assert crash.crash(crasher(-4.0, 2.5, 10.0), crasher(0.0, 0.0, 0.0)) is None
