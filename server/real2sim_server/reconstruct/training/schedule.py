@@ -85,7 +85,7 @@ class DensifyOptions:
     growth: float = 0.05
     hidden_rounds: tuple[float, ...] = (0.35, 0.6)
     hidden_share: float = 0.005
-    hidden_object_share: float = 0.02
+    hidden_object_share: float = 0.01
 
 
 @dataclass(frozen=True)

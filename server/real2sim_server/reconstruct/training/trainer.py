@@ -25,10 +25,12 @@ from .model import MIRRORED, Rendered, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
 from .schedule import TrainOptions, from_values, rates_at
-from .visibility import drop_hidden, visible_shares
+from .visibility import Look, drop_hidden, visible_shares
 
 SMOOTHING = 0.98
 """Share of the past in the running loss and PSNR."""
+LOOKS = 64
+"""Views at which Gaussians are looked for before hidden ones go."""
 CHECKPOINT = "checkpoint"
 
 
@@ -277,12 +279,17 @@ class Trainer:
             self.model.gaussians = drop_hidden(
                 self.model.gaussians,
                 self.optimizer,
-                visible_shares(self.model, self.views.looks()),
+                visible_shares(self.model, self._some_looks()),
                 limits=(densify.hidden_share, densify.hidden_object_share),
             )
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
         if self.densifier.resets_opacity(i):
             reset_opacity(self.model.gaussians, self.optimizer)
+
+    def _some_looks(self) -> list[Look]:
+        """Training views drawn at random, enough to tell what is hidden."""
+        looks = self.views.looks()
+        return [looks[self.views.order(k)] for k in range(min(LOOKS, len(looks)))]
 
     def _report(
         self, terms: dict[str, float], clock: _Clock, on_progress: OnTraining | None
