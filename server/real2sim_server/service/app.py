@@ -14,6 +14,7 @@ from real2sim_proto import Problem
 
 from ..settings import Settings
 from .auth import require_token
+from .hosts import LoopbackOnly
 from .openapi import published
 from .problems import install_problem_handlers
 from .requests import BodyLimit, RequestContext
@@ -81,6 +82,8 @@ def create_app(settings: Settings) -> FastAPI:
     uploads = dict.fromkeys(upload_paths, settings.max_upload_bytes)
     install_problem_handlers(app)
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
+    if settings.token is None:
+        app.add_middleware(LoopbackOnly)
     app.add_middleware(RequestContext, metrics=worker.metrics)
     for router in OPEN:
         app.include_router(router)

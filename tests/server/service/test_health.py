@@ -37,7 +37,7 @@ def test_a_started_worker_lives_and_becomes_ready(client):
 def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypatch):
     warm = threading.Event()
     monkeypatch.setattr("real2sim_server.service.pictures.warm_up", lambda _: warm.wait(30))
-    with TestClient(create_app(make_settings())) as client:
+    with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         assert client.get("/livez").status_code == 200
         response = client.get("/readyz")
         assert response.status_code == 503
@@ -52,7 +52,7 @@ def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
         raise RuntimeError("no compiler")
 
     monkeypatch.setattr("real2sim_server.service.pictures.warm_up", fail)
-    with TestClient(create_app(make_settings())) as client:
+    with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         deadline = time.monotonic() + 10
         while "no compiler" not in client.get("/readyz").text:
             assert time.monotonic() < deadline
