@@ -12,6 +12,9 @@ from real2sim_proto import ErrorCode
 from .auth import is_loopback
 from .problems import ServiceError
 
+FOREIGN = 4403
+"""Code with which sockets of other sites' pages are closed."""
+
 
 class LoopbackOnly:
     """ASGI middleware that refuses requests which name another host, or come from its pages.
@@ -29,7 +32,7 @@ class LoopbackOnly:
             _check(Headers(scope=scope))
         elif scope["type"] == "websocket" and not _is_from_here(Headers(scope=scope)):
             await receive()
-            await send({"type": "websocket.close", "code": 1008, "reason": "foreign host"})
+            await send({"type": "websocket.close", "code": FOREIGN, "reason": "foreign host"})
             return
         await self._app(scope, receive, send)
 

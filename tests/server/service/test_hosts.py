@@ -34,7 +34,8 @@ def test_pages_of_other_sites_may_not_open_sockets(run_worker):
         run_worker() as client,
         pytest.raises(WebSocketDisconnect) as refused,
         client.websocket_connect(
-            "/v1/scenarios/any/view", headers={"Origin": "http://evil.example"}
+            "/v1/scenarios/any/view",
+            headers={"Host": "127.0.0.1", "Origin": "http://evil.example"},
         ),
     ):
         pass

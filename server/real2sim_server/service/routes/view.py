@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from ..auth import same_secret
+from ..hosts import FOREIGN
 from ..problems import ServiceError
 from ..views_socket import View
 from ..worker import Worker, WorkerOf
@@ -22,7 +23,7 @@ router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
 async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
     """Frames and picks of a scenario for one browser; the latest question wins."""
     if not same_origin(socket.headers.get("Origin"), socket.headers.get("Host")):
-        await socket.close(code=4403, reason="pages of other sites may not look")
+        await socket.close(code=FOREIGN, reason="pages of other sites may not look")
         return
     await socket.accept()
     try:

@@ -18,7 +18,7 @@ def scenario(client) -> dict:
 
 def opened(client, scenario, **headers):
     return client.websocket_connect(
-        f"/v1/scenarios/{scenario['scenario_id']}/view", headers=headers
+        f"/v1/scenarios/{scenario['scenario_id']}/view", headers={"Host": "127.0.0.1"} | headers
     )
 
 
