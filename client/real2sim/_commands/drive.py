@@ -29,7 +29,10 @@ def drive(
     scene: Annotated[str | None, typer.Option(help="Name of a scene.")] = None,
     scenario: Annotated[str | None, typer.Option(help="Id of a scenario.")] = None,
     planner: Annotated[
-        str, typer.Option(help="'follow_route', or 'module:Class' of your own.")
+        str,
+        typer.Option(
+            help="follow_route, pid, idm, depth_sampling, learned=FILE, or 'module:Class'."
+        ),
     ] = "follow_route",
     steps: Annotated[int, typer.Option(min=1, help="Clock steps; fewer when it ends.")] = 100,
     cameras: Annotated[str, typer.Option(help="Names, with commas between; 'all'.")] = "",
@@ -46,11 +49,12 @@ def drive(
     json_file: JsonFile = None,
 ) -> None:
     """Drive a scene or scenario with a planner, over the drive socket."""
-    from real2sim.planners import load_planner, run_episode
+    from real2sim.planners import load_planner, needs_of, run_episode
 
     if (scene is None) == (scenario is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")
     driver = load_planner(planner)
+    needs = needs_of(driver)
     with (
         connected(url, token, timeout) as client,
         _session(client, scene=scene, scenario=scenario, codec=codec) as session,
@@ -66,13 +70,28 @@ def drive(
                 session,
                 driver,
                 steps=steps,
-                sensors=[{"camera": name, "width": width} for name in names],
+                sensors=_sensors(names, width, needs.sensors(session.welcome.cameras)),
                 on_observation=on_observation,
                 seed=seed,
                 dt_us=dt_us,
-                privileged=True,
+                action=needs.action,
+                # A planner that does not say what it needs is told everything.
+                privileged=needs.privileged or not hasattr(driver, "needs"),
             )
     _report(summary, out=out, json_file=json_file)
+
+
+def _sensors(
+    names: list[str], width: int | None, needed: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """What the planner needs, and rgb of the cameras asked for."""
+    sensors = {sensor["camera"]: sensor for sensor in needed}
+    for name in names:
+        sensor = sensors.setdefault(name, {"camera": name, "modalities": [], "width": None})
+        both = {*sensor["modalities"], "rgb"}
+        # Pictures to keep and pictures to drive by share one size.
+        sensors[name] = sensor | {"modalities": sorted(both), "width": width or sensor["width"]}
+    return list(sensors.values())
 
 
 @contextlib.contextmanager

@@ -20,15 +20,25 @@ and 5 m/s::
 Saved as ``my.py`` (its class alone), it also runs as ``real2sim drive --planner my:Cruise``.
 """
 
+from .depth_sampling import DepthSampling
 from .episode import EpisodeSummary, StageTimes, run_episode
 from .follow_route import FollowRoute
-from .planner import Planner, load_planner
+from .idm import Idm
+from .learned import LearnedPolicy
+from .pid import PidFollowRoute
+from .planner import Needs, Planner, load_planner, needs_of
 
 __all__ = [
+    "DepthSampling",
     "EpisodeSummary",
     "FollowRoute",
+    "Idm",
+    "LearnedPolicy",
+    "Needs",
+    "PidFollowRoute",
     "Planner",
     "StageTimes",
     "load_planner",
+    "needs_of",
     "run_episode",
 ]

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from real2sim_proto.drive import TrajectoryPlan
 
+from .planner import Needs
+
 if TYPE_CHECKING:
     from real2sim_proto.drive import AgentState, EgoState
 
@@ -47,6 +49,8 @@ class FollowRoute:
 
     Others are only seen in sessions that are reset with ``privileged=True``.
     """
+
+    needs = Needs(privileged=True)
 
     def __init__(
         self,
@@ -110,6 +114,7 @@ class Path:
         """The route [R, 2] from the vehicle on, resampled; a standing point where it is empty."""
         if len(route) == 0:
             return cls(np.zeros(1), np.zeros((1, 2)), np.zeros(2))
+        route = _from_vehicle_on(route)
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
         start = _nearest_arc(route, arc)
         count = max(int((arc[-1] - start) / spacing), 0) + 1
@@ -240,6 +245,17 @@ def drive_profile(
             speed = following
         travelled[k], now = position, delay
     return travelled
+
+
+def _from_vehicle_on(route: Array) -> Array:
+    """The route [R, 2] with the point beside the vehicle where it begins farther ahead."""
+    if len(route) < 2 or not (length := float(np.linalg.norm(route[1] - route[0]))) > 0.0:
+        return route
+    direction = (route[1] - route[0]) / length
+    before = float(route[0] @ direction)
+    if before <= 0.0:
+        return route
+    return np.concatenate([route[:1] - before * direction, route])
 
 
 def _nearest_arc(route: Array, arc: Array) -> float:

@@ -1,24 +1,35 @@
-"""What a planner is, and how one is found by name."""
+"""What a planner is, what it wants to see, and how one is found by name."""
 
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from real2sim_proto.drive import Plan
+    from real2sim_proto.scenes import CameraInfo
 
     from ..observation import Observation
 
-BUILT_IN = {"follow_route": "real2sim.planners.follow_route:FollowRoute"}
+BUILT_IN = {
+    "follow_route": "real2sim.planners.follow_route:FollowRoute",
+    "pid": "real2sim.planners.pid:PidFollowRoute",
+    "idm": "real2sim.planners.idm:Idm",
+    "depth_sampling": "real2sim.planners.depth_sampling:DepthSampling",
+    "learned": "real2sim.planners.learned:LearnedPolicy",
+}
 
 
 @runtime_checkable
 class Planner(Protocol):
-    """Drives: sees observations, answers with plans."""
+    """Drives: sees observations, answers with plans.
+
+    One that must see more than the ego and its route has an attribute ``needs``: :class:`Needs`.
+    """
 
     def reset(self, obs: Observation) -> None:
         """Forget the last episode; ``obs`` is the first of the new one."""
@@ -27,15 +38,68 @@ class Planner(Protocol):
         """The answer to an observation: a trajectory, a control or a pose."""
 
 
-def load_planner(name: str) -> Planner:
-    """A planner by name: a built-in one, or ``module:Class``, made without arguments.
+@dataclass(frozen=True)
+class Needs:
+    """What a planner must be shown, and how it drives.
 
-    Modules are looked for in the working folder too.
+    Attributes:
+        modalities: of its cameras; empty where it is blind.
+        cameras: by name; empty: the one that looks most nearly straight ahead.
+        width: of its images [px]; None: as recorded.
+        privileged: whether it is told of all objects.
+        action: kind of its plans.
+    """
+
+    modalities: tuple[Literal["rgb", "depth", "instance"], ...] = ()
+    cameras: tuple[str, ...] = ()
+    width: int | None = None
+    privileged: bool = False
+    action: Literal["trajectory", "control", "pose"] = "trajectory"
+
+    def sensors(self, cameras: Sequence[CameraInfo]) -> list[dict[str, Any]]:
+        """Sensors to reset with, out of a session's cameras.
+
+        Raises:
+            ValueError: a camera that the scene lacks.
+        """
+        if not self.modalities:
+            return []
+        there = [camera.name for camera in cameras]
+        missing = [name for name in self.cameras if name not in there]
+        if missing or not there:
+            raise ValueError(
+                f"the planner wants camera {(missing or ['any'])[0]!r}; the scene has "
+                f"{', '.join(there) or 'none'}"
+            )
+        return [
+            {"camera": name, "modalities": list(self.modalities), "width": self.width}
+            for name in self.cameras or [forward_camera(cameras)]
+        ]
+
+
+def needs_of(planner: Planner) -> Needs:
+    """What a planner asks for; nothing where it does not say."""
+    found = getattr(planner, "needs", None)
+    return found if isinstance(found, Needs) else Needs()
+
+
+def forward_camera(cameras: Sequence[CameraInfo]) -> str:
+    """Name of the camera whose axis is nearest to the vehicle's x axis; the first of equals."""
+    # The optical axis is z of the camera frame, so its part along vehicle x is element [0, 2].
+    return max(cameras, key=lambda camera: camera.T_vehicle_camera[0][2]).name
+
+
+def load_planner(name: str) -> Planner:
+    """A planner by name: a built-in one, or ``module:Class``.
+
+    It is made without arguments; what follows a ``=`` becomes its one argument, as in
+    ``learned=policy.safetensors``. Modules are looked for in the working folder too.
 
     Raises:
         ValueError: no such module or class, or it is not a planner.
     """
-    module_name, colon, attribute = BUILT_IN.get(name, name).partition(":")
+    given, equals, argument = name.partition("=")
+    module_name, colon, attribute = BUILT_IN.get(given, given).partition(":")
     if not colon:
         known = ", ".join(sorted(BUILT_IN))
         raise ValueError(f"planner {name!r} is unknown; give {known} or 'module:Class'")
@@ -45,7 +109,10 @@ def load_planner(name: str) -> Planner:
         make = getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
-    planner = make()
+    try:
+        planner = make(argument) if equals else make()
+    except TypeError as error:
+        raise ValueError(f"planner {name!r} cannot be made: {error}") from error
     if not isinstance(planner, Planner):
         raise ValueError(f"planner {name!r} needs the methods reset(obs) and plan(obs)")
     return planner

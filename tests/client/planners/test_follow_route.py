@@ -7,46 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from real2sim.observation import Observation
 from real2sim.planners import FollowRoute
 from real2sim.planners.follow_route import Comfort, Path, brake_ahead, speed_limits
-from real2sim_proto.drive import AgentState, EgoState
 
-STRAIGHT = np.stack([np.arange(0.0, 100.0), np.zeros(100)], axis=1)
-
-
-def observation(route, *, speed=0.0, position=(0.0, 0.0, 0.0), yaw=0.0, agents=()) -> Observation:
-    ego = EgoState(
-        position=position,
-        quaternion=(math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)),
-        yaw=yaw,
-        speed=speed,
-        acceleration=0.0,
-        steering=0.0,
-        yaw_rate=0.0,
-        size=(4.6, 1.9, 1.6),
-    )
-    return Observation(
-        step=0,
-        t_us=1_000_000,
-        revision=0,
-        frames={},
-        ego=ego,
-        route=np.asarray(route, float),
-        command="straight",
-        agents=agents,
-    )
-
-
-def agent(x, y, *, speed=0.0, yaw=0.0) -> AgentState:
-    return AgentState(
-        object_id="car",
-        category="car",
-        position=(x, y, 0.8),
-        quaternion=(math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)),
-        velocity=(speed * math.cos(yaw), speed * math.sin(yaw), 0.0),
-        size=(4.6, 1.9, 1.6),
-    )
+from .road import STRAIGHT, agent, observation
 
 
 def speeds(plan) -> np.ndarray:

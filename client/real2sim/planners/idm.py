@@ -1,0 +1,123 @@
+"""Follows the route behind whoever is ahead, by the intelligent driver model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from real2sim_proto.drive import TrajectoryPlan
+
+from .follow_route import Array, Comfort, Hindrance, Path, hindrances, speed_limits
+from .planner import Needs
+
+if TYPE_CHECKING:
+    from ..observation import Observation
+
+STEP = 0.05
+"""Of the integration [s]."""
+
+
+@dataclass(frozen=True)
+class Follower:
+    """Parameters of the model (Treiber, Hennecke, Helbing 2000), SI units.
+
+    Attributes:
+        acceleration: largest, a.
+        braking: comfortable, b.
+        hardest: braking beyond which the model's answer is cut.
+        headway: T, seconds kept behind who is ahead.
+        gap: s0, metres between bumpers at standstill.
+        clearance: metres to either side of the vehicle that must be free.
+    """
+
+    acceleration: float = 1.5
+    braking: float = 2.0
+    hardest: float = 8.0
+    headway: float = 1.2
+    gap: float = 2.5
+    clearance: float = 0.3
+
+    def answer(self, speed: float, desired: float, gap: float, closing: float) -> float:
+        """Acceleration [m/s^2] at ``gap`` metres behind a leader that one closes in on.
+
+        ``a (1 - (v/v0)^4 - (s*/s)^2)`` with ``s* = s0 + v T + v dv / (2 sqrt(a b))``.
+        """
+        wanted = self.gap + max(
+            speed * self.headway
+            + speed * closing / (2.0 * math.sqrt(self.acceleration * self.braking)),
+            0.0,
+        )
+        free = 1.0 - (speed / max(desired, 0.1)) ** 4
+        found = self.acceleration * (free - (wanted / max(gap, 0.1)) ** 2)
+        return max(found, -self.hardest)
+
+
+class Idm:
+    """A planner that knows all objects: along the route, as fast as the one ahead lets it.
+
+    Others are taken to keep their speed along the route for the length of the plan.
+    """
+
+    needs = Needs(privileged=True)
+
+    def __init__(
+        self,
+        *,
+        speed: float = 8.0,
+        horizon: float = 3.0,
+        spacing: float = 0.25,
+        follower: Follower | None = None,
+        comfort: Comfort | None = None,
+    ) -> None:
+        """Make a planner.
+
+        Args:
+            speed: desired speed, v0 [m/s].
+            horizon: length of a plan [s].
+            spacing: time between its poses [s].
+            follower: parameters of the model; default: ``Follower()``.
+            comfort: of bends and of the way back to the route; default: ``Comfort()``.
+        """
+        self.speed = speed
+        self.follower, self.comfort = follower or Follower(), comfort or Comfort()
+        self._delays = np.arange(1, int(horizon / spacing + 1e-9) + 1) * spacing
+
+    def reset(self, obs: Observation) -> None:
+        """Nothing is remembered between plans."""
+
+    def plan(self, obs: Observation) -> TrajectoryPlan:
+        """Poses over the next seconds in the vehicle frame of ``obs``."""
+        path = Path.along(obs.route)
+        limits = speed_limits(path, cruise=self.speed, comfort=self.comfort)
+        found = hindrances(path, obs.ego, obs.agents, clearance=self.follower.clearance)
+        travelled = self._drive(path.arc, limits, found, speed=max(obs.ego.speed, 0.0))
+        return TrajectoryPlan(
+            times_us=[obs.t_us + round(delay * 1e6) for delay in self._delays],
+            poses=[tuple(pose) for pose in path.poses(travelled, self.comfort.recovery).tolist()],
+        )
+
+    def _drive(self, arc: Array, limits: Array, found: list[Hindrance], *, speed: float) -> Array:
+        """[K] float64 metres travelled after each delay."""
+        travelled, position, now = np.empty(len(self._delays)), 0.0, 0.0
+        for k, delay in enumerate(self._delays):
+            while now < delay - 1e-9:
+                desired = float(np.interp(position, arc, limits))
+                rate = self._rate(speed, desired, position, now, found)
+                following = max(speed + rate * STEP, 0.0)
+                position += 0.5 * (speed + following) * STEP
+                speed, now = following, now + STEP
+            travelled[k] = position
+        return travelled
+
+    def _rate(
+        self, speed: float, desired: float, position: float, now: float, found: list[Hindrance]
+    ) -> float:
+        rates = [self.follower.answer(speed, desired, math.inf, 0.0)]
+        for one in found:
+            ahead = max(one.speed, 0.0)
+            gap = one.arc + ahead * now - position
+            rates.append(self.follower.answer(speed, desired, gap, speed - ahead))
+        return min(rates)

@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from real2sim.planners import Idm
+from real2sim.planners.idm import Follower
+
+from .road import STRAIGHT, agent, observation
+
+
+def distances(plan) -> np.ndarray:
+    return np.array([pose[0] for pose in plan.poses])
+
+
+def test_the_free_road_term_is_the_models():
+    follower = Follower(acceleration=1.5)
+    assert follower.answer(0.0, 10.0, math.inf, 0.0) == pytest.approx(1.5)
+    assert follower.answer(10.0, 10.0, math.inf, 0.0) == pytest.approx(0.0)
+    assert follower.answer(5.0, 10.0, math.inf, 0.0) == pytest.approx(1.5 * (1 - 0.5**4))
+
+
+def test_at_the_gap_of_equilibrium_the_speed_is_kept():
+    follower, speed, desired = Follower(), 6.0, 10.0
+    # v = v_leader: s = (s0 + v T) / sqrt(1 - (v / v0)^4), Treiber et al. 2000, eq. 4
+    gap = (follower.gap + speed * follower.headway) / math.sqrt(1 - (speed / desired) ** 4)
+    assert follower.answer(speed, desired, gap, 0.0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_closing_in_fast_brakes_as_hard_as_allowed_and_no_harder():
+    assert Follower(hardest=8.0).answer(15.0, 15.0, 5.0, 15.0) == -8.0
+
+
+def test_without_anybody_ahead_it_reaches_the_desired_speed():
+    plan = Idm(speed=8.0).plan(observation(STRAIGHT, speed=8.0))
+    assert distances(plan)[-1] == pytest.approx(24.0, abs=0.3)
+
+
+def test_it_stops_before_a_standing_car():
+    ego_front, car_rear = 0.75 * 4.6, 30.0 - 2.3
+    obs = observation(STRAIGHT, speed=8.0, agents=[agent(30.0, 0.0)])
+    gone = distances(Idm(speed=8.0, horizon=12.0).plan(obs))
+    assert gone[-1] < car_rear - ego_front - 1.0
+    assert gone[-1] - gone[-5] < 0.5
+
+
+def test_a_car_beside_the_route_does_not_matter():
+    free = Idm().plan(observation(STRAIGHT, speed=8.0))
+    beside = Idm().plan(observation(STRAIGHT, speed=8.0, agents=[agent(20.0, 4.0)]))
+    assert beside == free
+
+
+def test_a_leader_that_drives_lets_it_go_on_farther_than_one_that_stands():
+    stands = Idm().plan(observation(STRAIGHT, speed=8.0, agents=[agent(20.0, 0.0)]))
+    drives = Idm().plan(observation(STRAIGHT, speed=8.0, agents=[agent(20.0, 0.0, speed=8.0)]))
+    assert distances(drives)[-1] > distances(stands)[-1] + 5.0
