@@ -5,8 +5,9 @@ from __future__ import annotations
 from pydantic import Field
 
 from .base import Microseconds, Model
-from .drive import AgentState, EgoState, Event, Plan
+from .drive import AgentState, EgoState, Event
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
+from .plans import Plan
 from .scenes import Reply
 
 MAX_STEPS_PER_REQUEST = 1000

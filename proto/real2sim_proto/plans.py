@@ -1,0 +1,76 @@
+"""What a planner answers with."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
+
+from .base import Metres, Microseconds, Model
+
+MAX_PLAN_POSES = 1024
+
+
+def _as_lists(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+PlanTimes = Annotated[
+    list[Microseconds], BeforeValidator(_as_lists), Field(min_length=1, max_length=MAX_PLAN_POSES)
+]
+PlanPose = tuple[Metres, Metres, Annotated[float, Field(ge=-1e4, le=1e4)]]
+PlanPoses = Annotated[
+    list[PlanPose], BeforeValidator(_as_lists), Field(min_length=1, max_length=MAX_PLAN_POSES)
+]
+
+
+def check_times(times_us: list[int], poses: int) -> None:
+    """Raises ValueError unless there is one time for each pose and they increase."""
+    if len(times_us) != poses:
+        raise ValueError(f"{len(times_us)} times for {poses} poses")
+    if any(b <= a for a, b in itertools.pairwise(times_us)):
+        raise ValueError("times_us must increase strictly")
+
+
+class TrajectoryPlan(Model):
+    """Where the vehicle should be, tracked by the worker's controller until the next plan.
+
+    Poses are (x, y, yaw) at ``times_us``, which increase and lie after the observation.
+    """
+
+    kind: Literal["trajectory"] = "trajectory"
+    times_us: PlanTimes = Field(description="[N] int64 absolute simulation time")
+    poses: PlanPoses = Field(description="[N, 3] x [m], y [m], yaw [rad]")
+    frame: Literal["vehicle", "world"] = Field(
+        default="vehicle", description="'vehicle': the ego frame of the observation answered"
+    )
+
+    @model_validator(mode="after")
+    def _times_increase(self) -> TrajectoryPlan:
+        check_times(self.times_us, len(self.poses))
+        return self
+
+
+class Control(Model):
+    """Direct actuation for one step."""
+
+    kind: Literal["control"] = "control"
+    acceleration: Annotated[float, Field(ge=-100, le=100)] = Field(description="[m/s^2]")
+    steering: Annotated[float, Field(ge=-1.6, le=1.6)] = Field(
+        description="road-wheel angle [rad], positive to the left"
+    )
+
+
+class PoseCommand(Model):
+    """Puts the vehicle there at the next time stamp, whatever its dynamics; on the ground."""
+
+    kind: Literal["pose"] = "pose"
+    x: Metres = Field(description="world [m]")
+    y: Metres
+    yaw: Annotated[float, Field(ge=-1e4, le=1e4)]
+
+
+Plan = Annotated[TrajectoryPlan | Control | PoseCommand, Field(discriminator="kind")]
+PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
