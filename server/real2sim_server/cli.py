@@ -492,6 +492,19 @@ def bench_serve(json: JsonFile = None) -> None:
     _run(command.run, json_path=json)
 
 
+@bench.command("soak")
+def bench_soak(
+    sessions: Annotated[int, typer.Option(min=1, max=32)] = 16,
+    minutes: Annotated[float, typer.Option(min=0.1, max=1440)] = 10.0,
+    rate: Annotated[float, typer.Option(min=0.1, max=1000, help="Steps/s of a session.")] = 10.0,
+    json: JsonFile = None,
+) -> None:
+    """Many sessions side by side, misbehaving planners among them; every answer, and memory."""
+    from .commands import bench_soak as command
+
+    _run(command.run, sessions=sessions, minutes=minutes, rate=rate, json_path=json)
+
+
 @bench.command("edit")
 def bench_edit(
     operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000, json: JsonFile = None

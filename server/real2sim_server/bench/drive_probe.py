@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -13,17 +14,31 @@ from websockets.sync.client import connect
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.sessions import SessionInfo
 
+ANSWER_S = 60.0
 SPEED = 8.0
 PLAN_POSES = 20
 PLAN_PERIOD_US = 100_000
 
 
 class DriveProbe:
-    """Controls a session by messages made by hand; use it in a ``with`` block."""
+    """Controls a session by messages made by hand; use it in a ``with`` block.
 
-    def __init__(self, info: SessionInfo) -> None:
+    Args:
+        info: of the session.
+        resume: of an earlier connection that this one goes on for: its resume token, and the step
+            of the last observation it has.
+
+    Attributes:
+        resume_token: with which a further connection may go on.
+        pushed: the last observation that nobody has asked for; None for none.
+    """
+
+    def __init__(self, info: SessionInfo, *, resume: tuple[str, int] | None = None) -> None:
         self._info = info
+        self._resume = resume
         self._id = 0
+        self.resume_token = ""
+        self.pushed: dict[str, Any] | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -37,7 +52,10 @@ class DriveProbe:
         )
         self.socket = self._stack.enter_context(connection)
         hello = {"type": "hello", "protocols": [DRIVE_SUBPROTOCOL], "token": self._info.token}
-        self._ask(hello)
+        if self._resume is not None:
+            token, step = self._resume
+            hello["resume"] = {"token": token, "last_step": step}
+        self.resume_token = self._accepted(hello)[0]["resume_token"]
         return self
 
     def __exit__(
@@ -49,29 +67,53 @@ class DriveProbe:
         self._stack.close()
 
     def reset(
-        self, sensors: Sequence[Mapping[str, Any]], *, dt_us: int
+        self, sensors: Sequence[Mapping[str, Any]], *, dt_us: int, **spec: Any
     ) -> tuple[dict[str, Any], float]:
         """Begin an episode; its first observation and the seconds it took."""
-        return self._ask({"type": "reset", "spec": {"dt_us": dt_us, "sensors": list(sensors)}})
+        fields = {"dt_us": dt_us, "sensors": list(sensors), **spec}
+        return self._accepted({"type": "reset", "spec": fields})
 
     def act(self, obs: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
         """Drive straight on; the next observation and the seconds until its bytes were here."""
-        plan = straight_on(obs["t_us"])
-        return self._ask({"type": "action", "step": obs["step"], "plan": plan})
+        return self._accepted(action(obs))
 
-    def _ask(self, fields: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
+    def send(self, fields: Mapping[str, Any]) -> None:
+        """Send a message and wait for nothing."""
         self._id += 1
-        data = encode({"v": 1, "id": self._id, **fields})
+        self.socket.send(encode({"v": 1, "id": self._id, **fields}))
+
+    def ask(self, fields: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
+        """The answer to a message, be it an error, and the seconds it took."""
         started = time.perf_counter()
-        self.socket.send(data)
+        self.send(fields)
         while True:
-            received = self.socket.recv(decode=False)
+            received = self.socket.recv(ANSWER_S, decode=False)
             seconds = time.perf_counter() - started
             answer = decode(received)
-            if answer["type"] == "error":
-                raise RuntimeError(f"the worker refused {fields['type']}: {answer['detail']}")
-            if answer["type"] != "progress":
+            if answer["type"] == "obs" and answer["id"] == 0:
+                self.pushed = answer
+            elif answer["type"] != "progress":
                 return answer, seconds
+
+    def listen(self, seconds: float) -> None:
+        """Take what comes unasked for so long."""
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            with contextlib.suppress(TimeoutError):
+                answer = decode(self.socket.recv(left, decode=False))
+                if answer["type"] == "obs":
+                    self.pushed = answer
+
+    def _accepted(self, fields: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
+        answer, seconds = self.ask(fields)
+        if answer["type"] == "error":
+            raise RuntimeError(f"the worker refused {fields['type']}: {answer['detail']}")
+        return answer, seconds
+
+
+def action(obs: Mapping[str, Any]) -> dict[str, Any]:
+    """Straight on after an observation."""
+    return {"type": "action", "step": obs["step"], "plan": straight_on(obs["t_us"])}
 
 
 def straight_on(t_us: int) -> dict[str, Any]:

@@ -12,13 +12,16 @@ TITLES = {
     "no_sensors": "drive step, no sensors",
     "no_sensors_sdk": "the same, in the SDK",
     "one_raw_camera": "drive step, one raw camera",
+    "real_time": "drive step, demo's street, three raw cameras",
 }
+BY_STAGE = ("no_sensors", "one_raw_camera", "real_time")
 
 
 def print_report(console: Console, figures: Mapping[str, Any]) -> None:
     """Print latencies, stages, lag of the event loop and memory."""
     console.print(_latencies(figures))
-    console.print(_stages(figures))
+    for name in BY_STAGE:
+        console.print(_stages(TITLES[name], figures[name]))
     lag, memory = figures["event_loop"], figures["memory"]
     share, bound = lag["own_share_within_5_ms"], lag["own_p99_below_ms"]
     console.print(
@@ -43,10 +46,12 @@ def _latencies(figures: Mapping[str, Any]) -> Table:
     return table
 
 
-def _stages(figures: Mapping[str, Any]) -> Table:
-    camera = figures["one_raw_camera"]
-    table = Table("stage", "p50 [ms]", title=TITLES["one_raw_camera"], title_justify="left")
-    for stage, milliseconds in camera["p50_by_stage_ms"].items():
-        table.add_row(stage, f"{milliseconds:.2f}")
-    table.add_row("share that is not render", f"{camera['share_not_render']:.1%}")
+def _stages(title: str, case: Mapping[str, Any]) -> Table:
+    table = Table("stage [ms]", "p50", "p95", "p99", title=title, title_justify="left")
+    rows = {**case["by_stage_ms"], "all but render and physics": case["overhead_ms"]}
+    for stage, row in rows.items():
+        table.add_row(stage, *(f"{row[name]:.2f}" for name in ("p50", "p95", "p99")))
+    table.add_row("share that is not render", f"{case['share_not_render']:.1%}", "", "")
+    if "share_within_100_ms" in case:
+        table.add_row("steps within 100 ms", f"{case['share_within_100_ms']:.1%}", "", "")
     return table

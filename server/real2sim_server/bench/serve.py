@@ -19,6 +19,7 @@ from rich.console import Console
 
 import real2sim
 
+from ..demo.street import unpack_street
 from ..demo.worker import own_worker
 from ..scene.io import save_scene
 from .drive_probe import DriveProbe, straight_on
@@ -30,6 +31,11 @@ SCENE = "street"
 CAMERA = "front"
 SHORT_STEP_US = 1_000
 CAMERA_STEP_US = 50_000
+REAL_TIME = "demo_street"
+"""300,000 Gaussians, objects that repeat the log, three cameras of 480x320: to run at 10 Hz."""
+REAL_TIME_STEP_US = 100_000
+DEVICE_STAGES = ("render", "physics")
+"""What a step is for; all else is overhead."""
 WARM_UP_STEPS = 20
 SESSIONS = 10
 
@@ -45,6 +51,7 @@ class Effort:
         width, height: of its camera [px].
         steps, camera_steps: measured, without sensors and with one raw camera.
         heavy_seconds: how long large pictures are drawn while the event loop is watched.
+        real_time_steps: measured on the demo's street with its three cameras; see ``REAL_TIME``.
     """
 
     gaussians: int = 200_000
@@ -53,6 +60,7 @@ class Effort:
     steps: int = 2000
     camera_steps: int = 200
     heavy_seconds: float = 15.0
+    real_time_steps: int = 200
 
 
 def run(effort: Effort | None = None) -> Figures:
@@ -68,6 +76,7 @@ def run(effort: Effort | None = None) -> Figures:
             sizes = {"width": effort.width, "height": effort.height}
             scene = street(SCENE, gaussians=effort.gaussians, **sizes)
             save_scene(scene, root / "scenes" / f"{SCENE}.r2s")
+            unpack_street(root / "scenes", f"{REAL_TIME}.r2s")
         log_file = root / "worker.log"
         with own_worker(scenes=root / "scenes", data=root, log_file=log_file) as worker:
             figures = _measure(console, effort, url=worker.url, pid=worker.process.pid)
@@ -86,21 +95,38 @@ def _measure(console: Console, effort: Effort, *, url: str, pid: int) -> Figures
         with console.status(f"memory of {SESSIONS} sessions"):
             figures["memory"] = _memory(client, raw, pid)
         with console.status("drive steps without sensors"):
-            figures["no_sensors"] = _drive(client, [], effort.steps, SHORT_STEP_US)
+            figures["no_sensors"], _ = _drive(client, [], effort.steps, SHORT_STEP_US)
         with console.status("drive steps without sensors, by the SDK"):
             figures["no_sensors_sdk"] = _drive_by_sdk(client, effort.steps)
         with console.status(f"drive steps with one raw camera {effort.width}x{effort.height}"):
-            figures["one_raw_camera"] = _drive(client, raw, effort.camera_steps, CAMERA_STEP_US)
+            figures["one_raw_camera"], _ = _drive(client, raw, effort.camera_steps, CAMERA_STEP_US)
+        with console.status("drive steps with three raw cameras on the demo's street"):
+            figures["real_time"] = _real_time(client, effort.real_time_steps)
         with console.status("the event loop while large pictures are drawn"):
             figures["event_loop"] = _event_loop(client, url, effort.heavy_seconds)
     return figures
 
 
+def _real_time(client: real2sim.Client, steps: int) -> Figures:
+    """All cameras of the demo's street, and the share of steps that came within 100 ms."""
+    info = client.scenes.load(REAL_TIME)
+    sensors = [{"camera": camera.name, "codec": "raw"} for camera in info.cameras]
+    figures, latencies = _drive(client, sensors, steps, REAL_TIME_STEP_US, scene=REAL_TIME)
+    within = float(np.mean(np.array(latencies) <= REAL_TIME_STEP_US / 1e3))
+    sizes = [[camera.width, camera.height] for camera in info.cameras]
+    return figures | {"cameras": sizes, "share_within_100_ms": within}
+
+
 def _drive(
-    client: real2sim.Client, sensors: Sequence[Mapping[str, Any]], steps: int, dt_us: int
-) -> Figures:
-    """Latency from the action's bytes to the observation's, and its parts."""
-    info = client.sessions.create(scene=SCENE)
+    client: real2sim.Client,
+    sensors: Sequence[Mapping[str, Any]],
+    steps: int,
+    dt_us: int,
+    *,
+    scene: str = SCENE,
+) -> tuple[Figures, list[float]]:
+    """Latency from the action's bytes to the observation's, its parts, and all latencies."""
+    info = client.sessions.create(scene=scene)
     latencies, stages = [], []
     try:
         with DriveProbe(info) as probe:
@@ -114,19 +140,24 @@ def _drive(
                     stages.append(obs["timing"])
     finally:
         client.sessions.delete(info.session_id)
-    return percentiles(latencies) | _parts(latencies, stages)
+    return percentiles(latencies) | _parts(latencies, stages), latencies
 
 
 def _parts(latencies: Sequence[float], stages: Sequence[Mapping[str, float]]) -> Figures:
-    """Medians by stage, of what is in no stage, and of the share of a step that is not render."""
-    by_stage = {name: [stage[name] for stage in stages] for name in stages[-1]}
-    by_stage["socket, log and rest"] = [
-        total - sum(stage.values()) for total, stage in zip(latencies, stages, strict=True)
-    ]
-    shares = 1 - np.array(by_stage["render"]) / np.array(latencies)
+    """Milliseconds by stage, of what is in no stage, and of all that is neither render nor physics;
+    and the median share of a step that is not render."""
+    total = np.array(latencies)
+    by_stage = {name: np.array([s.get(name, 0.0) for s in stages]) for name in stages[-1]}
+    device = sum(
+        (by_stage[name] for name in DEVICE_STAGES if name in by_stage), np.zeros(len(total))
+    )
+    by_stage["socket, log and rest"] = total - sum(by_stage.values())
+    spread = {name: percentiles(ms.tolist()) for name, ms in by_stage.items()}
     return {
-        "p50_by_stage_ms": {name: float(np.median(ms)) for name, ms in by_stage.items()},
-        "share_not_render": float(np.median(shares)),
+        "p50_by_stage_ms": {name: row["p50"] for name, row in spread.items()},
+        "by_stage_ms": spread,
+        "overhead_ms": percentiles((total - device).tolist()),
+        "share_not_render": float(np.median(1 - by_stage["render"] / total)),
     }
 
 
@@ -167,7 +198,7 @@ def _memory(
                 obs, _ = probe.reset(sensors, dt_us=CAMERA_STEP_US)
                 for _ in range(3):
                     obs, _ = probe.act(obs)
-            resident.append(_resident_bytes(pid) / 1e6)
+            resident.append(resident_bytes(pid) / 1e6)
     finally:
         for info in infos:
             client.sessions.delete(info.session_id)
@@ -175,7 +206,8 @@ def _memory(
     return {"sessions": SESSIONS, "worker_mb": resident[0], "per_session_mb": each}
 
 
-def _resident_bytes(pid: int) -> int:
+def resident_bytes(pid: int) -> int:
+    """Resident memory of a process, by /proc."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
 

@@ -26,11 +26,16 @@ def test_a_quantile_of_a_histogram_is_known_up_to_its_bucket():
 
 @pytest.mark.slow
 def test_a_short_run_gives_all_figures_as_json(capsys):
-    effort = serve.Effort(gaussians=100_000, steps=50, camera_steps=5, heavy_seconds=1.0)
+    effort = serve.Effort(
+        gaussians=100_000, steps=50, camera_steps=5, heavy_seconds=1.0, real_time_steps=3
+    )
     figures = serve.run(effort)
     assert json.loads(json.dumps(figures)) == figures
     assert figures["no_sensors"]["count"] == 50
     assert figures["one_raw_camera"]["p50_by_stage_ms"]["render"] > 0
     assert 0 < figures["one_raw_camera"]["share_not_render"] < 1
+    assert figures["real_time"]["cameras"] == [[480, 320]] * 3
+    overhead = figures["real_time"]["overhead_ms"]
+    assert 0 < overhead["p50"] < figures["real_time"]["p50"]
     assert figures["memory"]["per_session_mb"] < 5
     assert "drive step, no sensors" in capsys.readouterr().out

@@ -53,6 +53,25 @@ def test_the_way_made_is_the_reward(env):
     assert reward == pytest.approx(0.5, abs=0.01)
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_ppo_of_stable_baselines3_runs_2000_steps_without_changes(env):
+    sb3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
+    from stable_baselines3.common.env_checker import check_env
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env, skip_render_check=True)
+        agent = sb3.PPO("MultiInputPolicy", env, n_steps=500, batch_size=100, n_epochs=2, seed=0)
+        before = {k: v.clone() for k, v in agent.policy.state_dict().items()}
+        agent.learn(2000)
+    assert agent.num_timesteps == 2000
+    after = agent.policy.state_dict()
+    assert all(bool(v.isfinite().all()) for v in after.values())
+    assert any(bool((after[k] != v).any()) for k, v in before.items())
+    assert len(agent.ep_info_buffer) >= 50
+
+
 def test_the_planner_example_of_the_readme_is_short_and_works(site, monkeypatch, capsys):
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
     (example,) = (b for b in blocks if "session.step(" in b)

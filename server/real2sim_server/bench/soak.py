@@ -1,0 +1,193 @@
+"""``real2sim bench soak``: many sessions side by side for a long time, misbehaving planners among
+them; do all steps get their answer, and does the worker's memory stay what it was?
+
+Half of the sessions drive properly, the others take turns in misbehaving. Half have a camera.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import real2sim
+
+from ..demo.worker import own_worker
+from ..scene.io import save_scene
+from .serve import percentiles, resident_bytes
+from .soak_planners import HABITS, Planner
+from .street import street
+
+SCENE = "street"
+DT_US = 100_000
+CAMERA = {"camera": "front", "codec": "raw", "modalities": ["rgb"]}
+WARM_UP_SHARE = 0.2
+LOOK_EVERY_S = 2.0
+GROWTH_MB = 16.0
+"""Memory at the end may be this much above that after warming up; allocators waver that much."""
+
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is soaked.
+
+    Attributes:
+        sessions: side by side.
+        minutes: in all, the first fifth of it warming up.
+        rate_hz: steps each session asks for in a second, at most.
+        gaussians, width: of the scene and its camera.
+    """
+
+    sessions: int = 16
+    minutes: float = 10.0
+    rate_hz: float = 10.0
+    gaussians: int = 100_000
+    width: int = 160
+
+
+@dataclass(eq=False)
+class Memory:
+    """Resident memory of the worker over time: seconds [s] and sizes [MB]."""
+
+    seconds: list[float] = field(default_factory=list)
+    mb: list[float] = field(default_factory=list)
+
+    def figures(self, warm_s: float) -> Figures:
+        """At the start, after warming up, at the end, and the slope in between [MB/min]."""
+        seconds, mb = np.array(self.seconds), np.array(self.mb)
+        warm = seconds >= warm_s
+        slope = np.polyfit(seconds[warm] / 60, mb[warm], 1)[0] if warm.sum() > 1 else float("nan")
+        tenth = max(int(warm.sum()) // 10, 1)
+        return {
+            "start_mb": float(mb[0]),
+            "warm_mb": float(np.median(mb[warm][:tenth])),
+            "end_mb": float(np.median(mb[warm][-tenth:])),
+            "slope_mb_per_minute": float(slope),
+            "curve": [[round(s, 1), round(m, 2)] for s, m in zip(seconds, mb, strict=True)],
+        }
+
+
+def run(effort: Effort | None = None) -> Figures:
+    """Soak a worker of its own; print a table and return its figures.
+
+    ``failures`` names what was not as the protocol says; ``grows`` whether memory grew.
+    """
+    effort = effort or Effort()
+    console = Console()
+    with tempfile.TemporaryDirectory(prefix="real2sim-soak-") as folder:
+        root = Path(folder)
+        size = {"width": effort.width, "height": effort.width * 2 // 3}
+        save_scene(
+            street(SCENE, gaussians=effort.gaussians, **size), root / "scenes" / "street.r2s"
+        )
+        places = {"scenes": root / "scenes", "data": root, "log_file": root / "worker.log"}
+        with own_worker(**places) as worker, real2sim.connect(worker.url) as client:
+            client.wait_ready()
+            client.scenes.load(SCENE)
+            figures = _soak(console, client, effort, pid=worker.process.pid)
+    _print(console, figures)
+    return figures
+
+
+def _soak(console: Console, client: real2sim.Client, effort: Effort, *, pid: int) -> Figures:
+    memory, failures = Memory(), []
+    infos = [client.sessions.create(scene=SCENE) for _ in range(effort.sessions)]
+    planners = [
+        Planner(info, habit=habit, sensors=[CAMERA] if k % 2 else [], dt_us=DT_US)
+        for k, (info, habit) in enumerate(zip(infos, habits(effort.sessions), strict=True))
+    ]
+    stop = threading.Event()
+    threads = [
+        threading.Thread(target=_drive, args=(p, effort.rate_hz, stop, failures), daemon=True)
+        for p in planners
+    ]
+    started = time.monotonic()
+    for thread in threads:
+        thread.start()
+    with console.status("soaking") as status:
+        while (passed := time.monotonic() - started) < effort.minutes * 60:
+            memory.seconds.append(passed)
+            memory.mb.append(resident_bytes(pid) / 1e6)
+            steps = sum(p.steps for p in planners)
+            status.update(f"{passed:.0f} s, {steps} steps, {memory.mb[-1]:.0f} MB")
+            time.sleep(min(LOOK_EVERY_S, effort.minutes * 6))
+    stop.set()
+    for thread in threads:
+        thread.join(60)
+    for info in infos:
+        client.sessions.delete(info.session_id)
+    return _figures(effort, planners, memory, failures)
+
+
+def habits(sessions: int) -> list[str]:
+    """Of each session: every other one is proper, the others take turns in misbehaving."""
+    bad = [name for name, misbehave in HABITS.items() if misbehave is not None]
+    return [
+        "proper" if k % 4 in {0, 1} else bad[(k // 4 * 2 + k % 4) % len(bad)]
+        for k in range(sessions)
+    ]
+
+
+def _drive(planner: Planner, rate_hz: float, stop: threading.Event, failures: list[str]) -> None:
+    try:
+        with planner:
+            due = time.monotonic()
+            while not stop.is_set():
+                planner.step()
+                due = max(due + 1 / rate_hz, time.monotonic() - 1 / rate_hz)
+                stop.wait(max(due - time.monotonic(), 0.0))
+    except Exception as error:
+        failures.append(f"{planner.habit}: {type(error).__name__}: {error}")
+
+
+def _figures(
+    effort: Effort, planners: Sequence[Planner], memory: Memory, failures: Sequence[str]
+) -> Figures:
+    latencies = [ms for p in planners if p.habit == "proper" for ms in p.latencies_ms]
+    held = memory.figures(effort.minutes * 60 * WARM_UP_SHARE)
+    return {
+        "setup": vars(effort),
+        "steps_answered": sum(p.steps for p in planners),
+        "proper_step_ms": percentiles(latencies) if latencies else None,
+        "by_habit": {
+            name: {
+                "sessions": sum(p.habit == name for p in planners),
+                "steps": sum(p.steps for p in planners if p.habit == name),
+                "misdeeds": sum(p.misdeeds for p in planners if p.habit == name),
+            }
+            for name in HABITS
+        },
+        "failures": list(failures),
+        "memory": held,
+        "grows": held["end_mb"] - held["warm_mb"] > GROWTH_MB,
+    }
+
+
+def _print(console: Console, figures: Figures) -> None:
+    table = Table("planners", "sessions", "steps", "misdeeds", title="soak", title_justify="left")
+    for name, row in figures["by_habit"].items():
+        table.add_row(name, *(str(row[k]) for k in ("sessions", "steps", "misdeeds")))
+    console.print(table)
+    if (ms := figures["proper_step_ms"]) is not None:
+        console.print(f"steps of proper planners: p50 {ms['p50']:.1f} ms, p99 {ms['p99']:.1f} ms")
+    memory = figures["memory"]
+    console.print(
+        f"{figures['steps_answered']} steps answered; memory {memory['start_mb']:.0f} MB at the "
+        f"start, {memory['warm_mb']:.0f} warm, {memory['end_mb']:.0f} at the end "
+        f"({memory['slope_mb_per_minute']:+.2f} MB/min)"
+    )
+    for failure in figures["failures"]:
+        console.print(f"[red]{failure}[/red]", highlight=False)
+
+
+__all__ = ["Effort", "Memory", "habits", "run"]
