@@ -298,6 +298,85 @@ def evaluate(
     )
 
 
+@app.command("evaluate-policy")
+def evaluate_policy(
+    out: Annotated[Path, typer.Option("--out", help="Folder for report and recordings.")],
+    policies: Annotated[
+        list[str],
+        typer.Option(
+            "--policy", help="follow_route, pid, idm, depth_sampling, learned=FILE, module:Class."
+        ),
+    ],
+    scenes: Annotated[
+        list[str] | None, typer.Option("--scene", help="To drive as recorded; repeat it.")
+    ] = None,
+    scenarios: Annotated[
+        list[str] | None, typer.Option("--scenario", help="Id, to drive as it is; repeat it.")
+    ] = None,
+    suite: Annotated[
+        Path | None,
+        typer.Option(help="JSON file of cases instead. With none: the demo's street, three ways."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="How many, from 0 on.")] = 3,
+    url: Annotated[
+        str | None, typer.Option(help="Of a running worker; default: one is started.")
+    ] = None,
+    token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
+    scenes_dir: Annotated[
+        Path | None, typer.Option("--scenes", help="Bundles for the worker that is started.")
+    ] = None,
+    sessions: Annotated[int, typer.Option(min=1, max=64, help="Episodes at a time.")] = 2,
+) -> None:
+    """Drive cases with planners; leave scores, recordings and a page that compares them."""
+    from .policies import evaluate as command
+
+    _run(
+        command.run,
+        out=out,
+        options=command.Options(
+            policies=tuple(policies),
+            scenes=tuple(scenes or ()),
+            scenarios=tuple(scenarios or ()),
+            suite=suite,
+            seeds=seeds,
+            url=url,
+            token=token,
+            scenes_dir=scenes_dir,
+            sessions=sessions,
+        ),
+    )
+
+
+@app.command("train-policy")
+def train_policy(
+    source: Annotated[Path, typer.Argument(help="Scene bundle, or folder of a driving log.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File of weights (.safetensors).")],
+    camera: Annotated[
+        str | None, typer.Option(help="Default: the one that looks most nearly ahead.")
+    ] = None,
+    epochs: Annotated[int, typer.Option(min=1, max=100_000)] = 60,
+    shifted: Annotated[
+        int, typer.Option(min=0, max=100, help="Views beside the path per frame, of a scene.")
+    ] = 5,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    json: JsonFile = None,
+) -> None:
+    """Teach a small network to drive as the recording vehicle did; for planner learned=FILE."""
+    from .policies import train as command
+
+    _run(
+        command.run,
+        source=source,
+        out=out,
+        asked=command.Asked(camera=camera, epochs=epochs, shifted=shifted, seed=seed),
+        log_format=log_format,
+        sequence=sequence,
+        json_path=json,
+    )
+
+
 @app.command()
 def validate(
     backend: Annotated[str, typer.Option(help="cpu or reference")] = "cpu",
@@ -334,6 +413,9 @@ def simulate(
     duration: Annotated[float | None, typer.Option(min=0.01, max=600, help="[s]")] = None,
     frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
     backend: Annotated[str, typer.Option(help="Of the solver.")] = "auto",
+    max_particles: Annotated[
+        int | None, typer.Option(min=100, help="Of all bodies; fewer are coarser and faster.")
+    ] = None,
     film: Annotated[bool, typer.Option(help="Draw film and stills.")] = True,
     json: JsonFile = None,
 ) -> None:
@@ -353,6 +435,7 @@ def simulate(
             frame=frame,
             backend=backend,
             film=film,
+            max_particles=max_particles,
         ),
         json_path=json,
     )

@@ -104,7 +104,8 @@ class DepthSampling:
         lattice, path, speed = self.lattice, Path.along(obs.route), max(obs.ego.speed, 0.0)
         limit = float(speed_limits(path, cruise=self.speed, comfort=self.comfort)[0])
         points = obstacle_points(obs, heights=lattice.heights, cell=lattice.cell)
-        best, chosen = np.inf, (0.0, np.zeros((len(self._times), 2)))
+        best = np.inf
+        chosen: tuple[float, Array] = (0.0, np.zeros((len(self._times), 2)))
         for acceleration in lattice.accelerations:
             way = _way(speed, acceleration, self._times, limit=limit)
             hits = self._hits(path, self._stop(speed, acceleration, limit), points, obs.ego)
@@ -136,7 +137,8 @@ class DepthSampling:
         if len(points) == 0:
             return [None] * len(self.lattice.offsets)
         poses = _poses(path, stop, self.lattice.offsets)
-        touched = _inside(poses, points, ego.size, self.lattice.margins).any(axis=2)
+        inside = _inside(poses, points, ego.size, self.lattice.margins)
+        touched: NDArray[np.bool_] = np.any(inside, axis=2)
         return [float(stop[k.argmax(), 1]) if k.any() else None for k in touched]
 
     def _cost(

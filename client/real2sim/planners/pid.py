@@ -78,6 +78,7 @@ class PidFollowRoute:
         self.speed, self.comfort = speed, comfort or Comfort()
         self._gains = longitudinal, lateral
         self._preview, self._wheelbase = preview, wheelbase
+        self._t_us: int | None = None
         self._forget()
 
     def reset(self, obs: Observation) -> None:
@@ -99,7 +100,7 @@ class PidFollowRoute:
         comfort = self.comfort
         self._throttle = Pid(longitudinal, low=-2 * comfort.braking, high=comfort.acceleration)
         self._wheel = Pid(lateral, low=-0.6, high=0.6)
-        self._t_us: int | None = None
+        self._t_us = None
 
     def _bend_to(self, path: Path, speed: float) -> float:
         """Curvature [1/m] of the arc from the vehicle to the route a preview distance ahead."""

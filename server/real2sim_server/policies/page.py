@@ -1,0 +1,135 @@
+"""One HTML page that compares planners; it holds everything and loads nothing."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+
+from ..world.scoring import VERSIONS
+from .episodes import Driven
+from .plots import curves, top_view
+from .summary import Group, Spread, groups_of
+
+STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1250px;padding:0 1rem;
+color:#1a1d21;background:#fff}
+h1{font-size:1.5rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin-top:2.2rem}
+h3{font-size:1rem;margin:1.2rem 0 .3rem}p{margin:.3rem 0 .8rem;color:#4a525c;max-width:60rem}
+table{border-collapse:collapse;margin:.6rem 0;font-size:.86rem}
+th,td{padding:.25rem .5rem;text-align:right;border-bottom:1px solid #dfe3e8;}
+td{white-space:nowrap}th:first-child,td:first-child{text-align:left}th{font-weight:600;background:#f4f6f8}
+th small{font-weight:400;color:#6a737d;display:block}
+td{font-variant-numeric:tabular-nums}td small{color:#6a737d}.bad{color:#c0303f;font-weight:600}
+.strip{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(0,210px);gap:5px}
+.strip figure{margin:0}img{width:100%;display:block;border-radius:3px}
+figcaption{font-size:.72rem;color:#4a525c}.scroll{overflow-x:auto}
+"""
+
+SENSE = {
+    "kinematic_infeasibility": "0 is good",
+    "delta_v": "m/s, 0 is good",
+    "neuroncap": "of 5",
+    "carla_ds": "of 100",
+}
+
+
+def page(driven: Sequence[Driven], *, title: str) -> str:
+    """The page for at least one episode."""
+    policies = list(dict.fromkeys(one.policy for one in driven))
+    cases = list(dict.fromkeys(one.case for one in driven))
+    groups = groups_of(driven)
+    parts = [_head(driven, title, policies, cases)]
+    parts += ["<h2>All cases</h2>", _table([g for g in groups if g.case is None])]
+    for case in cases:
+        mine = [one for one in driven if one.case == case]
+        shown = [one for one in mine if one.seed == min(m.seed for m in mine)]
+        parts += [
+            f"<h2>{escape(case)}</h2>",
+            _table([g for g in groups if g.case == case]),
+            _image(curves(mine, policies), "png", "speed, time to collision, error, progress"),
+            _image(top_view(shown, policies), "png", "driven paths from above"),
+            *(_strip(one) for one in shown if one.stills),
+        ]
+    parts += ["<h2>Episodes</h2>", _episodes(driven)]
+    body = "\n".join(parts)
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
+        f"</title><style>{STYLE}</style></head><body>\n{body}\n</body></html>\n"
+    )
+
+
+def _head(driven: Sequence[Driven], title: str, policies: list[str], cases: list[str]) -> str:
+    seeds = sorted({one.seed for one in driven})
+    return (
+        f"<h1>{escape(title)}</h1><p>{len(policies)} planners, {len(cases)} cases, seeds "
+        f"{', '.join(map(str, seeds))}: {len(driven)} episodes. Scores are mean and standard "
+        "deviation over seeds, computed from the recordings; <code>real2sim replay FILE</code> "
+        "computes them again. Curves show the first seed strong and the others faint, a cross a "
+        "collision; maps and pictures show the first seed.</p>"
+    )
+
+
+def _table(groups: Sequence[Group]) -> str:
+    names = "".join(
+        f"<th>{name.replace('_', ' ')}<small>v{version} {SENSE.get(name, '')}</small></th>"
+        for name, version in VERSIONS.items()
+    )
+    rows = [
+        f"<th>planner</th>{names}<th>collisions<small>at fault</small></th><th>ended by</th>",
+        *(_row(group) for group in groups),
+    ]
+    return f'<div class="scroll"><table>{"".join(f"<tr>{row}</tr>" for row in rows)}</table></div>'
+
+
+def _row(group: Group) -> str:
+    cells = "".join(f"<td>{_spread(group.scores[name])}</td>" for name in VERSIONS)
+    hits = f"{group.collisions} <small>{group.at_fault}</small>"
+    if group.at_fault:
+        hits = f'<span class="bad">{hits}</span>'
+    ended = ", ".join(f"{escape(reason)} {n}" for reason, n in group.reasons.items())
+    return f"<td>{escape(group.policy)}</td>{cells}<td>{hits}</td><td>{ended}</td>"
+
+
+def _spread(spread: Spread | None) -> str:
+    if spread is None:
+        return "–"
+    return f"{spread.mean:.3g} <small>±{spread.deviation:.2g}</small>"
+
+
+def _strip(one: Driven) -> str:
+    figures = "".join(
+        f"<figure>{_image(data, 'jpeg', f'{seconds:.1f} s')}<figcaption>{seconds:.1f} s"
+        "</figcaption></figure>"
+        for seconds, data in one.stills
+    )
+    return f'<h3>{escape(one.policy)}, {escape(one.reason)}</h3><div class="strip">{figures}</div>'
+
+
+def _episodes(driven: Sequence[Driven]) -> str:
+    heads = ("case", "planner", "seed", "ended by", "seconds", "metres", "least TTC", "plan ms")
+    rows = ["".join(f"<th>{head}</th>" for head in (*heads, "recording"))]
+    for one in driven:
+        found = one.figures
+        cells = (
+            escape(one.case),
+            escape(one.policy),
+            str(one.seed),
+            escape(one.error or one.reason),
+            f"{found['seconds']:.1f}",
+            f"{found['distance']:.1f}",
+            "–" if found["min_ttc"] is None else f"{found['min_ttc']:.1f}",
+            "–" if found["plan_ms_p50"] is None else f"{found['plan_ms_p50']:.1f}",
+            _link("/".join(one.file.parts[-4:])),
+        )
+        rows.append("".join(f"<td>{cell}</td>" for cell in cells))
+    return f'<div class="scroll"><table>{"".join(f"<tr>{row}</tr>" for row in rows)}</table></div>'
+
+
+def _link(path: str) -> str:
+    return f'<a href="{escape(path)}">{escape(path.rsplit("/", 1)[-1])}</a>'
+
+
+def _image(data: bytes, kind: str, alt: str) -> str:
+    text = base64.b64encode(data).decode()
+    return f'<img alt="{escape(alt)}" src="data:image/{kind};base64,{text}">'

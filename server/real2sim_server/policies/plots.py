@@ -1,0 +1,154 @@
+"""Curves and maps of episodes, as PNG."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..world.recording import Recording
+from .episodes import Driven
+
+COLOURS = ("#1f6feb", "#d1495b", "#2a9d5c", "#e08a00", "#7b4fc9", "#0e8f9e", "#8a5a2b", "#555e68")
+TTC_SHOWN = 4.0
+"""Times to collision above this are drawn there [s]."""
+MARGIN = 14.0
+
+Array = NDArray[np.float64]
+
+
+def curves(driven: Sequence[Driven], policies: Sequence[str]) -> bytes:
+    """Speed, time to collision, lateral error and progress over time, of one case.
+
+    Args:
+        driven: episodes of the case; seed 0 is drawn strong, the others faint.
+        policies: all of them, in the order that gives them their colours.
+    """
+    plt = _pyplot()
+    figure, axes = plt.subplots(2, 2, figsize=(13, 6.4), dpi=90, sharex=True)
+    first = min(one.seed for one in driven)
+    for one in driven:
+        strong = one.seed == first
+        colour = COLOURS[policies.index(one.policy) % len(COLOURS)]
+        times, series = _series(one.recording)
+        for ax, values in zip(axes.flat, series, strict=True):
+            ax.plot(
+                times,
+                values,
+                color=colour,
+                lw=1.8 if strong else 0.7,
+                alpha=0.95 if strong else 0.4,
+                label=one.policy if strong else None,
+            )
+        if one.reason == "collision":
+            for ax, values in zip(axes.flat, series, strict=True):
+                ax.plot(times[-1], values[-1], "x", color=colour, ms=8, mew=2)
+    titles = (
+        "speed [m/s]",
+        f"time to collision, up to {TTC_SHOWN:g} [s]",
+        "lateral error [m]",
+        "progress [m]",
+    )
+    for ax, title in zip(axes.flat, titles, strict=True):
+        ax.set_title(title, loc="left", fontsize=10)
+        ax.grid(alpha=0.25)
+    for ax in axes[1]:
+        ax.set_xlabel("time [s]")
+    axes[0, 1].set_ylim(-0.1, TTC_SHOWN + 0.2)
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return _png(figure)
+
+
+def top_view(driven: Sequence[Driven], policies: Sequence[str]) -> bytes:
+    """Driven paths from above, two in a row, with everybody where it ended."""
+    plt = _pyplot()
+    low, high = _extent([one.recording for one in driven])
+    rows = -(-len(driven) // 2)
+    height = 0.7 + 6.0 * (high[1] - low[1]) / max(high[0] - low[0], 1.0)
+    figure, axes = plt.subplots(rows, 2, figsize=(13, height * rows), dpi=90, squeeze=False)
+    for ax in axes.flat[len(driven) :]:
+        ax.set_visible(False)
+    for ax, one in zip(axes.flat, driven, strict=False):
+        colour = COLOURS[policies.index(one.policy) % len(COLOURS)]
+        _draw_episode(ax, one.recording, colour)
+        ax.set_title(f"{one.policy}: {one.reason}", loc="left", fontsize=9)
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(low[1], high[1])
+        ax.set_aspect("equal")
+    return _png(figure)
+
+
+def _series(recording: Recording) -> tuple[Array, tuple[Array, Array, Array, Array]]:
+    instants, tallies = recording.instants, recording.tallies()
+    times = np.array([(i.t_us - instants[0].t_us) * 1e-6 for i in instants])
+    ttc = np.array([min(tally.ttc, TTC_SHOWN) for tally in tallies])
+    return times, (
+        np.array([i.ego.speed for i in instants]),
+        ttc,
+        np.array([i.ego.offset for i in instants]),
+        np.array([tally.s - recording.context.start_s for tally in tallies]),
+    )
+
+
+def _draw_episode(ax: Any, recording: Recording, colour: str) -> None:
+    context, last = recording.context, recording.instants[-1]
+    ax.plot(context.route[:, 0], context.route[:, 1], color="black", lw=0.8, ls="--")
+    for k, object_id in enumerate(last.others.ids):
+        hit = any(object_id == c.object_id for i in recording.instants for c in i.contacts)
+        box = _box(last.others.centres[k, :2], last.others.yaws[k], last.others.sizes[k])
+        ax.fill(*box.T, color="#d1495b" if hit else "#8b949e", alpha=0.8 if hit else 0.45, lw=0)
+        track = _track(recording, object_id)
+        if np.ptp(track, axis=0).max() > 1.0:
+            ax.plot(*track.T, color="#8b949e", lw=0.6)
+    path = np.array([(i.ego.x, i.ego.y) for i in recording.instants])
+    ax.plot(*path.T, color=colour, lw=2)
+    ahead = np.array([math.cos(last.ego.yaw), math.sin(last.ego.yaw)]) * context.centre_ahead
+    box = _box(path[-1] + ahead, last.ego.yaw, np.array(context.ego_size))
+    ax.fill(*box.T, color=colour, alpha=0.85, lw=0)
+
+
+def _track(recording: Recording, object_id: str) -> Array:
+    places = [
+        i.others.centres[i.others.ids.index(object_id), :2]
+        for i in recording.instants
+        if object_id in i.others.ids
+    ]
+    return np.array(places)
+
+
+def _box(centre: Array, yaw: float, size: Array) -> Array:
+    """[4, 2] corners."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    local = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * size[:2] / 2
+    corners: Array = local @ np.array([[c, s], [-s, c]]) + centre
+    return corners
+
+
+def _extent(recordings: Sequence[Recording]) -> tuple[Array, Array]:
+    places = [[(i.ego.x, i.ego.y) for i in r.instants] for r in recordings]
+    places += [r.context.route.tolist() for r in recordings]
+    points = np.concatenate([np.array(p) for p in places])
+    low: Array = points.min(axis=0) - MARGIN
+    high: Array = points.max(axis=0) + MARGIN
+    return low, high
+
+
+def _pyplot() -> Any:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _png(figure: Any) -> bytes:
+    figure.tight_layout()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    _pyplot().close(figure)
+    return buffer.getvalue()

@@ -1,0 +1,126 @@
+"""What many episodes come to: mean and spread of every score, by planner and case."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ..world.recording import load_recording
+from ..world.scoring import VERSIONS
+from .episodes import Driven
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation (of the population) over ``count`` episodes."""
+
+    mean: float
+    deviation: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread | None:
+        """Of some values; None without any."""
+        if not values:
+            return None
+        return cls(statistics.fmean(values), statistics.pstdev(values), len(values))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Episodes of one planner: of one case, or of all where ``case`` is None.
+
+    Attributes:
+        scores: by name; None where it is undefined in every episode, or where a planner failed in
+            any: a mean over what is left would flatter it.
+        collisions, at_fault: summed.
+        reasons: of ending, counted.
+        failed: episodes in which the planner raised or sent what no vehicle can do.
+    """
+
+    policy: str
+    case: str | None
+    episodes: int
+    scores: dict[str, Spread | None]
+    collisions: int
+    at_fault: int
+    reasons: dict[str, int]
+    failed: int
+
+    @classmethod
+    def of(cls, policy: str, case: str | None, driven: Sequence[Driven]) -> Group:
+        """Of at least one episode."""
+        failed = sum(one.error is not None for one in driven)
+        found = [one.scores() for one in driven]
+        scores: dict[str, Spread | None] = {}
+        for name in VERSIONS:
+            values = [s[name]["value"] for s in found if name in s]
+            defined = [v for v in values if v is not None]
+            scores[name] = None if failed else Spread.of(defined)
+        return cls(
+            policy=policy,
+            case=case,
+            episodes=len(driven),
+            scores=scores,
+            collisions=sum(one.figures["collisions"] for one in driven),
+            at_fault=sum(one.figures["at_fault"] for one in driven),
+            reasons=dict(Counter(one.reason for one in driven)),
+            failed=failed,
+        )
+
+
+def groups_of(driven: Sequence[Driven]) -> list[Group]:
+    """Every planner over all cases, then every planner in every case; in their order."""
+    policies, cases = _unique(d.policy for d in driven), _unique(d.case for d in driven)
+    groups = []
+    for case in (None, *cases):
+        for policy in policies:
+            mine = [d for d in driven if d.policy == policy and case in (None, d.case)]
+            groups.append(Group.of(policy, case, mine))
+    return groups
+
+
+def figures_of(driven: Sequence[Driven], folder: Path) -> dict[str, Any]:
+    """Everything for JSON; files relative to ``folder``."""
+    return {
+        "metrics": dict(VERSIONS),
+        "groups": [asdict(group) for group in groups_of(driven)],
+        "episodes": [
+            {
+                "policy": one.policy,
+                "case": one.case,
+                "seed": one.seed,
+                "scene": one.recording.scene,
+                "scene_hash": one.recording.scene_hash,
+                "recording": one.file.relative_to(folder).as_posix(),
+                "reason": one.reason,
+                "error": one.error,
+                **one.figures,
+                "scores": list(one.scores().values()),
+            }
+            for one in driven
+        ],
+    }
+
+
+def recompute(figures: dict[str, Any], folder: Path) -> list[str]:
+    """Episodes of a report whose scores differ from those of their recordings; none if all agree.
+
+    Args:
+        figures: as ``figures_of`` made them.
+        folder: that their files are relative to.
+    """
+    differing = []
+    for episode in figures["episodes"]:
+        again = [s.fields() for s in load_recording(folder / episode["recording"]).rescore()]
+        if episode["error"] is None and again != episode["scores"]:
+            differing.append(episode["recording"])
+    return differing
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))

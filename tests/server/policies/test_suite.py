@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+from pydantic import ValidationError
+
+from real2sim_proto.episode import ResetSpec
+from real2sim_server.commands.console import CommandError
+from real2sim_server.policies.suite import Asked, Case, cases_of, demo_cases, load_suite
+
+BRAKES = {"agents": {"drivers": {"car": {"kind": "hard_brake", "gap": 20.0}}}}
+
+
+def gap(options) -> float:
+    return options["agents"]["drivers"]["car"]["gap"]
+
+
+def test_seed_0_is_the_case_as_written_and_others_stay_within_the_jitter():
+    case = Case(name="a", scene="s", reset=BRAKES, jitter={"agents.drivers.car.gap": 3.0})
+    gaps = [gap(case.reset_for(seed)) for seed in range(50)]
+    assert gaps[0] == 20.0
+    assert len(set(gaps)) == 50
+    assert all(17.0 <= g <= 23.0 for g in gaps)
+    assert gap(case.reset_for(7)) == gaps[7]
+    assert case.reset == BRAKES
+
+
+def test_times_are_varied_in_clock_steps():
+    case = Case(name="a", scene="s", reset={"start_us": 500_000}, jitter={"start_us": 500_000})
+    starts = {case.reset_for(seed)["start_us"] for seed in range(40)}
+    assert all(start % 100_000 == 0 and 0 <= start <= 1_000_000 for start in starts)
+    assert len(starts) > 5
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({}, "exactly one of scene and scenario"),
+        ({"scene": "s", "scenario": "t"}, "exactly one"),
+        ({"scene": "s", "reset": {"seed": 3}}, "seed"),
+        ({"scene": "s", "reset": {"dt": 3}}, "dt"),
+        ({"scene": "s", "jitter": {"agents.drivers.car.gap": 1.0}}, "no number"),
+        ({"scene": "s", "operations": [{"op": "fly"}]}, "fly"),
+    ],
+)
+def test_a_case_that_is_none_is_refused_with_the_reason(fields, says):
+    with pytest.raises(ValidationError, match=says):
+        Case(name="a", **fields)
+
+
+def test_a_suite_is_read_from_a_file(tmp_path):
+    file = tmp_path / "suite.json"
+    file.write_text(json.dumps({"cases": [{"name": "a", "scene": "s", "reset": BRAKES}]}))
+    (case,) = load_suite(file)
+    assert gap(case.reset_for(0)) == 20.0
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"cases": []}', '{"cases": [{"name": "a b"}]}', "[]"])
+def test_a_file_that_is_no_suite_is_refused(tmp_path, text):
+    file = tmp_path / "suite.json"
+    file.write_text(text)
+    with pytest.raises(CommandError):
+        load_suite(file)
+
+
+def test_cases_need_names_of_their_own():
+    with pytest.raises(CommandError, match="own"):
+        cases_of(["street", "street"], [])
+
+
+def test_the_cases_of_the_demo_can_be_driven():
+    for case in demo_cases("demo_street"):
+        for seed in range(20):
+            ResetSpec.model_validate(case.reset_for(seed))
+
+
+def test_episodes_are_the_product_of_cases_planners_and_seeds():
+    asked = Asked(cases_of(["a", "b"], []), ("pid", "idm"), (0, 1, 2))
+    assert len({(p, c.name, s) for p, c, s in asked.episodes()}) == 2 * 2 * 3
