@@ -5,6 +5,7 @@ from .compose import cloud_of, compose, instances_at
 from .errors import EditError
 from .review import GroundHeight
 from .scenario import LogEntry, Planned, Scenario
+from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
 from .tracks import PackedTracks, Placed
 
@@ -26,4 +27,6 @@ __all__ = [
     "cloud_of",
     "compose",
     "instances_at",
+    "pack_state",
+    "unpack_state",
 ]

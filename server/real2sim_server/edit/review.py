@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto.scenarios import EditWarning
 
+from ..scene import Trajectory
 from ..scene.box import box_corners, boxes_overlap
 from .state import ObjectState, ScenarioState
 from .tracks import Float, sample
@@ -31,6 +33,10 @@ AT_ONCE = 64
 """Instants at which boxes are compared in one go; most pairs that overlap do so early."""
 
 
+REMEMBERED = 512
+"""Objects whose sampled trajectories are kept, 26 kB each at most."""
+
+
 def review(
     state: ScenarioState, touched: Sequence[str], *, ground: GroundHeight | None = None
 ) -> Iterator[EditWarning]:
@@ -45,7 +51,7 @@ def review(
     """
     subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
     for subject in subjects:
-        times = _sample_times(subject)
+        times = _sample_times(subject.trajectory.start_us, subject.trajectory.end_us)
         transforms, _ = sample(subject.trajectory, times)
         yield from _overlaps(subject, state, times, transforms)
         recorded = None if subject.asset else state.recorded[subject.source_id]
@@ -53,8 +59,13 @@ def review(
         yield from _outside_map(subject, state.extent, transforms)
 
 
-def _sample_times(subject: ObjectState) -> NDArray[np.int64]:
-    start, end = subject.trajectory.start_us, subject.trajectory.end_us
+@lru_cache(maxsize=REMEMBERED)
+def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> tuple[Float, NDArray[np.bool_]]:
+    """The trajectory at the sample times of that range; remembered, for few objects move."""
+    return sample(trajectory, _sample_times(start_us, end_us))
+
+
+def _sample_times(start: int, end: int) -> NDArray[np.int64]:
     count = min(2 + (end - start) // SAMPLE_PERIOD_US, MAX_SAMPLES)
     steps = np.arange(count, dtype=object) * (end - start) // (count - 1)
     return np.unique((start + steps).astype(np.int64))
@@ -82,9 +93,10 @@ def _first_overlap(
     subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
 ) -> int | None:
     """First of ``times`` at which the two boxes overlap; None where they never do."""
-    theirs, covered = sample(other.trajectory, times)
-    apart = np.linalg.norm(own[:, :3, 3] - theirs[:, :3, 3], axis=1)
-    near = np.flatnonzero(covered & (apart <= subject.radius + other.radius))
+    theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
+    between = own[:, :3, 3] - theirs[:, :3, 3]
+    apart = np.einsum("ij,ij->i", between, between)
+    near = np.flatnonzero(covered & (apart <= (subject.radius + other.radius) ** 2))
     if subject.standing and other.standing:
         near = near[:1]
     for start in range(0, len(near), AT_ONCE):
@@ -113,8 +125,7 @@ def _off_ground(
 ) -> Iterator[EditWarning]:
     usual = 0.0
     if recorded is not None:
-        theirs, _ = sample(recorded.trajectory, _sample_times(recorded))
-        usual = float(np.median(_clearance(theirs, recorded, ground)))
+        usual = _usual_clearance(recorded, ground)
     off = _clearance(own, subject, ground) - usual
     worst = float(off[np.argmax(np.abs(off))])
     if abs(worst) > OFF_GROUND:
@@ -125,6 +136,13 @@ def _off_ground(
             message=f"the bottom of {subject.object_id!r} is {abs(worst):.2f} m {side} "
             + ("where it stood in the recording" if recorded else "the ground"),
         )
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _usual_clearance(recorded: ObjectState, ground: GroundHeight | None) -> float:
+    track = recorded.trajectory
+    theirs, _ = _sampled(track, track.start_us, track.end_us)
+    return float(np.median(_clearance(theirs, recorded, ground)))
 
 
 def _clearance(transforms: Float, subject: ObjectState, ground: GroundHeight | None) -> Float:

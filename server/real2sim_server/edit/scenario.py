@@ -27,7 +27,8 @@ class LogEntry:
     Attributes:
         revision: grows by one with each entry, from 1.
         kind: what it did.
-        operations: of an edit; empty for an undo or redo.
+        operations: of an edit; empty for an undo or redo. A log of thousands may hold them as
+            read and check each only when it is looked at.
         target: revision of the edit that was undone or redone; None for an edit.
         created_at: UTC, ISO 8601.
         who: as the client named itself; empty where it did not.
@@ -35,7 +36,7 @@ class LogEntry:
 
     revision: int
     kind: Literal["edit", "undo", "redo"]
-    operations: tuple[Operation, ...]
+    operations: Sequence[Operation]
     target: int | None
     created_at: str
     who: str = ""
@@ -80,8 +81,16 @@ class Scenario:
         *,
         scene: str = "",
         scene_hash: str = "",
+        known: tuple[int, ScenarioState] | None = None,
     ) -> Scenario:
         """The scenario after ``entries``, bit for bit as it was when they were committed.
+
+        Args:
+            initial_state: before any edit.
+            entries: the log, oldest first.
+            scene: name of the scene.
+            scene_hash: its content hash.
+            known: a revision and the state after it, which spares applying what is before.
 
         Raises:
             EditError: INVALID_OPERATION when the entries are no complete log of this scene.
@@ -89,6 +98,8 @@ class Scenario:
         scenario = cls(initial_state, scene=scene, scene_hash=scene_hash)
         for entry in entries:
             scenario._append(entry)
+            if known and entry.revision == known[0]:
+                scenario._keep(len(scenario._done), known[1])
         scenario.state = scenario._state_after(len(scenario._done))
         return scenario
 
@@ -142,7 +153,7 @@ class Scenario:
             raise EditError(ErrorCode.NOTHING_TO_UNDO, "no edit is in effect; nothing to undo")
         edit = self._done[-1]
         state = self._state_after(len(self._done) - 1)
-        outcome = EditOutcome(state=state, created=(), inverse=edit.operations, warnings=())
+        outcome = EditOutcome(state=state, created=(), inverse=tuple(edit.operations), warnings=())
         return Planned(self._entry("undo", (), edit.revision, who), outcome)
 
     def plan_redo(
@@ -240,18 +251,23 @@ class Scenario:
         return stack.pop()
 
     def _state_after(self, count: int) -> ScenarioState:
-        """State after the first ``count`` edits in effect, from the nearest one kept."""
+        """State after the first ``count`` edits in effect, from the nearest one kept.
+
+        The last states on the way there are kept, so that undoing many edits one after the other
+        does not begin from afar each time.
+        """
         nearest = max(n for n in self._states if n <= count)
         state = self._states[nearest]
-        for edit in self._done[nearest:count]:
+        for n, edit in enumerate(self._done[nearest:count], nearest + 1):
             state = advance(state, edit.operations)
-        self._keep(count, state)
+            if n > count - KEPT_STATES:
+                self._keep(n, state)
         return state
 
     def _keep(self, count: int, state: ScenarioState) -> None:
         self._states[count] = state
         self._states.move_to_end(count)
-        for old in list(self._states)[: len(self._states) - KEPT_STATES]:
+        for old in list(self._states)[: max(0, len(self._states) - KEPT_STATES)]:
             if old:
                 del self._states[old]
 

@@ -12,6 +12,9 @@ UNIT_CORNERS = np.array(
 )
 """[8, 3] corners of the unit box: x changes fastest, bottom four first."""
 
+NEXT, SECOND = [1, 2, 0], [2, 0, 1]
+"""The coordinates after each, in their cycle."""
+
 
 def box_corners(T_world_box: ArrayLike, size: ArrayLike) -> Float:
     """Corners [..., 8, 3] [m] in the world of boxes centred on their own origin.
@@ -50,29 +53,49 @@ def box_penetration(
     the sign turned. Arguments as in :func:`boxes_overlap`.
     """
     a, b = np.asarray(T_world_a, dtype=np.float64), np.asarray(T_world_b, dtype=np.float64)
-    half_a = np.asarray(size_a, dtype=np.float64) / 2
-    half_b = np.asarray(size_b, dtype=np.float64) / 2
-    rotation_a, rotation_b = np.broadcast_arrays(a[..., :3, :3], b[..., :3, :3])
-    axes, valid = _candidate_axes(rotation_a, rotation_b)
-    centre = b[..., :3, 3] - a[..., :3, 3]
-    gap = np.abs(np.einsum("...ki,...i->...k", axes, centre))
-    reach = _reach(axes, rotation_a, half_a) + _reach(axes, rotation_b, half_b)
-    return np.where(valid, reach - gap, np.inf).min(axis=-1)
+    half_a = np.asarray(size_a, dtype=np.float64)[..., :, None] / 2
+    half_b = np.asarray(size_b, dtype=np.float64)[..., None, :] / 2
+    to_a = np.swapaxes(a[..., :3, :3], -1, -2)
+    turn = to_a @ b[..., :3, :3]
+    centre = to_a @ (b[..., :3, 3:] - a[..., :3, 3:])
+    faces = _face_overlaps(turn, centre, half_a, half_b)
+    edges = _edge_overlaps(turn, centre, half_a, half_b)
+    return np.minimum(faces, edges)
 
 
-def _candidate_axes(rotation_a: Float, rotation_b: Float) -> tuple[Float, NDArray[np.bool_]]:
-    """Unit axes [..., 15, 3]: face normals of both and their cross products; which are usable."""
-    normals_a, normals_b = np.swapaxes(rotation_a, -1, -2), np.swapaxes(rotation_b, -1, -2)
-    crossed = np.cross(normals_a[..., :, None, :], normals_b[..., None, :, :])
-    crossed = crossed.reshape(*crossed.shape[:-3], 9, 3)
-    axes = np.concatenate([normals_a, normals_b, crossed], axis=-2)
-    length = np.linalg.norm(axes, axis=-1)
+def _face_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> Float:
+    """Least overlap [...] along the face normals of both boxes.
+
+    Args:
+        turn: [..., 3, 3] ``R_a_b``.
+        centre: [..., 3, 1] of b in the frame of a.
+        half_a, half_b: [..., 3, 1] and [..., 1, 3].
+    """
+    size = np.abs(turn)
+    along_a = half_a + (size * half_b).sum(-1, keepdims=True) - np.abs(centre)
+    along_b = half_b + (size * half_a).sum(-2, keepdims=True)
+    along_b = along_b - np.abs((turn * centre).sum(-2, keepdims=True))
+    least: Float = np.minimum(along_a.min((-2, -1)), along_b.min((-2, -1)))
+    return least
+
+
+def _edge_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> Float:
+    """Least overlap [...] along the products of an edge of a and one of b; see above.
+
+    Entry [i, j] of what follows belongs to the product of a's axis i and b's axis j. In the frame
+    of a it is (-turn[i + 2, j], turn[i + 1, j]) in the coordinates i + 1 and i + 2, so that the
+    reach of a needs these two rows of ``turn``, and that of b, seen from b, two columns.
+    """
+    size = np.abs(turn)
+    next_row, second_row = turn[..., NEXT, :], turn[..., SECOND, :]
+    gap = np.abs(centre[..., SECOND, :] * next_row - centre[..., NEXT, :] * second_row)
+    reach_a = (
+        half_a[..., NEXT, :] * size[..., SECOND, :] + half_a[..., SECOND, :] * size[..., NEXT, :]
+    )
+    reach_b = half_b[..., NEXT] * size[..., SECOND] + half_b[..., SECOND] * size[..., NEXT]
+    length = np.sqrt(next_row * next_row + second_row * second_row)
     # Parallel edges span no axis of their own; the face normals cover that case.
     valid = length > 1e-6
-    return axes / np.where(valid, length, 1.0)[..., None], valid
-
-
-def _reach(axes: Float, rotation: Float, half: Float) -> Float:
-    """Half extent [..., 15] of a box along each axis."""
-    along = np.abs(np.einsum("...ki,...ij->...kj", axes, rotation))
-    return np.einsum("...kj,...j->...k", along, half)
+    overlaps = np.where(valid, reach_a + reach_b - gap, np.inf) / np.where(valid, length, 1.0)
+    least: Float = overlaps.min((-2, -1))
+    return least

@@ -158,6 +158,8 @@ class Trajectory:
 
 def _whole_microseconds(times_us: ArrayLike) -> NDArray[np.int64]:
     given = np.atleast_1d(np.asarray(times_us))
+    if given.dtype == np.int64 and given.ndim == 1:
+        return given.copy()
     with np.errstate(invalid="ignore"):
         times = given.astype(np.int64)
     if given.ndim != 1 or not np.array_equal(times, given):

@@ -18,6 +18,22 @@ class ScenarioRow:
 
 
 @dataclass(frozen=True)
+class SnapshotRow:
+    """What the log of a scenario has led to.
+
+    Attributes:
+        revision: after which.
+        made_by: the program that made it; another one may read the same log otherwise.
+        state: as :func:`real2sim_server.edit.pack_state` has it.
+    """
+
+    scenario_id: str
+    revision: int
+    made_by: str
+    state: bytes
+
+
+@dataclass(frozen=True)
 class SessionRow:
     """A session as created.
 

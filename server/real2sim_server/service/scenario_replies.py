@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from functools import cached_property
+from typing import Any, overload
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.operations import Insert, Replace
+from real2sim_proto.operations import OPERATIONS, Insert, Operation, Replace
 from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 
 from ..edit import AssetLookup, LogEntry, Planned, Scenario, ScenarioState
@@ -53,14 +54,40 @@ def tag(result: OperationResult) -> dict[str, str]:
     return {"ETag": result.etag}
 
 
-def replayed_from_store(
-    row: ScenarioRow,
-    summary: SceneSummary,
-    entries: Sequence[Mapping[str, Any]],
-    assets: AssetLookup | None,
-) -> Scenario:
-    """The scenario that a stored log leads to."""
-    return replayed(row, summary, [HistoryEntry.model_validate(e) for e in entries], assets)
+class StoredOperations(Sequence[Operation]):
+    """Operations as the store has them, made into models when one is looked at.
+
+    They were checked when they were written; of a long log most are never looked at again.
+    """
+
+    def __init__(self, stored: Sequence[Mapping[str, Any]]) -> None:
+        self._stored = stored
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    @overload
+    def __getitem__(self, index: int) -> Operation: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Operation]: ...
+    def __getitem__(self, index: int | slice) -> Operation | Sequence[Operation]:
+        return self._models[index]
+
+    @cached_property
+    def _models(self) -> list[Operation]:
+        return OPERATIONS.validate_python(self._stored)
+
+
+def stored_entry(stored: Mapping[str, Any]) -> LogEntry:
+    """One revision as the store has it."""
+    return LogEntry(
+        revision=stored["revision"],
+        kind=stored["kind"],
+        operations=StoredOperations(stored["operations"]),
+        target=stored["target"],
+        created_at=stored["created_at"],
+        who=stored["who"],
+    )
 
 
 def replayed(

@@ -38,10 +38,10 @@ from .scenario_replies import (
     listed_info,
     operation_result,
     replayed,
-    replayed_from_store,
     stale_revision,
     tag,
 )
+from .snapshots import Snapshots
 from .store import ConflictError, ScenarioRow, Store, now_us
 
 KEPT_IN_MEMORY = 256
@@ -80,6 +80,7 @@ class Scenarios:
         self._assets = assets
         self._residency = residency
         self._metrics = metrics
+        self._snapshots = Snapshots(store)
         self._held: OrderedDict[str, _Held] = OrderedDict()
         self._opening: dict[str, asyncio.Lock] = {}
 
@@ -145,7 +146,12 @@ class Scenarios:
         """Remove a scenario and its history. Raises ServiceError: UNKNOWN_SCENARIO."""
         async with self._exclusive(scenario_id):
             self._held.pop(scenario_id, None)
+            self._snapshots.forget(scenario_id)
             await self._store.delete_scenario(scenario_id)
+
+    async def settle(self) -> None:
+        """Wait for what is still written behind the answers; none may be asked for after."""
+        await self._snapshots.written()
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -295,6 +301,7 @@ class Scenarios:
             result = operation_result(planned, revision=planned.entry.revision)
             await self._record(held, planned, once.reply(result, status=200, headers=tag(result)))
             scenario.commit(planned)
+            self._snapshots.offer(scenario_id, scenario.revision, scenario.state)
             return result
 
     async def _record(self, held: _Held, planned: Planned, reply: Any) -> None:
@@ -359,8 +366,7 @@ class Scenarios:
                 f"{row.scene_hash[:12]}; the bundle now has {summary.content_hash[:12]}",
                 hint="put the old bundle back, or start a new scenario",
             )
-        entries = await self._store.scenario_entries(scenario_id)
-        scenario = await asyncio.to_thread(replayed_from_store, row, summary, entries, self._assets)
+        scenario = await self._snapshots.opened(row, summary, self._assets)
         return _Held(row, scenario, summary)
 
     def _keep(self, held: _Held) -> None:

@@ -16,13 +16,14 @@ from sqlalchemy.engine import Connection, make_url
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from . import tables as t
-from .rows import ScenarioRow, SessionEntry, SessionRow, StoredReply
+from .rows import ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
 
 __all__ = [
     "ConflictError",
     "ScenarioRow",
     "SessionEntry",
     "SessionRow",
+    "SnapshotRow",
     "Store",
     "StoreError",
     "StoredReply",
@@ -111,6 +112,7 @@ class Store:
         of_scenario = t.scenario_log.c.scenario_id == scenario_id
         counts = await self._write(
             Write(sa.delete(t.scenario_log).where(of_scenario)),
+            Write(sa.delete(t.scenario_snapshots).where(_snapshot_of(scenario_id))),
             Write(sa.delete(t.scenarios).where(t.scenarios.c.scenario_id == scenario_id)),
         )
         return counts[-1] > 0
@@ -145,6 +147,23 @@ class Store:
         query = sa.select(log.c.entry).where(log.c.scenario_id == scenario_id)
         rows = await self._read(query.order_by(log.c.revision))
         return [json.loads(row["entry"]) for row in rows]
+
+    async def keep_snapshot(self, row: SnapshotRow) -> None:
+        """Keep it in place of an older one of its scenario.
+
+        Raises:
+            ConflictError: the scenario is gone.
+        """
+        await self._write(
+            Write(sa.delete(t.scenario_snapshots).where(_snapshot_of(row.scenario_id))),
+            _added(t.scenario_snapshots, asdict(row)),
+        )
+
+    async def snapshot(self, scenario_id: str) -> SnapshotRow | None:
+        """The last snapshot of a scenario."""
+        query = sa.select(t.scenario_snapshots).where(_snapshot_of(scenario_id))
+        rows = await self._read(query)
+        return SnapshotRow(**rows[0]) if rows else None
 
     async def scenario_kinds(self) -> dict[str, list[str]]:
         """Kinds of all log entries by scenario, oldest first."""
@@ -333,6 +352,10 @@ def _prepare_schema(connection: Connection) -> None:
 def _delete_old_replies() -> sa.Delete:
     table = t.idempotent_replies
     return sa.delete(table).where(table.c.created_us <= now_us() - REPLY_LIFETIME_US)
+
+
+def _snapshot_of(scenario_id: str) -> sa.ColumnElement[bool]:
+    return t.scenario_snapshots.c.scenario_id == scenario_id
 
 
 def _log_row(

@@ -47,6 +47,22 @@ scenario_log = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
+# What a log has led to at one revision, so that opening need not replay all of it. Made from the
+# log and nothing else: losing a row costs time, never an edit.
+scenario_snapshots = Table(
+    "scenario_snapshots",
+    metadata,
+    Column(
+        "scenario_id",
+        String(80),
+        ForeignKey("scenarios.scenario_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("revision", Integer, nullable=False),
+    Column("made_by", String(80), nullable=False),
+    Column("state", LargeBinary, nullable=False),
+)
+
 sessions = Table(
     "sessions",
     metadata,

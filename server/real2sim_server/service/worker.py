@@ -134,6 +134,7 @@ class Worker:
             at_exit.callback(self.residency.close)
             at_exit.push_async_callback(self.store.close)
             await self.store.open()
+            at_exit.push_async_callback(self.scenarios.settle)
             await self.residency.refresh()
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))

@@ -42,6 +42,8 @@ from real2sim_server.edit import (
     Scenario,
     ScenarioState,
     apply_operations,
+    pack_state,
+    unpack_state,
 )
 
 IDS = st.sampled_from(["parked", "crossing", "turning", "late", "parked_copy1"])
@@ -263,6 +265,28 @@ def test_a_replayed_log_gives_the_same_bits(
     assert (replayed.revision, replayed.can_undo, replayed.can_redo) == (
         (scenario.revision, scenario.can_undo, scenario.can_redo)
     )
+
+
+@ENOUGH
+@given(batches=st.lists(BATCHES, min_size=1, max_size=4), undos=st.integers(0, 2))
+def test_a_state_kept_on_the_way_gives_the_same_bits_as_the_whole_log(
+    state: ScenarioState, batches: list[list[Operation]], undos: int
+):
+    scenario = Scenario(state)
+    kept = [(0, pack_state(state))]
+    for batch in batches:
+        scenario.edit(possible(scenario.state, batch))
+        kept.append((scenario.revision, pack_state(scenario.state)))
+    for _ in range(min(undos, len(batches))):
+        scenario.undo()
+        kept.append((scenario.revision, pack_state(scenario.state)))
+
+    for revision, packed in kept:
+        known = (revision, unpack_state(state, packed))
+        opened = Scenario.replay(state, scenario.entries, known=known)
+        assert same_bits(opened.state, scenario.state)
+        if undos:
+            assert same_bits(opened.redo().state, Scenario.replay(state, opened.entries).state)
 
 
 @ENOUGH

@@ -9,7 +9,9 @@ import pytest
 
 from real2sim_proto import ErrorCode, decode
 from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
+from real2sim_server.edit import advance
 from real2sim_server.scene.io import save_scene
+from real2sim_server.service import snapshots
 from real2sim_server.service.store import StoreError
 
 DELETE_RED = {"op": "delete", "object_id": "car_red"}
@@ -257,6 +259,35 @@ def test_scenarios_survive_a_restart_of_the_worker(start_worker, run_worker):
     assert second.get(f"/v1/scenarios/{scenario.scenario_id}").json() == before
     assert act(second, scenario, "redo").json()["revision"] == 4
     assert set(shown(second, scenario)) == {"car_blue", "post", "twin"}
+
+
+@pytest.mark.parametrize("damage", [None, b"no state", b""])
+def test_a_snapshot_spares_replaying_and_is_never_needed(
+    run_worker, start_worker, monkeypatch, damage
+):
+    monkeypatch.setattr(snapshots, "INTERVAL", 2)
+    with run_worker() as first:
+        scenario = create(first)
+        for operation in (DELETE_RED, MOVE_POST, COPY_RED | {"object_id": "car_blue"}):
+            edit(first, scenario, operation)
+        before = first.get(f"/v1/scenarios/{scenario.scenario_id}").json()
+        store = first.app.state.worker.store
+        first.portal.call(first.app.state.worker.scenarios.settle)
+        kept = first.portal.call(store.snapshot, scenario.scenario_id)
+        assert kept.revision == 2
+        if damage is not None:
+            first.portal.call(store.keep_snapshot, replace(kept, state=damage))
+    replayed = []
+    monkeypatch.setattr(
+        "real2sim_server.edit.scenario.advance",
+        lambda state, operations: replayed.append(operations) or advance(state, operations),
+    )
+    second = start_worker()
+
+    assert second.get(f"/v1/scenarios/{scenario.scenario_id}").json() == before
+    assert len(replayed) == (1 if damage is None else 3)
+    assert [act(second, scenario, "undo").status_code for _ in range(4)] == [200, 200, 200, 409]
+    assert set(shown(second, scenario)) == {"car_red", "car_blue", "post"}
 
 
 def test_nothing_takes_effect_that_is_not_on_record(client, monkeypatch):

@@ -13,6 +13,7 @@ from real2sim_server.service.store import (
     ScenarioRow,
     SessionEntry,
     SessionRow,
+    SnapshotRow,
     Store,
     StoredReply,
     StoreError,
@@ -99,6 +100,28 @@ def test_deleting_a_scenario_takes_its_log_along(url):
         return await store.scenarios(), await store.scenario_kinds()
 
     assert run(url, work) == ([], {})
+
+
+def test_the_last_snapshot_of_a_scenario_is_kept(url):
+    async def write(store):
+        await store.create_scenario(SCENARIO)
+        for revision in (128, 256):
+            await store.keep_snapshot(SnapshotRow("sc_1", revision, "1", bytes([revision % 255])))
+        return await store.snapshot("sc_1"), await store.snapshot("sc_2")
+
+    assert run(url, write) == (SnapshotRow("sc_1", 256, "1", b"\x01"), None)
+
+
+def test_snapshots_go_with_their_scenario(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        await store.keep_snapshot(SnapshotRow("sc_1", 128, "1", b"state"))
+        await store.delete_scenario("sc_1")
+        with pytest.raises(ConflictError):
+            await store.keep_snapshot(SnapshotRow("sc_1", 256, "1", b"state"))
+        return await store.snapshot("sc_1")
+
+    assert run(url, work) is None
 
 
 def test_scenarios_are_listed_oldest_first(url):

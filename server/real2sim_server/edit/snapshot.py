@@ -1,0 +1,113 @@
+"""A state as bytes and back, bit for bit, so that a long log need not be replayed whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from real2sim_proto import CodecError, ErrorCode, decode, encode
+from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
+
+from ..scene import Trajectory
+from .errors import EditError
+from .state import AssetLookup, ObjectState, ScenarioState
+
+MAX_BYTES = 256 * 1024 * 1024
+
+
+def pack_state(state: ScenarioState) -> bytes:
+    """What differs from the recording, as msgpack; the recording itself is not in it."""
+    changed = [o for o in state.objects.values() if state.recorded.get(o.object_id) is not o]
+    return encode(
+        {
+            "objects": [_packed_object(o) for o in changed],
+            "next_instance_id": state.next_instance_id,
+            "clock": list(state.clock),
+            "regions": [r.model_dump(mode="json") for r in state.regions.values()],
+            "colliders": [c.model_dump(mode="json") for c in state.colliders.values()],
+            "gone": sorted(state.gone),
+        }
+    )
+
+
+def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
+    """The state that :func:`pack_state` was given.
+
+    Args:
+        initial: of the same scene, before any edit.
+        packed: the bytes.
+
+    Raises:
+        EditError: UNKNOWN_ASSET where an object shows an asset that is gone; INVALID_OPERATION
+            for bytes that hold no state of this scene.
+    """
+    try:
+        document = decode(packed, max_bytes=MAX_BYTES)
+        found = [_unpacked_object(o, initial.assets) for o in document["objects"]]
+        first, last = document["clock"]
+        regions = [EraseRegion.model_validate(r) for r in document["regions"]]
+        colliders = [AddCollider.model_validate(c) for c in document["colliders"]]
+        gone, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
+    except (CodecError, KeyError, TypeError, ValueError) as error:
+        raise EditError(
+            ErrorCode.INVALID_OPERATION,
+            f"these bytes hold no state: {error}",
+            hint="replay the whole log instead",
+        ) from error
+    return replace(
+        initial,
+        objects=MappingProxyType(dict(initial.objects) | {o.object_id: o for o in found}),
+        next_instance_id=next_instance_id,
+        clock=(first, last),
+        regions=MappingProxyType({str(r.region_id): r for r in regions}),
+        colliders=MappingProxyType({str(c.collider_id): c for c in colliders}),
+        gone=gone,
+    )
+
+
+def _packed_object(thing: ObjectState) -> dict[str, Any]:
+    return {
+        "object_id": thing.object_id,
+        "source_id": thing.source_id,
+        "category": thing.category,
+        "size": list(thing.size),
+        "scale": list(thing.scale),
+        "times_us": thing.trajectory.times_us,
+        "positions": thing.trajectory.positions,
+        "quaternions": thing.trajectory.quaternions,
+        "instance_id": thing.instance_id,
+        "deleted": thing.deleted,
+        "asset_id": thing.asset.asset_id if thing.asset else None,
+        "physics": thing.physics.model_dump(mode="json") if thing.physics else None,
+        "velocity": thing.velocity.model_dump(mode="json") if thing.velocity else None,
+        "placed": thing.placed,
+    }
+
+
+def _unpacked_object(packed: dict[str, Any], assets: AssetLookup | None) -> ObjectState:
+    asset_id = packed["asset_id"]
+    asset = assets(asset_id) if assets and asset_id is not None else None
+    if asset is None and asset_id is not None:
+        raise EditError(
+            ErrorCode.UNKNOWN_ASSET,
+            f"there is no asset {asset_id!r} in the library",
+            hint="put it back",
+        )
+    physics, velocity = packed["physics"], packed["velocity"]
+    length, width, height = packed["size"]
+    x, y, z = packed["scale"]
+    return ObjectState(
+        object_id=packed["object_id"],
+        source_id=packed["source_id"],
+        category=packed["category"],
+        size=(length, width, height),
+        scale=(x, y, z),
+        trajectory=Trajectory(packed["times_us"], packed["positions"], packed["quaternions"]),
+        instance_id=packed["instance_id"],
+        deleted=packed["deleted"],
+        asset=asset,
+        physics=SetPhysics.model_validate(physics) if physics else None,
+        velocity=SetVelocity.model_validate(velocity) if velocity else None,
+        placed=packed["placed"],
+    )
