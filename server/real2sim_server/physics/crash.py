@@ -198,9 +198,7 @@ def _mean_velocity(crashers: Sequence[Crasher]) -> Float:
     return masses @ np.stack([c.velocity for c in crashers]) / masses.sum()
 
 
-def _way_left(
-    first: Crasher, second: Crasher | Box, along: Float, cell: float
-) -> float | None:
+def _way_left(first: Crasher, second: Crasher | Box, along: Float, cell: float) -> float | None:
     """How far ``first`` can go [m] until surfaces are about to touch; None where it misses."""
     side = np.cross([0.0, 0.0, 1.0], along)
     across = np.stack([side / np.linalg.norm(side), np.cross(along, side)])
