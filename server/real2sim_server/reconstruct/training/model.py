@@ -40,6 +40,9 @@ class Rendered:
 class SceneModel:
     """Trainable parameters of a scene.
 
+    Attributes:
+        mirrored: by object, whether training shows its other side now and then.
+
     Args:
         scene: of stage 0; its cameras, ego path, boxes and times stay as they are.
         options: of training.
@@ -64,6 +67,8 @@ class SceneModel:
         cameras = len(scene.rig)
         self.exposure = packing.leaf(torch.eye(3, 4).expand(cameras, 3, 4))
         self.cameras = torch.zeros(cameras, 6, requires_grad=True)
+        vehicles = [o.category in MIRRORED for o in scene.objects.values()]
+        self.mirrored = tuple(options.mirror > 0 and vehicle for vehicle in vehicles)
         half = [np.array(o.size) / 2 for o in scene.objects.values()]
         self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float()
 

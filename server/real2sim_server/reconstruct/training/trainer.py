@@ -21,7 +21,7 @@ from .data import View, Views, held_out_frames, image_time
 from .densify import Densifier, ScreenSums, generator, reset_opacity
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .metrics import MetricsFile
-from .model import MIRRORED, Rendered, SceneModel
+from .model import Rendered, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
 from .schedule import TrainOptions, from_values, rates_at
@@ -122,7 +122,6 @@ class Trainer:
         self.iteration = 0
         self.running = Running()
         self.metrics = MetricsFile(folder / "metrics.jsonl") if folder else None
-        self._mirrored = [o.category in MIRRORED for o in scene.objects.values()]
 
     def run(
         self,
@@ -184,11 +183,12 @@ class Trainer:
 
     def _flips(self, i: int) -> tuple[bool, ...]:
         """Which vehicles show their other side in this step."""
-        if self.options.mirror <= 0 or not any(self._mirrored):
+        vehicles = self.model.mirrored
+        if not any(vehicles):
             return ()
-        drawn = generator(self.options.seed + 1, i).random(len(self._mirrored))
+        drawn = generator(self.options.seed + 1, i).random(len(vehicles))
         return tuple(
-            bool(m and d < self.options.mirror) for m, d in zip(self._mirrored, drawn, strict=True)
+            bool(m and d < self.options.mirror) for m, d in zip(vehicles, drawn, strict=True)
         )
 
     def _terms(self, view: View, rendered: Rendered) -> tuple[dict[str, Tensor], Tensor]:

@@ -8,6 +8,7 @@ ground under cars) is put back at the end.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -36,16 +37,19 @@ def visible_shares(model: SceneModel, looks: Iterable[Look]) -> Tensor:
     """[N] float32: of each Gaussian, how much reaches the images of what would without the others.
 
     The sum of its blending weights over all pixels, by what it would be over the whole image plane
-    if nothing stood before it; 0 for what is never before a camera.
+    if nothing stood before it; 0 for what is never before a camera. Where training shows vehicles
+    mirrored, they are looked at from both sides: what is hidden on one is learnt on the other.
     """
     gaussians = model.gaussians
     starts = [0]
     for count in gaussians.counts:
         starts.append(starts[-1] + count)
     shown, bare = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
-    for camera, t_us in looks:
+    sides = [(), model.mirrored] if any(model.mirrored) else [()]
+    for (camera, t_us), mirrored in itertools.product(looks, sides):
         viewmat = model.viewmat(camera, t_us).detach()
-        instances, drawn = model.instances(gaussians.clouds(degree=0), t_us)
+        clouds = gaussians.clouds(degree=0, mirrored=mirrored)
+        instances, drawn = model.instances(clouds, t_us)
         weights = blending_weights(instances, viewmat, camera, model)
         for index, instance, weight in zip(drawn, instances, weights, strict=True):
             rows = slice(starts[index], starts[index + 1])

@@ -80,6 +80,19 @@ def test_what_is_never_before_a_camera_has_no_share(model, looks):
     assert share == 0
 
 
+def test_sides_of_vehicles_that_training_shows_mirrored_count_as_seen(tiny_log, tiny_scene):
+    looks = Trainer(tiny_log, tiny_scene, TINY, backend="cpu").views.looks()
+    times = np.array([tiny_scene.start_us, tiny_scene.end_us])
+
+    def seen(mirror: float) -> torch.Tensor:
+        options = replace(TINY, refine_poses=False, mirror=mirror)
+        model = SceneModel(tiny_scene, options, times, backend="cpu")
+        return (visible_shares(model, looks) > 0.05)[model.gaussians.counts[0] :]
+
+    plain, mirrored = seen(0.0), seen(0.5)
+    assert bool((mirrored & ~plain).any())
+
+
 def test_the_unhindered_weight_is_the_area_of_the_ellipse_on_the_image(model):
     camera = model.scene.rig.cameras[0]
     viewmat = torch.from_numpy(camera.viewmat(model.scene.ego.transform(model.scene.start_us)))
