@@ -95,10 +95,15 @@ class DriveProbe:
             elif answer["type"] != "progress":
                 return answer, seconds
 
-    def listen(self, seconds: float) -> None:
-        """Take what comes unasked for so long."""
-        until = time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0:
+    def listen(self, seconds: float, *, until_pushed: float = 0.0) -> None:
+        """Take what comes unasked for so long, and on until something came, if that takes less
+        than ``until_pushed`` seconds."""
+        self.pushed, started = None, time.monotonic()
+        while True:
+            wanted = until_pushed if self.pushed is None else seconds
+            left = started + max(wanted, seconds) - time.monotonic()
+            if left <= 0:
+                return
             with contextlib.suppress(TimeoutError):
                 answer = decode(self.socket.recv(left, decode=False))
                 if answer["type"] == "obs":

@@ -15,6 +15,8 @@ from real2sim_proto.sessions import SessionInfo
 from .drive_probe import DriveProbe, action
 
 DEADLINE_MS = 100
+PUSHED_WITHIN_S = 30.0
+"""However busy the machine, a missed deadline is told by then."""
 MISBEHAVES_EVERY = 10
 """Steps from one time to the next."""
 
@@ -111,13 +113,13 @@ class Planner:
 
     def hang(self) -> None:
         """Say nothing for several deadlines; the clock goes on and says so."""
-        self._probe.listen(4 * DEADLINE_MS / 1e3)
+        self._probe.listen(4 * DEADLINE_MS / 1e3, until_pushed=PUSHED_WITHIN_S)
         self._catch_up()
 
     def be_late(self) -> None:
         """Answer after the deadline; the plan is stale."""
         asked = action(self._obs)
-        self._probe.listen(2 * DEADLINE_MS / 1e3)
+        self._probe.listen(2 * DEADLINE_MS / 1e3, until_pushed=PUSHED_WITHIN_S)
         answer, _ = self._probe.ask(asked)
         self._require(answer, "STALE_STEP")
         self._catch_up()

@@ -154,6 +154,20 @@ def learn(
     """Weights by name, and figures: mean error of positions [m] on seen and unseen places."""
     import torch
 
+    threads = torch.get_num_threads()
+    # The network is too small to share out, and one thread gives the same bits everywhere.
+    torch.set_num_threads(1)
+    try:
+        return _learn(lessons, shape, asked, on_epoch)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _learn(
+    lessons: Lessons, shape: PolicyShape, asked: Asked, on_epoch: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    import torch
+
     torch.manual_seed(asked.seed)
     model = network(shape)
     images, states, poses = map(torch.from_numpy, (lessons.images, lessons.states, lessons.poses))

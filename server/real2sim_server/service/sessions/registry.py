@@ -48,7 +48,8 @@ class SessionLimits:
     Attributes:
         worker_id: first part of session ids.
         max_sessions: open at one time.
-        idle_seconds: without use and without connection, after which a session ends.
+        idle_seconds: without use and without connection, after which a session leaves the memory;
+            whoever asks for it later gets it rebuilt from its log.
     """
 
     worker_id: str
@@ -107,7 +108,7 @@ class Sessions:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
-        """Idle sessions are ended for the length of the block; open ones end with it."""
+        """Idle sessions are put aside for the length of the block; open ones end with it."""
         sweeping = asyncio.create_task(self._sweep(), name="idle-sessions")
         try:
             yield self
@@ -254,6 +255,19 @@ class Sessions:
             farewell.add_done_callback(self._farewells.discard)
         log.info("session closed", session_id=session.session_id, reason=reason)
 
+    def put_aside(self, session: Session) -> None:
+        """Free the memory of a session that nobody is connected to; :meth:`find` brings it back."""
+        if self._open.pop(session.session_id, None) is None:
+            return
+        # Whoever has found it a moment ago must not move a world that is being rebuilt.
+        session.closed = ServiceError(
+            ErrorCode.QUEUE_FULL,
+            f"session {session.session_id!r} was put aside just now because nobody used it",
+            hint="send it again: the session is rebuilt from its log",
+        )
+        self._residency.unpin(session.row.scene)
+        log.info("session put aside", session_id=session.session_id)
+
     async def warm_up(self, session: Session) -> None:
         """Draw the session's scene once, so that no observation waits for a first render."""
         scene = session.start.scene
@@ -346,7 +360,7 @@ class Sessions:
             for session in self:
                 unused = time.monotonic() - session.used_at
                 if unused > idle and not session.connected and not session.lock.locked():
-                    await self.close(session, reason=f"unused for {unused:.0f} s")
+                    self.put_aside(session)
 
 
 def created_headers(info: SessionInfo) -> dict[str, str]:

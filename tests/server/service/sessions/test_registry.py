@@ -36,17 +36,20 @@ def test_beyond_the_limit_creation_is_refused_with_a_time_to_come_back(own_site)
     site.create()
 
 
-def test_sessions_that_nobody_uses_end_and_connected_ones_stay(own_site, join):
+def test_sessions_that_nobody_uses_leave_the_memory_and_come_back_as_they_were(own_site, join):
     site = own_site(session_idle_seconds=0.3)
     left, held = site.create(), site.create()
-    planner = join(held)
+    with join(left) as planner:
+        planner.reset(seed=3)
+        ego = planner.act(0)["ego"]
+    stays = join(held)
     until = time.monotonic() + 10
     while len(site.worker.sessions) > 1 and time.monotonic() < until:
         time.sleep(0.05)
-    answer = site.call("GET", left)
-    assert (answer.status_code, answer.json()["code"]) == (410, "SESSION_CLOSED")
-    assert "unused" in answer.json()["detail"]
-    assert planner.reset()["step"] == 0
+    assert len(site.worker.sessions) == 1
+    state = site.call("GET", left, "/state").json()
+    assert (state["step"], state["ego"]["speed"]) == (1, ego["speed"])
+    assert stays.reset()["step"] == 0
 
 
 def test_sessions_of_an_earlier_run_are_rebuilt_when_they_are_asked_for(own_site, tmp_path):
