@@ -23,8 +23,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from real2sim_proto.drive import Control, PoseCommand, TrajectoryPlan
     from real2sim_proto.episode import SensorSpec
+    from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 
     from .client import AsyncClient, Client, connect, connect_async
     from .drive_session import DriveSession
@@ -109,14 +109,14 @@ _ELSEWHERE = {
     "AsyncClient": "real2sim.client",
     "AsyncDriveSession": "real2sim.drive_session_async",
     "Client": "real2sim.client",
-    "Control": "real2sim_proto.drive",
+    "Control": "real2sim_proto.plans",
     "DriveSession": "real2sim.drive_session",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",
     "Observation": "real2sim.observation",
-    "PoseCommand": "real2sim_proto.drive",
+    "PoseCommand": "real2sim_proto.plans",
     "SensorSpec": "real2sim_proto.episode",
-    "TrajectoryPlan": "real2sim_proto.drive",
+    "TrajectoryPlan": "real2sim_proto.plans",
     "View": "real2sim.observation",
     "connect": "real2sim.client",
     "connect_async": "real2sim.client",

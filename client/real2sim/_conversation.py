@@ -23,7 +23,6 @@ from real2sim_proto import (
     encode,
 )
 from real2sim_proto.drive import (
-    PLAN,
     SERVER_MESSAGE,
     Action,
     Agent,
@@ -38,7 +37,6 @@ from real2sim_proto.drive import (
     Hello,
     Kept,
     Obs,
-    Plan,
     Progress,
     Render,
     Reset,
@@ -51,6 +49,7 @@ from real2sim_proto.drive import (
 )
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
+from real2sim_proto.plans import PLAN, Plan
 
 from ._replies import describe
 from ._requests import checked

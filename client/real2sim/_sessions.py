@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Unpack
 
-from real2sim_proto.drive import Plan
+from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import SessionCreate, SessionInfo, SessionState, StepRequest
 
 from . import _requests

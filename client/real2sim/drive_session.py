@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 import websockets
 from websockets.sync.client import connect
 
-from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Plan, Result, Welcome
+from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Result, Welcome
 from real2sim_proto.operations import Operation
+from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import SessionInfo
 
 from . import _requests

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 import websockets
 from websockets.asyncio.client import connect
 
-from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Plan, Result
+from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Result
 from real2sim_proto.operations import Operation
+from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import SessionInfo
 
 from . import _requests

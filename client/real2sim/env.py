@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from real2sim_proto.drive import Control
+from real2sim_proto.plans import Control
 
 from ._sensors import Sensor
 from .client import DEFAULT_URL, connect

@@ -19,16 +19,7 @@ from pydantic import (
 from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, Vector3
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .operations import Operation
-from .plans import (  # noqa: F401 - plans are messages too; only their number moved them out
-    PLAN,
-    Control,
-    Plan,
-    PlanPoses,
-    PlanTimes,
-    PoseCommand,
-    TrajectoryPlan,
-    check_times,
-)
+from .plans import Plan, PlanPoses, PlanTimes, check_times
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import CameraInfo, ObjectInfo
 

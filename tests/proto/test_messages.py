@@ -6,9 +6,10 @@ from pydantic import ValidationError
 
 from real2sim_proto import drive, operations, version
 from real2sim_proto.base import Pose
-from real2sim_proto.drive import CLIENT_MESSAGE, PLAN
+from real2sim_proto.drive import CLIENT_MESSAGE
 from real2sim_proto.errors import HTTP_STATUS, ErrorCode, Problem, title_of
 from real2sim_proto.operations import OPERATION
+from real2sim_proto.plans import PLAN
 from real2sim_proto.scenarios import OperationBatch
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.drive import TrajectoryPlan
+from real2sim_proto.plans import TrajectoryPlan
 
 from .follow_route import Array, Comfort, Path, speed_limits
 from .planner import Needs

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from real2sim_proto.drive import TrajectoryPlan
+from real2sim_proto.plans import TrajectoryPlan
 
 from .follow_route import Array, Comfort, Hindrance, Path, hindrances, speed_limits
 from .planner import Needs

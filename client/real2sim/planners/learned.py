@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.drive import TrajectoryPlan
+from real2sim_proto.plans import TrajectoryPlan
 
 from .planner import Needs
 

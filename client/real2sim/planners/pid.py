@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from real2sim_proto.drive import Control
+from real2sim_proto.plans import Control
 
 from .follow_route import Comfort, Path, speed_limits
 from .planner import Needs

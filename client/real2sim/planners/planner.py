@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from real2sim_proto.drive import Plan
+    from real2sim_proto.plans import Plan
     from real2sim_proto.scenes import CameraInfo
 
     from ..observation import Observation

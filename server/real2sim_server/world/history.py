@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from real2sim_proto import decode, encode
-from real2sim_proto.drive import PLAN, Plan
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation
+from real2sim_proto.plans import PLAN, Plan
 
 from ..edit import ScenarioState
 from ..scene import Scene

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from real2sim_proto.drive import TrajectoryPlan
 from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit.tracks import sample
 from ..scene import Scene

@@ -10,8 +10,8 @@ from typing import Protocol, assert_never
 import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import Control, PoseCommand, TrajectoryPlan
 from real2sim_proto.episode import EgoSpec, ResetSpec
+from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 
 from ..edit.tracks import sample
 from ..scene import Trajectory

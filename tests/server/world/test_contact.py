@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from real2sim_proto.base import Pose
-from real2sim_proto.drive import Control, PoseCommand
 from real2sim_proto.operations import SetPose, Translate
+from real2sim_proto.plans import Control, PoseCommand
 from real2sim_server.world.contact import REAR_OVERHANG, ego_box
 
 GO_ON = {"action": "control", "on_collision": "continue"}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_proto.drive import Control
 from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
 from real2sim_server.physics import crash
 from real2sim_server.scene import GaussianCloud, SceneObject

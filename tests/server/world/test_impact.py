@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_proto.drive import Control
 from real2sim_proto.operations import SetPhysics
+from real2sim_proto.plans import Control
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.world.impact import Body, Solid, corners, exchange, slid, touch
 

@@ -6,9 +6,9 @@ import zipfile
 
 import pytest
 
-from real2sim_proto.drive import TrajectoryPlan
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Translate
+from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.world.history import (
     Entry,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from real2sim_proto.drive import TrajectoryPlan
+from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.logs import open_log
 from real2sim_server.scene import Trajectory
 from real2sim_server.scene.rotation import quaternion_yaw, yaw_quaternion

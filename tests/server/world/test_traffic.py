@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import Control, PoseCommand
 from real2sim_proto.operations import Delete, Translate
+from real2sim_proto.plans import Control, PoseCommand
 from real2sim_server.world import WorldError
 
 COAST = Control(acceleration=0.0, steering=0.0)

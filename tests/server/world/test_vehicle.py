@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from real2sim_proto.drive import TrajectoryPlan
 from real2sim_proto.episode import EgoSpec
+from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.world.actuators import Command
 from real2sim_server.world.dynamic import axle_forces, fiala
 from real2sim_server.world.ego import Motion, drive

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from real2sim_proto import ErrorCode, encode
-from real2sim_proto.drive import Control, Obs, PoseCommand, ResetSpec, TrajectoryPlan
+from real2sim_proto.drive import Obs, ResetSpec
 from real2sim_proto.operations import Delete, Duplicate, Translate
+from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import EditError, ScenarioState
 from real2sim_server.world import World, WorldError
 
