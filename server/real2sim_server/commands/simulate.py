@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from ..edit.state import ScenarioState
-from ..physics.experiments import Experiment, draw_curves, leave_film, scene_road, set_up, views
+from ..physics.experiments import (
+    Experiment,
+    draw_curves,
+    leave_film,
+    scene_road,
+    set_up,
+    views,
+    walls,
+)
 from ..physics.playback import Playback
 from ..physics.presets import ObjectPhysics
 from ..physics.result import SimulationResult
@@ -31,6 +39,7 @@ class Asked:
         frame: recorded frame to start at.
         backend: of solver and renderer.
         film: whether pictures are drawn.
+        max_particles: of all bodies together; None takes the default.
     """
 
     experiment: str | None = None
@@ -41,6 +50,7 @@ class Asked:
     frame: int = 0
     backend: str = "auto"
     film: bool = True
+    max_particles: int | None = None
 
 
 def run(*, scene: Path, out: Path, asked: Asked, json_path: Path | None) -> None:
@@ -64,6 +74,7 @@ def run(*, scene: Path, out: Path, asked: Asked, json_path: Path | None) -> None
                 playback,
                 views(playback, experiment),
                 out,
+                outlines=walls(experiment),
                 on_progress=lambda done, total: tell("film", done, total),
             )
     figures = _figures(result)
@@ -87,6 +98,8 @@ def _experiment(scene: Scene, state: ScenarioState, asked: Asked) -> Experiment:
     options = replace(made.options, backend=asked.backend)
     if asked.duration is not None:
         options = replace(options, duration=asked.duration)
+    if asked.max_particles is not None:
+        options = replace(options, max_particles=asked.max_particles)
     return replace(made, options=options)
 
 

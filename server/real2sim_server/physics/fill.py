@@ -23,8 +23,9 @@ from .particles import Particles
 
 OPACITY_MIN = 0.05
 """Fainter Gaussians are haze and carry no matter."""
-BOX_SLACK = 0.1
-"""Gaussians further outside the box than this share of its size are not matter of the object."""
+BOX_SLACK, BOX_SLACK_MAX = 0.1, 0.15
+"""Gaussians further outside the box than this share of its size, and at most so much [m], are not
+matter of the object."""
 SEEN_SHARE = 0.5
 """A side is seen when this share of its silhouette shows matter of that side."""
 SAMPLES_MAX = 7
@@ -120,7 +121,8 @@ def _matter(cloud: GaussianCloud, size: Float) -> NDArray[np.int64]:
     """Indices of the Gaussians that are matter of the object."""
     means = cloud.means.detach().cpu().numpy().astype(np.float64)
     solid = cloud.opacities.detach().cpu().numpy() >= OPACITY_MIN
-    near = (np.abs(means) <= size * (0.5 + BOX_SLACK)).all(axis=1)
+    slack = np.minimum(size * BOX_SLACK, BOX_SLACK_MAX)
+    near = (np.abs(means) <= size / 2 + slack).all(axis=1)
     index = np.flatnonzero(solid & near & np.isfinite(means).all(axis=1))
     if len(index) == 0:
         raise ParticleError(

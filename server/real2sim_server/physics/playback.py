@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory
 from .coupling import Embedding, deform_cloud, stretched
 from .errors import PhysicsError
 from .result import SimulationResult
+
+WHEEL_RADIUS, WHEEL_HALF_WIDTH = 0.36, 0.2
+"""What Gaussians of a vehicle are its wheels: so far around the axle and along it [m]."""
 
 
 class PlacedObject(Protocol):
@@ -58,7 +64,8 @@ class Playback:
             raise PhysicsError(f"the simulation holds {sorted(missing)}, the scenario does not")
         self._clouds: dict[str, GaussianCloud] = {}
         self._embeddings: dict[str, Embedding] = {}
-        self._deformed: dict[str, tuple[int, GaussianCloud]] = {}
+        self._deformed: dict[str, tuple[tuple[int, bytes], GaussianCloud]] = {}
+        self._wheels: dict[str, NDArray[np.bool_]] = {}
 
     def instances(self, frame: int) -> list[Instance]:
         """Background, then simulated objects as they are at ``frame``, others as recorded.
@@ -86,14 +93,32 @@ class Playback:
     def _simulated(self, subject: PlacedObject, frame: int) -> Instance:
         own = self.result.objects[subject.object_id]
         pose, row = own.transform(frame), int(own.shape_index[frame])
-        if row < 0:
+        lifts = own.wheel_lifts[frame]
+        if row < 0 and not lifts.any():
             return Instance(self._cloud(subject), pose, subject.instance_id)
-        kept = self._deformed.get(subject.object_id)
-        if kept is None or kept[0] != row:
-            deformed = self._embedding(subject).follow(own.shapes[row].astype(np.float64))
-            kept = (row, deform_cloud(self._cloud(subject), deformed))
+        kept, key = self._deformed.get(subject.object_id), (row, lifts.tobytes())
+        if kept is None or kept[0] != key:
+            cloud = self._cloud(subject)
+            if row >= 0:
+                deformed = self._embedding(subject).follow(own.shapes[row].astype(np.float64))
+                cloud = deform_cloud(cloud, deformed)
+            if lifts.any():
+                cloud = self._lifted(subject, cloud, lifts)
+            kept = (key, cloud)
             self._deformed[subject.object_id] = kept
         return Instance(kept[1], pose, subject.instance_id)
+
+    def _lifted(
+        self, subject: PlacedObject, cloud: GaussianCloud, lifts: NDArray[np.float32]
+    ) -> GaussianCloud:
+        """Wheels stay on the road when the body comes down on its springs."""
+        key = subject.object_id
+        if key not in self._wheels:
+            rest = self._cloud(subject).means.detach().cpu().numpy()
+            self._wheels[key] = _in_wheels(rest, self.result.objects[key].wheels)
+        shift = torch.zeros_like(cloud.means)
+        shift[:, 2] = torch.from_numpy(self._wheels[key] @ lifts).to(shift)
+        return replace(cloud, means=cloud.means + shift)
 
     def _cloud(self, subject: PlacedObject) -> GaussianCloud:
         """At rest, in the colours of the start: deforming light is not recorded anywhere."""
@@ -112,3 +137,10 @@ class Playback:
                 own.rest.astype(np.float64), means, spacing=own.spacing
             )
         return self._embeddings[key]
+
+
+def _in_wheels(means: NDArray[np.float32], wheels: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """[G, W] which Gaussians belong to which wheel, by undersides [W, 3] in the same frame."""
+    offset = means[:, None] - (wheels + np.array([0, 0, WHEEL_RADIUS], dtype=np.float32))
+    in_disc = np.hypot(offset[..., 0], offset[..., 2]) < WHEEL_RADIUS + 0.02
+    return in_disc & (np.abs(offset[..., 1]) < WHEEL_HALF_WIDTH)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -33,6 +34,9 @@ class ObjectPhysics:
         T_world_object: [4, 4] where it starts; where the recording has it when None.
         brake: share of the wheels' grip that is braked, 0 to 1; when None, standing vehicles are
             braked, moving ones roll until they are hit.
+
+    Raises:
+        PhysicsError: for a mass, friction, restitution or brake out of its range.
     """
 
     mass: float | None = None
@@ -43,6 +47,19 @@ class ObjectPhysics:
     angular_velocity: ArrayLike | None = None
     T_world_object: ArrayLike | None = None
     brake: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("friction", 0.0, math.inf),
+            ("restitution", 0.0, 1.0),
+            ("brake", 0.0, 1.0),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                bounds = "not be negative" if high == math.inf else f"be in [{low:g}, {high:g}]"
+                raise PhysicsError(f"{name} of an object must {bounds}: {value!r}")
+        if self.mass is not None and not (math.isfinite(self.mass) and self.mass > 0):
+            raise PhysicsError(f"mass of an object must be positive [kg], not {self.mass!r}")
 
 
 @dataclass(frozen=True, kw_only=True)

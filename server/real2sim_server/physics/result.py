@@ -18,7 +18,7 @@ from ..scene.rotation import Float, transform_from
 from .errors import PhysicsError
 
 FORMAT = "real2sim-simulation"
-VERSION = 1
+VERSION = 2
 ENERGIES = ("kinetic", "elastic", "gravity", "friction_heat", "collider_work", "dissipated")
 
 
@@ -36,6 +36,8 @@ class ObjectResult:
         modes: [F] uint8, index into ``coupling.actor.MODES``.
         shape_index: [F] int32, row of ``shapes`` that holds at a frame; -1 for undeformed.
         shapes: [S, N, 3] float16, displacements of particles in the object's frame [m].
+        wheels: [W, 3] float32 undersides of its wheels, object frame [m]; W is 4 or 0.
+        wheel_lifts: [F, W] float32, how far each wheel was pushed up into its arch [m].
     """
 
     object_id: str
@@ -49,6 +51,8 @@ class ObjectResult:
     modes: NDArray[np.uint8]
     shape_index: NDArray[np.int32]
     shapes: NDArray[np.float16]
+    wheels: NDArray[np.float32]
+    wheel_lifts: NDArray[np.float32]
 
     def transform(self, frame: int) -> Float:
         """``T_world_object`` [4, 4] at a frame."""
@@ -183,4 +187,6 @@ ARRAYS = (
     "modes",
     "shape_index",
     "shapes",
+    "wheels",
+    "wheel_lifts",
 )

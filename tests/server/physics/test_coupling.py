@@ -215,3 +215,13 @@ def test_the_body_hangs_on_its_wheels_as_it_stands():
     start, tyres = car(0.0, brake=1.0)
     end = drive(start, tyres, 2.0)
     np.testing.assert_allclose(end.centre, start.centre, atol=2e-3)
+
+
+def test_wheels_go_up_into_the_body_as_far_as_it_came_down():
+    size = (4.0, 1.8, 1.5)
+    tyres = Tyres.of(size, np.zeros(3), 1e4)
+    ground = Plane(name="ground")
+    np.testing.assert_allclose(tyres.lifts(at(0, 0, 0.75), [ground]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(tyres.lifts(at(0, 0, 1.5), [ground]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(tyres.lifts(at(0, 0, 0.65), [ground]), 0.1)
+    assert (tyres.lifts(at(0, 0, -3.0), [ground]) <= 0.3).all()

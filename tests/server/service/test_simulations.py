@@ -59,6 +59,39 @@ def test_a_pushed_car_rolls_on_and_can_be_looked_at(client, scenario):
     assert film["result"]["frames"] == 4
 
 
+def test_physics_speed_and_wall_given_by_operations_are_what_the_rollout_has(client, scenario):
+    wall = {"kind": "box", "position": [17.0, -3.0, 1.0], "size": [1.0, 4.0, 2.0]}
+    edit(
+        client,
+        scenario,
+        {"op": "set_physics", "object_id": "car_red", "mass": 950.0},
+        PUSH,
+        {"op": "add_collider", "collider_id": "barrier", "shape": wall},
+    )
+    job = finished(client, client.post(f"{scenario}/simulate", json=SHORT | {"end_us": 250_000}))
+    assert job["state"] == "succeeded", job
+    hits = {(c["object_id"], c["other"]): c for c in job["result"]["contacts"]}
+    hit = hits["car_red", "barrier"]
+    # Half a metre at 6 m/s; Gaussians of this car reach a little out of its box.
+    assert 0.02 < hit["first_s"] < 0.1
+    assert 5.0 < hit["delta_v"] < 9.0
+    assert hit["impulse"][0] == pytest.approx(-950.0 * hit["delta_v"], rel=0.05)
+
+    files = f"/v1/jobs/{job['job_id']}/files"
+    own = client.get(f"{files}/playback.json").json()["tracks"]["car_red"]
+    assert own["mass"] == pytest.approx(950.0)
+    assert own["velocities"][0] == pytest.approx([6.0, 0.0, 0.0])
+    assert own["velocities"][-1][0] < 1.0
+
+
+def test_a_rollout_that_begins_inside_a_collider_fails_with_the_reason(client, scenario):
+    inside = {"kind": "box", "position": [14.0, -3.0, 1.0], "size": [1.0, 4.0, 2.0]}
+    edit(client, scenario, PUSH, {"op": "add_collider", "collider_id": "in", "shape": inside})
+    job = finished(client, client.post(f"{scenario}/simulate", json=SHORT))
+    assert job["state"] == "failed"
+    assert "inside collider 'in'" in job["error"]["detail"]
+
+
 def test_without_anything_set_in_motion_nothing_is_simulated(client, scenario):
     answer = client.post(f"{scenario}/simulate")
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST

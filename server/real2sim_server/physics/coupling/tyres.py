@@ -16,6 +16,8 @@ ROLLING = 0.015
 """Rolling resistance of a free wheel, share of its load."""
 ROUNDS = 6
 """Sweeps over the four patches in one step; their impulses act on each other."""
+LIFT_MAX = 0.3
+"""Wheels never go further into their arches than this [m]."""
 UPRIGHT = 0.5
 """Wheels carry while the body's up axis leans less than 60 degrees from the ground's normal."""
 
@@ -77,6 +79,13 @@ class Tyres:
     def braked(self, share: float) -> Tyres:
         """The same with ``share`` of their grip braked, in [0, 1]."""
         return replace(self, brake=share)
+
+    def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
+        """[4] by how far springs have given in, so that wheels stand on the road, not in it [m]."""
+        heights, normals = nearest(road, self._points(T_world_object))
+        carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
+        squeeze = np.where(carrying, self.rest - heights, 0.0)
+        return np.clip(squeeze, 0.0, LIFT_MAX)
 
     def act(
         self,

@@ -1,6 +1,6 @@
 """The paper's experiments on vehicles of a scene, and the pictures they leave."""
 
-from .film import draw_curves, leave_film, views
+from .film import draw_curves, leave_film, views, walls
 from .setups import Experiment, scene_road, set_up
 
-__all__ = ["Experiment", "draw_curves", "leave_film", "scene_road", "set_up", "views"]
+__all__ = ["Experiment", "draw_curves", "leave_film", "scene_road", "set_up", "views", "walls"]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ...render import RasterOptions, render_cameras
 from ...scene import Camera
-from ...scene.rotation import Float
+from ...scene.rotation import Float, apply_transform, invert_transform
+from ..colliders import Plane
 from ..coupling.actor import MODES
 from ..errors import PhysicsError
 from ..playback import Playback
@@ -23,6 +24,8 @@ Image = NDArray[np.uint8]
 RGB_ONLY = RasterOptions(depth=False, instance=False)
 FILM_RATE = 15.0
 STILLS = 5
+WALL_HALF_WIDTH, WALL_DOWN, WALL_UP = 1.3, 0.7, 0.9
+"""What is drawn of a virtual wall, around the focus [m]."""
 
 
 def views(playback: Playback, experiment: Experiment) -> list[Camera]:
@@ -44,6 +47,21 @@ def views(playback: Playback, experiment: Experiment) -> list[Camera]:
         Camera("scene", recorded.width, recorded.height, np.array(recorded.K), stood),
         Camera("near", recorded.width, recorded.height, K, near),
     ]
+
+
+def walls(experiment: Experiment) -> list[Float]:
+    """Corners [4, 3] [m] of what is drawn of each virtual wall, near the experiment's focus."""
+    drawn = []
+    for collider in experiment.options.colliders:
+        if not isinstance(collider, Plane) or collider.name in experiment.options.road:
+            continue
+        point, normal = np.asarray(collider.point), np.asarray(collider.normal)
+        foot = experiment.focus - ((experiment.focus - point) @ normal) * normal
+        across = np.cross([0.0, 0.0, 1.0], normal)
+        across = WALL_HALF_WIDTH * across / max(float(np.linalg.norm(across)), 1e-9)
+        low, high = np.array([0, 0, -WALL_DOWN]), np.array([0, 0, WALL_UP])
+        drawn.append(foot + np.array([-across + low, across + low, across + high, -across + high]))
+    return drawn
 
 
 def look_at(viewer: Float, focus: Float) -> Float:
@@ -75,10 +93,19 @@ def leave_film(
     cameras: Sequence[Camera],
     folder: Path,
     *,
+    outlines: Sequence[Float] = (),
     backend: str = "auto",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Write ``film.mp4``, the cameras side by side, and ``strip.png``, stills row by row.
+
+    Args:
+        playback: what is shown.
+        cameras: as ``views`` gives them.
+        folder: for the files.
+        outlines: of things without looks, see ``walls``.
+        backend: of the renderer.
+        on_progress: called with (pictures done, pictures).
 
     Raises:
         PhysicsError: when OpenCV cannot encode.
@@ -92,7 +119,10 @@ def leave_film(
     temporary = folder / ".film.tmp.mp4"
     writer, kept = None, []
     for done, frame in enumerate(frames):
-        images = draw(playback, cameras, frame, backend)
+        images = [
+            _outlined(image, camera, outlines)
+            for image, camera in zip(draw(playback, cameras, frame, backend), cameras, strict=True)
+        ]
         picture = _even(_captioned(np.concatenate(images, axis=1), float(result.times_s[frame])))
         if writer is None:
             size = (picture.shape[1], picture.shape[0])
@@ -159,6 +189,19 @@ def draw_curves(result: SimulationResult, path: Path) -> None:
     figure.savefig(path)
 
 
+def _outlined(image: Image, camera: Camera, outlines: Sequence[Float]) -> Image:
+    import cv2
+
+    picture = np.ascontiguousarray(image)
+    for corners in outlines:
+        seen_at = apply_transform(invert_transform(camera.T_vehicle_camera), corners)
+        if seen_at[:, 2].min() < 0.5:
+            continue
+        pixels = seen_at[:, :2] / seen_at[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+        cv2.polylines(picture, [np.rint(pixels).astype(np.int32)], True, (255, 90, 30), 1, 16)
+    return picture
+
+
 def _captioned(image: Image, time: float) -> Image:
     import cv2
 
@@ -174,4 +217,4 @@ def _even(image: Image) -> Image:
     return np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
 
 
-__all__ = ["draw", "draw_curves", "leave_film", "look_at", "views", "write_png"]
+__all__ = ["draw", "draw_curves", "leave_film", "look_at", "views", "walls", "write_png"]

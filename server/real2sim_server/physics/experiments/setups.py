@@ -11,14 +11,19 @@ from ...scene.rotation import Float
 from ..colliders import Collider, HeightField, Plane
 from ..errors import PhysicsError
 from ..ground import find_road
+from ..materials import Jelly
 from ..playback import PlacedObject, PlacedObjects
 from ..presets import VEHICLES, ObjectPhysics
 from ..simulation import SimulateOptions
+from .viewing import in_view, seen
 
 WALL_GAP = 0.5
 """Between the vehicle and the wall at the start [m]: contact after 1 s at 0.5 m/s."""
 DROP_HEIGHT = 1.225
 """Free fall of 0.5 s [m]."""
+DAMPED = Jelly(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
+"""The paper's medium for the fall. Its table has no damping, with which a block of this size jumps
+back up by a third of the height; this much leaves a slight bounce."""
 PAIR_GAP = 1.5
 """Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
 DEPTH_RANGE = (4.0, 45.0)
@@ -51,6 +56,7 @@ class _Asked:
     scene: Scene
     state: PlacedObjects
     chosen: tuple[PlacedObject, ...]
+    named: bool
     start_us: int
     preset: str
     speed: float | None
@@ -72,7 +78,7 @@ def set_up(
             ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground.
         preset: of the materials.
         speed: [m/s]; the paper's 2.5 and 3.5 by default.
-        objects: ids to take; the most visible vehicles by default.
+        objects: ids to take; by default vehicles in view, those that were seen best where it hits.
 
     Raises:
         PhysicsError: unknown name or objects, or no vehicles in view.
@@ -88,24 +94,23 @@ def set_up(
     chosen = [there[o] for o in objects] or most_visible(scene, state, start_us)
     if not chosen:
         raise PhysicsError(f"no vehicles in view at {start_us} us; name some with objects")
-    return builders[name](_Asked(scene, state, tuple(chosen), start_us, preset, speed))
+    return builders[name](
+        _Asked(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
+    )
 
 
 def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedObject]:
     """Vehicles before the first camera, the largest on its image first."""
     camera = scene.rig.cameras[0]
-    T_camera_world = camera.viewmat(scene.ego.transform(t_us))
+    ego = scene.ego.transform(t_us)
     found = []
     for subject in state.visible:
         if subject.category not in VEHICLES or not subject.trajectory.covers(t_us):
             continue
         place = subject.trajectory.transform(t_us)[:3, 3]
-        x, y, z = T_camera_world[:3, :3] @ place + T_camera_world[:3, 3]
-        if not DEPTH_RANGE[0] < z < DEPTH_RANGE[1]:
-            continue
-        u = camera.K[0, 0] * x / z + camera.K[0, 2]
-        v = camera.K[1, 1] * y / z + camera.K[1, 2]
-        if 0 < u < camera.width and 0 < v < camera.height:
+        near, far = DEPTH_RANGE
+        if in_view(camera, ego, place, nearest=near, farthest=far):
+            z = float((camera.viewmat(ego) @ np.append(place, 1.0))[2])
             found.append((z / subject.scaled_size[2], subject.object_id, subject))
     return [subject for _, _, subject in sorted(found, key=lambda f: f[:2])]
 
@@ -124,7 +129,9 @@ def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
 
 
 def _wall(asked: _Asked) -> Experiment:
-    subject, start_us = asked.chosen[0], asked.start_us
+    start_us = asked.start_us
+    # What is to be crushed must have been seen.
+    subject = max(asked.chosen, key=lambda s: seen(asked.scene, s).front)
     speed = 2.5 if asked.speed is None else asked.speed
     pose = subject.trajectory.transform(start_us)
     forward, length = _level(pose[:3, 0]), subject.scaled_size[0]
@@ -137,8 +144,7 @@ def _wall(asked: _Asked) -> Experiment:
         start_us=start_us,
         duration=WALL_GAP / speed + 1.0,
     )
-    side = _level(np.cross([0, 0, 1], forward)) * _towards(asked.scene, pose, forward, start_us)
-    view = _level(0.55 * side + 0.6 * forward) + np.array([0, 0, 0.35])
+    view = _viewer(asked.scene, subject, pose, slant=0.8)
     return Experiment(
         "wall", options, (subject.object_id,), front - 0.3 * length * forward, view, 6.5
     )
@@ -168,7 +174,13 @@ def _pair(asked: _Asked) -> Experiment:
     if len(chosen) < 2:
         raise PhysicsError("two vehicles in view are needed; name four or two with objects")
     count = min(len(chosen) // 2, 2)
-    runners, standing = chosen[:count], chosen[count : 2 * count]
+    if asked.named:
+        runners, standing = chosen[:count], chosen[count : 2 * count]
+    else:
+        looks = {s.object_id: seen(asked.scene, s) for s in chosen}
+        runners = sorted(chosen, key=lambda s: -looks[s.object_id].front)[:count]
+        rest = [s for s in chosen if s not in runners]
+        standing = sorted(rest, key=lambda s: -looks[s.object_id].rear)[:count]
     objects: dict[str, ObjectPhysics] = {}
     meeting = []
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
@@ -189,8 +201,7 @@ def _pair(asked: _Asked) -> Experiment:
         duration=PAIR_GAP / speed + 1.2,
         gravity=(0.0, 0.0, 0.0),
     )
-    forward = _level(runners[0].trajectory.transform(start_us)[:3, 0])
-    view = np.cross([0, 0, 1], forward) - 0.5 * forward + np.array([0, 0, 0.5])
+    view = _viewer(asked.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
     return Experiment("pair", options, tuple(objects), meeting[0], view, 9.0)
 
 
@@ -201,7 +212,9 @@ def _drop(asked: _Asked) -> Experiment:
         pose = subject.trajectory.transform(start_us)
         pose[2, 3] += DROP_HEIGHT
         down = (0.0, 0.0, -(asked.speed or 0.0))
-        objects[subject.object_id] = ObjectPhysics(T_world_object=pose, velocity=down)
+        objects[subject.object_id] = ObjectPhysics(
+            T_world_object=pose, velocity=down, material=DAMPED if asked.preset == "paper" else None
+        )
     options = SimulateOptions(
         preset=asked.preset,
         objects=objects,
@@ -210,8 +223,7 @@ def _drop(asked: _Asked) -> Experiment:
         duration=2.0,
     )
     pose = subjects[0].trajectory.transform(start_us)
-    side = np.cross([0, 0, 1], _level(pose[:3, 0]))
-    view = side - 0.6 * pose[:3, 0] + np.array([0, 0, 0.15])
+    view = _viewer(asked.scene, subjects[0], pose, slant=1.0, rise=0.15)
     return Experiment("drop", options, tuple(objects), pose[:3, 3], view, 8.0)
 
 
@@ -220,7 +232,16 @@ def _level(direction: Float) -> Float:
     return flat / max(float(np.linalg.norm(flat)), 1e-9)
 
 
-def _towards(scene: Scene, pose: Float, forward: Float, t_us: int) -> float:
-    """The side of a vehicle, left 1 or right -1, that the recording vehicle is on."""
-    offset = scene.ego.transform(t_us)[:3, 3] - pose[:3, 3]
-    return 1.0 if float(np.cross([0, 0, 1], forward) @ offset) >= 0 else -1.0
+def _viewer(
+    scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
+) -> Float:
+    """Direction [3] to a viewer on the side and at the end from which the subject was seen.
+
+    Args:
+        slant: how much to the side, against along the subject.
+        rise: how much up.
+    """
+    x, y, _ = seen(scene, subject).direction
+    along = (1.0 if x >= 0 else -1.0) * _level(pose[:3, 0])
+    side = (1.0 if y >= 0 else -1.0) * slant * _level(np.cross([0, 0, 1], pose[:3, 0]))
+    return _level(along + side) + np.array([0.0, 0.0, rise])

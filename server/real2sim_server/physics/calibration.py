@@ -1,0 +1,213 @@
+"""Materials and motion from what was seen, by least squares through the differentiable solver."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..scene.rotation import Float
+from .backends.reference import torch_model
+from .backends.reference_step import TorchRules, TorchState, settle, substep
+from .colliders import Collider
+from .errors import SolverError
+from .laws import stress as laws
+from .solver import Solver
+
+PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")
+"""What may be fitted: factors on what the solver was given, all positive."""
+DAMPING = 1e-3
+"""Of the first step, as a share of each parameter's own curvature (Marquardt 1963)."""
+DAMPING_MIN = 1e-12
+CALMER, BOLDER = 5.0, 0.2
+"""What damping is multiplied by after a step that was rejected, and after one that was kept."""
+LONGEST_STEP = 0.5
+"""Of the logarithm of a factor, in one step."""
+PATIENCE = 3
+"""Rejected steps in a row after which slopes are taken over a wider span."""
+SPANS = (0.1, 0.03, 0.01)
+"""Those spans, of the logarithm of a factor, one after the other."""
+REACHED = 1e-9
+"""Residuals below this are rounding [m]."""
+FLAT = 1e-12
+"""A parameter whose curvature is below this share of the largest is left where it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What was found.
+
+    Attributes:
+        factors: by parameter, on the value the solver was given.
+        uncertainty: by parameter, what one factor may be wrong by, as a share, when observations
+            are wrong by ``residual[-1]``; infinite for what they say nothing about.
+        residual: root mean square distance to what was observed [m], at the start and after each
+            step that was kept; it never rises.
+        rejected: steps that were taken back since they raised the residual.
+    """
+
+    factors: dict[str, float]
+    uncertainty: dict[str, float]
+    residual: tuple[float, ...]
+    rejected: int
+
+
+def calibrate(
+    solver: Solver,
+    observed: Float,
+    *,
+    parameters: Sequence[str],
+    dt: float,
+    every: int,
+    steps: int = 30,
+) -> Calibration:
+    """Fit factors so that a body's particles go where they were observed.
+
+    A step that raises the residual is taken back and tried shorter (Levenberg 1944, Marquardt
+    1963). Contact comes a substep sooner or later as parameters change, so that paths are stairs
+    with slopes on them: where no step along the slope helps, slopes are taken over several stairs.
+
+    Args:
+        solver: at its start, with guesses; its state is not changed.
+        observed: [T, N, 3] positions after ``every``, 2 ``every``, ... substeps [m].
+        parameters: names out of PARAMETERS.
+        dt: substep [s], small enough for all that is tried.
+        every: substeps between observations.
+        steps: tried at most, rejected ones included.
+
+    Raises:
+        SolverError: for names or shapes that do not fit, or guesses that already blow up.
+    """
+    names = tuple(dict.fromkeys(parameters))
+    target = _checked(solver, observed, names)
+    path = rollout(solver, names, dt=dt, every=every, observations=len(observed))
+    logs = torch.zeros(len(names), dtype=torch.float64)
+    off = (path(logs) - target).reshape(-1)
+    history, rejected, refused, damping = [_size(off)], 0, 0, DAMPING
+    if not math.isfinite(history[0]):
+        raise SolverError(f"the guesses blow up with dt of {dt!r} s; take a shorter one")
+    J = jacobian(path, logs)
+    for _ in range(steps):
+        if history[-1] < REACHED or refused >= PATIENCE * (len(SPANS) + 1):
+            break
+        tried = logs + _step(J, off, damping)
+        found = (path(tried) - target).reshape(-1)
+        if _size(found) < history[-1]:
+            logs, off, refused = tried, found, 0
+            history.append(_size(off))
+            damping = max(damping * BOLDER, DAMPING_MIN)
+            J = jacobian(path, logs)
+            continue
+        rejected, refused, damping = rejected + 1, refused + 1, damping * CALMER
+        wider, last = divmod(refused, PATIENCE)
+        if last == 0 and wider <= len(SPANS):
+            J, damping = _secants(path, logs, SPANS[wider - 1]), DAMPING
+    factors = dict(zip(names, logs.exp().tolist(), strict=True))
+    return Calibration(factors, _uncertainty(J, names, history[-1]), tuple(history), rejected)
+
+
+def _checked(solver: Solver, observed: Float, names: Sequence[str]) -> Tensor:
+    shape = (len(observed), len(solver.model.masses), 3)
+    if np.shape(observed) != shape or not len(observed):
+        raise SolverError(f"observed must be {shape}, at least once, not {np.shape(observed)}")
+    if not np.isfinite(observed).all():
+        raise SolverError("observed positions must be finite; leave out what was not seen")
+    unknown = sorted(set(names) - set(PARAMETERS))
+    if unknown or not names:
+        raise SolverError(f"cannot fit {unknown}; allowed are {list(PARAMETERS)}")
+    return torch.as_tensor(observed, dtype=torch.float64)
+
+
+def _size(off: Tensor) -> float:
+    """Root mean square; NaN compares as no improvement."""
+    return float(off.square().mean().sqrt())
+
+
+def _step(J: Tensor, off: Tensor, damping: float) -> Tensor:
+    """One damped step of the logarithms, in units in which every parameter weighs the same."""
+    scale = _scale(J)
+    scaled = J / scale
+    normal = scaled.T @ scaled + damping * torch.eye(len(scale), dtype=J.dtype)
+    step = torch.linalg.solve(normal, -(scaled.T @ off)) / scale
+    longest = float(step.abs().max())
+    return step * min(1.0, LONGEST_STEP / max(longest, 1e-30))
+
+
+def _scale(J: Tensor) -> Tensor:
+    """Lengths of the columns; infinite for parameters that hardly change anything."""
+    lengths = J.norm(dim=0)
+    known = lengths > math.sqrt(FLAT) * lengths.max()
+    return torch.where(known, lengths, torch.full_like(lengths, math.inf))
+
+
+def _uncertainty(J: Tensor, names: Sequence[str], residual: float) -> dict[str, float]:
+    scale = _scale(J)
+    scaled = J / scale
+    covariance = torch.linalg.pinv(scaled.T @ scaled, hermitian=True)
+    spread = residual * covariance.diagonal().clamp(min=0).sqrt() / scale
+    spread = torch.where(scale.isinf(), torch.full_like(spread, math.inf), spread)
+    return dict(zip(names, spread.tolist(), strict=True))
+
+
+def jacobian(path: Callable[[Tensor], Tensor], logs: Tensor) -> Tensor:
+    """[M, K] of a path by forward-mode dual numbers, all parameters in one run."""
+
+    def along(direction: Tensor) -> Tensor:
+        return torch.func.jvp(path, (logs,), (direction,))[1].reshape(-1)
+
+    with warnings.catch_warnings():
+        # Torch compiles its own forward rules by a function it has deprecated, and lacks a batched
+        # rule for an operation or two.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", UserWarning)
+        return torch.func.vmap(along)(torch.eye(len(logs), dtype=logs.dtype)).T
+
+
+def _secants(path: Callable[[Tensor], Tensor], logs: Tensor, span: float) -> Tensor:
+    """[M, K] by central differences over ``span``."""
+    steps = span / 2 * torch.eye(len(logs), dtype=logs.dtype)
+    columns = [(path(logs + step) - path(logs - step)).reshape(-1) / span for step in steps]
+    return torch.stack(columns, dim=1)
+
+
+def rollout(
+    solver: Solver, parameters: Sequence[str], *, dt: float, every: int, observations: int
+) -> Callable[[Tensor], Tensor]:
+    """Positions [T, N, 3] as a function of logarithms of factors [K]; differentiable."""
+    state, rules = torch_model(solver.model)
+    colliders: tuple[Collider, ...] = solver.colliders
+
+    def path(logs: Tensor) -> Tensor:
+        one = torch.ones((), dtype=torch.float64)
+        factor = dict.fromkeys(PARAMETERS, one)
+        factor.update(zip(parameters, logs.exp().unbind(), strict=True))
+        now, changed = _scaled(state, rules, factor)
+        seen = []
+        for count in range(every * observations):
+            moved = [c.after(count * dt) for c in colliders]
+            now, _ = substep(now, changed, moved, dt)
+            if (count + 1) % every == 0:
+                seen.append(now.x)
+        return torch.stack(seen)
+
+    return path
+
+
+def _scaled(
+    state: TorchState, rules: TorchRules, factor: dict[str, Tensor]
+) -> tuple[TorchState, TorchRules]:
+    columns = [torch.ones((), dtype=torch.float64)] * laws.ROW
+    columns[laws.MU] = columns[laws.LAMBDA] = factor["stiffness"]
+    columns[laws.A], columns[laws.VISCOSITY] = factor["yield_stress"], factor["viscosity"]
+    changed = replace(
+        rules,
+        rows=rules.rows * torch.stack(columns),
+        friction=rules.friction * factor["friction"],
+    )
+    thrown = replace(state, v=state.v * factor["speed"], L=state.L * factor["speed"])
+    return settle(thrown, changed), changed
