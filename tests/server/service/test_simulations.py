@@ -92,6 +92,63 @@ def test_a_rollout_that_begins_inside_a_collider_fails_with_the_reason(client, s
     assert "inside collider 'in'" in job["error"]["detail"]
 
 
+@pytest.mark.parametrize(
+    ("operation", "field"),
+    [
+        ({"op": "set_physics", "object_id": "car_red", "mass": 0.0}, "mass"),
+        ({"op": "set_physics", "object_id": "car_red", "mass": -1200.0}, "mass"),
+        ({"op": "set_physics", "object_id": "car_red", "friction": -0.1}, "friction"),
+        ({"op": "set_physics", "object_id": "car_red", "restitution": 1.5}, "restitution"),
+        ({"op": "set_physics", "object_id": "car_red", "material": "cheese"}, "material"),
+        ({"op": "set_physics", "object_id": "car_red", "poisson": 0.5}, "poisson"),
+        ({"op": "set_physics", "object_id": "car_red", "young": -2e6}, "young"),
+        ({"op": "set_velocity", "object_id": "car_red", "linear": [1e6, 0, 0]}, "linear"),
+        ({"op": "add_collider", "shape": {"kind": "box", "size": [0, 1, 1]}}, "shape"),
+        (
+            {
+                "op": "add_collider",
+                "shape": {"kind": "plane", "point": [0, 0, 0], "normal": [0] * 3},
+            },
+            "normal",
+        ),
+    ],
+)
+def test_nonsense_for_the_physics_is_refused_by_the_name_of_the_field(
+    client, scenario, operation, field
+):
+    answer = client.post(f"{scenario}/operations", json={"operations": [operation]})
+    assert answer.status_code == 422
+    problem = answer.json()
+    assert problem["code"] == ErrorCode.INVALID_REQUEST
+    assert field in str(problem)
+    assert client.get(scenario).json()["revision"] == 0
+
+
+def test_what_only_the_rollout_finds_wrong_fails_with_the_reason_and_the_worker_goes_on(
+    client, scenario
+):
+    start = client.post(f"{scenario}/simulate", json=SHORT | {"objects": ["car_red", "car_blue"]})
+    assert finished(client, start)["state"] == "succeeded"
+    onto_it = {
+        "op": "set_pose",
+        "object_id": "car_red",
+        "pose": {"position": [8.0, 0.0, 0.75], "quaternion": [1, 0, 0, 0]},
+    }
+    too_fast = PUSH | {"linear": [150.0, 150.0, 0.0]}
+    for operation, objects, reason in [
+        (too_fast, ["car_red"], "at most 200 m/s"),
+        (onto_it, ["car_red", "car_blue"], "inside each other"),
+    ]:
+        edit(client, scenario, operation)
+        job = finished(
+            client, client.post(f"{scenario}/simulate", json=SHORT | {"objects": objects})
+        )
+        assert (job["state"], job["error"]["code"]) == ("failed", ErrorCode.INVALID_REQUEST), job
+        assert reason in job["error"]["detail"]
+        client.post(f"{scenario}/undo")
+    assert finished(client, client.post(f"{scenario}/simulate", json=SHORT))["state"] == "succeeded"
+
+
 def test_without_anything_set_in_motion_nothing_is_simulated(client, scenario):
     answer = client.post(f"{scenario}/simulate")
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
