@@ -41,6 +41,24 @@ export const post = async (path, body, headers) => (await call("POST", path, { b
 export const picture = async (path, accept = "image/jpeg") =>
   URL.createObjectURL(await (await call("GET", path, { accept })).blob());
 
+// Server-sent events of a path, one object each, until the worker ends them.
+export async function* events(path) {
+  const { body } = await call("GET", path, { accept: "text/event-stream" });
+  const reader = body.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done) return;
+    text += value;
+    const messages = text.split("\n\n");
+    text = messages.pop();
+    for (const message of messages) {
+      const data = message.split("\n").filter((line) => line.startsWith("data: ")).map((line) => line.slice(6)).join("");
+      if (data) yield JSON.parse(data);
+    }
+  }
+}
+
 let asking = null;
 export function askForToken() {
   asking ??= new Promise((done) => {

@@ -47,6 +47,7 @@ function draw() {
   for (const o of shown()) if (o.trajectory.positions.length > 1) line(o.trajectory.positions, o.object_id === model.selected ? "#ffb45499" : "#33425680", 1.2);
   for (const region of model.scenario.erased) box(region.pose, region.size, "#ff7b72", false);
   for (const { shape } of model.scenario.colliders) if (shape.kind === "box") box(shape, shape.size, "#8a97a8", false);
+  if (!model.selected && model.box) { pen.setLineDash([4, 4]); box(model.box, model.box.size, "#dbe2ec", false); pen.setLineDash([]); }
   for (const o of shown()) box(poseOf(o), o.size, o.object_id === model.selected ? "#ffb454" : COLOURS[o.category] ?? "#5aa9ff", true, o.object_id);
   const ego = poseAt(model.scene.ego, model.t);
   const yaw = yawOf(ego.quaternion), p = ego.position;

@@ -6,6 +6,7 @@ import { say } from "./messages.js";
 export const model = {
   scene: null, scenario: null, history: null, camera: null, t: 0,
   selected: null, draft: null, job: null, playback: null, free: null, mosaic: false,
+  when: "always", box: null,
 };
 const listeners = {};
 export const on = (names, fn) => names.split(" ").forEach((n) => (listeners[n] ??= []).push(fn));
@@ -41,10 +42,19 @@ export function poseOf(subject) {
 export function draftOperations() {
   const draft = model.draft;
   if (!draft) return [];
-  const list = [];
-  if (draft.x || draft.y) list.push({ op: "translate", object_id: draft.id, x: draft.x, y: draft.y, snap: true });
-  if (draft.angle) list.push({ op: "rotate", object_id: draft.id, angle: draft.angle });
+  const list = [], time_range = timeRange();
+  if (draft.x || draft.y) list.push({ op: "translate", object_id: draft.id, x: draft.x, y: draft.y, snap: true, time_range });
+  if (draft.angle) list.push({ op: "rotate", object_id: draft.id, angle: draft.angle, time_range });
   return list;
+}
+
+// When a move holds; it is whole at the time shown, and blends in before or out after it.
+export function timeRange() {
+  const blend_us = 500_000, [start_us, end_us] = [model.t - blend_us, model.t + blend_us];
+  if (model.when === "on") return { start_us, blend_us };
+  if (model.when === "until") return { end_us, blend_us };
+  if (model.when === "around") return { start_us: start_us - blend_us, end_us: end_us + blend_us, blend_us };
+  return undefined;
 }
 
 export async function edit(operations) {

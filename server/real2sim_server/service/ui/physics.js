@@ -1,12 +1,11 @@
 // Physics: run it as a job, watch its progress, play the result, read contacts and energies.
 import { model, on, span, setTime, startSimulation, stopRun, tell } from "./model.js";
-import { call, get } from "./api.js";
+import { call, events, get } from "./api.js";
 import { el } from "./dom.js";
 import { attempt, say } from "./messages.js";
 import { plot } from "./plot.js";
 
 const page = () => document.getElementById("physics");
-const POLL_MS = 300;
 let running = null;
 
 export function startPhysics() {
@@ -25,22 +24,26 @@ function draw() {
       el("button", { id: "run", class: "primary", textContent: "Run from here", disabled: !!running || !moved.length, onclick: attempt(() => run(Number(seconds.value))) }),
       running && el("button", { textContent: "Cancel", onclick: attempt(() => call("DELETE", `/v1/jobs/${running.job_id}`)) }),
       model.job && el("button", { id: "leave-run", textContent: "Back to the scenario", onclick: stopRun }))];
-  if (running) parts.push(el("progress", { max: 1, value: running.progress }), el("small", { textContent: running.stage || running.state }));
+  if (running) parts.push(el("progress", { id: "progress", max: 1, value: running.progress }), el("small", { id: "stage-of-run", textContent: running.stage || running.state }));
   if (model.playback) parts.push(...results());
   page().replaceChildren(...parts);
   if (model.playback) chart();
+}
+// Not the whole page: what is being typed or clicked stays where it is.
+function progress() {
+  const bar = document.getElementById("progress");
+  if (!bar) return;
+  bar.value = running.progress;
+  document.getElementById("stage-of-run").textContent = running.stage || running.state;
 }
 async function run(seconds) {
   stopRun();
   const end = model.scenario.end_us, start = Math.min(model.t, end - 100_000);
   running = await startSimulation({ start_us: start, end_us: Math.min(end, Math.round(start + seconds * 1e6)) });
   try {
-    while (["queued", "running"].includes(running.state)) {
-      draw();
-      await new Promise((wake) => setTimeout(wake, POLL_MS));
-      running = await get(`/v1/jobs/${running.job_id}`);
-    }
-    const job = running;
+    draw();
+    for await (running of events(`/v1/jobs/${running.job_id}/events`)) progress();
+    const job = await get(`/v1/jobs/${running.job_id}`);
     if (job.state === "succeeded") await show(job.job_id);
     else say(job.error?.detail ?? `The run is ${job.state}.`, job.state === "failed" ? "bad" : "");
   } finally {

@@ -1,7 +1,8 @@
 // The property panel: shows the selected object, turns each changed field into one operation.
-import { model, on, object, poseOf, edit, select } from "./model.js";
+import { model, on, object, poseOf, edit, select, tell, timeRange } from "./model.js";
 import { yawOf, present } from "./poses.js";
-import { el } from "./dom.js";
+import { el, number, row, tidy } from "./dom.js";
+import { scenePanel } from "./scene_panel.js";
 
 const MATERIALS = ["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"];
 const page = () => document.getElementById("properties");
@@ -20,7 +21,7 @@ function list() {
   const rows = model.scenario.objects.map((o) =>
     el("button", { onclick: () => select(o.object_id) }, el("span", { textContent: o.object_id }),
       el("small", { textContent: present(o, model.t) ? o.category : `${o.category} · not now` })));
-  return [el("p", { textContent: "Click an object in the picture, on the map or here." }), el("div", { class: "object-list" }, ...rows)];
+  return [el("p", { textContent: "Click an object in the picture, on the map or here." }), el("div", { class: "object-list" }, ...rows), ...scenePanel()];
 }
 function panel(o) {
   const id = o.object_id, physics = o.physics ?? {};
@@ -35,8 +36,12 @@ function panel(o) {
       action("Duplicate", "duplicate", () => duplicate(id)), action("To the ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
       action("Delete", "delete", () => edit([{ op: "delete", object_id: id }]), "danger")),
     el("fieldset", {}, el("legend", { textContent: "Pose now" }),
-      row("x y z [m]", ["x", "y", "z"].map((axis, k) => number(`pose-${axis}`, 0, (v) => v !== null && edit([{ op: "translate", object_id: id, [axis]: v - poseOf(object(id)).position[k] }])))),
-      row("heading [°]", [number("heading", 0, (v) => v !== null && edit([{ op: "rotate", object_id: id, angle: (v * Math.PI) / 180 - yawOf(poseOf(object(id)).quaternion) }]), { class: "wide" })])),
+      row("x y z [m]", ["x", "y", "z"].map((axis, k) => number(`pose-${axis}`, 0, (v) => v !== null && edit([{ op: "translate", object_id: id, [axis]: v - poseOf(object(id)).position[k], time_range: timeRange() }])))),
+      row("heading [°]", [number("heading", 0, (v) => v !== null && edit([{ op: "rotate", object_id: id, angle: (v * Math.PI) / 180 - yawOf(poseOf(object(id)).quaternion), time_range: timeRange() }]), { class: "wide" })]),
+      row("holds", [when()])),
+    el("fieldset", {}, el("legend", { textContent: "Timing" }),
+      row("later by [s]", [number("delay", 0, (v) => v && edit([{ op: "retime", object_id: id, delay_us: Math.round(v * 1e6) }]), { class: "wide" })]),
+      row("speed [×]", [number("retime-speed", 1, (v) => v > 0 && v !== 1 && edit([{ op: "retime", object_id: id, speed: v }]), { class: "wide", min: 0.01, max: 100 })])),
     el("fieldset", {}, el("legend", { textContent: "Size" }),
       row("l w h [m]", ["x", "y", "z"].map((axis, k) => number(`size-${axis}`, o.size[k], (v) => v > 0 && edit([{ op: "scale", object_id: id, [axis]: v / o.size[k] }]))))),
     el("fieldset", {}, el("legend", { textContent: "Physics" }), optional("mass", "mass [kg]", 1e7), row("material", [material]),
@@ -46,17 +51,13 @@ function panel(o) {
 }
 export const duplicate = (id) => edit([{ op: "duplicate", object_id: id, x: object(id).size[0] + 1.5, frame: "object", snap: true }]);
 const action = (label, name, onclick, kind = "") => el("button", { textContent: label, onclick, class: kind, "data-action": name });
-const row = (label, inputs) => el("div", { class: "row" }, el("label", { textContent: label }), ...inputs);
-
-function number(id, value, change, { min, max, placeholder = "", class: kind = "" } = {}) {
-  const input = el("input", { id, type: "number", step: "any", placeholder, class: kind, value: value ?? value === 0 ? tidy(value) : "" });
-  if (min !== undefined) { input.min = min; input.max = max; }
-  input.setAttribute("aria-label", id);
-  input.onchange = () => change(input.value === "" ? null : Number(input.value));
-  return input;
+// For how long a move or turn holds, also one made with the mouse.
+function when() {
+  const choices = { always: "at all times", on: "from now on", until: "until now", around: "for 2 s around now" };
+  const choose = (e) => { model.when = e.target.value; tell("draft"); };
+  return el("select", { id: "when", class: "wide", onchange: choose, "aria-label": "when moves hold" },
+    ...Object.entries(choices).map(([value, textContent]) => el("option", { value, textContent, selected: value === model.when })));
 }
-const tidy = (v) => (v === null || v === undefined ? "" : String(Math.round(v * 1000) / 1000));
-
 function velocity(o) {
   const given = o.velocity;
   const inputs = [0, 1, 2].map((k) => number(`velocity-${"xyz"[k]}`, given?.linear?.[k], commit, { placeholder: "as is" }));
@@ -73,10 +74,10 @@ function refreshPose() {
   const subject = object(model.selected), first = document.getElementById("pose-x");
   if (!subject || !first) return;
   const { position, quaternion } = poseOf(subject);
-  ["x", "y", "z"].forEach((axis, k) => put(`pose-${axis}`, position[k]));
-  put("heading", (yawOf(quaternion) * 180) / Math.PI);
+  ["x", "y", "z"].forEach((axis, k) => put(`pose-${axis}`, position[k], 2));
+  put("heading", (yawOf(quaternion) * 180) / Math.PI, 2);
 }
-function put(id, value) {
+function put(id, value, digits) {
   const input = document.getElementById(id);
-  if (document.activeElement !== input) input.value = tidy(value);
+  if (document.activeElement !== input) input.value = tidy(value, digits);
 }
