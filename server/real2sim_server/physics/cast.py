@@ -15,6 +15,7 @@ from .coupling import Tyres, stretched
 from .coupling.actor import Actor
 from .errors import PhysicsError
 from .fill import fill_object
+from .particles import Particles
 from .playback import PlacedObject, PlacedObjects
 from .presets import VEHICLES, ObjectPhysics, Preset
 from .restitution import fit_restitution
@@ -156,12 +157,7 @@ def _actor(
 ) -> Actor:
     size = subject.scaled_size
     wheels = preset.wheels and subject.category in VEHICLES
-    cloud = stretched(scene.object(subject.source_id).cloud_at(start_us), subject.scale)
-    filling = fill_object(
-        cloud, size, spacing=preset.spacing, mass=physics.mass, category=subject.category
-    )
-    above = -size[2] / 2 + preset.clearance if wheels else -np.inf
-    particles = filling.lattice(above=above)
+    particles = matter_of(scene, subject, preset, start_us, mass=physics.mass)
     materials, regions_of = preset.build(subject.category, size[0])
     regions = regions_of(particles.positions[:, 0])
     if physics.material is not None:
@@ -196,6 +192,21 @@ def _actor(
     if physics.restitution is not None:
         _fit(actor, physics.restitution)
     return actor
+
+
+def matter_of(
+    scene: Scene, subject: PlacedObject, preset: Preset, start_us: int, *, mass: float | None = None
+) -> Particles:
+    """What an object is filled with, object frame; without the room between wheels.
+
+    Raises:
+        ParticleError: as ``fill_object``.
+    """
+    size = subject.scaled_size
+    cloud = stretched(scene.object(subject.source_id).cloud_at(start_us), subject.scale)
+    filling = fill_object(cloud, size, spacing=preset.spacing, mass=mass, category=subject.category)
+    wheels = preset.wheels and subject.category in VEHICLES
+    return filling.lattice(above=-size[2] / 2 + preset.clearance if wheels else -np.inf)
 
 
 def _pose(subject: PlacedObject, physics: ObjectPhysics, start_us: int) -> Float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Protocol
 
@@ -67,8 +68,12 @@ class Playback:
         self._deformed: dict[str, tuple[tuple[int, bytes], GaussianCloud]] = {}
         self._wheels: dict[str, NDArray[np.bool_]] = {}
 
-    def instances(self, frame: int) -> list[Instance]:
+    def instances(self, frame: int, *, without: Collection[str] = ()) -> list[Instance]:
         """Background, then simulated objects as they are at ``frame``, others as recorded.
+
+        Args:
+            frame: of the result.
+            without: ids of objects that are left out.
 
         Raises:
             PhysicsError: for a frame that there is not.
@@ -78,6 +83,8 @@ class Playback:
         t_us = self.time_us(frame)
         instances = [Instance(self.scene.background)]
         for subject in self.state.visible:
+            if subject.object_id in without:
+                continue
             if subject.object_id in self.result.objects:
                 instances.append(self._simulated(subject, frame))
             elif subject.trajectory.covers(t_us):

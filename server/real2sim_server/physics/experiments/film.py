@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from ...render import RasterOptions, render_cameras
-from ...scene import Camera
+from ...render import Instance, RasterOptions, render_cameras
+from ...scene import Camera, GaussianCloud
 from ...scene.rotation import Float, apply_transform, invert_transform
 from ..colliders import Plane
 from ..coupling.actor import MODES
@@ -24,15 +26,30 @@ Image = NDArray[np.uint8]
 RGB_ONLY = RasterOptions(depth=False, instance=False)
 FILM_RATE = 15.0
 STILLS = 5
+CLEAR = 0.8
+"""Of the distance from a near view to what it looks at."""
 WALL_HALF_WIDTH, WALL_DOWN, WALL_UP = 1.3, 0.7, 0.9
 """What is drawn of a virtual wall, around the focus [m]."""
 
 
-def views(playback: Playback, experiment: Experiment) -> list[Camera]:
-    """The scene's first camera where it stood at the start, and one near the subjects.
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera of the film.
 
-    Both fixed in the world: ``T_vehicle_camera`` is ``T_world_camera``.
+    Attributes:
+        camera: fixed in the world: ``T_vehicle_camera`` is ``T_world_camera``.
+        background: what of it is drawn.
+        clear: what takes no part is left out when it comes this near [m]; nobody ever saw it from
+            there, and it would hide what is to be seen.
     """
+
+    camera: Camera
+    background: GaussianCloud
+    clear: float = 0.0
+
+
+def views(playback: Playback, experiment: Experiment) -> list[View]:
+    """The scene's first camera where it stood at the start, and one near the subjects."""
     scene = playback.scene
     recorded = scene.rig.cameras[0]
     stood = scene.ego.transform(experiment.options.start_us) @ recorded.T_vehicle_camera
@@ -44,9 +61,24 @@ def views(playback: Playback, experiment: Experiment) -> list[Camera]:
     K[0, 0] = K[1, 1] = 0.9 * recorded.width
     K[0, 2], K[1, 2] = recorded.width / 2, recorded.height / 2
     return [
-        Camera("scene", recorded.width, recorded.height, np.array(recorded.K), stood),
-        Camera("near", recorded.width, recorded.height, K, near),
+        View(
+            Camera("scene", recorded.width, recorded.height, np.array(recorded.K), stood),
+            scene.background,
+        ),
+        View(
+            Camera("near", recorded.width, recorded.height, K, near),
+            _before(scene.background, viewer, experiment),
+            clear=CLEAR * experiment.distance,
+        ),
     ]
+
+
+def _before(cloud: GaussianCloud, viewer: Float, experiment: Experiment) -> GaussianCloud:
+    """The background without trees and posts between a near viewer and the focus."""
+    means = cloud.means.detach().cpu().numpy()
+    near = np.linalg.norm(means - viewer, axis=1) < CLEAR * experiment.distance
+    hides = torch.from_numpy(near & (means[:, 2] > experiment.focus[2]))
+    return cloud.select(~hides.to(cloud.device))
 
 
 def walls(experiment: Experiment) -> list[Float]:
@@ -75,33 +107,50 @@ def look_at(viewer: Float, focus: Float) -> Float:
     return pose
 
 
-def draw(playback: Playback, cameras: Sequence[Camera], frame: int, backend: str) -> list[Image]:
-    """RGB images of a frame, one for each camera."""
-    frames = render_cameras(
-        playback.instances(frame),
-        cameras,
-        np.eye(4),
-        sky=playback.scene.sky,
-        options=RGB_ONLY,
-        backend=backend,
-    )
-    return [f.rgb for f in frames]
+def draw(playback: Playback, shown: Sequence[View], frame: int, backend: str) -> list[Image]:
+    """RGB images of a frame, one for each view."""
+    images = []
+    for view in shown:
+        _, *objects = playback.instances(frame, without=_bystanders(playback, view, frame))
+        [drawn] = render_cameras(
+            [Instance(view.background), *objects],
+            [view.camera],
+            np.eye(4),
+            sky=playback.scene.sky,
+            options=RGB_ONLY,
+            backend=backend,
+        )
+        images.append(drawn.rgb)
+    return images
+
+
+def _bystanders(playback: Playback, view: View, frame: int) -> set[str]:
+    """What takes no part and is too near to the view to be shown."""
+    t_us, eye = playback.time_us(frame), view.camera.T_vehicle_camera[:3, 3]
+    return {
+        o.object_id
+        for o in playback.state.visible
+        if o.object_id not in playback.result.objects
+        and o.trajectory.covers(t_us)
+        and float(np.linalg.norm(o.trajectory.transform(t_us)[:3, 3] - eye))
+        < view.clear + o.scaled_size[0] / 2
+    }
 
 
 def leave_film(
     playback: Playback,
-    cameras: Sequence[Camera],
+    shown: Sequence[View],
     folder: Path,
     *,
     outlines: Sequence[Float] = (),
     backend: str = "auto",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write ``film.mp4``, the cameras side by side, and ``strip.png``, stills row by row.
+    """Write ``film.mp4``, the views side by side, and ``strip.png``, stills row by row.
 
     Args:
         playback: what is shown.
-        cameras: as ``views`` gives them.
+        shown: as ``views`` gives them.
         folder: for the files.
         outlines: of things without looks, see ``walls``.
         backend: of the renderer.
@@ -120,8 +169,8 @@ def leave_film(
     writer, kept = None, []
     for done, frame in enumerate(frames):
         images = [
-            _outlined(image, camera, outlines)
-            for image, camera in zip(draw(playback, cameras, frame, backend), cameras, strict=True)
+            _outlined(image, view.camera, outlines)
+            for image, view in zip(draw(playback, shown, frame, backend), shown, strict=True)
         ]
         picture = _even(_captioned(np.concatenate(images, axis=1), float(result.times_s[frame])))
         if writer is None:
@@ -138,7 +187,7 @@ def leave_film(
     assert writer is not None
     writer.release()
     os.replace(temporary, folder / "film.mp4")
-    rows = [np.concatenate([still[c] for still in kept], axis=1) for c in range(len(cameras))]
+    rows = [np.concatenate([still[c] for still in kept], axis=1) for c in range(len(shown))]
     write_png(folder / "strip.png", np.concatenate(rows, axis=0))
 
 
@@ -217,4 +266,4 @@ def _even(image: Image) -> Image:
     return np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
 
 
-__all__ = ["draw", "draw_curves", "leave_film", "look_at", "views", "walls", "write_png"]
+__all__ = ["View", "draw", "draw_curves", "leave_film", "look_at", "views", "walls", "write_png"]

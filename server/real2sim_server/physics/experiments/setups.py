@@ -8,12 +8,13 @@ import numpy as np
 
 from ...scene import Scene
 from ...scene.rotation import Float
+from ..cast import matter_of
 from ..colliders import Collider, HeightField, Plane
 from ..errors import PhysicsError
 from ..ground import find_road
 from ..materials import Jelly
 from ..playback import PlacedObject, PlacedObjects
-from ..presets import VEHICLES, ObjectPhysics
+from ..presets import VEHICLES, ObjectPhysics, preset_of
 from ..simulation import SimulateOptions
 from .viewing import in_view, seen
 
@@ -135,7 +136,7 @@ def _wall(asked: _Asked) -> Experiment:
     speed = 2.5 if asked.speed is None else asked.speed
     pose = subject.trajectory.transform(start_us)
     forward, length = _level(pose[:3, 0]), subject.scaled_size[0]
-    front = pose[:3, 3] + (length / 2) * forward
+    front = pose[:3, 3] + _reach(asked, subject)[1][0] * forward
     wall = Plane(name="wall", point=front + WALL_GAP * forward, normal=-forward, friction=0.3)
     options = SimulateOptions(
         preset=asked.preset,
@@ -158,10 +159,10 @@ def _standing_road(asked: _Asked, subject: PlacedObject) -> Collider:
     """The road; without wheels it must not reach into the vehicle's underside."""
     if asked.preset != "paper":
         return scene_road(asked.scene, asked.state, asked.start_us)
-    pose, height = subject.trajectory.transform(asked.start_us), subject.scaled_size[2]
+    pose = subject.trajectory.transform(asked.start_us)
     return Plane(
         name="ground",
-        point=pose[:3, 3] - (height / 2 + 0.05) * pose[:3, 2],
+        point=pose[:3, 3] + _reach(asked, subject)[0][2] * pose[:3, 2],
         normal=pose[:3, 2],
         friction=0.0,
     )
@@ -186,7 +187,7 @@ def _pair(asked: _Asked) -> Experiment:
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
         own = runner.trajectory.transform(start_us)
         forward = _level(own[:3, 0])
-        away = runner.scaled_size[0] / 2 + PAIR_GAP + hit.scaled_size[0] / 2
+        away = _reach(asked, runner)[1][0] + PAIR_GAP - _reach(asked, hit)[0][0]
         target = np.array(own)
         target[:3, 3] += away * forward
         target[:3, 3] += (0.25 - 0.5 * k) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
@@ -225,6 +226,16 @@ def _drop(asked: _Asked) -> Experiment:
     pose = subjects[0].trajectory.transform(start_us)
     view = _viewer(asked.scene, subjects[0], pose, slant=1.0, rise=0.15)
     return Experiment("drop", options, tuple(objects), pose[:3, 3], view, 8.0)
+
+
+def _reach(asked: _Asked, subject: PlacedObject) -> tuple[Float, Float]:
+    """How far an object's matter reaches back and forth along its own axes, [3] and [3] [m].
+
+    Tracked boxes are not that exact: matter reaches up to a voxel out of them.
+    """
+    preset = preset_of(asked.preset)
+    matter = matter_of(asked.scene, subject, preset, asked.start_us).positions
+    return matter.min(axis=0) - preset.spacing / 2, matter.max(axis=0) + preset.spacing / 2
 
 
 def _level(direction: Float) -> Float:
