@@ -1,0 +1,146 @@
+"""What the panels of the studio do to a scenario."""
+
+from __future__ import annotations
+
+import subprocess
+from typing import Any
+
+import pytest
+
+import real2sim
+from real2sim_server.service.serve import running_worker
+
+from .hands import enter, field, kept, shown, until
+
+pytestmark = [pytest.mark.browser, pytest.mark.network]
+
+
+def first(page: Any) -> str:
+    target = shown(page, "model.scenario.objects[0].object_id")
+    page.click(f".object-list button:has-text('{target}')")
+    return target
+
+
+def at(page: Any, share: float) -> None:
+    page.evaluate(
+        "async (share) => { const { model, setTime } = await import('/ui/model.js');"
+        " const { start_us: a, end_us: b } = model.scenario; setTime(a + share * (b - a)); }",
+        share,
+    )
+
+
+def test_a_move_from_now_on_leaves_what_was_before(studio):
+    first(studio)
+    at(studio, 0)
+    before = field(studio, "pose-y")
+    at(studio, 0.8)
+    studio.select_option("#when", "on")
+    moved = field(studio, "pose-y") + 2
+    enter(studio, "pose-y", moved)
+    kept(studio, 1)
+    assert field(studio, "pose-y") == pytest.approx(moved, abs=0.02)
+    at(studio, 0)
+    assert field(studio, "pose-y") == pytest.approx(before, abs=0.02)
+
+
+def test_an_object_may_do_the_same_later(studio):
+    first(studio)
+    start = shown(studio, "model.scenario.objects[0].start_us")
+    enter(studio, "delay", 0.5)
+    kept(studio, 1)
+    assert shown(studio, "model.scenario.objects[0].start_us") == start + 500_000
+
+
+def test_a_box_erases_stops_and_is_taken_back(studio):
+    enter(studio, "box-x", 21)
+    studio.click("#erase")
+    kept(studio, 1)
+    assert shown(studio, "model.scenario.erased[0].pose.position[0]") == 21
+    studio.click("#collide")
+    kept(studio, 2)
+    assert shown(studio, "model.scenario.colliders[0].shape.position[0]") == 21
+    studio.click("#plane")
+    kept(studio, 3)
+    assert studio.locator("[data-remove]").count() == 3
+    studio.locator("[data-remove]").first.click()
+    kept(studio, 4)
+    assert shown(studio, "model.scenario.erased.length") == 0
+
+
+def test_a_scenario_plays_in_the_span_given(studio):
+    end = shown(studio, "model.scenario.end_us")
+    enter(studio, "clock-end", end / 2e6)
+    kept(studio, 1)
+    assert shown(studio, "model.scenario.end_us") == end / 2
+
+
+def test_a_kept_object_is_inserted_and_takes_the_place_of_another(studio):
+    target = first(studio)
+    studio.click("[data-tab=assets]")
+    studio.click("button:has-text('as asset')")
+    studio.click(".card button:has-text('Insert')")
+    kept(studio, 1)
+    assert shown(studio, "model.scenario.objects.length") == 4
+    studio.click("[data-tab=properties]")
+    studio.keyboard.press("Escape")
+    studio.click(f".object-list button:not(:has-text('{target}')) >> nth=0")
+    studio.click("[data-tab=assets]")
+    studio.click(".card button:has-text('Replace')")
+    kept(studio, 2)
+    replaced = shown(studio, "model.scenario.objects.filter((o) => o.asset_id).length")
+    assert replaced == 2
+
+
+def test_a_worker_with_a_token_asks_for_it(visit, make_settings):
+    with running_worker(make_settings(token="correct horse")) as running:
+        page = visit(f"{running.url}/ui")
+        page.wait_for_selector("#token[open]")
+        page.fill("#token input", "correct horse")
+        page.click("#token button")
+        page.click("[data-scene=tiny]")
+        page.wait_for_selector("#picture[data-seq]")
+
+
+def test_what_is_copied_as_python_makes_the_same_scenario(studio, running):
+    edited(studio)
+    studio.click("[data-tab=log]")
+    studio.click("#copy-python")
+    script = studio.evaluate("navigator.clipboard.readText()")
+    exec(compile(script, "copied", "exec"), {})
+    with real2sim.connect(running.url) as sim:
+        *_, old, new = sim.scenarios.list()
+        objects = [sim.scenarios.get(s.scenario_id).info.objects for s in (old, new)]
+    assert objects[0] == objects[1]
+
+
+def test_what_is_copied_as_curl_makes_the_same_changes(studio):
+    edited(studio)
+    x = field(studio, "pose-x")
+    studio.click("[data-tab=log]")
+    studio.click("#copy-curl")
+    script = studio.evaluate("navigator.clipboard.readText()")
+    subprocess.run(["bash", "-ec", script], check=True, capture_output=True, timeout=60)
+    until(lambda: shown(studio, "model.scenario.revision") == 4)
+    assert field(studio, "pose-x") == pytest.approx(x + 3, abs=0.02)
+
+
+def edited(page: Any) -> None:
+    first(page)
+    enter(page, "pose-x", field(page, "pose-x") + 3)
+    kept(page, 1)
+    enter(page, "p-mass", 1200)
+    kept(page, 2)
+
+
+def test_a_fork_goes_its_own_way(studio):
+    edited(studio)
+    address = studio.url
+    studio.click("#fork")
+    studio.wait_for_url(lambda url: url.split("&")[0] != address.split("&")[0])
+    studio.wait_for_selector("body[data-ready]")
+    assert studio.inner_text("#name").endswith("(fork)")
+    studio.click("#undo")
+    kept(studio, 3)
+    studio.goto(address)
+    studio.wait_for_selector("body[data-ready]")
+    kept(studio, 2)
