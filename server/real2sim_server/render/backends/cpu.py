@@ -7,7 +7,7 @@ dealt to tiles and blended. Work space grows to what was needed and is kept.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -22,8 +22,9 @@ from .base import (
     place_instances,
 )
 from .cpu_blend import blend_tiles
+from .cpu_cull import Chunks, seen_chunks
 from .cpu_gradients import TrainingPasses
-from .cpu_inputs import Workspace, array_of, project, timed
+from .cpu_inputs import Workspace, array_of, project, timed, view_of
 from .cpu_records import TILE, Images, Records
 from .cpu_sky import add_sky
 from .cpu_sort import sort_records
@@ -56,9 +57,12 @@ class CpuBackend:
         timing: dict[str, float] = dict.fromkeys(("project", "sort", "tile", "blend", "sky"), 0.0)
         placement = place_instances(request.instances, request.viewmats.detach().cpu())
         with self._lock:
+            with timed(timing, "project"):
+                views = [view_of(request, c) for c in range(request.cameras)]
+                seen = seen_chunks(request, placement, views)
             for c in range(request.cameras):
                 images = Images(rgb[c], alpha[c], depth[c], instance[c])
-                self._draw(request, placement, c, images, timing)
+                self._draw(request, placement, c, chunks=seen[c], images=images, timing=timing)
         return RenderOutput(
             rgb=torch.from_numpy(rgb),
             alpha=torch.from_numpy(alpha),
@@ -77,11 +81,13 @@ class CpuBackend:
         request: RasterRequest,
         placement: Placement,
         camera: int,
+        *,
+        chunks: Sequence[Chunks],
         images: Images,
         timing: dict[str, float],
     ) -> None:
         with timed(timing, "project"):
-            records, regions = project(request, placement, camera, self._space)
+            records, regions = project(request, placement, camera, chunks, self._space)
         with timed(timing, "sort"):
             pairs = self._space.array("pairs", (int(records.counts[:regions].sum()),), np.uint64)
             scratch = self._space.array("pairs_scratch", pairs.shape, np.uint64)

@@ -22,6 +22,7 @@ from ..types import RenderOutput, ScreenStatistics
 from .base import Placement, RasterRequest, direction_matrix, place_instances
 from .cpu_blend import blend_tiles
 from .cpu_blend_backward import HALVES, SLOT, Losses, blend_tiles_backward, open_pixels
+from .cpu_cull import all_chunks
 from .cpu_inputs import (
     NO_COVARS,
     Workspace,
@@ -250,7 +251,7 @@ def _draw(training: TrainingPass, camera: int, images: Images, space: Workspace)
     """Draw one camera and keep what was made on the way."""
     request, timing = training.request, training.timing
     with timed(timing, "project"):
-        records, regions = project(request, training.placement, camera, space)
+        records, regions = project(request, training.placement, camera, all_chunks(request), space)
     with timed(timing, "sort"):
         pairs = space.array("pairs", (int(records.counts[:regions].sum()),), np.uint64)
         scratch = space.array("pairs_scratch", pairs.shape, np.uint64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..types import Instance
 from .base import CLAMP_MARGIN, Placement, RasterRequest
+from .cpu_cull import Chunks, arrays_of
 from .cpu_project import project_cluster, project_small_cluster
 from .cpu_records import CHUNK, RECORD, Cluster, Records, View
 
@@ -35,11 +36,14 @@ class Workspace:
 
 
 def project(
-    request: RasterRequest, placement: Placement, camera: int, space: Workspace
+    request: RasterRequest,
+    placement: Placement,
+    camera: int,
+    chunks: Sequence[Chunks],
+    space: Workspace,
 ) -> tuple[Records, int]:
-    """Records of all instances for one camera, and the number of regions they fill."""
-    regions = [-(-len(instance.cloud) // CHUNK) for instance in request.instances]
-    total = sum(regions)
+    """Records of the given chunks of all instances, and the number of regions they fill."""
+    total = sum(map(len, chunks))
     records = Records(
         space.array("values", (total * CHUNK, RECORD), np.float32),
         space.array("footprints", (total * CHUNK,), np.int64),
@@ -49,25 +53,21 @@ def project(
     view = view_of(request, camera)
     base = 0
     for index, instance in enumerate(request.instances):
-        if regions[index]:
+        count = len(chunks[index])
+        if count:
             cluster = cluster_of(instance, placement, camera, index)
-            draw = project_cluster if regions[index] > 1 else project_small_cluster
-            draw(cluster, view, base * CHUNK, records)
-        base += regions[index]
+            draw = project_cluster if count > 1 else project_small_cluster
+            draw(cluster, view, base * CHUNK, chunks[index], records)
+        base += count
     return records, total
 
 
 def cluster_of(instance: Instance, placement: Placement, camera: int, index: int) -> Cluster:
     """The arrays of one instance as one camera needs them; nothing large is copied."""
-    cloud = instance.cloud
-    covars = NO_COVARS if instance.covars is None else array_of(instance.covars)
+    cloud = arrays_of(instance.cloud)
     return Cluster(
-        means=array_of(cloud.means),
-        quats=array_of(cloud.quats),
-        scales=array_of(cloud.scales),
-        opacities=array_of(cloud.opacities),
-        sh=array_of(cloud.sh),
-        covars=covars,
+        *cloud[:5],
+        covars=NO_COVARS if instance.covars is None else array_of(instance.covars),
         linear=np.ascontiguousarray(placement.linear[camera, index].numpy()),
         offset=placement.offset[camera, index].numpy(),
         camera_position=placement.camera_position[camera, index].numpy().astype(np.float32),

@@ -49,33 +49,34 @@ FASTMATH = {"contract", "nsz", "arcp"}
 
 
 @kernel(parallel=True, fastmath=FASTMATH)
-def project_cluster(cluster, view, base, records):
-    """Write records of the Gaussians of one Cluster that a View may see.
+def project_cluster(cluster, view, base, chunks, records):
+    """Write records of those Gaussians of one Cluster that a View may see.
 
     Args:
         base: first record of this cluster, a multiple of CHUNK.
-        records: Records, written from ``base`` on.
+        chunks: [K] int64, numbers of the chunks to look at.
+        records: Records, K regions from ``base`` on are written.
     """
-    n = cluster.means.shape[0]
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     values, footprints = records.values, records.footprints
     depths, counts = records.depths, records.counts
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
-        project_chunk(cluster, view, base, chunk * CHUNK, values, footprints, depths, counts)
+    for k in prange(chunks.shape[0]):
+        first, start = base + k * CHUNK, chunks[k] * CHUNK
+        project_chunk(cluster, view, first, start, values, footprints, depths, counts)
 
 
 @kernel(fastmath=FASTMATH)
-def project_small_cluster(cluster, view, base, records):
+def project_small_cluster(cluster, view, base, chunks, records):
     """Like project_cluster for one chunk, where waking threads would take longer than the work."""
-    project_chunk(
-        cluster, view, base, 0, records.values, records.footprints, records.depths, records.counts
-    )
+    values, footprints = records.values, records.footprints
+    start = chunks[0] * CHUNK
+    project_chunk(cluster, view, base, start, values, footprints, records.depths, records.counts)
 
 
 @inlined(fastmath=FASTMATH)
-def project_chunk(cluster, view, base, start, values, footprints, depths, counts):
-    """Write the records of CHUNK Gaussians from ``start`` on."""
-    slot = base + start
+def project_chunk(cluster, view, first, start, values, footprints, depths, counts):
+    """Write the records of CHUNK Gaussians from ``start`` on to the region from ``first`` on."""
+    slot = first
     for i in range(start, min(cluster.means.shape[0], start + CHUNK)):
         footprint = project_gaussian(cluster, view, i, values, slot)
         if footprint != NOWHERE:
@@ -83,7 +84,7 @@ def project_chunk(cluster, view, base, start, values, footprints, depths, counts
             footprints[slot] = footprint
             depths[slot] = values[slot, DEPTH]
             slot += 1
-    counts[(base + start) // CHUNK] = slot - base - start
+    counts[first // CHUNK] = slot - first
 
 
 @inlined(fastmath=FASTMATH)

@@ -14,8 +14,10 @@ from .kernel import inlined, kernel
 
 F32 = np.float32
 ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
-OPAQUE = F32(1 - 1e-5)
-"""Nothing of the sky is seen through alpha at or above this."""
+CLEAR = F32(1e-5)
+"""Nothing of the sky is seen through less than this."""
+TASKS = 16
+"""Rows are dealt to this many tasks in turn; rows of open sky cost more than others."""
 
 
 @kernel(parallel=True)
@@ -23,18 +25,28 @@ def add_sky(faces, matrix, rgb, alpha):
     """Add ``(1 - alpha) * sky`` to ``rgb``.
 
     Args:
-        faces: [6, R, R, 3] float32, as in Sky.
+        faces: [6, R, R, 3] float32 in C order, as in Sky.
         matrix: [3, 3] float32 ``R_world_camera K^-1``, maps (x, y, 1) [px] to directions.
         rgb: [H, W, 3] float32, added to.
         alpha: [H, W] float32.
     """
     height, width = alpha.shape
-    for row in prange(height):
-        y = F32(row) + HALF
-        for column in range(width):
-            if alpha[row, column] < OPAQUE:
-                direction = pixel_direction(matrix, F32(column) + HALF, y)
-                add_sample(faces, direction, rgb, alpha, row, column)
+    texels = faces.reshape(-1)
+    for task in prange(TASKS):
+        # Where a row looks first and where in there, in two passes: the first has no branches and
+        # becomes vector code.
+        corners = np.empty(width, np.int32)
+        columns, rows = np.empty(width, np.float32), np.empty(width, np.float32)
+        for row in range(task, height, TASKS):
+            y = F32(row) + HALF
+            for x in range(width):
+                direction = pixel_direction(matrix, F32(x) + HALF, y)
+                corners[x], rows[x], columns[x] = texel_corner(direction, faces.shape[1])
+            for x in range(width):
+                weight = ONE - alpha[row, x]
+                if weight > CLEAR:
+                    corner, down, right = np.uint64(corners[x]), rows[x], columns[x]
+                    add_sample(texels, faces.shape[1], corner, down, right, weight, rgb[row, x])
 
 
 @inlined()
@@ -48,12 +60,26 @@ def pixel_direction(matrix, x, y):
 
 
 @inlined()
-def add_sample(faces, direction, rgb, alpha, y, x):
-    """Add the bilinear sample along ``direction`` behind one pixel."""
-    weight = ONE - alpha[y, x]
-    face, row, column = texel_coordinates(direction, faces.shape[1])
+def texel_corner(direction, size):
+    """First number of the texel above and left, and the shares of the ones below and right."""
+    face, row, column = texel_coordinates(direction, size)
+    last = np.int32(max(size - 2, 0))
+    r0, c0 = min(np.int32(row), last), min(np.int32(column), last)
+    corner = ((face * np.int32(size) + r0) * np.int32(size) + c0) * np.int32(3)
+    return corner, row - F32(r0), column - F32(c0)
+
+
+@inlined()
+def add_sample(texels, size, corner, down, right, weight, out):
+    """Add the bilinear sample of four texels, times ``weight``, to ``out`` [3]."""
+    next_column = np.uint64(3 if size > 1 else 0)
+    next_row = np.uint64(3 * size if size > 1 else 0)
     for k in range(3):
-        rgb[y, x, k] += weight * bilinear(faces[face], row, column, k)
+        first = corner + np.uint64(k)
+        top = texels[first] * (ONE - right) + texels[first + next_column] * right
+        first += next_row
+        bottom = texels[first] * (ONE - right) + texels[first + next_column] * right
+        out[k] += weight * (top * (ONE - down) + bottom * down)
 
 
 @inlined()
@@ -79,17 +105,16 @@ def bilinear(face, row, column, k):
 
 @inlined()
 def face_coordinates(direction):
-    """Face index and u, v in [-1, 1]; see scene.sky.face_coordinates."""
+    """Face index and u, v in [-1, 1]; see scene.sky.face_coordinates. Without branches."""
     x, y, z = direction
     ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        if x > ZERO:
-            return 0, -y / ax, -z / ax
-        return 1, y / ax, -z / ax
-    if ay >= az:
-        if y > ZERO:
-            return 2, x / ay, -z / ay
-        return 3, -x / ay, -z / ay
-    if z > ZERO:
-        return 4, -y / az, x / az
-    return 5, -y / az, -x / az
+    by_x = ax >= ay and ax >= az
+    by_y = not by_x and ay >= az
+    along = x if by_x else (y if by_y else z)
+    largest = ax if by_x else (ay if by_y else az)
+    axis = np.int32(0) if by_x else (np.int32(2) if by_y else np.int32(4))
+    forward = along > ZERO
+    sign = ONE if forward else -ONE
+    u = -sign * y if by_x else (sign * x if by_y else -y)
+    v = sign * x if not (by_x or by_y) else -z
+    return axis + (np.int32(0) if forward else np.int32(1)), u / largest, v / largest
