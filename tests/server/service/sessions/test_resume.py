@@ -191,18 +191,16 @@ def drive(worker: Killable, *, kill_at: tuple[int, ...] = (), delay: float = 0.0
     Kills come ``delay`` seconds after the episode has reached a step, whatever it does then.
     """
     killers = ThreadPoolExecutor(1)
-    with (
-        killers,
-        real2sim.connect(worker.url) as client,
-        client.session(scene="tiny") as session,
-    ):
-        seen = [hashed(session.reset(seed=5, sensors=SENSORS, privileged=True))]
-        for step in range(STEPS):
-            if step == 4:
-                session.edit([{"op": "translate", "object_id": "post", "y": -1.0}])
-            if step in kill_at:
-                killers.submit(worker.kill_and_start, delay)
-            seen.append(hashed(session.step(plan(step))))
+    with killers, real2sim.connect(worker.url) as client:
+        client.wait_ready(120)  # the kill before may have come after the last answer
+        with client.session(scene="tiny") as session:
+            seen = [hashed(session.reset(seed=5, sensors=SENSORS, privileged=True))]
+            for step in range(STEPS):
+                if step == 4:
+                    session.edit([{"op": "translate", "object_id": "post", "y": -1.0}])
+                if step in kill_at:
+                    killers.submit(worker.kill_and_start, delay)
+                seen.append(hashed(session.step(plan(step))))
     return seen
 
 
