@@ -193,7 +193,7 @@ def drive(worker: Killable, *, kill_at: tuple[int, ...] = (), delay: float = 0.0
     killers = ThreadPoolExecutor(1)
     with killers, real2sim.connect(worker.url) as client:
         client.wait_ready(120)  # the kill before may have come after the last answer
-        with client.session(scene="tiny") as session:
+        with client.session(scene="tiny", reconnect=240) as session:
             seen = [hashed(session.reset(seed=5, sensors=SENSORS, privileged=True))]
             for step in range(STEPS):
                 if step == 4:
