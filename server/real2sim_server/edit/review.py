@@ -29,10 +29,6 @@ OUTSIDE_MAP = 100.0
 
 NAMED_OVERLAPS = 5
 
-AT_ONCE = 64
-"""Instants at which boxes are compared in one go; most pairs that overlap do so early."""
-
-
 REMEMBERED = 512
 """Objects whose sampled trajectories are kept, 26 kB each at most."""
 
@@ -52,7 +48,7 @@ def review(
     subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
     for subject in subjects:
         times = _sample_times(subject.trajectory.start_us, subject.trajectory.end_us)
-        transforms, _ = sample(subject.trajectory, times)
+        transforms, _ = _sampled(subject.trajectory, int(times[0]), int(times[-1]))
         yield from _overlaps(subject, state, times, transforms)
         recorded = None if subject.asset else state.recorded[subject.source_id]
         yield from _off_ground(subject, recorded, transforms, ground)
@@ -74,11 +70,11 @@ def _sample_times(start: int, end: int) -> NDArray[np.int64]:
 def _overlaps(
     subject: ObjectState, state: ScenarioState, times: NDArray[np.int64], own: Float
 ) -> Iterator[EditWarning]:
-    hit: dict[str, float] = {}
-    for other in _within_reach(subject, state, own):
-        first = _first_overlap(subject, other, times, own)
-        if first is not None:
-            hit[other.object_id] = first * 1e-6
+    others = list(_within_reach(subject, state, own))
+    if not others:
+        return
+    first = _first_overlaps(subject, others, times, own)
+    hit = {others[k].object_id: times[first[k]] * 1e-6 for k in np.flatnonzero(first < len(times))}
     if hit:
         named = [f"{i!r} from t={t:.2f} s" for i, t in list(hit.items())[:NAMED_OVERLAPS]]
         more = f" and {len(hit) - len(named)} more" if len(hit) > len(named) else ""
@@ -89,22 +85,34 @@ def _overlaps(
         )
 
 
-def _first_overlap(
-    subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
-) -> int | None:
-    """First of ``times`` at which the two boxes overlap; None where they never do."""
-    theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
-    between = own[:, :3, 3] - theirs[:, :3, 3]
-    apart = np.einsum("ij,ij->i", between, between)
-    near = np.flatnonzero(covered & (apart <= (subject.radius + other.radius) ** 2))
-    if subject.standing and other.standing:
-        near = near[:1]
-    for start in range(0, len(near), AT_ONCE):
-        some = near[start : start + AT_ONCE]
-        overlapping = boxes_overlap(own[some], subject.scaled_size, theirs[some], other.scaled_size)
-        if overlapping.any():
-            return int(times[some][np.argmax(overlapping)])
-    return None
+def _first_overlaps(
+    subject: ObjectState, others: Sequence[ObjectState], times: NDArray[np.int64], own: Float
+) -> NDArray[np.intp]:
+    """Index [K] of the first of ``times`` at which each box overlaps; their number where none.
+
+    All pairs and times that need the full test go through it at once: for few of them numpy's
+    calls cost more than its arithmetic.
+    """
+    tracks = [_sampled(o.trajectory, int(times[0]), int(times[-1])) for o in others]
+    theirs = np.stack([transforms for transforms, _ in tracks])
+    covered = np.stack([known for _, known in tracks])
+    sizes = np.array([o.scaled_size for o in others])
+    between = own[:, :3, 3] - theirs[..., :3, 3]
+    apart = np.einsum("kij,kij->ki", between, between)
+    reach = subject.radius + np.array([o.radius for o in others])
+    near = covered & (apart <= reach[:, None] ** 2)
+    # Where the spheres inside the boxes overlap the boxes do: later times need no test.
+    inside = (min(subject.scaled_size) + sizes.min(axis=1)) / 2
+    certain = covered & (apart < inside[:, None] ** 2)
+    near &= np.cumsum(certain, axis=1) - certain == 0
+    if subject.standing:
+        standing = np.array([o.standing for o in others])
+        near &= ~standing[:, None] | (np.cumsum(near, axis=1) == 1)
+    which, when = np.nonzero(near)
+    overlapping = boxes_overlap(own[when], subject.scaled_size, theirs[which, when], sizes[which])
+    first = np.full(len(others), len(times))
+    np.minimum.at(first, which[overlapping], when[overlapping])
+    return first
 
 
 def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:

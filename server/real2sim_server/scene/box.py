@@ -41,7 +41,14 @@ def boxes_overlap(
         T_world_a, T_world_b: [..., 4, 4] rigid transforms to the world; origin at the box centre.
         size_a, size_b: [..., 3] (length, width, height) [m].
     """
-    return box_penetration(T_world_a, size_a, T_world_b, size_b) > 1e-9
+    turn, centre, half_a, half_b = _relative(T_world_a, size_a, T_world_b, size_b)
+    overlap = np.asarray(_face_overlaps(turn, centre, half_a, half_b) > 1e-9)
+    # Face normals tell most boxes apart; the other nine axes are for what is left.
+    left = overlap.copy()
+    half_a = np.broadcast_to(half_a, (*overlap.shape, 3, 1))[left]
+    half_b = np.broadcast_to(half_b, (*overlap.shape, 1, 3))[left]
+    overlap[left] = _edge_overlaps(turn[left], centre[left], half_a, half_b) > 1e-9
+    return overlap
 
 
 def box_penetration(
@@ -52,15 +59,23 @@ def box_penetration(
     Negative where they are apart; then it is a lower bound of the distance between them, with
     the sign turned. Arguments as in :func:`boxes_overlap`.
     """
+    turn, centre, half_a, half_b = _relative(T_world_a, size_a, T_world_b, size_b)
+    faces = _face_overlaps(turn, centre, half_a, half_b)
+    edges = _edge_overlaps(turn, centre, half_a, half_b)
+    return np.minimum(faces, edges)
+
+
+def _relative(
+    T_world_a: ArrayLike, size_a: ArrayLike, T_world_b: ArrayLike, size_b: ArrayLike
+) -> tuple[Float, Float, Float, Float]:
+    """``R_a_b`` [..., 3, 3], centre of b in the frame of a [..., 3, 1], halves of both sizes."""
     a, b = np.asarray(T_world_a, dtype=np.float64), np.asarray(T_world_b, dtype=np.float64)
     half_a = np.asarray(size_a, dtype=np.float64)[..., :, None] / 2
     half_b = np.asarray(size_b, dtype=np.float64)[..., None, :] / 2
     to_a = np.swapaxes(a[..., :3, :3], -1, -2)
     turn = to_a @ b[..., :3, :3]
     centre = to_a @ (b[..., :3, 3:] - a[..., :3, 3:])
-    faces = _face_overlaps(turn, centre, half_a, half_b)
-    edges = _edge_overlaps(turn, centre, half_a, half_b)
-    return np.minimum(faces, edges)
+    return turn, centre, half_a, half_b
 
 
 def _face_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> Float:
