@@ -58,7 +58,7 @@ def opens(given: str | None, *secrets: str | None) -> bool:
     return any(matches)
 
 
-def require_token(
+async def require_token(
     connection: HTTPConnection,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> None:

@@ -220,7 +220,8 @@ def _device_info(backend: Backend, settings: Settings) -> DeviceInfo:
     )
 
 
-def _worker_of(connection: HTTPConnection) -> Worker:
+# Async: FastAPI runs plain functions on threads, and each switch costs more than the work.
+async def _worker_of(connection: HTTPConnection) -> Worker:
     worker: Worker = connection.app.state.worker
     return worker
 

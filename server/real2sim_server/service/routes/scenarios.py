@@ -53,9 +53,9 @@ class Change:
     """What a request that changes a scenario may carry."""
 
     request: Request
-    if_match: IfMatch = None
-    idempotency_key: IdempotencyKey = None
-    who: ClientName = ""
+    if_match: str | None
+    idempotency_key: str | None
+    who: str
 
     @property
     def expected(self) -> int | None:
@@ -67,7 +67,16 @@ class Change:
         return worker.idempotency.once(self.request, self.idempotency_key)
 
 
-ChangeOf = Annotated[Change, Depends()]
+async def _change_of(
+    request: Request,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+    who: ClientName = "",
+) -> Change:
+    return Change(request, if_match, idempotency_key, who)
+
+
+ChangeOf = Annotated[Change, Depends(_change_of)]
 
 
 @router.post("", status_code=201, response_model=ScenarioInfo)

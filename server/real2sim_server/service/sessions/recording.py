@@ -51,6 +51,7 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
             entries,
             scene_hash=row.scene_hash,
             scenario=scenario,
+            state=start.state if scenario is not None else None,
             no_action_impact=impact,
         )
 
