@@ -1,4 +1,5 @@
-"""``real2sim bench edit``: what an edit costs, and what a thousand of them cost later.
+"""``real2sim bench edit``: what an edit costs, what a thousand of them cost later, and how fast
+pictures follow an object that is dragged.
 
 Measured from outside over loopback, with a worker in a process of its own. Between writing and
 opening that process is killed, so that what is opened comes from the disk.
@@ -31,12 +32,16 @@ from real2sim_proto.operations import (
     Translate,
 )
 
+from ..demo.street import unpack_street
 from ..demo.worker import own_worker
 from ..scene.io import save_scene
+from .dragging import drag
 from .serve import percentiles
 from .street import street
 
 SCENE = "street"
+DRAGGED = "demo_street"
+"""300,000 Gaussians, 18 objects."""
 OPENINGS = 5
 
 Figures = dict[str, Any]
@@ -44,17 +49,19 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: edits on one scenario, and Gaussians of its scene."""
+    """How much is measured: edits on one scenario, Gaussians of its scene, previews of a drag."""
 
     operations: int = 1000
     gaussians: int = 100_000
+    previews: int = 200
 
 
 def run(effort: Effort | None = None) -> Figures:
     """Edit one scenario many times, kill the worker, and open it again; figures in milliseconds.
 
     ``append`` is the time from sending an edit to its answer, which is on disk by then; ``open``
-    that of the first answer about the scenario from a new process, ``describe`` that of later ones.
+    that of the first answer about the scenario from a new process, ``describe`` that of later ones;
+    ``preview`` the time from asking for a picture of a moved object to having it.
     """
     effort = effort or Effort()
     console = Console()
@@ -62,6 +69,7 @@ def run(effort: Effort | None = None) -> Figures:
         root = Path(folder)
         scene = street(SCENE, gaussians=effort.gaussians, width=320, height=214)
         save_scene(scene, root / "scenes" / f"{SCENE}.r2s")
+        unpack_street(root / "scenes", f"{DRAGGED}.r2s")
         places = {"scenes": root / "scenes", "data": root}
         with (
             console.status(f"{effort.operations} edits"),
@@ -76,12 +84,20 @@ def run(effort: Effort | None = None) -> Figures:
                 opened.append(times[0])
                 described += times[1:]
                 worker.process.kill()
+        with (
+            console.status(f"{effort.previews} previews"),
+            own_worker(**places, log_file=root / "dragging.log") as worker,
+        ):
+            preview, size = drag(worker.url, scene=DRAGGED, frames=effort.previews)
     figures = {
         "operations": effort.operations,
         "append_ms": percentiles(append),
         "append_last_hundred_ms": percentiles(append[-100:]),
         "open_ms": percentiles(opened),
         "describe_ms": percentiles(described),
+        "preview_ms": percentiles(preview),
+        "preview_size": size,
+        "preview_fps": 1e3 * len(preview) / sum(preview),
     }
     _print(console, figures)
     return figures
@@ -148,8 +164,10 @@ def _open(url: str, scenario_id: str, *, revision: int) -> list[float]:
 
 def _print(console: Console, figures: Figures) -> None:
     table = Table("[ms]", "p50", "p95", "p99", "max", "n", title="edits", title_justify="left")
-    for name in ("append_ms", "append_last_hundred_ms", "open_ms", "describe_ms"):
+    for name in ("append_ms", "append_last_hundred_ms", "open_ms", "describe_ms", "preview_ms"):
         row = figures[name]
         numbers = [f"{row[column]:.2f}" for column in ("p50", "p95", "p99", "max")]
         table.add_row(name.removesuffix("_ms").replace("_", " "), *numbers, str(row["count"]))
     console.print(table)
+    width, height = figures["preview_size"]
+    console.print(f"dragging: {figures['preview_fps']:.1f} pictures of {width}x{height} a second")
