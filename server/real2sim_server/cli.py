@@ -461,6 +461,12 @@ def replay(
     scene: Annotated[
         Path | None, typer.Option("--scene", help="Its scene bundle: live through it again.")
     ] = None,
+    assets: Annotated[
+        Path | None, typer.Option("--assets", help="Asset library, for scenarios that use it.")
+    ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option("--mcap", help="Also write it for Foxglove and others.")
+    ] = None,
     video: Annotated[Path | None, typer.Option("--video", help="MP4 to draw.")] = None,
     camera: Annotated[str | None, typer.Option(help="Of the video; default: the first.")] = None,
     width: Annotated[int, typer.Option(min=64, max=4096, help="Of the video [px].")] = 640,
@@ -473,6 +479,8 @@ def replay(
         command.run,
         episode=episode,
         scene=scene,
+        assets=assets,
+        mcap=mcap,
         video=video,
         camera=camera,
         width=width,

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..edit import ScenarioState
+from ..edit import EditError
 from ..render import RasterOptions, render_cameras, select_backend
 from ..scene import Scene
 from ..scene.io import load_scene
 from ..scene.rotation import quaternion_yaw
+from ..service.assets import AssetLibrary
 from ..world import World
 from ..world.history import Retold
-from ..world.recording import Recording, first_difference, load_recording
+from ..world.mcap_file import save_mcap
+from ..world.recording import Recording, RecordingError, first_difference, load_recording
 from .console import CommandError, console, print_figures, write_json
 
 Image = NDArray[np.uint8]
@@ -29,6 +31,8 @@ def run(
     *,
     episode: Path,
     scene: Path | None,
+    assets: Path | None,
+    mcap: Path | None,
     video: Path | None,
     camera: str | None,
     width: int,
@@ -37,7 +41,7 @@ def run(
     """Check that the episode comes out the same, and score it by the formulas of today.
 
     Raises:
-        CommandError: the scene is another one, or the episode began from a scenario.
+        CommandError: the scene is another one, or an asset of its scenario is missing.
     """
     recording = load_recording(episode)
     figures: dict[str, object] = {
@@ -47,14 +51,18 @@ def run(
     }
     if scene is not None:
         loaded = _scene_of(recording, scene)
-        differs = first_difference(recording, _fresh(loaded))
+        begin = _beginnings(recording, loaded, assets)
+        differs = first_difference(recording, begin())
         figures["bit_identical"] = differs is None
         figures["first_difference"] = differs
         if video is not None:
-            _film(recording, loaded, video, camera=camera, width=width)
+            _film(_instants(recording, begin()), loaded, video, camera=camera, width=width)
             console.print(f"wrote {video}")
     elif video is not None:
         raise CommandError("--video draws the scene; name its bundle with --scene")
+    if mcap is not None:
+        save_mcap(recording, mcap)
+        console.print(f"wrote {mcap}")
     _report(recording, figures)
     if json_path is not None:
         write_json(json_path, figures)
@@ -66,12 +74,6 @@ def run(
 
 
 def _scene_of(recording: Recording, path: Path) -> Scene:
-    if recording.scenario_id is not None:
-        raise CommandError(
-            f"the episode began from scenario {recording.scenario_id!r} at revision "
-            f"{recording.scenario_revision}, which is not in the file; without --scene it can "
-            "still be scored"
-        )
     scene = load_scene(path)
     if scene.content_hash != recording.scene_hash:
         raise CommandError(
@@ -81,8 +83,20 @@ def _scene_of(recording: Recording, path: Path) -> Scene:
     return scene
 
 
-def _fresh(scene: Scene) -> Retold:
-    return Retold.on(scene, ScenarioState.of(scene))
+def _beginnings(recording: Recording, scene: Scene, assets: Path | None) -> Callable[[], Retold]:
+    """Makes the session before its first entry, as often as wanted."""
+    library = AssetLibrary(assets) if assets is not None else None
+
+    def begin() -> Retold:
+        try:
+            return recording.fresh(scene, library.find if library else None)
+        except EditError as error:
+            hint = "name the folder of the worker's asset library with --assets"
+            raise CommandError(f"{error}; {hint}") from error
+        except RecordingError as error:
+            raise CommandError(f"{error} without --scene") from error
+
+    return begin
 
 
 def _report(recording: Recording, figures: dict[str, object]) -> None:
@@ -102,13 +116,13 @@ def _report(recording: Recording, figures: dict[str, object]) -> None:
 
 
 def _film(
-    recording: Recording, scene: Scene, path: Path, *, camera: str | None, width: int
+    worlds: Iterator[World], scene: Scene, path: Path, *, camera: str | None, width: int
 ) -> None:
     """An MP4 of one camera with speed, scores and events, and a map of who is where."""
     chosen = scene.rig[camera or scene.rig.names[0]].resized(width)
     backend, writer = select_backend("auto"), None
     path.parent.mkdir(parents=True, exist_ok=True)
-    for world in _instants(recording, scene):
+    for world in worlds:
         (frame,) = render_cameras(
             world.instances(),
             [chosen],
@@ -129,8 +143,7 @@ def _film(
         writer.release()
 
 
-def _instants(recording: Recording, scene: Scene) -> Iterator[World]:
-    retold = _fresh(scene)
+def _instants(recording: Recording, retold: Retold) -> Iterator[World]:
     for entry in recording.entries:
         world = retold.tell(entry)
         if entry.kind in {"reset", "action", "restore"}:

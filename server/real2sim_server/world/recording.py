@@ -6,6 +6,7 @@ The file is a zip archive:
 - ``log.msgpack``: entries of the session from its reset on (kind, step, payload);
 - ``instants.msgpack``: what the scores saw of every step, and a digest of its observation;
 - ``context.msgpack``: what stays the same for the scores;
+- ``state.msgpack``: how the scenario differed from the scene, where it began from one;
 - ``frames/<camera>/<step>.jpg`` and ``.png``: images, where they were asked for.
 
 Everything but the frames is the same bytes for the same episode.
@@ -29,6 +30,8 @@ import numpy as np
 
 from real2sim_proto import CodecError, decode, encode
 
+from ..edit import AssetLookup, ScenarioState, pack_state, unpack_state
+from ..scene import Scene
 from . import scoring
 from .history import Entry, Retold
 from .scoring import (
@@ -66,6 +69,8 @@ class Recording:
         digests: SHA-256 of every observation without images, by instant.
         scores: at the end, as they were when it was recorded.
         metrics: versions of the scores.
+        state: the objects that it began with, see :func:`~real2sim_server.edit.pack_state`; None
+            for the bare scene.
         frames: file names in the archive by camera and step, for images.
     """
 
@@ -79,7 +84,29 @@ class Recording:
     digests: tuple[str, ...]
     scores: tuple[dict[str, Any], ...]
     metrics: str
+    state: bytes | None = field(default=None, repr=False)
     frames: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+
+    def fresh(self, scene: Scene, assets: AssetLookup | None = None) -> Retold:
+        """The session before its first entry.
+
+        Args:
+            scene: that it ran on.
+            assets: finds those that its scenario shows.
+
+        Raises:
+            EditError: UNKNOWN_ASSET.
+            RecordingError: it began from a scenario, and an old file does not tell how that was.
+        """
+        begun = ScenarioState.of(scene, assets=assets)
+        if self.state is not None:
+            begun = unpack_state(begun, self.state)
+        elif self.scenario_id is not None:
+            raise RecordingError(
+                f"the episode began from scenario {self.scenario_id!r} at revision "
+                f"{self.scenario_revision}, which is not in the file; it can still be scored"
+            )
+        return Retold.on(scene, begun)
 
     def rescore(self) -> list[Score]:
         """Scores by the formulas of this version, from the recorded instants alone."""
@@ -113,6 +140,7 @@ def record(
     *,
     scene_hash: str,
     scenario: tuple[str, int] | None = None,
+    state: ScenarioState | None = None,
     no_action_impact: float | None = None,
 ) -> Recording:
     """The recording of an episode, by living through it again.
@@ -122,6 +150,7 @@ def record(
         entries: of the episode, its reset first; returns to snapshots cut off what they undo.
         scene_hash: of the scene's bundle.
         scenario: id and revision.
+        state: of that scenario.
         no_action_impact: for NeuroNCAP, see :func:`~.history.no_action_impact`.
     """
     instants: list[Instant] = []
@@ -147,6 +176,7 @@ def record(
         digests=tuple(digests),
         scores=tuple(s.fields() for s in scores),
         metrics=metrics_version(),
+        state=pack_state(state) if state is not None else None,
     )
 
 
@@ -179,6 +209,7 @@ def to_bytes(recording: Recording) -> bytes:
         "log.msgpack": encode({"entries": entries}),
         "instants.msgpack": encode({"instants": rows}),
         "context.msgpack": encode(recording.context.fields()),
+        **({"state.msgpack": recording.state} if recording.state is not None else {}),
         **recording.frames,
     }
     file = io.BytesIO()
@@ -225,6 +256,8 @@ def load_recording(path: Path) -> Recording:
                 decode(_part(archive, f"{name}.msgpack"), max_bytes=MAX_PART_BYTES)
                 for name in ("log", "instants", "context")
             )
+            there = "state.msgpack" in archive.namelist()
+            state = _part(archive, "state.msgpack") if there else None
             frames = {n: _part(archive, n) for n in archive.namelist() if n.startswith("frames/")}
         rows = [_instant(row) for row in instants["instants"]]
         return Recording(
@@ -238,6 +271,7 @@ def load_recording(path: Path) -> Recording:
             digests=tuple(found for _, found in rows),
             scores=tuple(about["scores"]),
             metrics=about["metrics"],
+            state=state,
             frames=frames,
         )
     except (zipfile.BadZipFile, CodecError, KeyError, TypeError, json.JSONDecodeError) as error:

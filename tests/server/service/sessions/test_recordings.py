@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 import real2sim
 from real2sim.cli import build_app
-from real2sim_server.world.recording import load_recording
+from real2sim_server.world.mcap_file import recording_in
+from real2sim_server.world.recording import load_recording, to_bytes
 
 pytestmark = pytest.mark.network
 
@@ -67,3 +68,32 @@ def test_replay_finds_the_same_bits_and_films_them(recorded, site, tmp_path):
     film = cv2.VideoCapture(str(video))
     assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 6
     film.release()
+
+
+def test_episodes_of_scenarios_are_replayed_with_the_assets_they_show(site, tmp_path):
+    path, out = tmp_path / "drive.r2e", tmp_path / "out.json"
+    with real2sim.connect(site.url) as client:
+        client.assets.cut(scene="tiny", object_id="post", asset_id="replayed-post")
+        scenario = client.scenarios.create(scene="tiny")
+        scenario.insert("replayed-post", position=(6.0, 2.0, 0.0))
+        scenario.objects["post"].translate(y=1.0)
+        with client.session(scenario=scenario.scenario_id) as session:
+            session.reset(action="control")
+            for _ in range(3):
+                session.step(PLAN)
+            session.save_recording(path)
+    settings = site.worker.settings
+    scene = settings.scenes_path / "tiny.r2s"
+    arguments = ["replay", str(path), "--scene", str(scene), "--json", str(out)]
+    refused = runner.invoke(build_app(), arguments)
+    assert refused.exit_code == 1
+    done = runner.invoke(build_app(), [*arguments, "--assets", str(settings.assets_path)])
+    assert done.exit_code == 0, done.output
+    assert json.loads(out.read_text())["bit_identical"] is True
+
+
+def test_replay_writes_mcap_that_holds_the_recording(recorded, tmp_path):
+    path = tmp_path / "drive.mcap"
+    done = runner.invoke(build_app(), ["replay", str(recorded[0]), "--mcap", str(path)])
+    assert done.exit_code == 0, done.output
+    assert to_bytes(recording_in(path)) == recorded[0].read_bytes()

@@ -1,0 +1,108 @@
+"""Episodes as MCAP: what any reader sees, and the recording out of it again."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from dataclasses import replace
+
+import pytest
+from mcap.reader import make_reader
+
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import Control, TrajectoryPlan
+from real2sim_server.edit import ScenarioState
+from real2sim_server.world.history import Entry, Retold, action_payload, reset_payload
+from real2sim_server.world.mcap_file import mcap_bytes, recording_in, save_mcap
+from real2sim_server.world.recording import RecordingError, record, to_bytes
+
+PICTURE = b"\xff\xd8 a picture"
+
+
+@pytest.fixture(scope="module")
+def recording(make_scene, moving):
+    scene = make_scene(car=moving(14, 0, z=0.8), other=moving(40, 3.5, z=0.8, speed=5.0))
+    spec = ResetSpec(on_collision="continue", action="trajectory")
+    log = [Entry("reset", 0, reset_payload(spec))]
+    for step in range(12):
+        times = [5_000_000 + 100_000 * (step + k + 1) for k in range(10)]
+        plan = TrajectoryPlan(times_us=times, poses=[(k + 1.0, 0.0, 0.0) for k in range(10)])
+        log.append(Entry("action", step, action_payload(plan)))
+    made = record(Retold.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
+    return replace(made, frames={"frames/front/rgb/000002.jpg": PICTURE})
+
+
+@pytest.fixture(scope="module")
+def messages(recording, tmp_path_factory):
+    """Messages by topic, as a reader that knows nothing of us finds them."""
+    path = save_mcap(recording, tmp_path_factory.mktemp("mcap") / "a" / "episode.mcap")
+    found: dict[str, list] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert schema.encoding == "jsonschema"
+            assert json.loads(schema.data)["title"] == schema.name
+            content = json.loads(message.data)
+            found.setdefault(channel.topic, []).append((schema.name, message.log_time, content))
+    return found
+
+
+def test_the_recording_comes_back_whole(recording, tmp_path):
+    path = save_mcap(recording, tmp_path / "episode.mcap")
+    assert to_bytes(recording_in(path)) == to_bytes(recording)
+
+
+def test_the_same_episode_is_the_same_file(recording):
+    assert mcap_bytes(recording) == mcap_bytes(recording)
+
+
+def test_every_instant_has_the_pose_of_the_vehicle(recording, messages):
+    assert len(messages["/tf"]) == len(recording.instants) == 13
+    for instant, (schema, log_time, told) in zip(recording.instants, messages["/tf"], strict=True):
+        assert schema == "foxglove.FrameTransform"
+        assert log_time == instant.t_us * 1000
+        assert told["timestamp"]["sec"] * 1_000_000 + told["timestamp"]["nsec"] // 1000 == (
+            instant.t_us
+        )
+        assert told["translation"] == {"x": instant.ego.x, "y": instant.ego.y, "z": instant.ego.z}
+        yaw = 2 * math.atan2(told["rotation"]["z"], told["rotation"]["w"])
+        assert yaw == pytest.approx(instant.ego.yaw, abs=1e-12)
+
+
+def test_objects_are_boxes_where_they_were(recording, messages):
+    last, (schema, _, told) = recording.instants[-1], messages["/scene"][-1]
+    assert schema == "foxglove.SceneUpdate"
+    entities = {e["id"]: e for e in told["entities"]}
+    assert set(entities) == {"ego", "car", "other"}
+    (cube,) = entities["other"]["cubes"]
+    row = last.others.ids.index("other")
+    assert list(cube["pose"]["position"].values()) == last.others.centres[row].tolist()
+    assert list(cube["size"].values()) == last.others.sizes[row].tolist()
+
+
+def test_plans_contacts_scores_and_images_are_there(recording, messages):
+    assert len(messages["/plan"]) == 12
+    assert len(messages["/plan"][0][2]["poses"]) == 10
+    contacts = [c[2]["object_id"] for c in messages["/contact"]]
+    assert contacts == [c.object_id for i in recording.instants for c in i.contacts] != []
+    assert messages["/metrics"][-1][2]["collisions"] == recording.tallies()[-1].collisions > 0
+    ((schema, log_time, told),) = messages["/camera/front/rgb"]
+    assert (schema, told["format"]) == ("foxglove.CompressedImage", "jpeg")
+    assert base64.b64decode(told["data"]) == PICTURE
+    assert log_time == recording.instants[2].t_us * 1000
+
+
+def test_episodes_without_plans_have_no_topic_for_them(make_scene):
+    scene = make_scene()
+    log = [Entry("reset", 0, reset_payload(ResetSpec(action="control")))]
+    log.append(Entry("action", 0, action_payload(Control(acceleration=0.0, steering=0.0))))
+    made = record(Retold.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
+    assert b"/plan" not in mcap_bytes(made)
+    assert b"/tf" in mcap_bytes(made)
+
+
+def test_files_without_an_episode_are_refused(tmp_path):
+    path = tmp_path / "other.mcap"
+    path.write_bytes(b"not mcap at all, but long enough to be looked at")
+    with pytest.raises(RecordingError, match="no MCAP file"):
+        recording_in(path)
