@@ -26,6 +26,11 @@ from .optimizer import SelectiveAdam
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
+FAINT = -3.0
+"""Logit of an opacity that hides next to nothing and is well above what blending skips."""
+GUESS_SHARE = 5e-4
+"""Visible share behind what was trained up to which a guess comes back. Guesses are opaque and
+many, so that even the little that each would show adds up."""
 EPS2D = RasterOptions().eps2d
 
 Look = tuple[Camera, int]
@@ -139,8 +144,10 @@ def put_back_guesses(
     """
     hidden = (visible_shares(first, looks) <= limit).nonzero()[:, 0]
     guesses, trained = first.gaussians.take(hidden), model.gaussians
-    # What training has cleared away must not come back before what it shows.
-    model.gaussians, is_guess = joined(trained, guesses)
-    shows = visible_shares(model, looks) > limit
-    model.gaussians = model.gaussians.take((~(is_guess & shows)).nonzero()[:, 0])
+    # Faint, so that no guess hides another: several may stand behind one gap of the surface.
+    faint = replace(guesses, logits=torch.full_like(guesses.logits, FAINT))
+    model.gaussians, is_guess = joined(trained, faint)
+    behind = visible_shares(model, looks) <= GUESS_SHARE
+    model.gaussians, _ = joined(trained, guesses)
+    model.gaussians = model.gaussians.take((~is_guess | behind).nonzero()[:, 0])
     return len(model.gaussians) - len(trained)

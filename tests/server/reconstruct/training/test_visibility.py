@@ -121,7 +121,7 @@ def test_two_packs_are_joined_owner_by_owner():
 
 
 def test_guesses_come_back_where_nothing_shows_them_and_nowhere_else(model, looks):
-    wall = [ahead(model, 4, 3.0, 0.99)]
+    wall = [ahead(model, 4, 3.0, 0.99), ahead(model, 4.1, 3.0, 0.99)]
     behind, beside = ahead(model, 8, 0.2, 0.7), ahead(model, 3, 0.2, 0.7)
     trained, first = model_of(model, wall), model_of(model, [*wall, behind, beside])
     assert put_back_guesses(trained, first, looks, limit=0.05) == 1
@@ -132,6 +132,14 @@ def test_guesses_that_training_has_laid_open_stay_away(model, looks):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     first = model_of(model, [*wall, ahead(model, 8, 0.2, 0.7)])
+    assert put_back_guesses(trained, first, looks, limit=0.05) == 0
+
+
+def test_a_guess_stays_away_though_another_stands_before_it(model, looks):
+    wall = [ahead(model, 4, 3.0, 0.99)]
+    trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
+    pair = [ahead(model, 8, 0.2, 0.99), ahead(model, 8.5, 0.1, 0.99)]
+    first = model_of(model, [*wall, *pair])
     assert put_back_guesses(trained, first, looks, limit=0.05) == 0
 
 
