@@ -31,7 +31,8 @@ def drive(
     planner: Annotated[
         str,
         typer.Option(
-            help="follow_route, pid, idm, depth_sampling, learned=FILE, or 'module:Class'."
+            help="follow_route, pid, idm, depth_sampling, learned=FILE, neuroncap=URL, "
+            "alpasim=HOST:PORT, or 'module:Class'."
         ),
     ] = "follow_route",
     steps: Annotated[int, typer.Option(min=1, help="Clock steps; fewer when it ends.")] = 100,

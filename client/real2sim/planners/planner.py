@@ -21,6 +21,8 @@ BUILT_IN = {
     "idm": "real2sim.planners.idm:Idm",
     "depth_sampling": "real2sim.planners.depth_sampling:DepthSampling",
     "learned": "real2sim.planners.learned:LearnedPolicy",
+    "neuroncap": "real2sim.planners.neuroncap:NeuroNcap",
+    "alpasim": "real2sim.planners.alpasim:AlpasimDriver",
 }
 
 
@@ -45,6 +47,7 @@ class Needs:
     Attributes:
         modalities: of its cameras; empty where it is blind.
         cameras: by name; empty: the one that looks most nearly straight ahead.
+        all_cameras: whether it wants every camera of the scene instead.
         width: of its images [px]; None: as recorded.
         privileged: whether it is told of all objects.
         action: kind of its plans.
@@ -55,6 +58,7 @@ class Needs:
     width: int | None = None
     privileged: bool = False
     action: Literal["trajectory", "control", "pose"] = "trajectory"
+    all_cameras: bool = False
 
     def sensors(self, cameras: Sequence[CameraInfo]) -> list[dict[str, Any]]:
         """Sensors to reset with, out of a session's cameras.
@@ -73,7 +77,7 @@ class Needs:
             )
         return [
             {"camera": name, "modalities": list(self.modalities), "width": self.width}
-            for name in self.cameras or [forward_camera(cameras)]
+            for name in (there if self.all_cameras else self.cameras or [forward_camera(cameras)])
         ]
 
 
@@ -93,7 +97,8 @@ def load_planner(name: str) -> Planner:
     """A planner by name: a built-in one, or ``module:Class``.
 
     It is made without arguments; what follows a ``=`` becomes its one argument, as in
-    ``learned=policy.safetensors``. Modules are looked for in the working folder too.
+    ``learned=policy.safetensors`` or ``neuroncap=http://127.0.0.1:9000``. Modules are looked for
+    in the working folder too.
 
     Raises:
         ValueError: no such module or class, or it is not a planner.

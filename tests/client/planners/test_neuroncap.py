@@ -1,0 +1,152 @@
+"""A planner behind NeuroNCAP's interface, played by a small server on loopback."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim.planners import load_planner, needs_of
+from real2sim.planners.neuroncap import NeuroNcap
+from real2sim.planners.peer import PeerError
+
+from . import rig
+
+pytestmark = pytest.mark.network
+
+AHEAD = [[3.0 * (k + 1), 0.5 * (k + 1)] for k in range(6)]
+
+
+class Peer(HTTPServer):
+    """Answers with ``reply``; keeps what it was asked."""
+
+    def __init__(self):
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.asked: list[tuple[str, dict]] = []
+        self.reply: object = {"trajectory": AHEAD, "aux_outputs": {}}
+        self.status = 200
+        self.url = f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Peer
+
+    def do_GET(self):
+        self._answer(True)
+
+    def do_POST(self):
+        content = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        self.server.asked.append((self.path, content))
+        self._answer(self.server.reply if self.path == "/infer" else True)
+
+    def _answer(self, content):
+        body = json.dumps(content).encode()
+        self.send_response(self.server.status if self.path == "/infer" else 200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def peer():
+    with Peer() as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def planner(peer):
+    planner = NeuroNcap(peer.url)
+    planner.reset(rig.seen())
+    yield planner
+    planner.close()
+
+
+def test_it_is_found_by_name_and_wants_all_cameras(peer):
+    planner = load_planner(f"neuroncap={peer.url}")
+    assert needs_of(planner).all_cameras
+    assert needs_of(planner).modalities == ("rgb",)
+    planner.close()
+
+
+def test_the_way_comes_back_with_times_and_headings(planner):
+    plan = planner.plan(rig.seen())
+    assert plan.times_us == [1_500_000 + 500_000 * k for k in range(6)]
+    assert [pose[:2] for pose in plan.poses] == [tuple(p) for p in AHEAD]
+    assert [pose[2] for pose in plan.poses] == pytest.approx([math.atan2(0.5, 3.0)] * 6)
+
+
+def test_standing_keeps_the_heading(peer, planner):
+    peer.reply = {"trajectory": [[0.0, 0.0], [0.01, 0.005], [0.01, 0.005]], "aux_outputs": {}}
+    assert [pose[2] for pose in planner.plan(rig.seen()).poses] == [0.0] * 3
+
+
+def test_it_is_told_what_neuroncap_tells(peer, planner):
+    planner.plan(rig.seen())
+    (_, reset), (path, told) = peer.asked
+    assert reset == {}
+    assert path == "/infer"
+    assert set(told) == {"images", "ego2world", "canbus", "timestamp", "command", "calibration"}
+    assert (told["timestamp"], told["command"]) == (1_000_000, 2)
+    pose = np.array(told["ego2world"])
+    np.testing.assert_allclose(pose[:3, :3], rig.turned(30.0), atol=1e-12)
+    assert pose[:3, 3].tolist() == [100.0, 50.0, 2.0]
+    assert len(told["canbus"]) == 16
+    assert told["canbus"][13] == 6.0
+
+
+def test_cameras_get_the_names_that_the_planner_knows(peer, planner):
+    planner.plan(rig.seen())
+    told = peer.asked[-1][1]
+    ours = {"CAM_FRONT": "front", "CAM_FRONT_LEFT": "left", "CAM_BACK": "CAM_BACK"}
+    assert set(told["images"]) == set(ours)
+    for k, name in enumerate(ours):
+        saved = io.BytesIO(base64.b64decode(told["images"][name]))
+        image = torch.load(saved, weights_only=True)
+        assert (image.dtype, tuple(image.shape)) == (torch.uint8, (32, 48, 3))
+        assert image.unique().tolist() == [10 * k]
+        placed = np.array(told["calibration"]["camera2ego"][name])
+        expected = rig.camera_on_vehicle(rig.CAMERAS[ours[name]])
+        np.testing.assert_allclose(placed, expected, atol=1e-9)
+        assert told["calibration"]["camera2image"][name] == rig.K.tolist()
+
+
+@pytest.mark.parametrize(
+    ("reply", "said"),
+    [
+        ({"trajectory": [[1.0, math.nan]], "aux_outputs": {}}, "not finite"),
+        ({"trajectory": [[1.0, 2.0, 3.0]]}, r"shape \[1, 3\]"),
+        ({"trajectory": []}, "shape"),
+        ({}, "shape"),
+        ([1, 2], "shape"),
+        ({"trajectory": [["a", "b"]]}, "no list of points"),
+    ],
+)
+def test_answers_that_are_no_way_are_refused(peer, planner, reply, said):
+    peer.reply = reply
+    with pytest.raises(PeerError, match=said):
+        planner.plan(rig.seen())
+
+
+def test_what_the_planner_complains_of_is_passed_on(peer, planner):
+    peer.status, peer.reply = 500, {"detail": "out of memory"}
+    with pytest.raises(PeerError, match=r"/infer answers 500.*out of memory"):
+        planner.plan(rig.seen())
+
+
+def test_nobody_there_is_said_by_address():
+    with pytest.raises(PeerError, match=r"no planner answers at http://127\.0\.0\.1:9"):
+        NeuroNcap("http://127.0.0.1:9", timeout=0.3)
