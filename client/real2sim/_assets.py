@@ -71,6 +71,10 @@ class Assets:
         asked = _requests.checked(AssetUpload, **fields)
         return self._transport.send(_requests.upload_asset(Path(path), asked))
 
+    def delete(self, asset_id: str) -> None:
+        """Remove one that no scenario has in its history."""
+        self._transport.send(_requests.delete_asset(asset_id))
+
     def thumbnail(self, asset_id: str, *, width: int = 256) -> Image:
         """A picture of it (png)."""
         return self._transport.send(_requests.asset_thumbnail(asset_id, width))
@@ -124,6 +128,10 @@ class AsyncAssets:
         }
         asked = _requests.checked(AssetUpload, **fields)
         return await self._transport.send(_requests.upload_asset(Path(path), asked))
+
+    async def delete(self, asset_id: str) -> None:
+        """Remove one that no scenario has in its history."""
+        await self._transport.send(_requests.delete_asset(asset_id))
 
     async def thumbnail(self, asset_id: str, *, width: int = 256) -> Image:
         """A picture of it (png)."""

@@ -248,6 +248,10 @@ def upload_asset(path: Path, asked: AssetUpload) -> Call[AssetInfo]:
     return Call(_upload("/v1/assets", path, form), model_of(AssetInfo))
 
 
+def delete_asset(asset_id: str) -> Call[None]:
+    return Call(Request("DELETE", f"/v1/assets/{_segment(asset_id)}"), nothing)
+
+
 def asset_thumbnail(asset_id: str, width: int) -> Call[Image]:
     path = f"/v1/assets/{_segment(asset_id)}/thumbnail"
     request = Request("GET", path, {"width": str(width)}, patient=True)

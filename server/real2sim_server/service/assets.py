@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import secrets
+import shutil
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,6 +102,7 @@ class AssetLibrary:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._assets: dict[str, LibraryAsset] = {}
+        self._leaving: set[str] = set()
         self._lock = threading.Lock()
 
     def list(self) -> list[LibraryAsset]:
@@ -111,6 +116,8 @@ class AssetLibrary:
     def find(self, asset_id: str) -> LibraryAsset | None:
         """The asset of that id, read from disk the first time."""
         with self._lock:
+            if asset_id in self._leaving:
+                return None
             known = self._assets.get(asset_id)
             if known is None and self._bundle(asset_id).is_dir():
                 try:
@@ -149,6 +156,31 @@ class AssetLibrary:
             self.folder.mkdir(parents=True, exist_ok=True)
             kept = self._assets[asset.asset_id] = LibraryAsset(save_asset(asset, target))
             return kept
+
+    @contextmanager
+    def withheld(self, asset_id: str) -> Iterator[None]:
+        """Nobody finds the asset while the block runs; it stays on disk until :meth:`remove`.
+
+        Raises:
+            ServiceError: UNKNOWN_ASSET, also where somebody else withholds it.
+        """
+        self.get(asset_id)
+        with self._lock:
+            self._leaving.add(asset_id)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._leaving.discard(asset_id)
+
+    def remove(self, asset_id: str) -> None:
+        """Delete a withheld asset; its id may be given again."""
+        with self._lock:
+            # Renamed first: a crash must not leave half a bundle under its name.
+            gone = self.folder / f".removed-{secrets.token_hex(6)}"
+            self._bundle(asset_id).rename(gone)
+            self._assets.pop(asset_id, None)
+        shutil.rmtree(gone, ignore_errors=True)
 
     def _bundle(self, asset_id: str) -> Path:
         return self.folder / f"{asset_id}{ASSET_SUFFIX}"

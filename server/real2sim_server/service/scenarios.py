@@ -184,6 +184,18 @@ class Scenarios:
             entries=[history_entry(e) for e in scenario.entries[max(0, after) :]],
         )
 
+    async def with_asset(self, asset_id: str) -> Sequence[str]:
+        """Ids of the scenarios whose history names an asset, edits that are under way included."""
+        for held in list(self._held.values()):
+            async with held.lock:
+                pass
+        return await self._store.scenarios_naming(asset_id)
+
+    @property
+    def assets(self) -> AssetLookup | None:
+        """Where scenarios find what they insert."""
+        return self._assets
+
     # --- editing ----------------------------------------------------------------------------
 
     async def edit(

@@ -174,6 +174,13 @@ class Store:
             kinds.setdefault(row["scenario_id"], []).append(row["kind"])
         return kinds
 
+    async def scenarios_naming(self, asset_id: str) -> list[str]:
+        """Scenarios that have an operation with this asset in their log, also if undone."""
+        log = t.scenario_log
+        named = log.c.entry.contains(f'"asset_id": {json.dumps(asset_id)}', autoescape=True)
+        query = sa.select(log.c.scenario_id).where(named).distinct()
+        return [row["scenario_id"] for row in await self._read(query.order_by(log.c.scenario_id))]
+
     # --- sessions ---------------------------------------------------------------------------
 
     async def create_session(self, row: SessionRow, *, reply: StoredReply | None = None) -> None:

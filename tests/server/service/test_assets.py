@@ -149,3 +149,32 @@ def test_an_unknown_asset_is_refused_with_its_place(client):
     assert answer.status_code == 404
     assert answer.json()["code"] == ErrorCode.UNKNOWN_ASSET
     assert answer.json()["errors"][0]["pointer"] == "/operations/0"
+
+
+def test_an_asset_that_nobody_uses_can_be_deleted_and_its_id_given_again(client):
+    assert client.post("/v1/assets", json=CUT).status_code == 201
+    assert client.delete("/v1/assets/red").status_code == 204
+    assert client.get("/v1/assets").json()["assets"] == []
+    assert client.delete("/v1/assets/red").json()["code"] == ErrorCode.UNKNOWN_ASSET
+    assert client.post("/v1/assets", json=CUT).status_code == 201
+
+
+def test_an_asset_in_a_history_stays_until_the_scenario_is_gone(client):
+    client.post("/v1/assets", json=CUT)
+    scenario = create(client)
+    edit(client, scenario, {"op": "insert", "asset_id": "red", "pose": THERE})
+    client.post(f"/v1/scenarios/{scenario}/undo")
+    refused = client.delete("/v1/assets/red")
+    assert (refused.status_code, refused.json()["code"]) == (409, ErrorCode.ASSET_IN_USE)
+    assert scenario in refused.json()["detail"]
+    assert client.post(f"/v1/scenarios/{scenario}/redo").status_code == 200
+    client.delete(f"/v1/scenarios/{scenario}")
+    assert client.delete("/v1/assets/red").status_code == 204
+
+
+def test_an_asset_whose_id_is_part_of_a_used_one_can_be_deleted(client):
+    for name in ("red", "red_2", "redx2"):
+        client.post("/v1/assets", json=CUT | {"asset_id": name})
+    edit(client, create(client), {"op": "insert", "asset_id": "redx2", "pose": THERE})
+    assert client.delete("/v1/assets/red").status_code == 204
+    assert client.delete("/v1/assets/red_2").status_code == 204

@@ -91,6 +91,21 @@ async def describe(worker: WorkerOf, asset_id: Identifier) -> AssetInfo:
     return (await asyncio.to_thread(worker.assets.get, asset_id)).info()
 
 
+@router.delete("/{asset_id}", status_code=204, response_class=Response)
+async def delete(worker: WorkerOf, asset_id: Identifier) -> Response:
+    """Remove an asset that no scenario has in its history; its id may then be given again.
+
+    Sessions that show it go on.
+    """
+    asset = await asyncio.to_thread(worker.assets.get, asset_id)
+    await _refuse_use(worker, asset.asset_id)
+    with worker.assets.withheld(asset_id):
+        # Once more: an edit that was under way may have found it before.
+        await _refuse_use(worker, asset_id)
+        await worker.residency.on_disk_thread(lambda: worker.assets.remove(asset_id))
+    return Response(status_code=204)
+
+
 @router.get(
     "/{asset_id}/thumbnail",
     response_class=Response,
@@ -113,6 +128,17 @@ async def thumbnail(
     # The same id is the same asset for ever.
     headers = {"Cache-Control": "public, max-age=86400, immutable"}
     return Response(encoded.data, media_type="image/png", headers=headers)
+
+
+async def _refuse_use(worker: Worker, asset_id: str) -> None:
+    users = await worker.scenarios.with_asset(asset_id)
+    if users:
+        more = f" and {len(users) - 3} more" if len(users) > 3 else ""
+        raise ServiceError(
+            ErrorCode.ASSET_IN_USE,
+            f"asset {asset_id!r} is in the history of {', '.join(users[:3])}{more}",
+            hint="delete those scenarios first",
+        )
 
 
 async def _cut(worker: Worker, asked: AssetCut) -> LibraryAsset:

@@ -350,7 +350,9 @@ class Sessions:
     async def _bare_state(self, scene: Scene) -> ScenarioState:
         state = self._bare_states.get(scene)
         if state is None:
-            state = self._bare_states[scene] = await asyncio.to_thread(ScenarioState.of, scene)
+            assets = self._scenarios.assets
+            state = await asyncio.to_thread(lambda: ScenarioState.of(scene, assets=assets))
+            self._bare_states[scene] = state
         return state
 
     async def _sweep(self) -> None:

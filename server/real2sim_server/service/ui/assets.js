@@ -1,6 +1,6 @@
 // The library: put an asset in front of the recording vehicle, in place of the selection, or add one.
 import { model, on, edit, object } from "./model.js";
-import { get, post, picture } from "./api.js";
+import { call, get, post, picture } from "./api.js";
 import { poseAt, yawOf } from "./poses.js";
 import { el } from "./dom.js";
 import { attempt, say } from "./messages.js";
@@ -21,15 +21,23 @@ function card(asset) {
   return el("div", { class: "card" }, image, el("strong", { textContent: asset.asset_id }),
     el("small", { textContent: `${asset.category} · ${asset.size.map((s) => s.toFixed(1)).join(" × ")} m` }),
     el("button", { textContent: "Insert", onclick: () => insert(asset) }),
-    el("button", { textContent: "Replace", title: "Give the selected object this look", disabled: !model.selected, onclick: () => edit([{ op: "replace", object_id: model.selected, asset_id: asset.asset_id }]) }));
+    el("button", { textContent: "Replace", title: "Give the selected object this look", disabled: !model.selected, onclick: () => edit([{ op: "replace", object_id: model.selected, asset_id: asset.asset_id }]) }),
+    el("button", { textContent: "Delete", class: "danger", onclick: attempt(() => remove(asset)) }));
 }
 function insert(asset) {
   const { position: [x, y, z], quaternion } = poseAt(model.scene.ego, model.t), yaw = yawOf(quaternion);
   const position = [x + 15 * Math.cos(yaw), y + 15 * Math.sin(yaw), z + asset.size[2] / 2];
   return edit([{ op: "insert", asset_id: asset.asset_id, pose: { position, quaternion } }]);
 }
+async function remove(asset) {
+  await call("DELETE", `/v1/assets/${asset.asset_id}`);
+  await draw();
+}
 async function keep(subject) {
-  await post("/v1/assets", { scene: model.scenario.scene, object_id: subject.recorded_id });
-  say(`${subject.recorded_id} is in the library now`);
+  const { assets } = await get("/v1/assets"), taken = new Set(assets.map((a) => a.asset_id));
+  let asset_id = subject.recorded_id;
+  for (let n = 2; taken.has(asset_id); n++) asset_id = `${subject.recorded_id}_${n}`;
+  await post("/v1/assets", { scene: model.scenario.scene, object_id: subject.recorded_id, asset_id });
+  say(`The library has ${asset_id} now`);
   await draw();
 }

@@ -71,7 +71,7 @@ function outline() {
   canvas.width = canvas.clientWidth * devicePixelRatio;
   canvas.height = canvas.clientHeight * devicePixelRatio;
   const subject = object(model.selected);
-  $("stage-hint").textContent = subject ? subject.object_id : model.free ? "" : "Click an object to select it";
+  $("stage-hint").textContent = subject ? subject.object_id : model.free || model.mosaic ? "" : "Click an object to select it";
   if (!header || !subject || !present(subject, model.t)) return;
   const { scale, left, top } = frameBox();
   const pen = canvas.getContext("2d");

@@ -12,12 +12,13 @@ export function startMap() {
   canvas.addEventListener("pointermove", move);
   canvas.addEventListener("pointerup", up);
   canvas.addEventListener("wheel", zoom, { passive: false });
-  on("scenario selection time draft run camera", draw);
+  on("scenario selection time draft run camera box", draw);
   new ResizeObserver(draw).observe(canvas);
   centre();
 }
 const toScreen = ([x, y]) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 const toWorld = (e) => [view.x + (e.offsetX - canvas.clientWidth / 2) / view.scale, view.y - (e.offsetY - canvas.clientHeight / 2) / view.scale];
+export const screenOfBox = () => toScreen(model.box.position);
 export const screenOf = (id) => toScreen(poseOf(object(id)).position);
 
 export function fit() {
@@ -104,6 +105,7 @@ function down(e) {
   }
   const hit = under(at);
   if (hit && !model.job) { select(hit.object_id); return begin("move", hit.object_id, at); }
+  if (!hit && !model.selected && model.box && inside(at)) { drag = { kind: "box", at, from: [...model.box.position] }; return; }
   drag = { kind: "pan", from: [e.offsetX, e.offsetY], view: { ...view } };
 }
 function begin(kind, id, at) {
@@ -117,15 +119,24 @@ function move(e) {
     return draw();
   }
   const [x, y] = toWorld(e);
+  if (drag.kind === "box") return moveBox(x - drag.at[0], y - drag.at[1]);
   const angle = Math.atan2(y - drag.centre[1], x - drag.centre[0]) - drag.angle;
   model.draft = drag.kind === "move" ? { id: drag.id, x: x - drag.at[0], y: y - drag.at[1], angle: 0 }
     : { id: drag.id, x: 0, y: 0, angle: Math.atan2(Math.sin(angle), Math.cos(angle)) };
   tell("draft");
 }
+// The box lies along the axes of the world, and belongs to no object: nothing is committed.
+const inside = (at) => [0, 1].every((k) => Math.abs(at[k] - model.box.position[k]) < model.box.size[k] / 2);
+function moveBox(dx, dy) {
+  const place = (v) => Math.round(v * 10) / 10;
+  model.box.position = [place(drag.from[0] + dx), place(drag.from[1] + dy), drag.from[2]];
+  model.box.placed = true;
+  tell("box");
+}
 async function up() {
   const was = drag;
   drag = null;
-  if (was?.kind === "pan" || !model.draft) return;
+  if (was?.kind === "pan" || was?.kind === "box" || !model.draft) return;
   const { x, y } = model.draft;
   const round = (v) => Math.round(v * 1e4) / 1e4;
   if (was.kind === "move" && Math.hypot(x, y) * view.scale < 3) { model.draft = null; tell("draft"); return; }

@@ -1,12 +1,12 @@
 // Physics: run it as a job, watch its progress, play the result, read contacts and energies.
 import { model, on, span, setTime, startSimulation, stopRun, tell } from "./model.js";
-import { call, events, get } from "./api.js";
+import { call, events, get, sentence } from "./api.js";
 import { el } from "./dom.js";
 import { attempt, say } from "./messages.js";
 import { plot } from "./plot.js";
 
 const page = () => document.getElementById("physics");
-let running = null;
+let running = null, refused = "", duration = 2;
 
 export function startPhysics() {
   on("scenario selection run", draw);
@@ -15,16 +15,18 @@ export function startPhysics() {
 }
 function draw() {
   const { start_us: start, end_us: end } = model.scenario;
-  const seconds = el("input", { id: "duration", type: "number", min: 0.1, max: (end - start) / 1e6, step: 0.1, value: 2, class: "wide" });
+  const seconds = el("input", { id: "duration", type: "number", min: 0.1, max: (end - start) / 1e6, step: "any", value: duration, class: "wide" });
+  seconds.oninput = () => { duration = Number(seconds.value); };
   const moved = model.scenario.objects.filter((o) => o.velocity || o.physics).map((o) => o.object_id);
   const parts = [
     el("p", { textContent: moved.length ? `Physics moves ${moved.join(", ")} and whatever they touch, from the time shown on.` : "Set a velocity or physical properties of an object first; physics moves it and whatever it touches." }),
     el("div", { class: "row" }, el("label", { textContent: "for [s]" }), seconds),
     el("div", { class: "actions" },
-      el("button", { id: "run", class: "primary", textContent: "Run from here", disabled: !!running || !moved.length, onclick: attempt(() => run(Number(seconds.value))) }),
+      el("button", { id: "run", class: "primary", textContent: "Run from here", disabled: !!running || !moved.length, onclick: attempt(() => run(duration)) }),
       running && el("button", { textContent: "Cancel", onclick: attempt(() => call("DELETE", `/v1/jobs/${running.job_id}`)) }),
       model.job && el("button", { id: "leave-run", textContent: "Back to the scenario", onclick: stopRun }))];
   if (running) parts.push(el("progress", { id: "progress", max: 1, value: running.progress }), el("small", { id: "stage-of-run", textContent: running.stage || running.state }));
+  if (refused) parts.push(el("p", { id: "refused", class: "refused", textContent: refused }));
   if (model.playback) parts.push(...results());
   page().replaceChildren(...parts);
   if (model.playback) chart();
@@ -39,13 +41,15 @@ function progress() {
 async function run(seconds) {
   stopRun();
   const end = model.scenario.end_us, start = Math.min(model.t, end - 100_000);
+  refused = "";
   running = await startSimulation({ start_us: start, end_us: Math.min(end, Math.round(start + seconds * 1e6)) });
   try {
     draw();
     for await (running of events(`/v1/jobs/${running.job_id}/events`)) progress();
     const job = await get(`/v1/jobs/${running.job_id}`);
     if (job.state === "succeeded") await show(job.job_id);
-    else say(job.error?.detail ?? `The run is ${job.state}.`, job.state === "failed" ? "bad" : "");
+    else if (job.state === "failed") refused = sentence(job.error?.detail ?? "the run failed");
+    else say(`The run is ${job.state}.`);
   } finally {
     running = null;
     draw();

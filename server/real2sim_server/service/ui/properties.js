@@ -2,7 +2,7 @@
 import { model, on, object, poseOf, edit, select, tell, timeRange } from "./model.js";
 import { yawOf, present } from "./poses.js";
 import { el, number, row, tidy } from "./dom.js";
-import { scenePanel } from "./scene_panel.js";
+import { refreshBox, scenePanel } from "./scene_panel.js";
 
 const MATERIALS = ["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"];
 const page = () => document.getElementById("properties");
@@ -10,6 +10,7 @@ const page = () => document.getElementById("properties");
 export function startProperties() {
   on("scenario selection run", draw);
   on("time draft", refreshPose);
+  on("box", refreshBox);
   draw();
 }
 function draw() {

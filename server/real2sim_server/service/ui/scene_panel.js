@@ -5,10 +5,11 @@ import { el, number, row } from "./dom.js";
 
 export function scenePanel() {
   const { erased, colliders } = model.scenario;
-  model.box ??= ahead();
+  if (!model.box?.placed) model.box = ahead();
   return [
     el("fieldset", {}, el("legend", { textContent: "Scenario plays" }), span()),
     el("fieldset", {}, el("legend", { textContent: "Box, dashed on the map" }),
+      el("p", { textContent: "Drag it there, or type its place and size." }),
       row("x y z [m]", ["x", "y", "z"].map((axis, k) => field(`box-${axis}`, model.box.position, k))),
       row("l w h [m]", ["l", "w", "h"].map((axis, k) => field(`box-${axis}`, model.box.size, k))),
       el("div", { class: "actions" },
@@ -28,7 +29,11 @@ function ahead() {
   return { position: [x + 12 * forward[0], y + 12 * forward[1], z + 1].map(tenth), size: [4, 4, 2] };
 }
 function field(id, values, k) {
-  return number(id, values[k], (v) => { if (v !== null) values[k] = v; tell("draft"); });
+  return number(id, values[k], (v) => { if (v !== null) values[k] = v; model.box.placed = true; tell("draft"); });
+}
+// While the box is dragged on the map.
+export function refreshBox() {
+  ["x", "y", "z"].forEach((axis, k) => { document.getElementById(`box-${axis}`).value = model.box.position[k]; });
 }
 function span() {
   const { start_us: start, end_us: end } = model.scenario;

@@ -232,6 +232,17 @@ def test_an_edit_takes_effect_before_the_next_step(planner):
     assert "edited" in {e["type"] for e in obs["events"]}
 
 
+def test_an_asset_is_inserted_into_a_session_without_a_scenario(site, planner):
+    cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}
+    site.http.post("/v1/assets", json=cut).raise_for_status()
+    planner.reset(privileged=True)
+    insert = {"op": "insert", "asset_id": "red", "pose": {"position": [20.0, 3.0, 0.8]}}
+    edited = planner.ask("edit", operations=[insert])
+    assert edited["type"] == "edited"
+    assert edited["created"][0] in {a["object_id"] for a in planner.act(0)["agents"]}
+    site.http.delete("/v1/assets/red").raise_for_status()
+
+
 @pytest.mark.parametrize(
     ("fields", "code"),
     [

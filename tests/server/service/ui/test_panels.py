@@ -10,7 +10,7 @@ import pytest
 import real2sim
 from real2sim_server.service.serve import running_worker
 
-from .hands import enter, field, kept, shown, until
+from .hands import drag, enter, field, kept, place, shown, until
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -65,6 +65,16 @@ def test_a_box_erases_stops_and_is_taken_back(studio):
     studio.locator("[data-remove]").first.click()
     kept(studio, 4)
     assert shown(studio, "model.scenario.erased.length") == 0
+
+
+def test_the_box_is_dragged_on_the_map(studio):
+    x = field(studio, "box-x")
+    drag(studio, place(studio, "#map", "map.js", "screenOfBox()"), (45, 0))
+    assert field(studio, "box-x") > x + 1
+    studio.click("#erase")
+    kept(studio, 1)
+    erased = shown(studio, "model.scenario.erased[0].pose.position[0]")
+    assert erased == field(studio, "box-x")
 
 
 def test_a_scenario_plays_in_the_span_given(studio):
