@@ -27,6 +27,9 @@ DAMPED = Jelly(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
 back up by a third of the height; this much leaves a slight bounce."""
 PAIR_GAP = 1.5
 """Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
+SIDEWAYS, SLANT_MIN = 2.0, 0.25
+"""Near views stand at most so many times as far to the side as the recording saw it from, and at
+least so far."""
 DEPTH_RANGE = (4.0, 45.0)
 OPAQUE = 0.3
 
@@ -199,7 +202,7 @@ def _pair(asked: _Asked) -> Experiment:
         preset=asked.preset,
         objects=objects,
         start_us=start_us,
-        duration=PAIR_GAP / speed + 1.2,
+        duration=PAIR_GAP / speed + 0.8,
         gravity=(0.0, 0.0, 0.0),
     )
     view = _viewer(asked.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
@@ -223,9 +226,11 @@ def _drop(asked: _Asked) -> Experiment:
         start_us=start_us,
         duration=2.0,
     )
-    pose = subjects[0].trajectory.transform(start_us)
-    view = _viewer(asked.scene, subjects[0], pose, slant=1.0, rise=0.15)
-    return Experiment("drop", options, tuple(objects), pose[:3, 3], view, 8.0)
+    shown = max(subjects, key=lambda s: abs(float(seen(asked.scene, s).direction[1])))
+    pose = shown.trajectory.transform(start_us)
+    view = _viewer(asked.scene, shown, pose, slant=1.0, rise=0.15)
+    focus = pose[:3, 3] + np.array([0.0, 0.0, DROP_HEIGHT / 3])
+    return Experiment("drop", options, tuple(objects), focus, view, 8.0)
 
 
 def _reach(asked: _Asked, subject: PlacedObject) -> tuple[Float, Float]:
@@ -249,10 +254,11 @@ def _viewer(
     """Direction [3] to a viewer on the side and at the end from which the subject was seen.
 
     Args:
-        slant: how much to the side, against along the subject.
+        slant: how much to the side, against along the subject; less for a side hardly seen.
         rise: how much up.
     """
     x, y, _ = seen(scene, subject).direction
+    slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
     along = (1.0 if x >= 0 else -1.0) * _level(pose[:3, 0])
     side = (1.0 if y >= 0 else -1.0) * slant * _level(np.cross([0, 0, 1], pose[:3, 0]))
     return _level(along + side) + np.array([0.0, 0.0, rise])
