@@ -110,16 +110,14 @@ def _place(options: Options, out: Path) -> Iterator[Place]:
 
 
 def _print(driven: Sequence[Driven], out: Path) -> None:
-    table = Table(title="mean over cases and seeds", title_justify="left")
-    table.add_column("planner")
     groups = [group for group in groups_of(driven) if group.case is None]
-    names = list(groups[0].scores)
-    for name in names:
-        table.add_column(name, justify="right", overflow="fold")
-    table.add_column("at fault", justify="right")
+    table = Table(title="mean over cases and seeds", title_justify="left")
+    table.add_column("score")
     for group in groups:
-        spreads = [group.scores[name] for name in names]
-        cells = ["–" if s is None else f"{s.mean:.3g}" for s in spreads]
-        table.add_row(escape(group.policy), *cells, str(group.at_fault))
+        table.add_column(escape(group.policy), justify="right", overflow="fold")
+    for name in groups[0].scores:
+        spreads = [group.scores[name] for group in groups]
+        table.add_row(name, *("–" if s is None else f"{s.mean:.3g}" for s in spreads))
+    table.add_row("collisions at fault", *(str(group.at_fault) for group in groups))
     console.print(table)
     console.print(f"in {out}: {PAGE}, {FIGURES}, {RECORDINGS}/", highlight=False)
