@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 from ..laws.matrices import det, rotation_step
-from ..laws.shared import F32, ONE, ZERO
+from ..laws.shared import ONE, ZERO
 from ..laws.stress import (
     COROTATED,
     KIND,
@@ -23,14 +23,13 @@ from ..laws.stress import (
     NEO_HOOKEAN,
     VISCOSITY,
     VOLUME_MIN,
-    VON_MISES,
     add_viscosity,
     advance_gradient,
     corotated_about,
     neo_hookean_at,
-    respond,
 )
 from .kernel import inner
+from .particle import deform
 
 BATCH = 16
 _F, _L, _TAU, _ENERGY, _VOLUME, _MU, _LAMBDA, _ETA, _OFF = 0, 9, 18, 24, 25, 26, 27, 28, 29
@@ -155,31 +154,3 @@ def put(s: Any, lane: Any, F: Any, tau: Any, energy: Any) -> None:
     for c in range(6):
         s[(_TAU + c) * BATCH + lane] = tau[c]
     s[_ENERGY * BATCH + lane] = energy
-
-
-@inner()
-def nine(a: Any, p: Any) -> Any:
-    """Row p of a [N, 9] array as a tuple."""
-    return (
-        a[p, 0], a[p, 1], a[p, 2], a[p, 3], a[p, 4], a[p, 5], a[p, 6], a[p, 7], a[p, 8],
-    )  # fmt: skip
-
-
-@inner()
-def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
-    """Advance one particle's deformation by its velocity gradient and find its stress."""
-    L = nine(state.L, p)
-    trial = advance_gradient(nine(state.F, p), L, dt)
-    F, tau, energy, history = respond(trial, state.history[p], row, dt)
-    if row[VISCOSITY] > ZERO:
-        tau = add_viscosity(tau, L, det(F), row[VISCOSITY])
-    for c in range(9):
-        state.F[p, c] = F[c]
-    for c in range(6):
-        state.tau[p, c] = tau[c]
-    state.energy[p] = energy
-    if row[KIND] >= F32(VON_MISES):
-        state.history[p] = history
-        F = advance_gradient(nine(state.F_total, p), L, dt)
-        for c in range(9):
-            state.F_total[p, c] = F[c]

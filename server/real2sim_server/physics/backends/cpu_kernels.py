@@ -5,98 +5,25 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from numba import prange
-from numpy.typing import NDArray
 
-from ..laws.shared import F32, FOUR, HALF, ONE, ZERO
+from ..laws.shared import ONE, ZERO
 from ..laws.weights import spline_weights
 from .cpu_contact import meet_bodies, meet_colliders
 from .cpu_deform import deform_all
-from .cpu_layout import BLOCK, CHUNKS, Layout
-from .cpu_simd import LANES, SIDE, gather, scatter
+from .cpu_simd import LANES, gather, scatter
 from .kernel import entry, inner
-
-TILE = SIDE**3
-NODES = BLOCK**3
-LOW, HIGH = F32(-0.5), F32(5.5)
-"""Cells from the start of its block between which a particle's nodes stay on the tile."""
-
-
-class State(NamedTuple):
-    """Particles sorted by home, in one precision.
-
-    Attributes:
-        xi: [N, 3] position from the start of the block [cells].
-        v: [N, 3] [m/s].
-        L: [N, 9] velocity gradient [1/s].
-        F: [N, 9] elastic deformation gradient.
-        F_total: [N, 9], or [0, 9] where nothing is plastic and F says it all.
-        tau: [N, 6] Kirchhoff stress [Pa].
-        energy: [N] stored energy per rest volume [J/m^3].
-        history: [N].
-        mass, volume: [N] [kg], [m^3].
-        material: [N] int32.
-    """
-
-    xi: NDArray[Any]
-    v: NDArray[Any]
-    L: NDArray[Any]
-    F: NDArray[Any]
-    F_total: NDArray[Any]
-    tau: NDArray[Any]
-    energy: NDArray[Any]
-    history: NDArray[Any]
-    mass: NDArray[Any]
-    volume: NDArray[Any]
-    material: NDArray[Any]
-
-
-class Work(NamedTuple):
-    """Space for one layout.
-
-    Attributes:
-        tiles: [P, 512, 4] momentum and mass, then velocities.
-        moments: [Q, 512, 4] first moment of volume about the nodes [m^3 cells], and volume [m^3].
-        velocity: [M, 64, 4] velocity and mass of the fields.
-        offset: [M, 64, 4] first moments of the fields.
-        scratch: [CHUNKS, SCRATCH], see ``cpu_deform``.
-        strayed: [P] bool, whether a particle left its home's reach.
-        by_collider: [T, TOTALS] float64, of each touch.
-        by_body: [M, B, TOTALS] float64, on a field from each body; [0, B, TOTALS] for one body.
-    """
-
-    tiles: NDArray[Any]
-    moments: NDArray[Any]
-    velocity: NDArray[Any]
-    offset: NDArray[Any]
-    scratch: NDArray[Any]
-    strayed: NDArray[np.bool_]
-    by_collider: NDArray[np.float64]
-    by_body: NDArray[np.float64]
-
-
-class Rules(NamedTuple):
-    """What holds for the whole run.
-
-    Attributes:
-        table: [K, ROW] materials, in the state's precision.
-        dx: cell size [m], in the state's precision.
-        gravity: [3] [m/s^2], in the state's precision.
-        friction: [B] float64.
-        obstacles: [C, COLLIDER_ROW] float64.
-        heights: [H] float64.
-    """
-
-    table: NDArray[Any]
-    dx: Any
-    gravity: NDArray[Any]
-    friction: NDArray[np.float64]
-    obstacles: NDArray[np.float64]
-    heights: NDArray[np.float64]
+from .layout import BLOCK, CHUNKS
+from .particle import (
+    NODES,
+    SIDE,
+    momentum,
+    move,
+    place,
+    velocity_gradient,
+)
 
 
 @entry()
@@ -135,49 +62,25 @@ def scatter_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> No
 @inner()
 def scatter_particles(begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any) -> None:
     """Add the particles of one home to its tile."""
-    stress_scale = -dt * FOUR / dx
     for p in range(begin, end):
-        first, fx, fy, fz = place(state.xi, p)
-        m = state.mass[p]
-        k = stress_scale * state.volume[p]
-        md = m * dx
-        L, t = state.L, state.tau
-        qx = (k * t[p, 0] + md * L[p, 0], k * t[p, 3] + md * L[p, 3], k * t[p, 4] + md * L[p, 6])
-        qy = (k * t[p, 3] + md * L[p, 1], k * t[p, 1] + md * L[p, 4], k * t[p, 5] + md * L[p, 7])
-        qz = (k * t[p, 4] + md * L[p, 2], k * t[p, 5] + md * L[p, 5], k * t[p, 2] + md * L[p, 8])
-        start = (
-            m * state.v[p, 0] - qx[0] * fx - qy[0] * fy - qz[0] * fz,
-            m * state.v[p, 1] - qx[1] * fx - qy[1] * fy - qz[1] * fz,
-            m * state.v[p, 2] - qx[2] * fx - qy[2] * fy - qz[2] * fz,
-            m,
-        )
-        wx, wy, wz = spline_weights(fx), spline_weights(fy), spline_weights(fz)
-        scatter(tile, first, wx, wy, wz, start, qx, qy, qz)
+        first, f = place(p, state.xi)
+        start, qx, qy, qz = momentum(p, dt, dx, f, state)
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        scatter(tile, first, wx, wy, wz, (*start, state.mass[p]), qx, qy, qz)
 
 
 @inner()
 def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
     """Add w V (x_p - x_i) and w V of one home's particles to its moments; V at rest."""
     for p in range(begin, end):
-        first, fx, fy, fz = place(state.xi, p)
+        first, f = place(p, state.xi)
         V = state.volume[p]
         zero = ZERO * V
-        wx, wy, wz = spline_weights(fx), spline_weights(fy), spline_weights(fz)
-        start = (V * fx, V * fy, V * fz, V)
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        start = (V * f[0], V * f[1], V * f[2], V)
         scatter(
             moments, first, wx, wy, wz, start, (-V, zero, zero), (zero, -V, zero), (zero, zero, -V)
         )
-
-
-@inner()
-def place(xi: Any, p: Any) -> Any:
-    """First of a particle's nodes on the tile, and its distance from it [cells]."""
-    i = math.floor(xi[p, 0] - HALF)
-    j = math.floor(xi[p, 1] - HALF)
-    k = math.floor(xi[p, 2] - HALF)
-    # Tiles start one cell below the block.
-    first = ((i + 1) * SIDE + j + 1) * SIDE + k + 1
-    return first, xi[p, 0] - F32(i), xi[p, 1] - F32(j), xi[p, 2] - F32(k)
 
 
 @inner(parallel=True)
@@ -298,35 +201,13 @@ def gather_particles(
     begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any, moving: Any
 ) -> Any:
     """Move the particles of one home; returns whether one strayed off its tile."""
-    stride = dt / dx
     strayed = False
     if moving:
         for p in range(begin, end):
-            v, L = pick_up(p, dx, state.xi, tile)
-            for axis in range(3):
-                state.v[p, axis] = v[axis]
-                xi = state.xi[p, axis] + stride * v[axis]
-                state.xi[p, axis] = xi
-                # NaN fails both comparisons, so it counts as strayed.
-                if xi >= LOW and xi < HIGH:
-                    continue
+            first, f = place(p, state.xi)
+            wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+            g = gather(tile, first, wx, wy, wz)
+            L = velocity_gradient(g, dx, f)
+            if move(p, dt, dx, (g[0], g[1], g[2]), L, state):
                 strayed = True
-            for c in range(9):
-                state.L[p, c] = L[c]
     return strayed
-
-
-@inner()
-def pick_up(p: Any, dx: Any, xi: Any, tile: Any) -> Any:
-    """Velocity and velocity gradient of one particle from its nodes."""
-    first, fx, fy, fz = place(xi, p)
-    g = gather(tile, first, spline_weights(fx), spline_weights(fy), spline_weights(fz))
-    scale = FOUR / dx
-    return (g[0], g[1], g[2]), (
-        scale * (g[3] - fx * g[0]), scale * (g[6] - fy * g[0]), scale * (g[9] - fz * g[0]),
-        scale * (g[4] - fx * g[1]), scale * (g[7] - fy * g[1]), scale * (g[10] - fz * g[1]),
-        scale * (g[5] - fx * g[2]), scale * (g[8] - fy * g[2]), scale * (g[11] - fz * g[2]),
-    )  # fmt: skip
-
-
-__all__ = ["Layout", "Rules", "State", "Work", "advance"]

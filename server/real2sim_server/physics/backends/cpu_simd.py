@@ -16,8 +16,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-SIDE = 8
-"""Nodes along an edge of a tile."""
+from .particle import SIDE
+
 LANES = 4
 
 

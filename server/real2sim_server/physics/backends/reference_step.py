@@ -278,7 +278,9 @@ def _meet_colliders(
             meet = (mass[b] > 0) & (distance <= 0) & (gap <= 0)
             own = collider.friction is None
             friction = (
-                rules.friction[b] if own else torch.tensor(min(collider.friction, float(STICKS)))
+                rules.friction[b]
+                if own
+                else rules.friction.new_tensor(min(collider.friction, float(STICKS)))
             )
             u = _material_velocity(collider, nodes)
             after = u + coulomb(fields[b] - u, n, friction, collider.separable)

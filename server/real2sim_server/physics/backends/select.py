@@ -7,7 +7,7 @@ import functools
 from ..errors import SolverError
 from .base import Backend
 
-BACKENDS = ("cpu", "reference")
+BACKENDS = ("cpu", "cuda", "reference")
 
 
 @functools.cache
@@ -15,15 +15,20 @@ def select_backend(name: str = "auto") -> Backend:
     """The one backend of that name.
 
     Args:
-        name: ``cpu``, ``reference``, or ``auto``, which is the fastest usable here.
+        name: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``: a device is used only
+            when asked for, as its sums differ in the last bits from run to run.
 
     Raises:
-        SolverError: for an unknown name.
+        SolverError: for an unknown name, or for ``cuda`` where no device is usable.
     """
     if name in ("auto", "cpu"):
         from .cpu import CpuBackend
 
         return CpuBackend()
+    if name == "cuda":
+        from .cuda import CudaBackend
+
+        return CudaBackend()
     if name == "reference":
         from .reference import ReferenceBackend
 

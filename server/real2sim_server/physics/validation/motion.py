@@ -14,32 +14,34 @@ from .check import Check, block, solve
 GRAVITY = 9.81
 
 
-def free_fall(backend: str) -> list[Check]:
+def free_fall(backend: str, *, edge: float = 0.4, steps: int = 100) -> list[Check]:
     """A falling block: symplectic Euler gives z0 - g t (t + dt) / 2, and F stays I."""
-    solver = solve(
-        [block(Jelly(young=2e6))], gravity=(0, 0, -GRAVITY), backend=backend, dt_max=1e-4
-    )
-    solver.step(0.01)
+    dt = 1e-4
+    body = block(Jelly(young=2e6), size=(edge,) * 3)
+    solver = solve([body], gravity=(0, 0, -GRAVITY), backend=backend, dt_max=dt)
+    solver.step(steps * dt)
     fallen = float(solver.measure.centre[0, 2])
     F = solver.particles().F_elastic
-    dt = 1e-4
+    exact = -GRAVITY * steps * dt * (steps + 1) * dt / 2
     return [
-        Check("free fall: height", fallen, -GRAVITY * 0.01 * (0.01 + dt) / 2, 1e-6, "m"),
+        Check("free fall: height", fallen, exact, 1e-6, "m"),
         Check("free fall: |F - I|", float(np.abs(F - np.eye(3)).max()), 0, 1e-6),
     ]
 
 
-def affine_patch(backend: str) -> list[Check]:
+def affine_patch(backend: str, *, edge: float = 0.4) -> list[Check]:
     """v = A x on a block without stiffness: C = A, F = (I + dt A)^n.
 
     The first step is exact. Later ones differ by O(dt^2): the field v = A x moves with itself, and
     the gradients particles carry lag behind by a step.
     """
     A = np.array([[0.3, -0.2, 0.1], [0.5, -0.4, 0.2], [-0.1, 0.6, 0.2]])
-    still = block(Jelly(young=1e-9))
+    size = (edge,) * 3
+    still = block(Jelly(young=1e-9), size=size)
     x = still.particles.positions
     moving = block(
         Jelly(young=1e-9),
+        size=size,
         particle_velocities=x @ A.T,
         particle_gradients=np.tile(A, (len(x), 1, 1)),
     )
@@ -57,13 +59,13 @@ def affine_patch(backend: str) -> list[Check]:
     ]
 
 
-def spin(backend: str) -> list[Check]:
+def spin(backend: str, *, edge: float = 0.48, turns: float = 1.0) -> list[Check]:
     """A free block at 60 rad/s keeps its angular momentum and its energy for a revolution."""
     material = Jelly(young=2e6, poisson=0.4)
-    body = block(material, size=(0.48, 0.48, 0.48), spacing=0.06, angular_velocity=(0, 0, 60.0))
+    body = block(material, size=(edge,) * 3, spacing=0.06, angular_velocity=(0, 0, 60.0))
     solver = solve([body], backend=backend, dx=0.12)
     start = solver.measure
-    solver.step(2 * np.pi / 60)
+    solver.step(turns * 2 * np.pi / 60)
     end = solver.measure
     turn = float(end.angular_momentum[0, 2] / start.angular_momentum[0, 2])
     kinetic = float(end.kinetic[0] / start.kinetic[0])
@@ -73,17 +75,20 @@ def spin(backend: str) -> list[Check]:
     ]
 
 
-def invariants(backend: str) -> list[Check]:
+def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Check]:
     """Two blocks that collide in space: mass, momentum, angular momentum, energy, volume."""
     material = Jelly(young=2e5, poisson=0.3)
+    size, away = (edge,) * 3, 0.625 * edge
     bodies = [
-        block(material, at=(-0.25, 0, 0), velocity=(1.5, 0, 0), name="left"),
-        block(material, at=(0.25, 0.1, 0.05), velocity=(-1.5, 0, 0), name="right"),
+        block(material, size=size, at=(-away, 0, 0), velocity=(1.5, 0, 0), name="left"),
+        block(
+            material, size=size, at=(away, edge / 4, edge / 8), velocity=(-1.5, 0, 0), name="right"
+        ),
     ]
     solver = solve(bodies, backend=backend)
     start, energy = solver.measure, solver.energies().total
     highest, smallest = energy, 1.0
-    for _ in range(10):
+    for _ in range(parts):
         solver.step(0.006)
         highest = max(highest, solver.energies().total)
         smallest = min(smallest, solver.measure.min_volume_ratio)

@@ -1,0 +1,125 @@
+"""Contact at one node: of a body with an obstacle, of two bodies; the same for every device.
+
+Arrays are rows of one node: velocity and mass [4], first moment of volume and volume [4], and the
+totals [TOTALS] of one touch.
+"""
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ..laws.contact import OPPOSED, coulomb, face_score, surface_offset
+from ..laws.obstacle import (
+    FRICTION,
+    SEPARABLE,
+    obstacle_distance,
+    obstacle_velocity,
+    unit,
+)
+from ..laws.shared import ZERO, law
+from .layout import BLOCK
+
+
+@law
+def node_position(block: Any, node: Any, dx: Any) -> Any:
+    """World position [m] of a node of a block."""
+    x = (block[0] * BLOCK + node // (BLOCK * BLOCK)) * dx
+    y = (block[1] * BLOCK + node // BLOCK % BLOCK) * dx
+    z = (block[2] * BLOCK + node % BLOCK) * dx
+    return x, y, z
+
+
+@law
+def meet_obstacle(
+    row: Any, heights: Any, dx: Any, body_friction: Any, at: Any, node: Any, moment: Any, total: Any
+) -> None:
+    """Contact of one body's node at ``at`` with one collider, where surfaces have met."""
+    distance, n = obstacle_distance(row, heights, at[0], at[1], at[2])
+    if distance > 0.0:
+        return
+    depth = (moment[0] * n[0] + moment[1] * n[1] + moment[2] * n[2]) / moment[3]
+    if distance / dx + surface_offset(depth) > 0.0:
+        return
+    friction = row[FRICTION] if row[FRICTION] >= ZERO else body_friction
+    u = obstacle_velocity(row, at[0], at[1], at[2])
+    touch_node(node, n, u, friction, row[SEPARABLE] > 0.5, at, total)
+
+
+@law
+def touch_node(
+    node: Any, n: Any, u: Any, friction: Any, separable: Any, at: Any, total: Any
+) -> None:
+    """Touch of a node with an obstacle that moves at ``u``; adds to the touch's totals."""
+    relative = (node[0] - u[0], node[1] - u[1], node[2] - u[2])
+    after = coulomb(relative, n, friction, separable)
+    change = (after[0] - relative[0], after[1] - relative[1], after[2] - relative[2])
+    if change[0] != 0.0 or change[1] != 0.0 or change[2] != 0.0:
+        for axis in range(3):
+            node[axis] = u[axis] + after[axis]
+        m = node[3]
+        impulse = (m * change[0], m * change[1], m * change[2])
+        record(impulse, after, u, at, 1.0, total)
+
+
+@law
+def record(impulse: Any, slip: Any, other: Any, at: Any, share: Any, total: Any) -> None:
+    """Add an impulse at a place, what it rubbed and what it did; see ``base.TOTALS``."""
+    px, py, pz = impulse
+    total[0] += px
+    total[1] += py
+    total[2] += pz
+    total[3] += at[1] * pz - at[2] * py
+    total[4] += at[2] * px - at[0] * pz
+    total[5] += at[0] * py - at[1] * px
+    total[6] -= share * (px * slip[0] + py * slip[1] + pz * slip[2])
+    total[7] += px * other[0] + py * other[1] + pz * other[2]
+
+
+@law
+def pair_friction(a: Any, b: Any) -> Any:
+    """Coulomb coefficient between two surfaces."""
+    return math.sqrt(a * b)
+
+
+@law
+def meet_node(
+    node_a: Any, node_b: Any, moment_a: Any, moment_b: Any,
+    friction: Any, dx: Any, at: Any, total_a: Any, total_b: Any,
+) -> None:  # fmt: skip
+    """Contact of two bodies at a node, where their surfaces have met.
+
+    The normal is that of the body that shows more of a face, or edges would plough through faces;
+    surfaces that do not look at each other pass by. Each surface lies where a half-space with that
+    centroid has it.
+    """
+    ma, mb = node_a[3], node_b[3]
+    volume_a, volume_b = moment_a[3], moment_b[3]
+    into_b, size_b = unit(moment_b[0], moment_b[1], moment_b[2])
+    out_of_a, size_a = unit(-moment_a[0], -moment_a[1], -moment_a[2])
+    facing = into_b[0] * out_of_a[0] + into_b[1] * out_of_a[1] + into_b[2] * out_of_a[2]
+    if facing < OPPOSED:
+        return
+    per_cell = 1.0 / (dx * dx * dx)
+    score_a = face_score(size_a * per_cell, volume_a * per_cell)
+    score_b = face_score(size_b * per_cell, volume_b * per_cell)
+    n = out_of_a if score_a > score_b else into_b
+    depth_a = -(moment_a[0] * n[0] + moment_a[1] * n[1] + moment_a[2] * n[2]) / volume_a
+    depth_b = (moment_b[0] * n[0] + moment_b[1] * n[1] + moment_b[2] * n[2]) / volume_b
+    if surface_offset(depth_a) + surface_offset(depth_b) > ZERO:
+        return
+    relative = (node_b[0] - node_a[0], node_b[1] - node_a[1], node_b[2] - node_a[2])
+    after = coulomb(relative, n, friction, True)
+    change = (after[0] - relative[0], after[1] - relative[1], after[2] - relative[2])
+    if change[0] != 0.0 or change[1] != 0.0 or change[2] != 0.0:
+        reduced = ma * mb / (ma + mb)
+        on_b = (reduced * change[0], reduced * change[1], reduced * change[2])
+        on_a = (-on_b[0], -on_b[1], -on_b[2])
+        for axis in range(3):
+            node_a[axis] += on_a[axis] / ma
+            node_b[axis] += on_b[axis] / mb
+        record(on_a, (-after[0], -after[1], -after[2]), node_b, at, 0.5, total_a)
+        record(on_b, after, node_a, at, 0.5, total_b)

@@ -1,0 +1,265 @@
+"""What happens to one particle, on any device: transfer, deformation, and what it adds to sums."""
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..laws.matrices import det
+from ..laws.shared import F32, FOUR, HALF, ZERO, law
+from ..laws.stress import (
+    KIND,
+    LAMBDA,
+    MU,
+    SNOW,
+    VISCOSITY,
+    VON_MISES,
+    C,
+    add_viscosity,
+    advance_gradient,
+    respond,
+)
+from .layout import BLOCK
+
+SIDE = 8
+"""Nodes along an edge of a tile: a block and two nodes below and above."""
+TILE = SIDE**3
+NODES = BLOCK**3
+LOW, HIGH = F32(-0.5), F32(5.5)
+"""Cells from the start of its block between which a particle's nodes stay on the tile."""
+MASS, CENTRE, MOMENTUM, SPIN, KINETIC, ELASTIC = 0, 1, 4, 7, 10, 11
+SPEED_SQUARE, WAVE_SQUARE, VOLUME_RATIO = 12, 13, 14
+SUMS, COLUMNS = 12, 15
+"""The first SUMS columns of a row of sums are added up, the others are bounds."""
+
+
+class State(NamedTuple):
+    """Particles sorted by home, in one precision.
+
+    Attributes:
+        xi: [N, 3] position from the start of the block [cells].
+        v: [N, 3] [m/s].
+        L: [N, 9] velocity gradient [1/s].
+        F: [N, 9] elastic deformation gradient.
+        F_total: [N, 9], or [0, 9] where nothing is plastic and F says it all.
+        tau: [N, 6] Kirchhoff stress [Pa].
+        energy: [N] stored energy per rest volume [J/m^3].
+        history: [N].
+        mass, volume: [N] [kg], [m^3].
+        material: [N] int32.
+    """
+
+    xi: NDArray[Any]
+    v: NDArray[Any]
+    L: NDArray[Any]
+    F: NDArray[Any]
+    F_total: NDArray[Any]
+    tau: NDArray[Any]
+    energy: NDArray[Any]
+    history: NDArray[Any]
+    mass: NDArray[Any]
+    volume: NDArray[Any]
+    material: NDArray[Any]
+
+
+class Work(NamedTuple):
+    """Space for one layout.
+
+    Attributes:
+        tiles: [P, 512, 4] momentum and mass, then velocities.
+        moments: [Q, 512, 4] first moment of volume about the nodes [m^3 cells], and volume [m^3].
+        velocity: [M, 64, 4] velocity and mass of the fields.
+        offset: [M, 64, 4] first moments of the fields.
+        scratch: [CHUNKS, SCRATCH], see ``cpu_deform``; the CPU's only.
+        strayed: [P] bool, whether a particle left its home's reach.
+        by_collider: [T, TOTALS] float64, of each touch.
+        by_body: [M, B, TOTALS] float64, on a field from each body; [0, B, TOTALS] for one body.
+    """
+
+    tiles: NDArray[Any]
+    moments: NDArray[Any]
+    velocity: NDArray[Any]
+    offset: NDArray[Any]
+    scratch: NDArray[Any]
+    strayed: NDArray[np.bool_]
+    by_collider: NDArray[np.float64]
+    by_body: NDArray[np.float64]
+
+
+class Rules(NamedTuple):
+    """What holds for the whole run.
+
+    Attributes:
+        table: [K, ROW] materials, in the state's precision.
+        dx: cell size [m], in the state's precision.
+        gravity: [3] [m/s^2], in the state's precision.
+        friction: [B] float64.
+        obstacles: [C, COLLIDER_ROW] float64.
+        heights: [H] float64.
+    """
+
+    table: NDArray[Any]
+    dx: Any
+    gravity: NDArray[Any]
+    friction: NDArray[np.float64]
+    obstacles: NDArray[np.float64]
+    heights: NDArray[np.float64]
+
+
+@law
+def first_node(x: Any) -> Any:
+    """First node along one axis that a particle at ``x`` [cells] sees, and its distance from it."""
+    # On a device floor gives no whole number.
+    node = int(math.floor(x - HALF))  # noqa: RUF046
+    return node, x - F32(node)
+
+
+@law
+def tile_node(i: Any, j: Any, k: Any) -> Any:
+    """Number on the tile of a node of the block; tiles start one cell below the block."""
+    return ((i + 1) * SIDE + j + 1) * SIDE + k + 1
+
+
+@law
+def place(p: Any, xi: Any) -> Any:
+    """First of a particle's nodes on the tile, and its distance from it (3) [cells]."""
+    i, fx = first_node(xi[p, 0])
+    j, fy = first_node(xi[p, 1])
+    k, fz = first_node(xi[p, 2])
+    return tile_node(i, j, k), (fx, fy, fz)
+
+
+@law
+def momentum(p: Any, dt: Any, dx: Any, f: Any, state: Any) -> Any:
+    """What a particle gives to its nodes: start (3) and slopes along x, y and z (3 each) [kg m/s].
+
+    A node at offset (i, j, k) from the first gets its weight times start + i qx + j qy + k qz:
+    m v + Q (x_i - x_p) with Q = m L - dt V 4 / dx^2 tau (MLS-MPM, Hu et al. 2018).
+    """
+    m = state.mass[p]
+    k = -dt * FOUR / dx * state.volume[p]
+    md = m * dx
+    v, L, t = state.v, state.L, state.tau
+    qx = (k * t[p, 0] + md * L[p, 0], k * t[p, 3] + md * L[p, 3], k * t[p, 4] + md * L[p, 6])
+    qy = (k * t[p, 3] + md * L[p, 1], k * t[p, 1] + md * L[p, 4], k * t[p, 5] + md * L[p, 7])
+    qz = (k * t[p, 4] + md * L[p, 2], k * t[p, 5] + md * L[p, 5], k * t[p, 2] + md * L[p, 8])
+    start = (
+        m * v[p, 0] - qx[0] * f[0] - qy[0] * f[1] - qz[0] * f[2],
+        m * v[p, 1] - qx[1] * f[0] - qy[1] * f[1] - qz[1] * f[2],
+        m * v[p, 2] - qx[2] * f[0] - qy[2] * f[1] - qz[2] * f[2],
+    )
+    return start, qx, qy, qz
+
+
+@law
+def velocity_gradient(g: Any, dx: Any, f: Any) -> Any:
+    """Velocity gradient (9) [1/s] from the twelve sums over nodes.
+
+    g: sum w v (3), then the sums of w v times the offset i, j and k of each node (3 each).
+    """
+    s = FOUR / dx
+    return (
+        s * (g[3] - f[0] * g[0]), s * (g[6] - f[1] * g[0]), s * (g[9] - f[2] * g[0]),
+        s * (g[4] - f[0] * g[1]), s * (g[7] - f[1] * g[1]), s * (g[10] - f[2] * g[1]),
+        s * (g[5] - f[0] * g[2]), s * (g[8] - f[1] * g[2]), s * (g[11] - f[2] * g[2]),
+    )  # fmt: skip
+
+
+@law
+def move(p: Any, dt: Any, dx: Any, v: Any, L: Any, state: Any) -> Any:
+    """Give a particle its new velocity and gradient and move it; whether it left its home's reach.
+
+    NaN fails both comparisons, so it has left.
+    """
+    stride = dt / dx
+    stays = True
+    for axis in range(3):
+        state.v[p, axis] = v[axis]
+        xi = state.xi[p, axis] + stride * v[axis]
+        state.xi[p, axis] = xi
+        stays = stays and xi >= LOW and xi < HIGH
+    for c in range(9):
+        state.L[p, c] = L[c]
+    return not stays
+
+
+@law
+def nine(a: Any, p: Any) -> Any:
+    """Row p of a [N, 9] array as a tuple."""
+    return (
+        a[p, 0], a[p, 1], a[p, 2], a[p, 3], a[p, 4], a[p, 5], a[p, 6], a[p, 7], a[p, 8],
+    )  # fmt: skip
+
+
+@law
+def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
+    """Advance one particle's deformation by its velocity gradient and find its stress."""
+    L = nine(state.L, p)
+    trial = advance_gradient(nine(state.F, p), L, dt)
+    F, tau, energy, history = respond(trial, state.history[p], row, dt)
+    if row[VISCOSITY] > ZERO:
+        tau = add_viscosity(tau, L, det(F), row[VISCOSITY])
+    for c in range(9):
+        state.F[p, c] = F[c]
+    for c in range(6):
+        state.tau[p, c] = tau[c]
+    state.energy[p] = energy
+    if row[KIND] >= F32(VON_MISES):
+        state.history[p] = history
+        F = advance_gradient(nine(state.F_total, p), L, dt)
+        for c in range(9):
+            state.F_total[p, c] = F[c]
+
+
+@law
+def add_motion(p: Any, block: Any, state: Any, dx: Any, out: Any) -> None:
+    """Mass, momentum, angular momentum and kinetic energy, with APIC's affine part."""
+    m = float(state.mass[p])
+    x = (
+        (block[0] * BLOCK + float(state.xi[p, 0])) * dx,
+        (block[1] * BLOCK + float(state.xi[p, 1])) * dx,
+        (block[2] * BLOCK + float(state.xi[p, 2])) * dx,
+    )
+    v = (float(state.v[p, 0]), float(state.v[p, 1]), float(state.v[p, 2]))
+    affine = m * dx * dx / 4
+    L = state.L[p]
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    gradient_square = 0.0
+    for c in range(9):
+        gradient_square += float(L[c]) * float(L[c])
+    out[MASS] += m
+    for axis in range(3):
+        out[CENTRE + axis] += m * x[axis]
+        out[MOMENTUM + axis] += m * v[axis]
+    out[SPIN] += m * (x[1] * v[2] - x[2] * v[1]) + affine * (L[7] - L[5])
+    out[SPIN + 1] += m * (x[2] * v[0] - x[0] * v[2]) + affine * (L[2] - L[6])
+    out[SPIN + 2] += m * (x[0] * v[1] - x[1] * v[0]) + affine * (L[3] - L[1])
+    out[KINETIC] += 0.5 * (m * square + affine * gradient_square)
+    # Comparisons that NaN fails keep NaN out of maxima, so it is added instead.
+    out[SPEED_SQUARE] = max(out[SPEED_SQUARE], square) + (square - square)
+
+
+@law
+def add_matter(p: Any, state: Any, row: Any, out: Any) -> None:
+    """Stored energy, wave speed in the present shape, volume ratio."""
+    out[ELASTIC] += float(state.volume[p]) * float(state.energy[p])
+    f = state.F[p]
+    F = (f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8])
+    ratio = float(det(F))
+    out[VOLUME_RATIO] = min(out[VOLUME_RATIO], ratio) + (ratio - ratio)
+    stretch = 0.0
+    for c in range(9):
+        stretch += float(F[c]) * float(F[c])
+    stiffening = max(stretch / 3.0, 1.0 / max(ratio, 1e-2))
+    if row[0] == SNOW:
+        hardening = row[C] * (1.0 - math.exp(float(state.history[p])))
+        stiffening *= math.exp(min(max(hardening, -3.0), 3.0))
+    modulus = float(row[LAMBDA]) + 2.0 * float(row[MU])
+    square = modulus * stiffening * float(state.volume[p]) / float(state.mass[p])
+    out[WAVE_SQUARE] = max(out[WAVE_SQUARE], square) + (square - square)

@@ -1,0 +1,210 @@
+"""The CUDA backend in Numba's simulator, on scenes of a few particles: a program of its own.
+
+The simulator must be chosen before Numba is imported. Prints how far each scene is from the
+reference, and the lines of cheap validation cases, as JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+os.environ["NUMBA_ENABLE_CUDASIM"] = "1"
+
+import numpy as np
+
+from real2sim_server.physics import (
+    Body,
+    Box,
+    Foam,
+    HeightField,
+    Jelly,
+    Metal,
+    NeoHookean,
+    Plane,
+    Sand,
+    Snow,
+    Solver,
+    SolverOptions,
+    box_particles,
+)
+from real2sim_server.physics.laws import contact, matrices, obstacle, stress
+from real2sim_server.physics.validation import motion
+
+from .scenes import at
+
+# The simulator's host thread polls; with long slices it would keep the device's threads waiting.
+sys.setswitchinterval(2e-5)
+
+STATE = ("positions", "velocities", "gradients", "F_elastic", "F_total", "history")
+DT = 5e-4
+MATERIALS = (
+    Jelly(young=2e5, poisson=0.4, viscosity=100),
+    NeoHookean(young=2e5),
+    Metal(young=2e5, yield_stress=5e3, hardening=1e4),
+    Foam(young=2e5, yield_stress=3e3, plastic_viscosity=100),
+    Sand(young=2e5, density=200),
+    Snow(density=200),
+)
+COLLIDERS = (
+    Plane(name="slope", point=(0.2, 0.2, 0.17), normal=(0.3, 0, 1), friction=0.2),
+    Box(
+        name="moving box",
+        T_world_box=at(0.2, 0.2, 0.07),
+        size=(0.5, 0.5, 0.2),
+        velocity=(0.5, 0, 1),
+        angular_velocity=(0, 1, 3),
+    ),
+    HeightField(
+        name="height field",
+        heights=0.16 + 0.01 * np.sin(np.arange(36.0)).reshape(6, 6),
+        origin=(-1.03, -1.07),
+        spacing=0.4,
+    ),
+    Plane(name="glue", point=(0, 0, 0.17), friction=float("inf"), separable=False),
+)
+
+
+def keeping_type(function: Callable[..., float]) -> Callable[..., Any]:
+    """A function of ``math`` as devices know it: of the precision of its argument.
+
+    Python's gives a float, which NumPy takes for less precise than the laws' single constants.
+    """
+
+    def typed(x: Any, *more: Any) -> Any:
+        kind = type(x) if isinstance(x, np.floating) else np.float64
+        return kind(function(x, *more))
+
+    return typed
+
+
+DEVICE_MATH = SimpleNamespace(
+    **{name: keeping_type(getattr(math, name)) for name in ("sqrt", "log", "exp", "copysign")},
+    floor=math.floor,
+)
+
+
+@contextlib.contextmanager
+def device_math() -> Iterator[None]:
+    """Laws run by Python compute as they do compiled, as long as nothing is compiled meanwhile."""
+    with contextlib.ExitStack() as stack:
+        for module in (contact, matrices, obstacle, stress):
+            if hasattr(module, "math"):
+                stack.enter_context(mock.patch.object(module, "math", DEVICE_MATH))
+        yield
+
+
+def cube(name: str, position: tuple[float, float, float], material: Any, **options: Any) -> Body:
+    """Eight particles."""
+    matter = box_particles([0.1] * 3, spacing=0.05, density=200).moved(at(*position))
+    return Body(name=name, particles=matter, material=material, **options)
+
+
+def strained(material: Any) -> tuple[list[Body], list[Any]]:
+    """A cube bent so much that it flows, on the ground."""
+    F = np.array([[1.08, 0.06, 0.0], [0.02, 0.97, -0.05], [0.03, 0.0, 0.92]])
+    body = cube(
+        "cube", (0.21, 0.2, 0.2), material, velocity=(1, 0, -3), deformation=np.tile(F, (8, 1, 1))
+    )
+    return [body], [Plane(name="ground", point=(0, 0, 0.17))]
+
+
+def on(collider: Any) -> tuple[list[Body], list[Any]]:
+    """A cube thrown at a collider."""
+    soft = Jelly(young=2e5, poisson=0.4)
+    return [cube("cube", (0.21, 0.2, 0.2), soft, velocity=(0.5, 0.2, -3))], [collider]
+
+
+def meeting() -> tuple[list[Body], list[Any]]:
+    """Two cubes that collide and rub."""
+    soft = Jelly(young=2e5, poisson=0.4)
+    return [
+        cube("left", (0.15, 0.2, 0.2), soft, velocity=(3, 0.5, 0), friction=0.3),
+        cube("right", (0.253, 0.21, 0.2), soft, velocity=(-3, 0, 0), friction=0.3),
+    ], []
+
+
+def leaving() -> tuple[list[Body], list[Any]]:
+    """A cube so fast that it must be sorted into other blocks on its way."""
+    return [cube("cube", (0.3, 0.2, 0.2), Jelly(young=2e5), velocity=(120, 0, 30))], []
+
+
+SCENES: dict[str, Callable[[], tuple[list[Body], list[Any]]]] = {
+    **{type(m).__name__: (lambda m=m: strained(m)) for m in MATERIALS},
+    **{c.name: (lambda c=c: on(c)) for c in COLLIDERS},
+    "two bodies": meeting,
+    "leaving": leaving,
+}
+MATERIAL_NAMES = tuple(type(m).__name__ for m in MATERIALS)
+CASES: dict[str, Callable[[], list[Any]]] = {
+    "free_fall": lambda: motion.free_fall("cuda", edge=0.1, steps=8),
+    "affine_patch": lambda: motion.affine_patch("cuda", edge=0.1),
+    "spin": lambda: motion.spin("cuda", edge=0.12, turns=0.02),
+    "invariants": lambda: motion.invariants("cuda", edge=0.1, parts=3),
+}
+
+
+def run(scene: str, backend: str, precision: str = "double", steps: int = 3) -> Solver:
+    """A scene after a few substeps of fixed length."""
+    bodies, colliders = SCENES[scene]()
+    options = SolverOptions(dx=0.1, backend=backend, precision=precision, dt_max=DT)
+    with device_math() if backend == "cuda" else contextlib.nullcontext():
+        solver = Solver(bodies, colliders, options)
+        solver.step(steps * DT)
+    return solver
+
+
+def difference(scene: str, other: str, precision: str = "double") -> dict[str, float]:
+    """Largest difference from another backend, relative to one and the largest number."""
+    expected, found = (run(scene, name, precision) for name in (other, "cuda"))
+    a, b = expected.particles(), found.particles()
+    off = {
+        name: float(
+            np.abs(getattr(b, name) - getattr(a, name)).max() / (1 + np.abs(getattr(a, name)).max())
+        )
+        for name in STATE
+    }
+    touched = [c.impulse for c in expected.contacts]
+    off["contacts"] = float(len(touched))
+    same = [c.impulse for c in found.contacts]
+    off["impulses"] = float(np.abs(np.array(same) - np.array(touched)).max(initial=0.0))
+    return off
+
+
+def restored() -> float:
+    """How far a run goes astray that is taken back on its way."""
+    straight = run("Metal", "cuda", steps=2).particles()
+    solver = run("Metal", "cuda", steps=1)
+    kept = solver.snapshot()
+    with device_math():
+        solver.step(DT)
+        solver.restore(kept)
+        solver.step(DT)
+    return float(np.abs(solver.particles().positions - straight.positions).max())
+
+
+def lines() -> Iterator[dict[str, Any]]:
+    """Every line of the cheap validation cases."""
+    for case, make in CASES.items():
+        for check in make():
+            yield {"case": case, "name": check.name, "measured": check.measured} | {
+                "passed": check.passed
+            }
+
+
+if __name__ == "__main__":
+    report = {
+        "reference": {name: difference(name, "reference") for name in SCENES},
+        "cpu": {name: difference(name, "cpu") for name in MATERIAL_NAMES},
+        "single": difference("Jelly", "reference", "single"),
+        "restored": restored(),
+        "lines": list(lines()),
+    }
+    json.dump(report, sys.stdout)
