@@ -20,11 +20,13 @@ from .ground import RecordedGround
 from .shadow import shadow_under
 from .state import ObjectState, ScenarioState
 from .tracks import Placed
+from .uncovered import uncovered, vacated_at
 
 T = TypeVar("T")
 
 KEPT_BACKGROUNDS = 4
-"""Backgrounds with erased regions that are kept for each scene; one costs 4 bytes a Gaussian."""
+"""Backgrounds with erased regions that are kept for each scene; one costs 4 bytes a Gaussian, and
+that of its colours too where parked objects are gone."""
 
 
 def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance]:
@@ -39,7 +41,8 @@ def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance
     Raises:
         UnknownObjectError: ``state`` is of another scene.
     """
-    return compose(scene, state.tracks.at(t_us), t_us, erased=state.erased)
+    vacated = vacated_at(state, t_us)
+    return compose(scene, state.tracks.at(t_us), t_us, erased=state.erased, vacated=vacated)
 
 
 def compose(
@@ -48,9 +51,11 @@ def compose(
     t_us: int,
     *,
     erased: tuple[EraseRegion, ...] = (),
+    vacated: tuple[str, ...] = (),
 ) -> list[Instance]:
-    """The same for objects already looked up. Raises like :func:`instances_at`."""
-    instances = [Instance(background_without(scene, erased))]
+    """The same for objects already looked up; ``vacated`` as :func:`vacated_at` has it. Raises
+    like :func:`instances_at`."""
+    instances = [Instance(background_without(scene, erased, vacated))]
     edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         cloud = cloud_of(scene, subject, t_us)
@@ -85,11 +90,19 @@ def cloud_of(scene: Scene, subject: ObjectState, t_us: int) -> GaussianCloud:
     return scene.object(subject.source_id).cloud_at(t_us)
 
 
-def background_without(scene: Scene, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
-    """The background with all Gaussians inside ``erased`` made invisible; the rest is shared."""
-    if not erased:
+def background_without(
+    scene: Scene, erased: tuple[EraseRegion, ...], vacated: tuple[str, ...] = ()
+) -> GaussianCloud:
+    """The background with all Gaussians inside ``erased`` made invisible, and with plain ground at
+    the places of the recorded objects ``vacated``; the rest is shared."""
+    if not erased and not vacated:
         return scene.background
-    return _kept(scene, erased, lambda: _hidden(scene.background, erased))
+
+    def make() -> GaussianCloud:
+        background = uncovered(scene, scene.background, vacated) if vacated else scene.background
+        return _hidden(background, erased) if erased else background
+
+    return _kept(scene, (erased, vacated), make)
 
 
 def _hidden(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:

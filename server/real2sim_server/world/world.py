@@ -11,7 +11,14 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
-from ..edit import EditError, EditOutcome, ScenarioState, apply_operations, compose
+from ..edit import (
+    EditError,
+    EditOutcome,
+    ScenarioState,
+    apply_operations,
+    compose,
+    vacated_at,
+)
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
@@ -260,7 +267,13 @@ class World:
 
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
-        drawn = compose(self.scene, self.agents, self.t_us, erased=self.state.erased)
+        drawn = compose(
+            self.scene,
+            self.agents,
+            self.t_us,
+            erased=self.state.erased,
+            vacated=vacated_at(self.state, self.t_us),
+        )
         if self.deformation is not None:
             # Background first, then the objects, then shadows.
             for k, subject in enumerate(self.agents.objects, start=1):

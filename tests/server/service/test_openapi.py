@@ -81,18 +81,24 @@ def test_the_example_of_a_cut_is_valid(made):
 
 # Answers of these are streams that end with the job, or sockets and pages of other programs.
 UNFUZZED = ("/events", "/docs", "/ui")
-FEW = settings(
-    max_examples=6,
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=list(HealthCheck),
-)
+
+
+def examples(most: int) -> settings:
+    return settings(
+        max_examples=most,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
 
 
 @pytest.mark.network
 @pytest.mark.filterwarnings("ignore")
-def test_any_request_gets_a_documented_answer_and_none_breaks_the_worker(make_settings, made):
+@pytest.mark.parametrize(
+    "most", [6, pytest.param(30, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+)
+def test_any_request_gets_a_documented_answer_and_none_breaks_the_worker(make_settings, made, most):
     schemathesis = pytest.importorskip(
         "schemathesis", reason="not installed: pip install 'real2sim[dev]'"
     )
@@ -112,6 +118,6 @@ def test_any_request_gets_a_documented_answer_and_none_breaks_the_worker(make_se
         for found in schemathesis.openapi.from_dict(made).get_all_operations():
             operation = found.ok()
             if not any(part in operation.path for part in UNFUZZED):
-                FEW(given(case=operation.as_strategy())(ask))()
+                examples(most)(given(case=operation.as_strategy())(ask))()
         assert httpx2.get(f"{worker.url}/livez", trust_env=False).status_code == 200
     assert asked > 100

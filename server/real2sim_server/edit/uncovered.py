@@ -1,0 +1,93 @@
+"""Ground under parked objects that an edit took away.
+
+No picture shows it while they stand there, so that training leaves a smear of their own colours.
+The ground beside them is what is known best about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..scene import GaussianCloud, Scene
+from ..scene.rotation import invert_transform
+from .state import ObjectState, ScenarioState
+
+PARKED = 0.5
+"""An object whose recorded places are all within this of each other is parked; tracks of things
+that stand still waver by some decimetres [m]."""
+
+AWAY = 0.5
+"""An object this far from its parking place leaves it to be seen [m]."""
+
+MARGIN = 0.25
+"""Colours reach this far beyond a box [m]."""
+
+RIM = 1.2
+"""Ground up to this far beyond the box is taken for what is under it [m]."""
+
+LOW = 0.25
+"""The ground's Gaussians are less than this above or below the box's bottom [m]."""
+
+NEIGHBOURS = 6
+
+
+def vacated_at(state: ScenarioState, t_us: int) -> tuple[str, ...]:
+    """Ids of recorded objects that were parked and are not at their places at ``t_us``."""
+    return tuple(
+        recorded.object_id
+        for recorded in state.recorded.values()
+        if state.objects[recorded.object_id] is not recorded
+        and _parked(recorded)
+        and _gone(state.objects[recorded.object_id], recorded, t_us)
+    )
+
+
+def uncovered(scene: Scene, background: GaussianCloud, vacated: Iterable[str]) -> GaussianCloud:
+    """The background with the ground at the places of ``vacated`` coloured like that around them.
+
+    Gaussians inside a box and above its ground become invisible: they belonged to the object.
+
+    Raises:
+        UnknownObjectError: ``scene`` has no such object.
+    """
+    opacities, sh = background.opacities.clone(), background.sh.clone()
+    for object_id in vacated:
+        parked = scene.object(object_id)
+        track = parked.trajectory
+        T_world_box = track.transform((track.start_us + track.end_us) // 2)
+        to_box = torch.from_numpy(invert_transform(T_world_box)).to(background.means)
+        local = background.means @ to_box[:3, :3].T + to_box[:3, 3]
+        half = torch.tensor(parked.size).to(local) / 2
+        beyond = (local[:, :2].abs() - half[:2]).amax(dim=1)
+        height = local[:, 2] + half[2]
+        level = height.abs() <= LOW
+        opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
+        known = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
+        _recolour(sh, local[:, :2], level & (beyond <= MARGIN), known)
+    return replace(background, opacities=opacities, sh=sh)
+
+
+def _parked(recorded: ObjectState) -> bool:
+    low, high = recorded.bounds[:, :2]
+    return bool((high - low - 2 * recorded.radius).max() <= PARKED)
+
+
+def _gone(now: ObjectState, parked: ObjectState, t_us: int) -> bool:
+    if now.deleted or not now.trajectory.covers(t_us):
+        return True
+    moved = now.trajectory.transform(t_us)[:2, 3] - parked.trajectory.positions[0, :2]
+    return bool(np.hypot(*moved) > AWAY)
+
+
+def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
+    """Give those of ``unknown`` [N] bool the mean ``sh`` of the nearest of ``known``, in place."""
+    if int(known.sum()) < NEIGHBOURS or not bool(unknown.any()):
+        return
+    distances = torch.cdist(places[unknown], places[known])
+    nearest = distances.topk(NEIGHBOURS, largest=False).indices
+    sh[unknown] = sh[known][nearest].mean(dim=1)

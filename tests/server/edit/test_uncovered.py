@@ -1,0 +1,65 @@
+"""Ground where a parked object was."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from real2sim_proto.operations import Delete, Translate
+from real2sim_server.edit import ScenarioState, apply_operations, vacated_at
+from real2sim_server.edit.uncovered import uncovered
+from real2sim_server.scene import GaussianCloud
+from real2sim_server.scene.harmonics import SH_C0
+
+PARKED = "post"
+
+
+def at(scene, state: ScenarioState, *operations) -> tuple[str, ...]:
+    after = apply_operations(state, operations).state
+    return vacated_at(after, scene.start_us)
+
+
+@pytest.fixture
+def state(tiny_scene) -> ScenarioState:
+    return ScenarioState.of(tiny_scene)
+
+
+@pytest.mark.parametrize(
+    "operation",
+    [Delete(object_id=PARKED), Translate(object_id=PARKED, y=2.0)],
+)
+def test_a_parked_object_that_was_taken_away_leaves_its_place(tiny_scene, state, operation):
+    assert at(tiny_scene, state, operation) == (PARKED,)
+
+
+def test_small_moves_and_moves_of_what_was_driving_leave_no_place(tiny_scene, state):
+    driving = next(o.object_id for o in state.visible if not o.standing)
+    nudged = Translate(object_id=PARKED, y=0.1)
+    assert at(tiny_scene, state, nudged, Delete(object_id=driving)) == ()
+    assert vacated_at(state, tiny_scene.start_us) == ()
+
+
+def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(tiny_scene):
+    parked = tiny_scene.object(PARKED)
+    centre = parked.trajectory.transform(tiny_scene.start_us)[:3, 3]
+    half = torch.tensor(parked.size) / 2
+    cells = torch.linspace(-3, 3, 41)
+    plane = torch.cartesian_prod(cells, cells)
+    inside = (plane.abs() <= half[:2]).all(dim=1)
+    ground = torch.cat([plane, -half[2] * torch.ones(len(plane), 1)], dim=1)
+    above = torch.tensor([[0.0, 0.0, 0.0]])
+    means = torch.cat([ground, above]) + torch.from_numpy(centre).float()
+    colours = torch.full((len(means), 3), 0.4)
+    colours[:-1][inside] = torch.tensor([0.1, 0.1, 0.9])
+    smeared = GaussianCloud(
+        means=means,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
+        scales=torch.full((len(means), 3), 0.05),
+        opacities=torch.ones(len(means)),
+        sh=((colours - 0.5) / SH_C0)[:, None],
+    )
+    clean = uncovered(tiny_scene, smeared, (PARKED,))
+    seen = clean.sh[:-1, 0] * SH_C0 + 0.5
+    assert torch.allclose(seen, torch.full_like(seen, 0.4), atol=1e-5)
+    assert float(clean.opacities[-1]) == 0.0
+    assert torch.equal(clean.opacities[:-1], smeared.opacities[:-1])
