@@ -8,6 +8,7 @@ from real2sim_server.physics.experiments.published import PUBLISHED
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_figures_are_met(name):
     for check in PUBLISHED[name]():
