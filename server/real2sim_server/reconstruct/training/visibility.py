@@ -28,9 +28,9 @@ NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
 FAINT = -3.0
 """Logit of an opacity that hides next to nothing and is well above what blending skips."""
-GUESS_SHARE = 5e-4
-"""Visible share behind what was trained up to which a guess comes back. Guesses are opaque and
-many, so that even the little that each would show adds up."""
+GUESS_SHARE = 0.01
+"""Visible share behind what was trained up to which a guess comes back: more costs what logged
+views show, less leaves holes in sides that only a turned object shows."""
 EPS2D = RasterOptions().eps2d
 
 Look = tuple[Camera, int]
