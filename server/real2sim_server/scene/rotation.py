@@ -131,7 +131,8 @@ def yaw_quaternion(yaw: ArrayLike) -> Float:
 
 def quaternion_yaw(quaternion: ArrayLike) -> Float:
     """Heading [...] [rad] in (-pi, pi] of the rotated x axis, seen from above."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
+    q = np.asarray(quaternion, dtype=np.float64)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     return np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 

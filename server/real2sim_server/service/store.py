@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, make_url
 from sqlalchemy.exc import DBAPIError, IntegrityError
+from sqlalchemy.pool import StaticPool
 
 from . import tables as t
 from .rows import ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
@@ -57,7 +59,9 @@ class Store:
     """SQLAlchemy Core on one thread of its own, so that the event loop never waits for a disk.
 
     One thread is enough: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which has
-    one writer at a time anyway, and the order of appends is the order of the calls.
+    one writer at a time anyway, and the order of appends is the order of the calls. Who computes
+    on another thread may write from there, by :meth:`record`: to be woken by a thread and to wake
+    another one takes longer than an append.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
@@ -66,6 +70,7 @@ class Store:
     def __init__(self, url: str) -> None:
         self.url = url
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="store")
+        self._writing = threading.Lock()
         self._engine: sa.Engine | None = None
 
     async def open(self) -> None:
@@ -214,9 +219,13 @@ class Store:
         Raises:
             ConflictError: a ``seq`` is taken, or the session does not exist.
         """
+        await self._run(self.record, session_id, entries)
+
+    def record(self, session_id: str, entries: Sequence[SessionEntry]) -> None:
+        """Like :meth:`append_session_entries`, on the calling thread; never on the event loop."""
         rows = [{"session_id": session_id} | asdict(entry) for entry in entries]
         if rows:
-            await self._write(_added(t.session_log, *rows))
+            self._written([_added(t.session_log, *rows)])
 
     async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
         """The log of a session behind ``after``, oldest first."""
@@ -269,17 +278,17 @@ class Store:
 
     async def _write(self, *changes: Write) -> list[int]:
         """Rows changed by each statement, in one transaction."""
+        return await self._run(self._written, changes)
 
-        def write() -> list[int]:
-            try:
-                with self._connected().begin() as connection:
-                    return [connection.execute(c.statement, c.rows).rowcount for c in changes]
-            except DBAPIError as error:
-                if _is_conflict(error):
-                    raise ConflictError(f"not stored: {error.orig}") from error
-                raise
-
-        return await self._run(write)
+    def _written(self, changes: Sequence[Write]) -> list[int]:
+        try:
+            # SQLite lets those who find it locked sleep and try again; they had better queue here.
+            with self._writing, self._connected().begin() as connection:
+                return [connection.execute(c.statement, c.rows).rowcount for c in changes]
+        except DBAPIError as error:
+            if _is_conflict(error):
+                raise ConflictError(f"not stored: {error.orig}") from error
+            raise
 
     def _connected(self) -> sa.Engine:
         if self._engine is None:
@@ -327,9 +336,13 @@ def _connect(url: str) -> sa.Engine:
     parsed = make_url(url)
     if parsed.get_backend_name() != "sqlite":
         return sa.create_engine(parsed, pool_pre_ping=True)
-    if parsed.database and parsed.database != ":memory:":
+    if not parsed.database or parsed.database == ":memory:":
+        # Such a database belongs to its connection, whichever thread uses it.
+        other_threads = {"check_same_thread": False}
+        engine = sa.create_engine(parsed, poolclass=StaticPool, connect_args=other_threads)
+    else:
         Path(parsed.database).absolute().parent.mkdir(parents=True, exist_ok=True)
-    engine = sa.create_engine(parsed)
+        engine = sa.create_engine(parsed)
     sa.event.listen(engine, "connect", _set_up_sqlite)
     return engine
 

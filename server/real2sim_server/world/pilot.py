@@ -134,7 +134,8 @@ class Pilot:
                 poses = to_world(plan.poses, motion)
                 plan = plan.model_copy(update={"poses": poses, "frame": "world"})
         kept = tuple(c for c in self.coming if c.from_us < from_us)
-        return replace(self, coming=(*kept, Coming(from_us, plan)))
+        coming = (*kept, Coming(from_us, plan))
+        return Pilot(self.spec, self.ego, self.controller, self.since_us, coming)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[Pilot, Motion]:
         """Pilot and vehicle ``us`` later than ``t_us``."""
@@ -156,9 +157,8 @@ class Pilot:
         """With the newest plan that has taken effect in charge."""
         pilot = self
         while pilot.coming and pilot.coming[0].from_us <= t_us:
-            first, *rest = pilot.coming
-            controller = pilot._controller(first.plan, motion, t_us)
-            pilot = replace(pilot, controller=controller, since_us=t_us, coming=tuple(rest))
+            controller = pilot._controller(pilot.coming[0].plan, motion, t_us)
+            pilot = Pilot(self.spec, self.ego, controller, t_us, pilot.coming[1:])
         if pilot.controller is None:
             log = pilot._follow_log(motion, t_us)
             pilot = replace(pilot, controller=log, since_us=t_us)

@@ -37,7 +37,7 @@ def cloud_shapes(gaussians: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 def tensor_hash(tensor: Tensor) -> str:
     """SHA-256 of the bytes of a contiguous CPU tensor, little-endian, row-major."""
-    return hashlib.sha256(tensor.reshape(-1).view(torch.uint8).numpy().data).hexdigest()
+    return hashlib.sha256(tensor.numpy()).hexdigest()
 
 
 def tensor_hashes(tensors: Mapping[str, Tensor]) -> dict[str, str]:

@@ -30,6 +30,10 @@ MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
 
+def _not_recorded() -> None:
+    pass
+
+
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """An instant on its way into a message.
@@ -40,6 +44,7 @@ class Drawn:
         kind, fields: of the message, without frames and timing.
         reply_to: id of the message that it answers.
         watch: runs on.
+        record: called once the message is made.
     """
 
     world: World
@@ -48,6 +53,7 @@ class Drawn:
     fields: Mapping[str, Any]
     reply_to: int
     watch: Stopwatch
+    record: Callable[[], None] = _not_recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +112,12 @@ class Show:
         return await asyncio.get_running_loop().run_in_executor(self._worlds, fn, *args)
 
     async def observe(
-        self, change: Callable[[], World], cameras: Mapping[str, Camera], *, reply_to: int
+        self,
+        change: Callable[[], World],
+        cameras: Mapping[str, Camera],
+        *,
+        reply_to: int,
+        record: Callable[[], None] = _not_recorded,
     ) -> Shown:
         """The world that ``change`` makes, and the observation of it.
 
@@ -114,6 +125,8 @@ class Show:
             change: makes the new world; runs on another thread and leaves the present one alone.
             cameras: of the world's sensors, by name, at the sizes asked for.
             reply_to: id of the message that is answered.
+            record: puts the change on record once its message is made, on the thread that made it;
+                where it raises, nothing has happened.
 
         Raises:
             QueueFullError: too much waits for the engine.
@@ -131,7 +144,7 @@ class Show:
                 watch.stage("physics")
             images = self._images(world, sensors, [cameras[s.camera] for s in sensors])
             watch.stage("render")
-            drawn = Drawn(world, images, "obs", fields, reply_to, watch)
+            drawn = Drawn(world, images, "obs", fields, reply_to, watch, record)
             return _packed(drawn, list(map(encode_frame, images))) if _is_raw(images) else drawn
 
         if cameras:
@@ -207,11 +220,15 @@ class Show:
         if isinstance(made, Drawn):
             frames = await self._pictures.on_encoders(encode_frame, made.images)
             (made,) = await self._pictures.on_encoders(lambda d: _packed(d, frames), [made])
-        for stage, ms in made.timing_ms.items():
-            self._metrics.stages.labels(stage).observe(ms / 1e3)
-        for frame in made.frames:
-            self._metrics.frames.labels("drive", frame.codec).inc()
+        # Once the answer is on its way.
+        asyncio.get_running_loop().call_soon(self._count, made)
         return made
+
+    def _count(self, shown: Shown) -> None:
+        for stage, ms in shown.timing_ms.items():
+            self._metrics.stages.labels(stage).observe(ms / 1e3)
+        for frame in shown.frames:
+            self._metrics.frames.labels("drive", frame.codec).inc()
 
 
 def _is_raw(images: Sequence[Image]) -> bool:
@@ -223,4 +240,5 @@ def _packed(drawn: Drawn, frames: Sequence[EncodedFrame]) -> Shown:
     watch.stage("encode")
     message = pack_with_frames(drawn.kind, drawn.fields, frames, watch)
     wire = message.with_id(drawn.reply_to)
+    drawn.record()
     return Shown(drawn.world, frames, message, wire, watch.timing_ms)

@@ -7,7 +7,7 @@ was, and leaves no trace in its log.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Agent
@@ -15,6 +15,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation
 
 from ...edit import EditOutcome
+from ...scene import Camera
 from ...world import Event, Plan, World
 from ...world.history import (
     KEPT_PLAN,
@@ -30,6 +31,9 @@ from ..store import SessionEntry, Store, now_us
 from .session import Session
 from .show import Show, Shown
 from .wire import Message
+
+Thing = tuple[str, int, bytes]
+"""Kind, step and payload of an entry of a session's log."""
 
 MAX_SNAPSHOTS = 32
 
@@ -56,8 +60,10 @@ class Stepper:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
         cameras = self._show.cameras(session.start.scene, spec.sensors)
-        shown = await self._show.observe(_beginning(session, spec), cameras, reply_to=reply_to)
-        await self._record(session, [("reset", 0, reset_payload(spec))])
+        thing = ("reset", 0, reset_payload(spec))
+        shown = await self._show_and_record(
+            session, _beginning(session, spec), cameras, thing, reply_to=reply_to
+        )
         session.begin(shown.world, cameras)
         session.publish(shown.message)
         return shown.wire
@@ -104,7 +110,10 @@ class Stepper:
         """
         measured = session.spec.latency.model == "measured"
         latency_us = latency_us if measured else 0
-        shown = await self._step(session, plan, latency_us, session.late, reply_to=reply_to)
+        late, recorded = session.late, payload
+        if latency_us or late:
+            recorded = action_payload(plan, latency_us=latency_us, missed=late)
+        shown = await self._step(session, plan, latency_us, late, recorded, reply_to=reply_to)
         session.lockstep.advance(payload, shown.message, over=shown.world.over)
         return shown.wire
 
@@ -113,7 +122,8 @@ class Stepper:
 
         Whoever sends that action later is told that it is stale.
         """
-        shown = await self._step(session, None, 0, True, reply_to=0)
+        recorded = action_payload(None, missed=True)
+        shown = await self._step(session, None, 0, True, recorded, reply_to=0)
         session.lockstep.skip(1, over=shown.world.over)
         return shown.message
 
@@ -126,15 +136,22 @@ class Stepper:
             world.stop(reason)
             return world
 
-        shown = await self._show.observe(stopped, session.cameras, reply_to=0)
-        await self._record(session, [("stop", now.steps, stop_payload(reason))])
+        thing = ("stop", now.steps, stop_payload(reason))
+        shown = await self._show_and_record(session, stopped, session.cameras, thing, reply_to=0)
         session.world = shown.world
         session.lockstep.end()
         session.publish(shown.message)
         return shown.message
 
     async def _step(
-        self, session: Session, plan: Plan | None, latency_us: int, missed: bool, *, reply_to: int
+        self,
+        session: Session,
+        plan: Plan | None,
+        latency_us: int,
+        missed: bool,
+        payload: bytes,
+        *,
+        reply_to: int,
     ) -> Shown:
         now = session.running_world()
 
@@ -143,9 +160,9 @@ class Stepper:
             world.step(plan, latency_us=latency_us, missed=missed)
             return world
 
-        shown = await self._show.observe(moved, session.cameras, reply_to=reply_to)
-        payload = action_payload(plan, latency_us=latency_us, missed=missed)
-        await self._record(session, [("action", now.steps, payload)])
+        shown = await self._show_and_record(
+            session, moved, session.cameras, ("action", now.steps, payload), reply_to=reply_to
+        )
         session.world, session.late = shown.world, False
         session.publish(shown.message)
         return shown
@@ -227,21 +244,46 @@ class Stepper:
                 hint=f"snapshots of this session: {named}",
             )
         cameras = self._show.cameras(kept.scene, kept.spec.sensors)
-        shown = await self._show.observe(lambda: kept, cameras, reply_to=reply_to)
-        await self._record(session, [("restore", kept.steps, name_payload(name))])
+        thing = ("restore", kept.steps, name_payload(name))
+        shown = await self._show_and_record(
+            session, lambda: kept, cameras, thing, reply_to=reply_to
+        )
         session.begin(kept, cameras)
         session.lockstep.reset(kept.steps, over=kept.over)
         session.publish(shown.message)
         return shown.wire
 
-    async def _record(self, session: Session, things: Sequence[tuple[str, int, bytes]]) -> None:
-        created_us = now_us()
-        entries = [
-            SessionEntry(session.next_seq + k, kind, step, payload, created_us)
-            for k, (kind, step, payload) in enumerate(things)
-        ]
+    async def _show_and_record(
+        self,
+        session: Session,
+        change: Callable[[], World],
+        cameras: Mapping[str, Camera],
+        thing: Thing,
+        *,
+        reply_to: int,
+    ) -> Shown:
+        entries = _entries(session, [thing])
+        shown = await self._show.observe(
+            change,
+            cameras,
+            reply_to=reply_to,
+            record=lambda: self._store.record(session.session_id, entries),
+        )
+        session.next_seq += len(entries)
+        return shown
+
+    async def _record(self, session: Session, things: Sequence[Thing]) -> None:
+        entries = _entries(session, things)
         await self._store.append_session_entries(session.session_id, entries)
         session.next_seq += len(entries)
+
+
+def _entries(session: Session, things: Sequence[Thing]) -> list[SessionEntry]:
+    created_us = now_us()
+    return [
+        SessionEntry(session.next_seq + k, kind, step, payload, created_us)
+        for k, (kind, step, payload) in enumerate(things)
+    ]
 
 
 def _beginning(session: Session, spec: ResetSpec) -> Callable[[], World]:

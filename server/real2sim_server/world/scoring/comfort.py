@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -77,7 +77,7 @@ class Ride:
         window = window_of(dt)
         samples = (*self.samples, (speed, yaw))[-window:]
         if len(samples) < window:
-            return replace(self, samples=samples)
+            return Ride(samples, self.comfortable, self.worst)
         felt = felt_in(np.array(samples), dt)
         worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, felt, strict=True))
         return Ride(samples, self.comfortable and felt.comfortable, worst)
@@ -121,17 +121,19 @@ def plans_agree(before: PlanNote, now: PlanNote) -> bool | None:
     if count < 6:
         return None
     at = first * 1e-6 + PLAN_STEP * np.arange(count)
-    a, b = _dynamics(before, at), _dynamics(now, at)
+    # [2, 3, count]: x, y, yaw of both plans; their rates [2, 3, count - 1].
+    poses = np.stack([before.sampled(at), now.sampled(at)])
+    rates = (poses[..., 1:] - poses[..., :-1]) / PLAN_STEP
+    speeds = np.sqrt(rates[:, 0] * rates[:, 0] + rates[:, 1] * rates[:, 1])
+    # Differences of derivatives are derivatives of differences.
+    speed, yaw_rate = speeds[0] - speeds[1], rates[0, 2] - rates[1, 2]
+    acceleration, yaw_acceleration = _slopes(speed), _slopes(yaw_rate)
+    unlike = (acceleration, _slopes(acceleration), yaw_rate, yaw_acceleration)
     return all(
-        float(np.sqrt(np.mean((p - q) ** 2))) <= bound
-        for p, q, bound in zip(a, b, PLAN_BOUNDS, strict=True)
+        d.dot(d) <= len(d) * bound * bound for d, bound in zip(unlike, PLAN_BOUNDS, strict=True)
     )
 
 
-def _dynamics(plan: PlanNote, at: Float) -> tuple[Float, Float, Float, Float]:
-    times, poses = np.array(plan.times_us) * 1e-6, np.array(plan.poses)
-    x, y = np.interp(at, times, poses[:, 0]), np.interp(at, times, poses[:, 1])
-    yaw = np.interp(at, times, np.unwrap(poses[:, 2]))
-    speed = np.hypot(np.diff(x), np.diff(y)) / PLAN_STEP
-    acceleration, rate = np.diff(speed) / PLAN_STEP, np.diff(yaw) / PLAN_STEP
-    return acceleration, np.diff(acceleration) / PLAN_STEP, rate, np.diff(rate) / PLAN_STEP
+def _slopes(values: Float) -> Float:
+    slopes: Float = (values[1:] - values[:-1]) / PLAN_STEP
+    return slopes

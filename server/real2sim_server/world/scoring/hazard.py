@@ -34,17 +34,19 @@ def time_to_collision(
     ego, others = instant.ego, instant.others
     if not others.ids or math.hypot(ego.speed, ego.lateral_speed) < STANDSTILL:
         return NEVER
-    angles = bearings(ego, others)
-    asked = (angles < AHEAD) | (off_lane & (angles <= BEHIND))
-    asked &= on_level(instant, context)
-    asked &= np.array([i not in hit for i in others.ids])
     cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
     velocity = np.array(
         [ego.speed * cos - ego.lateral_speed * sin, ego.speed * sin + ego.lateral_speed * cos]
     )
     centre = ego_centre(ego, context)
     reach = (math.hypot(*context.ego_size[:2]) + np.hypot(*others.sizes[:, :2].T)) / 2
-    asked &= _closest(others.centres[:, :2] - centre, others.velocities - velocity) < reach
+    near = _closest(others.centres[:, :2] - centre, others.velocities - velocity) < reach
+    if not near.any():
+        return NEVER
+    angles = bearings(ego, others)
+    asked = near & ((angles < AHEAD) | (off_lane & (angles <= BEHIND)))
+    asked &= on_level(instant, context)
+    asked &= np.array([i not in hit for i in others.ids])
     rows = np.flatnonzero(asked)
     if not len(rows):
         return NEVER

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -89,6 +90,24 @@ class PlanNote:
     times_us: tuple[int, ...]
     poses: tuple[tuple[float, float, float], ...]
 
+    @cached_property
+    def _curves(self) -> tuple[Float, Float]:
+        """Times [N] [s] and poses [3, N], yaw continuous."""
+        poses = np.array(self.poses).T
+        turns = poses[2, 1:] - poses[2, :-1]
+        if (np.abs(turns) > math.pi).any():
+            poses[2] = np.unwrap(poses[2])
+        return np.array(self.times_us) * 1e-6, poses
+
+    def sampled(self, at: Float) -> Float:
+        """x, y [m] and continuous yaw [rad] at times ``at`` [T] [s] within the plan, [3, T]."""
+        times, poses = self._curves
+        after = np.minimum(np.maximum(times.searchsorted(at), 1), len(times) - 1)
+        before = after - 1
+        share = (at - times[before]) / (times[after] - times[before])
+        found: Float = poses[:, before] * (1 - share) + poses[:, after] * share
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class Instant:
@@ -165,13 +184,12 @@ class ScoringContext:
         lines = [_dense(line) for line in self.lanes if len(line) > 1]
         return cKDTree(np.vstack(lines)) if lines else None
 
-    def drivable(self, points: Float, *, tolerance: float = 0.0) -> Float:
-        """Whether points [N, 2] [m] are in the corridor, [N] bool."""
-        inside = self.route_tree.query(points)[0] <= self.corridor + tolerance
-        if not inside.all() and self.lane_tree is not None:
-            inside |= self.lane_tree.query(points)[0] <= self.lane + tolerance
-        found: Float = inside
-        return found
+    def outside(self, points: Float) -> Float:
+        """How far points [N, 2] [m] are out of the corridor, [N] [m]; 0 and less within it."""
+        beyond: Float = self.route_tree.query(points)[0] - self.corridor
+        if self.lane_tree is not None and beyond.max() > 0:
+            beyond = np.minimum(beyond, self.lane_tree.query(points)[0] - self.lane)
+        return beyond
 
     def fields(self) -> dict[str, Any]:
         """Plain values, for a recording."""

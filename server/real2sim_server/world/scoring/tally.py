@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from ..path import Float
 from .boxes import ego_centre, ego_corners
 from .comfort import Ride, plans_agree
 from .hazard import NEVER, time_to_collision
@@ -116,8 +118,10 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
     assert tally.ego is not None
     before = tally.ego
     corners = ego_corners(ego, context)
-    inside = context.drivable(corners)
-    off_road = not inside.all()
+    quarters = (corners + ego_centre(ego, context)) / 2
+    outside = context.outside(np.concatenate([corners, quarters]))
+    beyond = float(outside[:4].max())
+    off_road = beyond > 0
     off_lane = off_road or bool(_in_several_lanes(ego, context))
     tally = _with_contacts(tally, instant, off_lane)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=tally.hit)
@@ -127,15 +131,15 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
     lane_run = tally.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
     limit = context.speed_limit
     return replace(
-        _with_plan(tally, instant.plan),
+        tally,
+        **_of_plans(tally, instant.plan),
         steps=tally.steps + 1,
         distance=tally.distance + math.hypot(ego.x - before.x, ego.y - before.y),
         s=ego.s,
         furthest=max(tally.furthest, ego.s) if abs(ego.offset) < HUGSIM_REACHED else tally.furthest,
         offset=ego.offset,
         off_road=tally.off_road or off_road,
-        far_off_road=tally.far_off_road
-        or (off_road and not context.drivable(corners, tolerance=NUPLAN_DRIVABLE_TOLERANCE).all()),
+        far_off_road=tally.far_off_road or beyond > NUPLAN_DRIVABLE_TOLERANCE,
         ttc=ttc,
         min_ttc=min(tally.min_ttc, ttc),
         ride=ride,
@@ -145,7 +149,7 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
         lane_run=lane_run,
         left_lane=tally.left_lane or lane_run >= LANE_SECONDS - 1e-9,
         overspeed=tally.overspeed + (max(ego.speed - limit, 0.0) * dt if limit else 0.0),
-        hugsim=tally.hugsim + _hugsim_step(instant, context, ttc, ride),
+        hugsim=tally.hugsim + _hugsim_step(instant, outside[4:], ttc, ride),
         infeasible=tally.infeasible or _infeasible(before, ego, dt),
         ego=ego,
     )
@@ -205,34 +209,31 @@ def kind_of(category: str) -> str:
     return "vehicle" if category in VEHICLES else "object"
 
 
-def _with_plan(tally: Tally, plan: PlanNote | None) -> Tally:
+def _of_plans(tally: Tally, plan: PlanNote | None) -> dict[str, Any]:
+    """What a new plan changes."""
     if plan is None:
-        return tally
+        return {}
     agree = plans_agree(tally.plan, plan) if tally.plan is not None else None
     if agree is None:
-        return replace(tally, plan=plan)
-    return replace(
-        tally,
-        plan=plan,
-        plans_compared=tally.plans_compared + 1,
-        plans_disagree=tally.plans_disagree or not agree,
-    )
+        return {"plan": plan}
+    return {
+        "plan": plan,
+        "plans_compared": tally.plans_compared + 1,
+        "plans_disagree": tally.plans_disagree or not agree,
+    }
 
 
-def _hugsim_step(instant: Instant, context: ScoringContext, ttc: float, ride: Ride) -> float:
-    """HUGSIM's score of one step: NC DAC (5 TTC + 2 C) / 7."""
+def _hugsim_step(instant: Instant, quarters: Float, ttc: float, ride: Ride) -> float:
+    """HUGSIM's score of one step: NC DAC (5 TTC + 2 C) / 7.
+
+    ``quarters`` [4] [m]: how far the middles of the footprint's quarters are off the road.
+    """
     if instant.contacts:
         return 0.0
-    share = _covered(instant.ego, context)
+    share = np.count_nonzero(quarters <= 0) / len(quarters)
     drivable = 0.0 if share < 0.3 else 0.5 if share < 0.5 else 1.0
     safe = float(ttc > HUGSIM_TTC + 1e-9)
     return drivable * (5 * safe + 2 * float(ride.comfortable)) / 7
-
-
-def _covered(ego: EgoSample, context: ScoringContext) -> float:
-    """Share of a 2 x 2 grid of the footprint that is drivable."""
-    quarters = (ego_corners(ego, context) + ego_centre(ego, context)) / 2
-    return float(np.mean(context.drivable(quarters)))
 
 
 def _infeasible(before: EgoSample, ego: EgoSample, dt: float) -> bool:

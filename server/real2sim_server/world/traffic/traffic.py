@@ -88,6 +88,8 @@ class Traffic:
             seen: the instant before; its ``others`` are those of ``placed``.
         """
         base = state.tracks.at(seen.t_us + seen.dt_us)
+        if not (self.drivers or self._drives):
+            return Traffic(self.spec, self.drivers, base, self.reacting)
         drivers = {i: d.advance(seen) for i, d in self.drivers.items()}
         moved = replace(self, drivers=MappingProxyType(drivers))
         return moved._joined(state, base, replace(seen, t_us=seen.t_us + seen.dt_us))
@@ -146,7 +148,7 @@ class Traffic:
     def _joined(self, state: ScenarioState, base: Agents, seen: Surroundings) -> Traffic:
         """With drivers for objects that have just appeared."""
         drivers = dict(self.drivers)
-        if self.spec.drivers or self.spec.default != "log" or self.reacting:
+        if self._drives:
             for subject in base.objects:
                 if subject.object_id not in drivers:
                     driver = self._driver_for(subject, seen)
@@ -154,6 +156,11 @@ class Traffic:
                         drivers[subject.object_id] = driver
         frozen = MappingProxyType(drivers)
         return replace(self, drivers=frozen, placed=_placed(base, frozen))
+
+    @property
+    def _drives(self) -> bool:
+        """Whether objects that appear may get a driver."""
+        return bool(self.spec.drivers) or self.spec.default != "log" or self.reacting
 
     def _driver_for(self, subject: ObjectState, seen: Surroundings) -> AgentDriver | None:
         spec = self.spec.drivers.get(subject.object_id)

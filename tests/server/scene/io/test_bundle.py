@@ -243,3 +243,19 @@ def test_a_damaged_asset_is_refused(asset, tmp_path):
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(BundleError, match=r"asset.safetensors"):
         load_asset(tmp_path / "taxi.r2s")
+
+
+def test_a_broadcast_view_of_one_gaussian_is_saved(scene, tmp_path):
+    asset = scene.objects[next(iter(scene.objects))]
+    one = GaussianCloud(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 0.1),
+        opacities=torch.tensor(0.5).expand(1),
+        sh=torch.zeros(1, 1, 3),
+    )
+    save_scene(
+        replace(scene, objects={asset.object_id: replace(asset, cloud=one)}), tmp_path / "a.r2s"
+    )
+    loaded = load_scene(tmp_path / "a.r2s").objects[asset.object_id].cloud
+    assert_same_cloud(loaded, one)

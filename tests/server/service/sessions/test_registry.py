@@ -123,11 +123,11 @@ def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeyp
     planner = join(site.create())
     planner.reset()
 
-    async def full_disk(*_: object) -> None:
+    def full_disk(*_: object) -> None:
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(site.worker.store, "append_session_entries", full_disk)
+        patch.setattr(site.worker.store, "record", full_disk)
         assert planner.act(0)["code"] == "INTERNAL"
     obs = planner.act(0)
     assert (obs["step"], obs["type"]) == (1, "obs")
