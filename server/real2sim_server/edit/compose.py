@@ -58,11 +58,18 @@ def compose(
     instances = [Instance(background_without(scene, erased, vacated))]
     edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        cloud = cloud_of(scene, subject, t_us)
-        instances.append(Instance(cloud, transform, subject.instance_id, subject.scale))
+        instances.append(_standing(scene, subject, transform, t_us))
         if subject.placed:
             edited.append((subject, transform))
     return instances + shadows_of(scene, edited, t_us)
+
+
+def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> Instance:
+    placement = (transform, subject.instance_id, subject.scale)
+    if subject.asset is not None:
+        return Instance(subject.asset.cloud_in(scene), *placement)
+    source = scene.object(subject.source_id)
+    return Instance(source.cloud, *placement, colour=source.colour, t_us=t_us)
 
 
 def shadows_of(

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..scene import GaussianCloud
-from ..scene.rotation import is_rotation
+from ..scene import GaussianCloud, TimeColour
+from ..scene.rotation import are_rigid, is_rotation
 from .backends.base import Backend, RasterRequest
 from .backends.select import select_backend
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
@@ -21,7 +21,7 @@ RASTERIZE_MODES = ("classic", "antialiased")
 MAX_IMAGE_SIZE = 16_384
 MAX_INSTANCE_ID = 65_535
 
-_checked_clouds: weakref.WeakSet[GaussianCloud] = weakref.WeakSet()
+_checked: weakref.WeakSet[GaussianCloud | TimeColour] = weakref.WeakSet()
 
 
 def rasterize(
@@ -69,6 +69,7 @@ def rasterize(
     )
     _check_cameras(request)
     _check_options(options)
+    _check_poses(request.instances)
     for index, instance in enumerate(request.instances):
         _check_instance(index, instance)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
@@ -115,6 +116,19 @@ def _check_rigid(matrix: np.ndarray, name: str) -> None:
         raise RenderError(f"{name} must be a rigid transform, not {matrix.tolist()}")
 
 
+def _check_poses(instances: Sequence[Instance]) -> None:
+    """Poses of all instances at once, since there may be many; a bad one is then looked for."""
+    poses = {
+        f"instances[{index}].T_world_object": _values(instance.T_world_object)
+        for index, instance in enumerate(instances)
+        if instance.T_world_object is not None
+    }
+    shaped = all(pose.shape == (4, 4) for pose in poses.values())
+    if poses and not (shaped and are_rigid(np.stack(list(poses.values()))).all()):
+        for name, pose in poses.items():
+            _check_rigid(pose, name)
+
+
 def _check_options(options: RasterOptions) -> None:
     if options.rasterize_mode not in RASTERIZE_MODES:
         raise RenderError(
@@ -134,8 +148,6 @@ def _check_options(options: RasterOptions) -> None:
 
 def _check_instance(index: int, instance: Instance) -> None:
     name = f"instances[{index}]"
-    if instance.T_world_object is not None:
-        _check_rigid(_values(instance.T_world_object), f"{name}.T_world_object")
     if not 0 <= instance.instance_id <= MAX_INSTANCE_ID:
         raise RenderError(
             f"{name}.instance_id must be 0 to {MAX_INSTANCE_ID}, not {instance.instance_id!r}"
@@ -152,9 +164,11 @@ def _check_instance(index: int, instance: Instance) -> None:
             )
         if not torch.isfinite(instance.covars).all():
             raise RenderError(f"{name}.covars hold values that are not finite")
-    if instance.cloud not in _checked_clouds:
+    if instance.cloud not in _checked:
         _check_cloud(instance.cloud, f"{name}.cloud")
-        _checked_clouds.add(instance.cloud)
+        _checked.add(instance.cloud)
+    if instance.colour is not None:
+        _check_colour(instance.colour, len(instance.cloud), f"{name}.colour")
 
 
 def _check_cloud(cloud: GaussianCloud, name: str) -> None:
@@ -174,3 +188,14 @@ def _check_cloud(cloud: GaussianCloud, name: str) -> None:
     low, high = cloud.opacities.detach().aminmax()
     if low < 0 or high > 1:
         raise RenderError(f"{name}.opacities must lie in [0, 1]; were logits given?")
+
+
+def _check_colour(colour: TimeColour, gaussians: int, name: str) -> None:
+    """A colour and its cloud; its values once, since colours are immutable."""
+    rows = len(colour.coefficients)
+    if rows != gaussians:
+        raise RenderError(f"{name} has {rows} rows for a cloud of {gaussians} Gaussians")
+    if colour not in _checked:
+        if not torch.isfinite(colour.coefficients).all():
+            raise RenderError(f"{name}.coefficients hold values that are not finite")
+        _checked.add(colour)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..scene import GaussianCloud, Sky
+from ..scene import GaussianCloud, Sky, TimeColour
 
 
 class RenderError(ValueError):
@@ -27,6 +27,8 @@ class Instance:
         scale: [3] multiplies the cloud about its own origin along its own axes.
         covars: [N, 3, 3] float32, covariances in the cloud's frame that replace quats and scales
             (deformed clouds), or None.
+        colour: how the cloud's colours change over time, or None.
+        t_us: instant at which ``colour`` is taken [us].
     """
 
     cloud: GaussianCloud
@@ -34,6 +36,8 @@ class Instance:
     instance_id: int = 0
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     covars: Tensor | None = None
+    colour: TimeColour | None = None
+    t_us: int = 0
 
 
 @dataclass(frozen=True)

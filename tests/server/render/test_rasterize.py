@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.render import Instance, RasterOptions, RenderOutput, rasterize
-from real2sim_server.scene import GaussianCloud, Sky
+from real2sim_server.render import (
+    Instance,
+    RasterOptions,
+    RenderError,
+    RenderOutput,
+    rasterize,
+)
+from real2sim_server.scene import GaussianCloud, Sky, TimeColour
 from real2sim_server.scene.rotation import (
     invert_transform,
     matrix_to_quaternion,
@@ -278,6 +284,26 @@ def test_sky_shows_through_by_what_is_left_of_the_light(backend: str) -> None:
     out = look([Instance(cloud_of((4.0, 0.7, (1, 0, 0))))], backend, sky=Sky.uniform((0, 0, 1)))
     assert out.rgb[0, CENTRE, CENTRE].tolist() == pytest.approx([0.7, 0, 0.3], abs=1e-5)
     assert out.rgb[0, 0, 0].tolist() == pytest.approx([0, 0, 1])
+
+
+def test_colours_are_those_of_the_instant(backend: str) -> None:
+    cloud = random_cloud(8)
+    coefficients = torch.randn(120, 3, 3, generator=torch.Generator().manual_seed(9)) * 0.3
+    colour = TimeColour(coefficients, "cosine", 0, 1000)
+    for t_us in (0, 300, 1000):
+        shown = look([Instance(cloud, TURN, colour=colour, t_us=t_us)], backend)
+        baked = look([Instance(colour.at(cloud, t_us), TURN)], backend)
+        torch.testing.assert_close(shown.rgb, baked.rgb, atol=2e-5, rtol=0)
+        assert torch.equal(shown.alpha, baked.alpha)
+
+
+def test_a_colour_that_does_not_fit_its_cloud_is_refused(backend: str) -> None:
+    few = TimeColour(torch.zeros(3, 2, 3), "cosine", 0, 1000)
+    with pytest.raises(RenderError, match=r"instances\[0\].colour has 3 rows for a cloud of 120"):
+        look([Instance(random_cloud(8), TURN, colour=few)], backend)
+    broken = TimeColour(torch.full((120, 2, 3), torch.nan), "cosine", 0, 1000)
+    with pytest.raises(RenderError, match="not finite"):
+        look([Instance(random_cloud(8), TURN, colour=broken)], backend)
 
 
 def test_images_that_are_no_multiple_of_a_tile_are_filled_to_the_edge(backend: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -55,7 +55,17 @@ def needs_gradients(request: RasterRequest) -> bool:
     tensors: list[object] = [request.viewmats, request.sky.faces if request.sky else None]
     for instance in request.instances:
         tensors += [*vars(instance.cloud).values(), instance.T_world_object, instance.covars]
+        tensors += [instance.colour.coefficients] if instance.colour else []
     return any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in tensors)
+
+
+def with_colours(request: RasterRequest) -> RasterRequest:
+    """The request with colours that change over time put into the clouds."""
+    instances = tuple(
+        i if i.colour is None else replace(i, cloud=i.colour.at(i.cloud, i.t_us), colour=None)
+        for i in request.instances
+    )
+    return replace(request, instances=instances)
 
 
 class Backend(Protocol):

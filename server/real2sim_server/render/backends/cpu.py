@@ -20,6 +20,7 @@ from .base import (
     direction_matrix,
     needs_gradients,
     place_instances,
+    with_colours,
 )
 from .cpu_blend import blend_tiles
 from .cpu_cull import Chunks, seen_chunks
@@ -48,7 +49,7 @@ class CpuBackend:
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw one camera after the other into shared output arrays."""
         if needs_gradients(request):
-            return self._training.rasterize(request)
+            return self._training.rasterize(with_colours(request))
         shape = (request.cameras, request.height, request.width)
         options = request.options
         rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)

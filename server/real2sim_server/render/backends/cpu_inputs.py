@@ -18,6 +18,8 @@ from .cpu_project import project_cluster, project_small_cluster
 from .cpu_records import CHUNK, RECORD, Cluster, Records, View
 
 NO_COVARS = np.zeros((0, 3, 3), np.float32)
+NO_COEFFICIENTS = np.zeros((0, 0, 3), np.float32)
+NO_TONES = np.zeros(0, np.float32)
 
 
 class Workspace:
@@ -64,7 +66,7 @@ def project(
 
 def cluster_of(instance: Instance, placement: Placement, camera: int, index: int) -> Cluster:
     """The arrays of one instance as one camera needs them; nothing large is copied."""
-    cloud = arrays_of(instance.cloud)
+    cloud, colour = arrays_of(instance.cloud), instance.colour
     return Cluster(
         *cloud[:5],
         covars=NO_COVARS if instance.covars is None else array_of(instance.covars),
@@ -73,6 +75,8 @@ def cluster_of(instance: Instance, placement: Placement, camera: int, index: int
         camera_position=placement.camera_position[camera, index].numpy().astype(np.float32),
         scale=placement.scale[index].numpy().astype(np.float32),
         instance_id=np.float32(instance.instance_id),
+        coefficients=NO_COEFFICIENTS if colour is None else array_of(colour.coefficients),
+        tones=NO_TONES if colour is None else array_of(colour.tones(instance.t_us)),
     )
 
 

@@ -242,7 +242,13 @@ def write_color(cluster, i, out):
     sh = cluster.sh[i]
     bands = cluster.sh.shape[1]
     c0 = F32(0.2820947917738781)
-    r, g, b = c0 * sh[0, 0] + HALF, c0 * sh[0, 1] + HALF, c0 * sh[0, 2] + HALF
+    r, g, b = sh[0, 0], sh[0, 1], sh[0, 2]
+    for k in range(cluster.tones.shape[0]):
+        tone = cluster.tones[k]
+        r += tone * cluster.coefficients[i, k, 0]
+        g += tone * cluster.coefficients[i, k, 1]
+        b += tone * cluster.coefficients[i, k, 2]
+    r, g, b = c0 * r + HALF, c0 * g + HALF, c0 * b + HALF
     if bands > 1:
         x = cluster.scale[0] * cluster.means[i, 0] - cluster.camera_position[0]
         y = cluster.scale[1] * cluster.means[i, 1] - cluster.camera_position[1]

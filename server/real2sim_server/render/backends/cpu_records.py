@@ -42,7 +42,11 @@ EXPONENT_LIMIT = math.log(255.0) / EXPONENT_UNIT
 
 
 class Cluster(NamedTuple):
-    """Arrays of one cloud, float32 and contiguous; ``covars`` is [0, 3, 3] where not given."""
+    """Arrays of one cloud, float32 and contiguous; ``covars`` is [0, 3, 3] where not given.
+
+    ``coefficients`` [N, F, 3] times ``tones`` [F] are added to ``sh[:, 0]``; F is 0 where colours
+    do not change over time.
+    """
 
     means: NDArray[np.float32]
     quats: NDArray[np.float32]
@@ -55,6 +59,8 @@ class Cluster(NamedTuple):
     camera_position: NDArray[np.float32]
     scale: NDArray[np.float32]
     instance_id: np.float32
+    coefficients: NDArray[np.float32]
+    tones: NDArray[np.float32]
 
 
 class View(NamedTuple):

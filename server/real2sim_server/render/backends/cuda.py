@@ -98,6 +98,8 @@ class CudaBackend:
 
     def _place(self, instance: Instance, placement: Placement, index: int) -> _World:
         cloud = self._on_device(instance.cloud)
+        if instance.colour is not None:
+            cloud = instance.colour.to(self.device).at(cloud, instance.t_us)
         scale = placement.scale[index]
         T = torch.eye(4, dtype=torch.float64, device=self.device)
         if instance.T_world_object is not None:

@@ -23,6 +23,7 @@ from .base import (
     needs_gradients,
     pixel_directions,
     place_instances,
+    with_colours,
 )
 from .screen import ScreenTracker, ScreenWatch
 from .spherical_harmonics import evaluate_sh
@@ -52,6 +53,7 @@ class ReferenceBackend:
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw one camera after the other, tile by tile."""
         start = time.perf_counter()
+        request = with_colours(request)
         placement = place_instances(request.instances, request.viewmats)
         options = request.options
         tracker = None

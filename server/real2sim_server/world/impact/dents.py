@@ -84,7 +84,9 @@ class Dents:
         if dented is None or dented.origin.subject.scale != instance.scale:
             return instance
         cloud = dented.cloud(t_us)
-        return instance if cloud is None else replace(instance, cloud=cloud, scale=(1.0, 1.0, 1.0))
+        if cloud is None:
+            return instance
+        return replace(instance, cloud=cloud, colour=None, scale=(1.0, 1.0, 1.0))
 
     def _before(
         self, name: str | None, subjects: Mapping[str, ObjectState], impact: Impact
