@@ -1,13 +1,15 @@
-"""Clients that hang up before their answer is ready."""
+"""Clients that hang up before their answer is ready, and what is finished all the same."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
-from typing import Any, TypeVar
+import functools
+from collections.abc import Callable, Coroutine
+from typing import Any, ParamSpec, TypeVar
 
 from starlette.requests import Request
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -40,3 +42,24 @@ async def unless_gone(request: Request, work: Coroutine[Any, Any, T]) -> T:
 async def _hang_up(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
+
+
+def to_its_end(
+    method: Callable[P, Coroutine[Any, Any, T]],
+) -> Callable[P, Coroutine[Any, Any, T]]:
+    """A coroutine function that goes to its end even when its caller is cancelled meanwhile.
+
+    For changes that are on record before they take effect in memory: one without the other would
+    refuse every later change. The caller is held until then, and with it the locks it has.
+    """
+
+    @functools.wraps(method)
+    async def whole(*args: P.args, **kwargs: P.kwargs) -> T:
+        work = asyncio.create_task(method(*args, **kwargs))
+        try:
+            return await asyncio.shield(work)
+        except asyncio.CancelledError:
+            await asyncio.wait([work])
+            raise
+
+    return whole

@@ -157,6 +157,15 @@ def stale_revision(scenario: Scenario, expected: int) -> ServiceError:
     )
 
 
+def changed_elsewhere(scenario_id: str) -> ServiceError:
+    """The refusal of a change that another worker was faster than."""
+    return ServiceError(
+        ErrorCode.STALE_REVISION,
+        f"another worker has changed scenario {scenario_id!r}",
+        hint="read its operations and send the edit again",
+    )
+
+
 def listed_info(row: ScenarioRow, kinds: Sequence[str]) -> ScenarioInfo:
     """What a list says of a scenario, from the kinds of its log entries."""
     done = undone = 0

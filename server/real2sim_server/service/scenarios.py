@@ -8,7 +8,6 @@ from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation
@@ -22,8 +21,9 @@ from real2sim_proto.scenarios import (
     ScenarioInfo,
 )
 
-from ..edit import AssetLookup, Planned, Scenario, ScenarioState
+from ..edit import AssetLookup, EditError, LogEntry, Planned, Scenario, ScenarioState
 from ..scene.io import SceneSummary
+from .disconnects import to_its_end
 from .idempotency import Once
 from .library import BUNDLE_SUFFIX
 from .metrics import Metrics
@@ -32,6 +32,7 @@ from .residency import Residency
 from .scenario_replies import (
     ScenarioView,
     asset_hashes,
+    changed_elsewhere,
     created_headers,
     history_entry,
     iso_time,
@@ -42,7 +43,7 @@ from .scenario_replies import (
     tag,
 )
 from .snapshots import Snapshots
-from .store import ConflictError, ScenarioRow, Store, now_us
+from .store import ConflictError, ScenarioRow, Store, StoredReply, now_us
 
 KEPT_IN_MEMORY = 256
 """Scenarios kept ready; others are rebuilt from the store when they are asked for."""
@@ -292,6 +293,7 @@ class Scenarios:
             hint="put that bundle into the scene folder, or POST /v1/scenes to import it",
         )
 
+    @to_its_end
     async def _change(
         self,
         scenario_id: str,
@@ -306,37 +308,37 @@ class Scenarios:
             if expected is not None and expected != scenario.revision:
                 self._metrics.edit_conflicts.inc()
                 raise stale_revision(scenario, expected)
-            # Overlap checks of large batches take milliseconds; they need no device.
-            planned = await asyncio.to_thread(plan, scenario)
-            if dry_run:
-                return operation_result(planned, revision=scenario.revision, dry_run=True)
-            result = operation_result(planned, revision=planned.entry.revision)
-            await self._record(held, planned, once.reply(result, status=200, headers=tag(result)))
-            scenario.commit(planned)
-            self._snapshots.offer(scenario_id, scenario.revision, scenario.state)
+
+            def change() -> tuple[Planned, OperationResult]:
+                # Overlap checks of large batches take milliseconds; they need no device.
+                planned = plan(scenario)
+                revision = scenario.revision if dry_run else planned.entry.revision
+                result = operation_result(planned, revision=revision, dry_run=dry_run)
+                if not dry_run:
+                    reply = once.reply(result, status=200, headers=tag(result))
+                    self._record(scenario_id, planned.entry, reply)
+                return planned, result
+
+            try:
+                planned, result = await asyncio.to_thread(change)
+            except EditError:
+                raise
+            except Exception as error:
+                # Only the store knows whether the entry is in the log.
+                self._held.pop(scenario_id, None)
+                if isinstance(error, ConflictError):
+                    raise changed_elsewhere(scenario_id) from error
+                raise
+            if not dry_run:
+                scenario.commit(planned)
+                self._snapshots.offer(scenario_id, scenario.revision, scenario.state)
             return result
 
-    async def _record(self, held: _Held, planned: Planned, reply: Any) -> None:
-        entry = planned.entry
-        scenario_id = held.row.scenario_id
-        try:
-            await self._store.append_scenario_entry(
-                scenario_id,
-                entry.revision,
-                history_entry(entry).model_dump(mode="json"),
-                created_us=now_us(),
-                reply=reply,
-            )
-        except BaseException as error:
-            # Cancelled or refused: only the store knows whether the entry is in the log.
-            self._held.pop(scenario_id, None)
-            if isinstance(error, ConflictError):
-                raise ServiceError(
-                    ErrorCode.STALE_REVISION,
-                    f"another worker has changed scenario {scenario_id!r}",
-                    hint="read its operations and send the edit again",
-                ) from error
-            raise
+    def _record(self, scenario_id: str, entry: LogEntry, reply: StoredReply | None) -> None:
+        fields = history_entry(entry).model_dump(mode="json")
+        self._store.record_revision(
+            scenario_id, entry.revision, fields, created_us=now_us(), reply=reply
+        )
 
     @asynccontextmanager
     async def _exclusive(self, scenario_id: str) -> AsyncIterator[_Held]:

@@ -9,15 +9,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection, make_url
 from sqlalchemy.exc import DBAPIError, IntegrityError
-from sqlalchemy.pool import StaticPool
 
 from . import tables as t
+from .database import StoreError, connect, prepare_schema, shown_url
 from .rows import ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
 
 __all__ = [
@@ -39,10 +37,6 @@ T = TypeVar("T")
 REPLY_LIFETIME_US = 24 * 3600 * 1_000_000
 
 
-class StoreError(RuntimeError):
-    """The store cannot be used; the message says why and what to do."""
-
-
 class ConflictError(StoreError):
     """A row that must be new exists already: another writer was first."""
 
@@ -60,8 +54,8 @@ class Store:
 
     One thread is enough: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which has
     one writer at a time anyway, and the order of appends is the order of the calls. Who computes
-    on another thread may write from there, by :meth:`record`: to be woken by a thread and to wake
-    another one takes longer than an append.
+    on another thread may write from there, by :meth:`record` and :meth:`record_revision`: to be
+    woken by a thread and to wake another one takes longer than an append.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
@@ -143,8 +137,22 @@ class Store:
         Raises:
             ConflictError: the revision exists, or the scenario does not.
         """
+        await self._run(
+            self.record_revision, scenario_id, revision, entry, created_us=created_us, reply=reply
+        )
+
+    def record_revision(
+        self,
+        scenario_id: str,
+        revision: int,
+        entry: Mapping[str, Any],
+        *,
+        created_us: int,
+        reply: StoredReply | None = None,
+    ) -> None:
+        """Like :meth:`append_scenario_entry`, on the calling thread; never on the event loop."""
         row = _log_row(scenario_id, revision, entry, created_us)
-        await self._write(_added(t.scenario_log, row), *_keep(reply))
+        self._written([_added(t.scenario_log, row), *_keep(reply)])
 
     async def scenario_entries(self, scenario_id: str) -> list[dict[str, Any]]:
         """The log of a scenario, oldest first."""
@@ -297,13 +305,13 @@ class Store:
 
     def _open(self) -> None:
         try:
-            self._engine = _connect(self.url)
+            self._engine = connect(self.url)
             with self._engine.begin() as connection:
-                _prepare_schema(connection)
+                prepare_schema(connection)
                 connection.execute(_delete_old_replies())
         except (sa.exc.SQLAlchemyError, OSError) as error:
             reason = getattr(error, "orig", None) or error
-            raise StoreError(f"cannot open the store {_shown(self.url)!r}: {reason}") from error
+            raise StoreError(f"cannot open the store {shown_url(self.url)!r}: {reason}") from error
 
     def _close(self) -> None:
         if self._engine is not None:
@@ -322,51 +330,6 @@ def _is_conflict(error: DBAPIError) -> bool:
 def now_us() -> int:
     """Wall-clock time [us] since 1970 UTC."""
     return time.time_ns() // 1000
-
-
-def _shown(url: str) -> str:
-    """The URL without its password."""
-    try:
-        return make_url(url).render_as_string(hide_password=True)
-    except sa.exc.ArgumentError:
-        return "<no SQLAlchemy URL>"
-
-
-def _connect(url: str) -> sa.Engine:
-    parsed = make_url(url)
-    if parsed.get_backend_name() != "sqlite":
-        return sa.create_engine(parsed, pool_pre_ping=True)
-    if not parsed.database or parsed.database == ":memory:":
-        # Such a database belongs to its connection, whichever thread uses it.
-        other_threads = {"check_same_thread": False}
-        engine = sa.create_engine(parsed, poolclass=StaticPool, connect_args=other_threads)
-    else:
-        Path(parsed.database).absolute().parent.mkdir(parents=True, exist_ok=True)
-        engine = sa.create_engine(parsed)
-    sa.event.listen(engine, "connect", _set_up_sqlite)
-    return engine
-
-
-def _set_up_sqlite(connection: Any, _record: object) -> None:
-    cursor = connection.cursor()
-    # NORMAL loses no committed transaction when the process dies, only when the machine does.
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.execute("PRAGMA busy_timeout=5000")
-    cursor.close()
-
-
-def _prepare_schema(connection: Connection) -> None:
-    t.schema_version.create(connection, checkfirst=True)
-    found = connection.execute(sa.select(sa.func.max(t.schema_version.c.version))).scalar()
-    if found is not None and found != t.SCHEMA_VERSION:
-        raise StoreError(
-            f"the store has schema version {found}, this worker reads {t.SCHEMA_VERSION}; "
-            "start a worker of that version, or give another REAL2SIM_STORE_URL"
-        )
-    t.metadata.create_all(connection)
-    if found is None:
-        connection.execute(sa.insert(t.schema_version), {"version": t.SCHEMA_VERSION})
 
 
 def _delete_old_replies() -> sa.Delete:

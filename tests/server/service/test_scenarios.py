@@ -293,11 +293,11 @@ def test_a_snapshot_spares_replaying_and_is_never_needed(
 def test_nothing_takes_effect_that_is_not_on_record(client, monkeypatch):
     scenario = create(client)
 
-    async def fail(*_args, **_kwargs):
+    def fail(*_args, **_kwargs):
         raise StoreError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(client.app.state.worker.store, "append_scenario_entry", fail)
+        patch.setattr(client.app.state.worker.store, "record_revision", fail)
         assert edit(client, scenario, DELETE_RED).status_code == 500
     assert "car_red" in shown(client, scenario)
     assert edit(client, scenario, DELETE_RED).json()["revision"] == 1
