@@ -34,6 +34,7 @@ def rasterize(
     sky: Sky | None = None,
     options: RasterOptions = DEFAULT_OPTIONS,
     backend: str | Backend = "auto",
+    check_values: bool = True,
 ) -> RenderOutput:
     """Draw instances from C cameras of one size, with the semantics of gsplat 1.5.3.
 
@@ -54,6 +55,8 @@ def rasterize(
         sky: behind everything, in place of ``options.background``.
         options: planes, blur, mode and which images are made.
         backend: ``auto``, ``cpu``, ``cuda``, ``reference``, or a Backend.
+        check_values: False for callers that make new clouds for every call, which would be checked
+            each time, and answer for their values themselves.
 
     Raises:
         RenderError: for anything that is not as said above; nothing is drawn then.
@@ -71,7 +74,7 @@ def rasterize(
     _check_options(options)
     _check_poses(request.instances)
     for index, instance in enumerate(request.instances):
-        _check_instance(index, instance)
+        _check_instance(index, instance, check_values=check_values)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     return chosen.rasterize(request)
 
@@ -146,7 +149,7 @@ def _check_options(options: RasterOptions) -> None:
         raise RenderError(f"background must be three finite numbers, not {options.background!r}")
 
 
-def _check_instance(index: int, instance: Instance) -> None:
+def _check_instance(index: int, instance: Instance, *, check_values: bool) -> None:
     name = f"instances[{index}]"
     if not 0 <= instance.instance_id <= MAX_INSTANCE_ID:
         raise RenderError(
@@ -164,7 +167,7 @@ def _check_instance(index: int, instance: Instance) -> None:
             )
         if not torch.isfinite(instance.covars).all():
             raise RenderError(f"{name}.covars hold values that are not finite")
-    if instance.cloud not in _checked:
+    if check_values and instance.cloud not in _checked:
         _check_cloud(instance.cloud, f"{name}.cloud")
         _checked.add(instance.cloud)
     if instance.colour is not None:

@@ -11,7 +11,7 @@ import torch
 from real2sim_server.render import Instance, rasterize
 from real2sim_server.render.backends import cpu
 from real2sim_server.render.backends.base import RasterRequest, place_instances
-from real2sim_server.render.backends.cpu_cull import all_chunks, arrays_of, seen_chunks
+from real2sim_server.render.backends.cpu_cull import all_chunks, bounds_of, seen_chunks
 from real2sim_server.render.backends.cpu_inputs import view_of
 from real2sim_server.render.backends.cpu_records import CHUNK
 from real2sim_server.render.types import RasterOptions
@@ -111,10 +111,10 @@ def test_deformed_clouds_are_looked_at_as_a_whole():
 
 def test_bounds_hold_all_centres_and_scales_of_a_chunk():
     cloud = street(2)
-    arrays = arrays_of(cloud)
+    bounds, means = bounds_of(cloud), cloud.means.numpy()
     for chunk in range(12):
         part = slice(chunk * CHUNK, (chunk + 1) * CHUNK)
-        off = np.abs(arrays.means[part] - arrays.centres[chunk])
-        assert (off <= arrays.halves[chunk] + 1e-12).all()
-        assert arrays.sigmas[chunk] == arrays.scales[part].max()
-    assert arrays_of(cloud) is arrays
+        off = np.abs(means[part] - bounds.centres[chunk])
+        assert (off <= bounds.halves[chunk] + 1e-12).all()
+        assert bounds.sigmas[chunk] == cloud.scales[part].max()
+    assert bounds_of(cloud) is bounds

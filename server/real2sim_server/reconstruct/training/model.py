@@ -122,6 +122,7 @@ class SceneModel:
             sky=Sky(self.sky),
             options=options,
             backend=self.backend,
+            check_values=False,
         )
         rgb = output.rgb[0]
         if self.options.rates.exposure > 0:
@@ -141,15 +142,16 @@ class SceneModel:
             camera.height,
             options=RasterOptions(depth=False, instance=False),
             backend=self.backend,
+            check_values=False,
         )
         return output.alpha[0]
 
     def instances(self, clouds: list[GaussianCloud], t_us: int) -> tuple[list[Instance], list[int]]:
         """Clouds of background and objects where they are at ``t_us``, and which are there."""
         instances, drawn = [Instance(clouds[0])], [0]
-        for index, key in enumerate(self.poses.keys):
-            if key.covers(t_us) and len(clouds[index + 1]):
-                pose = self.poses.transform(index, t_us)
+        there, poses = self.poses.at(t_us)
+        for index, pose in zip(there, poses.unbind(), strict=True):
+            if len(clouds[index + 1]):
                 instances.append(Instance(clouds[index + 1], pose, instance_id=index + 1))
                 drawn.append(index + 1)
         return instances, drawn

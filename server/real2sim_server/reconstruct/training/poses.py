@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...scene import Scene, Trajectory
-from ...scene.rotation import Float, multiply_quaternions, quaternion_to_matrix, yaw_quaternion
+from ...scene.rotation import (
+    Float,
+    multiply_quaternions,
+    quaternion_to_matrix,
+    transform_from,
+    yaw_quaternion,
+)
 from .losses import second_differences
 
 
@@ -70,23 +76,27 @@ class ObjectPoses:
             key = KeyPoses(times, *(np.array(part) for part in zip(*poses, strict=True)), row)
             self.keys.append(key)
             row += len(times)
+        self._given = [Trajectory(k.times_us, k.positions, k.quaternions) for k in self.keys]
         self.shifts = torch.zeros(row, 3, requires_grad=True)
         self.yaws = torch.zeros(row, 1, requires_grad=True)
 
-    def transform(self, index: int, t_us: int) -> Tensor:
-        """``T_world_object`` [4, 4] float64 of object ``index``; carries gradients."""
-        key = self.keys[index]
-        before, after, fraction = key.bracket(t_us)
-        rows = key.first_row + before, key.first_row + after
-        shift = self.shifts[rows[0]] * (1 - fraction) + self.shifts[rows[1]] * fraction
-        yaw = self.yaws[rows[0], 0] * (1 - fraction) + self.yaws[rows[1], 0] * fraction
-        given = Trajectory(key.times_us, key.positions, key.quaternions).transform(t_us)
-        zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
-        c, s, (x, y, z) = yaw.double().cos(), yaw.double().sin(), shift.double().unbind()
-        rows_of = ((c, -s, zero, x), (s, c, zero, y), (zero, zero, one, z))
-        last = torch.stack([zero, zero, zero, one])
-        correction = torch.stack([*(torch.stack(row) for row in rows_of), last])
-        return torch.from_numpy(given) @ correction
+    def at(self, t_us: int) -> tuple[list[int], Tensor]:
+        """Indices of the objects that exist at ``t_us``, K of them, and their ``T_world_object``
+        [K, 4, 4] float64, which carry gradients."""
+        there = [index for index, key in enumerate(self.keys) if key.covers(t_us)]
+        if not there:
+            return [], torch.zeros(0, 4, 4, dtype=torch.float64)
+        keys = [self.keys[index] for index in there]
+        before, after, fractions = zip(*(key.bracket(t_us) for key in keys), strict=True)
+        first = np.array([key.first_row for key in keys])
+        rows = torch.from_numpy(first + before), torch.from_numpy(first + after)
+        later = torch.tensor(fractions, dtype=torch.float64)[:, None]
+        shares = (1 - later).float(), later.float()
+        shift = self.shifts[rows[0]] * shares[0] + self.shifts[rows[1]] * shares[1]
+        yaw = self.yaws[rows[0]] * shares[0] + self.yaws[rows[1]] * shares[1]
+        poses = [self._given[index].pose(t_us) for index in there]
+        given = transform_from(*(np.array(part) for part in zip(*poses, strict=True)))
+        return there, torch.from_numpy(given) @ _corrections(shift.double(), yaw[:, 0].double())
 
     def roughness(self) -> Tensor:
         """Mean squared second differences of all refined trajectories [m, rad] at 10 Hz."""
@@ -115,6 +125,14 @@ class ObjectPoses:
         positions = key.positions + np.einsum("tij,tj->ti", turn, shift)
         quaternions = multiply_quaternions(key.quaternions, yaw_quaternion(yaw))
         return Trajectory(key.times_us, positions, quaternions)
+
+
+def _corrections(shift: Tensor, yaw: Tensor) -> Tensor:
+    """``[Rz(yaw) | shift]`` [K, 4, 4] of shifts [K, 3] and yaws [K]."""
+    c, s, (x, y, z) = yaw.cos(), yaw.sin(), shift.unbind(1)
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    rows = (c, -s, zero, x), (s, c, zero, y), (zero, zero, one, z), (zero, zero, zero, one)
+    return torch.stack([value for row in rows for value in row], dim=1).reshape(-1, 4, 4)
 
 
 def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -> NDArray[np.int64]:

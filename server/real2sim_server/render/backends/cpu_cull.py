@@ -30,38 +30,51 @@ Chunks = NDArray[np.int64]
 
 
 class CloudArrays(NamedTuple):
-    """The parts of a cloud where they lie, and what its chunks fill.
-
-    Attributes:
-        means, quats, scales, opacities, sh: as in GaussianCloud, float32 and contiguous.
-        centres, halves: [chunks, 3] float64, boxes around the centres in the cloud's frame [m].
-        sigmas: [chunks] float64, largest standard deviation [m].
-    """
+    """The parts of a cloud where they lie: as in GaussianCloud, float32 and contiguous."""
 
     means: NDArray[np.float32]
     quats: NDArray[np.float32]
     scales: NDArray[np.float32]
     opacities: NDArray[np.float32]
     sh: NDArray[np.float32]
+
+
+class ChunkBounds(NamedTuple):
+    """What the chunks of a cloud fill.
+
+    Attributes:
+        centres, halves: [chunks, 3] float64, boxes around the centres in the cloud's frame [m].
+        sigmas: [chunks] float64, largest standard deviation [m].
+    """
+
     centres: NDArray[np.float64]
     halves: NDArray[np.float64]
     sigmas: NDArray[np.float64]
 
 
-_known: weakref.WeakKeyDictionary[GaussianCloud, CloudArrays] = weakref.WeakKeyDictionary()
+_arrays: weakref.WeakKeyDictionary[GaussianCloud, CloudArrays] = weakref.WeakKeyDictionary()
+_bounds: weakref.WeakKeyDictionary[GaussianCloud, ChunkBounds] = weakref.WeakKeyDictionary()
 
 
 def arrays_of(cloud: GaussianCloud) -> CloudArrays:
-    """Arrays and bounds of a cloud; made once, since clouds are immutable."""
-    known = _known.get(cloud)
+    """Arrays of a cloud; made once, since clouds are immutable."""
+    known = _arrays.get(cloud)
     if known is None:
         parts = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
-        arrays = [part.detach().cpu().contiguous().numpy() for part in parts]
-        chunks = -(-len(cloud) // CHUNK)
-        bounds = np.empty((chunks, 7))
-        bound_chunks(arrays[0], arrays[2], bounds)
-        known = CloudArrays(*arrays, bounds[:, :3], bounds[:, 3:6], bounds[:, 6])
-        _known[cloud] = known
+        known = CloudArrays(*(part.detach().cpu().contiguous().numpy() for part in parts))
+        _arrays[cloud] = known
+    return known
+
+
+def bounds_of(cloud: GaussianCloud) -> ChunkBounds:
+    """Bounds of the chunks of a cloud; made once, for who draws it more than once."""
+    known = _bounds.get(cloud)
+    if known is None:
+        arrays = arrays_of(cloud)
+        table = np.empty((-(-len(cloud) // CHUNK), 7))
+        bound_chunks(arrays.means, arrays.scales, table)
+        known = ChunkBounds(table[:, :3], table[:, 3:6], table[:, 6])
+        _bounds[cloud] = known
     return known
 
 
@@ -76,13 +89,13 @@ def seen_chunks(
     """Numbers of the chunks that may be seen, by camera and instance."""
     if not request.instances:
         return [[] for _ in views]
-    clouds = [arrays_of(instance.cloud) for instance in request.instances]
-    counts = np.array([len(cloud.sigmas) for cloud in clouds])
-    owner = np.repeat(np.arange(len(clouds)), counts)
-    centres = np.concatenate([cloud.centres for cloud in clouds])
-    halves = np.concatenate([cloud.halves for cloud in clouds])
+    bounds = [bounds_of(instance.cloud) for instance in request.instances]
+    counts = np.array([len(held.sigmas) for held in bounds])
+    owner = np.repeat(np.arange(len(bounds)), counts)
+    centres = np.concatenate([held.centres for held in bounds])
+    halves = np.concatenate([held.halves for held in bounds])
     scale = placement.scale.numpy().max(1)
-    sigmas = np.concatenate([cloud.sigmas for cloud in clouds]) * scale[owner]
+    sigmas = np.concatenate([held.sigmas for held in bounds]) * scale[owner]
     deformed = np.array([instance.covars is not None for instance in request.instances])
     starts = np.cumsum(counts) - counts
     seen = []

@@ -68,7 +68,7 @@ def cluster_of(instance: Instance, placement: Placement, camera: int, index: int
     """The arrays of one instance as one camera needs them; nothing large is copied."""
     cloud, colour = arrays_of(instance.cloud), instance.colour
     return Cluster(
-        *cloud[:5],
+        *cloud,
         covars=NO_COVARS if instance.covars is None else array_of(instance.covars),
         linear=np.ascontiguousarray(placement.linear[camera, index].numpy()),
         offset=placement.offset[camera, index].numpy(),
