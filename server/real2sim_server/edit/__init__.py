@@ -8,7 +8,7 @@ from .scenario import LogEntry, Planned, Scenario
 from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
 from .tracks import PackedTracks, Placed
-from .uncovered import vacated_at
+from .uncovered import vacated
 
 __all__ = [
     "AssetLookup",
@@ -30,5 +30,5 @@ __all__ = [
     "instances_at",
     "pack_state",
     "unpack_state",
-    "vacated_at",
+    "vacated",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
 from typing import TypeVar
 from weakref import WeakKeyDictionary
@@ -20,7 +20,7 @@ from .ground import RecordedGround
 from .shadow import shadow_under
 from .state import ObjectState, ScenarioState
 from .tracks import Placed
-from .uncovered import uncovered, vacated_at
+from .uncovered import uncovered, vacated
 
 T = TypeVar("T")
 
@@ -41,21 +41,19 @@ def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance
     Raises:
         UnknownObjectError: ``state`` is of another scene.
     """
-    vacated = vacated_at(state, t_us)
-    return compose(scene, state.tracks.at(t_us), t_us, erased=state.erased, vacated=vacated)
+    return compose(scene, state, state.tracks.at(t_us), t_us)
 
 
 def compose(
     scene: Scene,
+    state: ScenarioState,
     placed: Placed[ObjectState],
     t_us: int,
-    *,
-    erased: tuple[EraseRegion, ...] = (),
-    vacated: tuple[str, ...] = (),
 ) -> list[Instance]:
-    """The same for objects already looked up; ``vacated`` as :func:`vacated_at` has it. Raises
-    like :func:`instances_at`."""
-    instances = [Instance(background_without(scene, erased, vacated))]
+    """The same for objects that are ``placed`` already, wherever. Raises like
+    :func:`instances_at`."""
+    poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
+    instances = [Instance(background_of(scene, state, poses))]
     edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         instances.append(_standing(scene, subject, transform, t_us))
@@ -97,19 +95,19 @@ def cloud_of(scene: Scene, subject: ObjectState, t_us: int) -> GaussianCloud:
     return scene.object(subject.source_id).cloud_at(t_us)
 
 
-def background_without(
-    scene: Scene, erased: tuple[EraseRegion, ...], vacated: tuple[str, ...] = ()
-) -> GaussianCloud:
-    """The background with all Gaussians inside ``erased`` made invisible, and with plain ground at
-    the places of the recorded objects ``vacated``; the rest is shared."""
-    if not erased and not vacated:
+def background_of(scene: Scene, state: ScenarioState, poses: Mapping[str, Float]) -> GaussianCloud:
+    """The background with all Gaussians in erased regions made invisible, and with plain ground
+    where parked objects stood that ``poses`` (``T_world_object`` [4, 4] by id) have elsewhere; the
+    rest is shared."""
+    erased, left = state.erased, vacated(state, poses)
+    if not erased and not left:
         return scene.background
 
     def make() -> GaussianCloud:
-        background = uncovered(scene, scene.background, vacated) if vacated else scene.background
+        background = uncovered(scene, scene.background, left) if left else scene.background
         return _hidden(background, erased) if erased else background
 
-    return _kept(scene, (erased, vacated), make)
+    return _kept(scene, (erased, left), make)
 
 
 def _hidden(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:

@@ -6,16 +6,18 @@ The ground beside them is what is known best about it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..scene import GaussianCloud, Scene
 from ..scene.rotation import invert_transform
 from .state import ObjectState, ScenarioState
+from .tracks import Float
 
 PARKED = 0.5
 """An object whose recorded places are all within this of each other is parked; tracks of things
@@ -36,14 +38,24 @@ LOW = 0.25
 NEIGHBOURS = 6
 
 
-def vacated_at(state: ScenarioState, t_us: int) -> tuple[str, ...]:
-    """Ids of recorded objects that were parked and are not at their places at ``t_us``."""
+def vacated(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
+    """Ids of recorded objects that were parked and are not at their places.
+
+    Args:
+        state: knows what was recorded.
+        poses: ``T_world_object`` [4, 4] of all objects that exist, by id; where an edit or a blow
+            has brought them.
+    """
     return tuple(
         recorded.object_id
         for recorded in state.recorded.values()
-        if state.objects[recorded.object_id] is not recorded
-        and _parked(recorded)
-        and _gone(state.objects[recorded.object_id], recorded, t_us)
+        if _parked(recorded)
+        and (
+            _away(poses[recorded.object_id], recorded)
+            if recorded.object_id in poses
+            # What is unedited and not there was not recorded at that time.
+            else state.objects[recorded.object_id] is not recorded
+        )
     )
 
 
@@ -72,16 +84,16 @@ def uncovered(scene: Scene, background: GaussianCloud, vacated: Iterable[str]) -
     return replace(background, opacities=opacities, sh=sh)
 
 
+@lru_cache(maxsize=4096)
 def _parked(recorded: ObjectState) -> bool:
     low, high = recorded.bounds[:, :2]
     return bool((high - low - 2 * recorded.radius).max() <= PARKED)
 
 
-def _gone(now: ObjectState, parked: ObjectState, t_us: int) -> bool:
-    if now.deleted or not now.trajectory.covers(t_us):
-        return True
-    moved = now.trajectory.transform(t_us)[:2, 3] - parked.trajectory.positions[0, :2]
-    return bool(np.hypot(*moved) > AWAY)
+def _away(pose: Float, parked: ObjectState) -> bool:
+    (low_x, low_y), (high_x, high_y) = parked.bounds[:, :2].tolist()
+    x, y = float(pose[0, 3]), float(pose[1, 3])
+    return math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
 
 
 def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:

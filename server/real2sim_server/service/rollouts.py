@@ -15,7 +15,7 @@ from real2sim_proto.jobs import SimulateRequest
 from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, MaterialName, PlaneShape
 
 from ..edit import ObjectState, ScenarioState
-from ..edit.compose import background_without, shadows_of
+from ..edit.compose import background_of, shadows_of
 from ..edit.ground import RecordedGround
 from ..physics.colliders import Box, Collider, HeightField, Plane
 from ..physics.materials import (
@@ -177,14 +177,20 @@ class Show:
         """What is drawn at the kept frame nearest to ``t_us`` [us], with contact shadows."""
         since = (t_us - self._result.start_us) * 1e-6
         frame = int(np.abs(self._result.times_s - since).argmin())
-        placed = [
+        standing = [
             (subject, self._pose(subject, frame, t_us))
             for subject in self._state.visible
-            if subject.object_id in self._result.objects
-            or (subject.placed and subject.trajectory.covers(t_us))
+            if subject.object_id in self._result.objects or subject.trajectory.covers(t_us)
         ]
-        shadows = shadows_of(self._scene, placed, t_us)
-        return [*self._playback.instances(frame), *shadows]
+        poses = {subject.object_id: pose for subject, pose in standing}
+        background = Instance(background_of(self._scene, self._state, poses))
+        _, *objects = self._playback.instances(frame)
+        placed = [
+            (subject, pose)
+            for subject, pose in standing
+            if subject.placed or subject.object_id in self._result.objects
+        ]
+        return [background, *objects, *shadows_of(self._scene, placed, t_us)]
 
     def _pose(self, subject: ObjectState, frame: int, t_us: int) -> Float:
         simulated = self._result.objects.get(subject.object_id)
@@ -194,7 +200,7 @@ class Show:
 
 
 def with_everything(scene: Scene, state: ScenarioState) -> tuple[Scene, StandIns]:
-    """The scene as the scenario shows it: assets are objects of it, erased parts hidden."""
+    """The scene with the scenario's assets as objects of it."""
     objects = dict(scene.objects)
     visible = []
     for subject in state.visible:
@@ -207,8 +213,7 @@ def with_everything(scene: Scene, state: ScenarioState) -> tuple[Scene, StandIns
             stand_in, subject.category, subject.size, cloud, subject.trajectory
         )
         visible.append(replace(subject, source_id=stand_in))
-    background = background_without(scene, state.erased)
-    return replace(scene, objects=objects, background=background), StandIns(tuple(visible))
+    return replace(scene, objects=objects), StandIns(tuple(visible))
 
 
 def _span(state: ScenarioState, asked: SimulateRequest) -> tuple[int, int]:

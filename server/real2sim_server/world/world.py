@@ -17,7 +17,6 @@ from ..edit import (
     ScenarioState,
     apply_operations,
     compose,
-    vacated_at,
 )
 from ..render.types import Instance
 from ..scene import Scene
@@ -267,13 +266,7 @@ class World:
 
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
-        drawn = compose(
-            self.scene,
-            self.agents,
-            self.t_us,
-            erased=self.state.erased,
-            vacated=vacated_at(self.state, self.t_us),
-        )
+        drawn = compose(self.scene, self.state, self.agents, self.t_us)
         if self.deformation is not None:
             # Background first, then the objects, then shadows.
             for k, subject in enumerate(self.agents.objects, start=1):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from real2sim_proto.operations import Delete, Translate
-from real2sim_server.edit import ScenarioState, apply_operations, vacated_at
+from real2sim_server.edit import ScenarioState, apply_operations, vacated
 from real2sim_server.edit.uncovered import uncovered
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.scene.harmonics import SH_C0
@@ -14,9 +15,14 @@ from real2sim_server.scene.harmonics import SH_C0
 PARKED = "post"
 
 
+def poses_of(state: ScenarioState, t_us: int) -> dict[str, np.ndarray]:
+    placed = state.tracks.at(t_us)
+    return {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
+
+
 def at(scene, state: ScenarioState, *operations) -> tuple[str, ...]:
     after = apply_operations(state, operations).state
-    return vacated_at(after, scene.start_us)
+    return vacated(after, poses_of(after, scene.start_us))
 
 
 @pytest.fixture
@@ -36,7 +42,18 @@ def test_small_moves_and_moves_of_what_was_driving_leave_no_place(tiny_scene, st
     driving = next(o.object_id for o in state.visible if not o.standing)
     nudged = Translate(object_id=PARKED, y=0.1)
     assert at(tiny_scene, state, nudged, Delete(object_id=driving)) == ()
-    assert vacated_at(state, tiny_scene.start_us) == ()
+    assert vacated(state, poses_of(state, tiny_scene.start_us)) == ()
+
+
+def test_a_blow_that_pushes_a_parked_object_away_uncovers_its_place(tiny_scene, state):
+    poses = poses_of(state, tiny_scene.start_us)
+    pushed = poses[PARKED].copy()
+    pushed[0, 3] += 1.0
+    assert vacated(state, poses | {PARKED: pushed}) == (PARKED,)
+
+
+def test_what_was_not_recorded_at_a_time_has_not_left_its_place(state):
+    assert vacated(state, {}) == ()
 
 
 def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(tiny_scene):
