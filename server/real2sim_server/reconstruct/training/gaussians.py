@@ -74,13 +74,12 @@ class Gaussians:
             mirrored: objects to be reflected at their x z plane.
         """
         k = (degree + 1) ** 2
-        sh = self.sh[:, :k].contiguous()
+        background, objects = self.sh[:, :k].contiguous().tensor_split([self.counts[0]])
         if tones is not None and self.fourier.numel():
             counts = torch.tensor(self.counts[1:])
             weights = torch.repeat_interleave(tones, counts, dim=0)
             change = (self.fourier * weights[..., None]).sum(1)
-            shift = torch.cat([change.new_zeros(self.counts[0], 3), change])
-            sh = torch.cat([sh[:, :1] + shift[:, None], sh[:, 1:]], dim=1)
+            objects = torch.cat([objects[:, :1] + change[:, None], objects[:, 1:]], dim=1)
         parts = [
             torch.split(tensor, self.counts)
             for tensor in (
@@ -88,9 +87,9 @@ class Gaussians:
                 torch.nn.functional.normalize(self.quats, dim=-1),
                 self.log_scales.exp(),
                 self.logits.sigmoid(),
-                sh,
             )
         ]
+        parts.append((background, *objects.split(self.counts[1:])))
         clouds = [GaussianCloud(*columns) for columns in zip(*parts, strict=True)]
         for index, flip in enumerate(mirrored):
             if flip:
