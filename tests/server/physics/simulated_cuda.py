@@ -11,6 +11,7 @@ import json
 import math
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,8 @@ from unittest import mock
 os.environ["NUMBA_ENABLE_CUDASIM"] = "1"
 
 import numpy as np
+from numba.cuda.simulator.kernelapi import FakeCUDAShared
+from numba.np.numpy_support import as_dtype
 
 from real2sim_server.physics import (
     Body,
@@ -42,6 +45,25 @@ from .scenes import at
 
 # The simulator's host thread polls; with long slices it would keep the device's threads waiting.
 sys.setswitchinterval(2e-5)
+
+_allocating = threading.Lock()
+
+
+def shared_array(shared: FakeCUDAShared, shape: tuple[int, ...], dtype: Any) -> Any:
+    """What ``cuda.shared.array`` stands for: one array for all threads of a block.
+
+    The simulator's own looks for it and makes it in two steps, so that of two threads that come at
+    once each may get an array of its own, and their sums are lost to each other.
+    """
+    caller = sys._getframe(1)
+    where = caller.f_code.co_filename, caller.f_lineno
+    with _allocating:
+        if where not in shared._allocations:
+            shared._allocations[where] = np.empty(shape, as_dtype(dtype))
+        return shared._allocations[where]
+
+
+FakeCUDAShared.array = shared_array
 
 STATE = ("positions", "velocities", "gradients", "F_elastic", "F_total", "history")
 DT = 5e-4
