@@ -59,8 +59,8 @@ def vacated(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]
     )
 
 
-def uncovered(scene: Scene, background: GaussianCloud, vacated: Iterable[str]) -> GaussianCloud:
-    """The background with the ground at the places of ``vacated`` coloured like that around them.
+def uncovered(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
+    """The background with the ground coloured like that around it where objects ``left`` stood.
 
     Gaussians inside a box and above its ground become invisible: they belonged to the object.
 
@@ -68,7 +68,7 @@ def uncovered(scene: Scene, background: GaussianCloud, vacated: Iterable[str]) -
         UnknownObjectError: ``scene`` has no such object.
     """
     opacities, sh = background.opacities.clone(), background.sh.clone()
-    for object_id in vacated:
+    for object_id in left:
         parked = scene.object(object_id)
         track = parked.trajectory
         T_world_box = track.transform((track.start_us + track.end_us) // 2)

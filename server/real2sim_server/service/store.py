@@ -116,7 +116,7 @@ class Store:
         )
         return counts[-1] > 0
 
-    async def append_scenario_entry(
+    def record_revision(
         self,
         scenario_id: str,
         revision: int,
@@ -125,7 +125,8 @@ class Store:
         created_us: int,
         reply: StoredReply | None = None,
     ) -> None:
-        """Append one revision, and in the same transaction the answer to the request for it.
+        """Append one revision, and in the same transaction the answer to the request for it; on the
+        calling thread, never on the event loop.
 
         Args:
             scenario_id: of the scenario.
@@ -137,20 +138,6 @@ class Store:
         Raises:
             ConflictError: the revision exists, or the scenario does not.
         """
-        await self._run(
-            self.record_revision, scenario_id, revision, entry, created_us=created_us, reply=reply
-        )
-
-    def record_revision(
-        self,
-        scenario_id: str,
-        revision: int,
-        entry: Mapping[str, Any],
-        *,
-        created_us: int,
-        reply: StoredReply | None = None,
-    ) -> None:
-        """Like :meth:`append_scenario_entry`, on the calling thread; never on the event loop."""
         row = _log_row(scenario_id, revision, entry, created_us)
         self._written([_added(t.scenario_log, row), *_keep(reply)])
 

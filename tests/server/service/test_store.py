@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import sqlite3
 from dataclasses import replace
 
 import pytest
+import sqlalchemy as sa
 
 from real2sim_proto.jobs import JobInfo, JobState
+from real2sim_server.service import tables
 from real2sim_server.service.job_log import JobLog
 from real2sim_server.service.store import (
     ConflictError,
@@ -17,6 +20,7 @@ from real2sim_server.service.store import (
     Store,
     StoredReply,
     StoreError,
+    Write,
     now_us,
 )
 
@@ -62,8 +66,8 @@ def entry(text: str) -> dict:
 def test_a_scenario_and_its_log_survive_closing(url):
     async def write(store):
         await store.create_scenario(SCENARIO)
-        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
-        await store.append_scenario_entry("sc_1", 2, entry("b"), created_us=2)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1)
+        store.record_revision("sc_1", 2, entry("b"), created_us=2)
 
     async def read(store):
         return await store.scenario("sc_1"), await store.scenario_entries("sc_1")
@@ -75,9 +79,9 @@ def test_a_scenario_and_its_log_survive_closing(url):
 def test_a_revision_can_be_written_only_once(url):
     async def write(store):
         await store.create_scenario(SCENARIO)
-        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1)
         with pytest.raises(ConflictError):
-            await store.append_scenario_entry("sc_1", 1, entry("b"), created_us=1)
+            store.record_revision("sc_1", 1, entry("b"), created_us=1)
         return await store.scenario_entries("sc_1")
 
     assert run(url, write) == [entry("a")]
@@ -86,7 +90,7 @@ def test_a_revision_can_be_written_only_once(url):
 def test_an_entry_without_its_scenario_is_refused(url):
     async def write(store):
         with pytest.raises(ConflictError):
-            await store.append_scenario_entry("sc_9", 1, entry("a"), created_us=1)
+            store.record_revision("sc_9", 1, entry("a"), created_us=1)
 
     run(url, write)
 
@@ -94,7 +98,7 @@ def test_an_entry_without_its_scenario_is_refused(url):
 def test_deleting_a_scenario_takes_its_log_along(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
-        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1)
         assert await store.delete_scenario("sc_1") is True
         assert await store.delete_scenario("sc_1") is False
         return await store.scenarios(), await store.scenario_kinds()
@@ -136,10 +140,10 @@ def test_scenarios_are_listed_oldest_first(url):
 def test_a_reply_is_stored_with_its_effect_or_not_at_all(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
-        await store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1, reply=REPLY)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1, reply=REPLY)
         other = replace(REPLY, key="other")
         with pytest.raises(ConflictError):
-            await store.append_scenario_entry("sc_1", 1, entry("b"), created_us=1, reply=other)
+            store.record_revision("sc_1", 1, entry("b"), created_us=1, reply=other)
         return await store.reply("key"), await store.reply("other")
 
     assert run(url, work) == (REPLY, None)
@@ -231,8 +235,9 @@ def test_a_password_in_the_url_is_not_shown():
 def test_what_was_handed_over_is_written_although_the_caller_was_cancelled(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
-        append = store.append_scenario_entry("sc_1", 1, entry("a"), created_us=1)
-        task = asyncio.create_task(append)
+        row = {"scenario_id": "sc_1", "revision": 1, "kind": "edit", "created_us": 1}
+        row["entry"] = json.dumps(entry("a"))
+        task = asyncio.create_task(store.write(Write(sa.insert(tables.scenario_log), [row])))
         await asyncio.sleep(0)
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
