@@ -32,6 +32,11 @@ def connect(url: str) -> sa.Engine:
     return engine
 
 
+def is_local(engine: sa.Engine) -> bool:
+    """Whether the database is a file of this machine: a connection to it is never lost."""
+    return engine.dialect.name == "sqlite" and not isinstance(engine.pool, StaticPool)
+
+
 def _set_up_sqlite(connection: Any, _record: object) -> None:
     cursor = connection.cursor()
     # NORMAL loses no committed transaction when the process dies, only when the machine does.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import json
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any, ParamSpec, TypeVar
@@ -15,7 +17,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from . import tables as t
-from .database import StoreError, connect, prepare_schema, shown_url
+from .database import StoreError, connect, is_local, prepare_schema, shown_url
 from .rows import ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
 
 __all__ = [
@@ -66,6 +68,7 @@ class Store:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="store")
         self._writing = threading.Lock()
         self._engine: sa.Engine | None = None
+        self._writer: sa.Connection | None = None
 
     async def open(self) -> None:
         """Connect and create what is missing.
@@ -218,7 +221,7 @@ class Store:
 
     def record(self, session_id: str, entries: Sequence[SessionEntry]) -> None:
         """Like :meth:`append_session_entries`, on the calling thread; never on the event loop."""
-        rows = [{"session_id": session_id} | asdict(entry) for entry in entries]
+        rows = [{"session_id": session_id} | vars(entry) for entry in entries]
         if rows:
             self._written([_added(t.session_log, *rows)])
 
@@ -278,12 +281,22 @@ class Store:
     def _written(self, changes: Sequence[Write]) -> list[int]:
         try:
             # SQLite lets those who find it locked sleep and try again; they had better queue here.
-            with self._writing, self._connected().begin() as connection:
+            with self._writing, self._transaction() as connection:
                 return [connection.execute(c.statement, c.rows).rowcount for c in changes]
         except DBAPIError as error:
             if _is_conflict(error):
                 raise ConflictError(f"not stored: {error.orig}") from error
             raise
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[sa.Connection]:
+        """A transaction of its own, committed at the end; for whoever holds the lock of writers."""
+        if self._writer is None:
+            with self._connected().begin() as connection:
+                yield connection
+        else:
+            with self._writer.begin():
+                yield self._writer
 
     def _connected(self) -> sa.Engine:
         if self._engine is None:
@@ -296,11 +309,17 @@ class Store:
             with self._engine.begin() as connection:
                 prepare_schema(connection)
                 connection.execute(_delete_old_replies())
+            if is_local(self._engine):
+                # Fetching a connection from the pool and giving it back takes as long as an append.
+                self._writer = self._engine.connect()
         except (sa.exc.SQLAlchemyError, OSError) as error:
             reason = getattr(error, "orig", None) or error
             raise StoreError(f"cannot open the store {shown_url(self.url)!r}: {reason}") from error
 
     def _close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
         if self._engine is not None:
             self._engine.dispose()
             self._engine = None
@@ -341,7 +360,13 @@ def _log_row(
 
 
 def _added(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
-    return Write(sa.insert(table), [dict(row) for row in rows])
+    return Write(_insert(table), [dict(row) for row in rows])
+
+
+@functools.cache
+def _insert(table: sa.Table) -> sa.Insert:
+    """One statement for all rows of a table: to recognise a new one as known takes longer."""
+    return sa.insert(table)
 
 
 def _keep(reply: StoredReply | None) -> list[Write]:
