@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
+
 # Machines under load are slow now and then, and a failure must come back on the next run.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")

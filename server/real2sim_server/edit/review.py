@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from real2sim_proto.scenarios import EditWarning
 
 from ..scene import Trajectory
-from ..scene.box import box_corners, boxes_overlap
+from ..scene.box import box_corners
+from ..scene.box_kernels import first_overlap
 from .state import ObjectState, ScenarioState
 from .tracks import Float, sample
 
@@ -61,20 +62,23 @@ def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> tuple[Float,
     return sample(trajectory, _sample_times(start_us, end_us))
 
 
+@lru_cache(maxsize=REMEMBERED)
 def _sample_times(start: int, end: int) -> NDArray[np.int64]:
     count = min(2 + (end - start) // SAMPLE_PERIOD_US, MAX_SAMPLES)
     steps = np.arange(count, dtype=object) * (end - start) // (count - 1)
-    return np.unique((start + steps).astype(np.int64))
+    times = np.unique((start + steps).astype(np.int64))
+    times.flags.writeable = False
+    return times
 
 
 def _overlaps(
     subject: ObjectState, state: ScenarioState, times: NDArray[np.int64], own: Float
 ) -> Iterator[EditWarning]:
-    others = list(_within_reach(subject, state, own))
-    if not others:
-        return
-    first = _first_overlaps(subject, others, times, own)
-    hit = {others[k].object_id: times[first[k]] * 1e-6 for k in np.flatnonzero(first < len(times))}
+    hit = {}
+    for other in _within_reach(subject, state, own):
+        first = _first_overlap(subject, other, times, own)
+        if first < len(times):
+            hit[other.object_id] = times[first] * 1e-6
     if hit:
         named = [f"{i!r} from t={t:.2f} s" for i, t in list(hit.items())[:NAMED_OVERLAPS]]
         more = f" and {len(hit) - len(named)} more" if len(hit) > len(named) else ""
@@ -85,34 +89,19 @@ def _overlaps(
         )
 
 
-def _first_overlaps(
-    subject: ObjectState, others: Sequence[ObjectState], times: NDArray[np.int64], own: Float
-) -> NDArray[np.intp]:
-    """Index [K] of the first of ``times`` at which each box overlaps; their number where none.
-
-    All pairs and times that need the full test go through it at once: for few of them numpy's
-    calls cost more than its arithmetic.
-    """
-    tracks = [_sampled(o.trajectory, int(times[0]), int(times[-1])) for o in others]
-    theirs = np.stack([transforms for transforms, _ in tracks])
-    covered = np.stack([known for _, known in tracks])
-    sizes = np.array([o.scaled_size for o in others])
-    between = own[:, :3, 3] - theirs[..., :3, 3]
-    apart = np.einsum("kij,kij->ki", between, between)
-    reach = subject.radius + np.array([o.radius for o in others])
-    near = covered & (apart <= reach[:, None] ** 2)
-    # Where the spheres inside the boxes overlap the boxes do: later times need no test.
-    inside = (min(subject.scaled_size) + sizes.min(axis=1)) / 2
-    certain = covered & (apart < inside[:, None] ** 2)
-    near &= np.cumsum(certain, axis=1) - certain == 0
-    if subject.standing:
-        standing = np.array([o.standing for o in others])
-        near &= ~standing[:, None] | (np.cumsum(near, axis=1) == 1)
-    which, when = np.nonzero(near)
-    overlapping = boxes_overlap(own[when], subject.scaled_size, theirs[which, when], sizes[which])
-    first = np.full(len(others), len(times))
-    np.minimum.at(first, which[overlapping], when[overlapping])
-    return first
+def _first_overlap(
+    subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
+) -> int:
+    """Index of the first of ``times`` at which the boxes overlap; their number where none."""
+    theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
+    found: int = first_overlap(
+        (own, theirs),
+        (subject.scaled_size, other.scaled_size),
+        covered,
+        subject.radius + other.radius,
+        subject.standing and other.standing,
+    )
+    return found
 
 
 def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
@@ -120,7 +109,7 @@ def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Ite
     others = [o for o in state.objects.values() if not o.deleted and o is not subject]
     if not others:
         return
-    bounds = np.stack([o.bounds for o in others])
+    bounds = np.array([o.bounds for o in others])
     at, radius = own[:, :3, 3], subject.radius
     low, high = at.min(axis=0) - radius, at.max(axis=0) + radius
     apart = (bounds[:, 0] > high) | (bounds[:, 1] < low)

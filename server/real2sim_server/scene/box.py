@@ -1,9 +1,9 @@
-"""Oriented boxes: corners and overlap."""
+"""Oriented boxes: corners and depth of overlap."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .rotation import Float, apply_transform
 
@@ -29,35 +29,18 @@ def box_corners(T_world_box: ArrayLike, size: ArrayLike) -> Float:
     return apply_transform(T_world_box, local)
 
 
-def boxes_overlap(
-    T_world_a: ArrayLike, size_a: ArrayLike, T_world_b: ArrayLike, size_b: ArrayLike
-) -> NDArray[np.bool_]:
-    """Whether boxes share volume, [...] bool; boxes that only touch do not.
-
-    Separating-axis test over the 15 candidate axes (Gottschalk et al. 1996, OBBTree). Leading
-    dimensions broadcast, so one box can be tested against many.
-
-    Args:
-        T_world_a, T_world_b: [..., 4, 4] rigid transforms to the world; origin at the box centre.
-        size_a, size_b: [..., 3] (length, width, height) [m].
-    """
-    turn, centre, half_a, half_b = _relative(T_world_a, size_a, T_world_b, size_b)
-    overlap = np.asarray(_face_overlaps(turn, centre, half_a, half_b) > 1e-9)
-    # Face normals tell most boxes apart; the other nine axes are for what is left.
-    left = overlap.copy()
-    half_a = np.broadcast_to(half_a, (*overlap.shape, 3, 1))[left]
-    half_b = np.broadcast_to(half_b, (*overlap.shape, 1, 3))[left]
-    overlap[left] = _edge_overlaps(turn[left], centre[left], half_a, half_b) > 1e-9
-    return overlap
-
-
 def box_penetration(
     T_world_a: ArrayLike, size_a: ArrayLike, T_world_b: ArrayLike, size_b: ArrayLike
 ) -> Float:
     """Shortest distance [...] [m] to shift one box so that the two no longer overlap.
 
     Negative where they are apart; then it is a lower bound of the distance between them, with
-    the sign turned. Arguments as in :func:`boxes_overlap`.
+    the sign turned. Separating-axis test over the 15 candidate axes (Gottschalk et al. 1996,
+    OBBTree). Leading dimensions broadcast, so one box can be tested against many.
+
+    Args:
+        T_world_a, T_world_b: [..., 4, 4] rigid transforms to the world; origin at the box centre.
+        size_a, size_b: [..., 3] (length, width, height) [m].
     """
     turn, centre, half_a, half_b = _relative(T_world_a, size_a, T_world_b, size_b)
     faces = _face_overlaps(turn, centre, half_a, half_b)

@@ -19,6 +19,7 @@ from real2sim_proto.scenes import DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
 from ..settings import Settings
+from ..world import warm_up
 from .assets import AssetLibrary
 from .engine import Engine
 from .idempotency import Idempotency
@@ -169,6 +170,7 @@ class Worker:
         started = time.perf_counter()
         try:
             await self.pictures.warm_up()
+            await asyncio.to_thread(warm_up)
         except Exception as error:
             log.exception("warm-up failed")
             self.waiting_for = {f"warm-up failed: {error}"}

@@ -9,6 +9,7 @@ from .observation import Observation
 from .path import LoggedPath
 from .pilot import Plan
 from .scoring import Score, metrics_version
+from .warming import warm_up
 from .world import World
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "WorldError",
     "agent_fields",
     "metrics_version",
+    "warm_up",
 ]

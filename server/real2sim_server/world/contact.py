@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from ..scene.box import boxes_overlap
+from ..scene.box_kernels import boxes_overlap
 from .agents import Agents
+from .contact_kernels import shifted, within_reach
 from .path import Float
 
 REAR_OVERHANG = 0.95
@@ -31,8 +30,7 @@ class Contact:
 def ego_box(T_world_vehicle: Float, size: tuple[float, float, float]) -> Float:
     """``T_world_box`` [4, 4] of the ego box, whose bottom is on the ground."""
     length, _, height = size
-    T_world_box = T_world_vehicle.copy()
-    T_world_box[:3, 3] += T_world_vehicle[:3, :3] @ [length / 2 - REAR_OVERHANG, 0.0, height / 2]
+    T_world_box: Float = shifted(T_world_vehicle, length / 2 - REAR_OVERHANG, height / 2)
     return T_world_box
 
 
@@ -40,11 +38,6 @@ def touching(T_world_box: Float, size: tuple[float, float, float], agents: Agent
     """Places in ``agents`` of the objects whose boxes overlap the ego box."""
     if not agents.objects:
         return []
-    sizes = agents.sizes
-    reach = np.sqrt(np.sum(sizes * sizes, axis=1)) / 2
-    local = np.abs((agents.positions - T_world_box[:3, 3]) @ T_world_box[:3, :3])
-    near = np.flatnonzero((local < np.array(size) / 2 + reach[:, None]).all(axis=1))
-    if not len(near):
-        return []
-    hit = boxes_overlap(T_world_box, size, agents.transforms[near], sizes[near])
-    return [int(i) for i in near[hit]]
+    transforms, sizes = agents.transforms, agents.sizes
+    near = within_reach(T_world_box, size, transforms, sizes).tolist()
+    return [k for k in near if boxes_overlap(T_world_box, size, transforms[k], sizes[k])]

@@ -9,9 +9,9 @@ from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit.tracks import sample
 from ..scene import Scene
-from ..scene.rotation import quaternion_yaw
 from .agents import Agents
 from .contact import REAR_OVERHANG
+from .contact_kernels import headings
 from .ego import Motion, logged_motion
 from .episode import Clock
 from .path import LoggedPath, PathPoint
@@ -87,12 +87,12 @@ def ego_sample(motion: Motion, near: PathPoint, z: float) -> EgoSample:
 def others_of(agents: Agents) -> Others:
     """Objects for the scores."""
     return Others(
-        ids=tuple(o.object_id for o in agents.objects),
-        categories=tuple(o.category for o in agents.objects),
+        ids=tuple([o.object_id for o in agents.objects]),
+        categories=tuple([o.category for o in agents.objects]),
         centres=agents.positions,
-        yaws=quaternion_yaw(agents.quaternions),
+        yaws=headings(agents.quaternions),
         sizes=agents.sizes,
-        velocities=agents.velocities[:, :2],
+        velocities=np.ascontiguousarray(agents.velocities[:, :2]),
     )
 
 

@@ -15,6 +15,7 @@ from ..scene.rotation import quaternion_yaw
 from .actuators import Command
 from .agents import Agents
 from .contact import Contact, ego_box, touching
+from .contact_kernels import may_overlap
 from .ego import Motion
 from .impact import Bout, Impact, Outcome, Wreck, ego_body, ego_solid, resolve
 from .obstacles import Obstacles
@@ -46,21 +47,16 @@ def may_meet(
     if not agents.objects:
         return False
     cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
-    dx, dy = agents.positions[:, 0] - motion.x, agents.positions[:, 1] - motion.y
-    vx, vy = agents.velocities[:, 0], agents.velocities[:, 1]
-    along = np.abs(dx * cos + dy * sin - centre_ahead)
-    aside = np.abs(dy * cos - dx * sin)
-    speed = math.hypot(motion.speed, motion.lateral_speed)
-    turned = quaternion_yaw(agents.quaternions) - motion.yaw
-    c, s = np.abs(np.cos(turned)), np.abs(np.sin(turned))
-    half = agents.sizes[:, :2] / 2
-    # The ego may turn, brake or speed up within the step.
-    drift = dt * (0.15 * speed + abs(motion.lateral_speed) + abs(motion.yaw_rate) * ego_size[0])
-    slack_along = dt * (speed + np.abs(vx * cos + vy * sin) + 2.0) + 0.3
-    slack_aside = drift + dt * np.abs(vy * cos - vx * sin) + 0.3
-    near = along < ego_size[0] / 2 + half[:, 0] * c + half[:, 1] * s + slack_along
-    near &= aside < ego_size[1] / 2 + half[:, 0] * s + half[:, 1] * c + slack_aside
-    return bool(near.any())
+    ego = (
+        motion.x + centre_ahead * cos,
+        motion.y + centre_ahead * sin,
+        motion.yaw,
+        motion.speed,
+        motion.lateral_speed,
+        motion.yaw_rate,
+    )
+    boxes = (agents.positions, agents.quaternions, agents.velocities, agents.sizes)
+    return bool(may_overlap(ego, ego_size[:2], dt, *boxes))
 
 
 def run_bout(
@@ -146,13 +142,13 @@ def met(
     """
     T_world_box = ego_box(T_world_vehicle, ego_size)
     rows = touching(T_world_box, ego_size, agents)
-    box = (*T_world_box[:2, 3].tolist(), motion.yaw, *ego_size[:2])
     names = [agents.objects[k].object_id for k in rows]
-    velocity = T_world_vehicle[:3, :2] @ [motion.speed, motion.lateral_speed]
     contacts, notes = [], []
     for k, name in zip(rows, names, strict=True):
         if name in before:
             continue
+        box = (*T_world_box[:2, 3].tolist(), motion.yaw, *ego_size[:2])
+        velocity = T_world_vehicle[:3, :2] @ [motion.speed, motion.lateral_speed]
         relative = velocity - agents.velocities[k]
         speed = float(np.sqrt(relative @ relative))
         contacts.append(Contact(name, speed))

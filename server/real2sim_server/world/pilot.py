@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, assert_never
@@ -167,12 +168,11 @@ class Pilot:
     def _controller(self, plan: Plan, motion: Motion, t_us: int) -> Controller:
         match plan:
             case TrajectoryPlan():
-                ahead = [k for k, t in enumerate(plan.times_us) if t > t_us]
-                if not ahead:
+                over = bisect_right(plan.times_us, t_us)
+                if over == len(plan.times_us):
                     # All of it is over by the time it takes effect: stop where it ends.
                     return self._tracker(motion, t_us, [t_us + 1], [plan.poses[-1]])
-                times = [plan.times_us[k] for k in ahead]
-                return self._tracker(motion, t_us, times, [plan.poses[k] for k in ahead])
+                return self._tracker(motion, t_us, plan.times_us[over:], plan.poses[over:])
             case Control():
                 return Hold(Command(plan.acceleration, plan.steering), self.spec.ego)
             case PoseCommand():

@@ -296,7 +296,7 @@ def _row(instant: Instant, found: str) -> dict[str, Any]:
         "centres": others.centres,
         "yaws": others.yaws,
         "sizes": others.sizes,
-        "velocities": np.ascontiguousarray(others.velocities),
+        "velocities": others.velocities,
         "contacts": [asdict(c) | {"impulse": list(c.impulse)} for c in instant.contacts],
         "secondary": instant.secondary,
         "digest": found,
@@ -319,10 +319,11 @@ def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
         others=Others(
             ids=tuple(row["ids"]),
             categories=tuple(row["categories"]),
-            centres=row["centres"],
-            yaws=row["yaws"],
-            sizes=row["sizes"],
-            velocities=row["velocities"],
+            # Copies, since kernels are compiled anew for arrays that must not be written to.
+            centres=np.array(row["centres"]),
+            yaws=np.array(row["yaws"]),
+            sizes=np.array(row["sizes"]),
+            velocities=np.array(row["velocities"]),
         ),
         contacts=tuple(
             ContactNote(**c | {"impulse": (c["impulse"][0], c["impulse"][1])})

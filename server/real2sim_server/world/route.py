@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
-
 from .path import Float, LoggedPath
+from .path_kernels import turn_between, waypoints
 
 Command = Literal["straight", "left", "right"]
 
@@ -31,22 +30,13 @@ def route_ahead(path: LoggedPath, s: float, x: float, y: float, yaw: float) -> F
         s: where the vehicle is along it [m].
         x, y, yaw: vehicle in the world [m], [rad].
     """
-    at = s + WAYPOINT_SPACING * np.arange(1, WAYPOINTS + 1)
-    east = np.interp(at, path.s, path.positions[:, 0])
-    north = np.interp(at, path.s, path.positions[:, 1])
-    beyond = np.maximum(at - path.length, 0.0)
-    last = path.yaws[-1]
-    dx = east + beyond * np.cos(last) - x
-    dy = north + beyond * np.sin(last) - y
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1)
+    found: Float = waypoints(path.knots, s, (x, y, yaw), WAYPOINTS, WAYPOINT_SPACING)
+    return found
 
 
 def command_ahead(path: LoggedPath, s: float) -> Command:
     """Which way the path turns over the next 25 m."""
-    here, there = np.interp([s, s + COMMAND_AHEAD], path.s, path.yaws)
-    if there - here > TURN:
+    turn = turn_between(path.knots, s, s + COMMAND_AHEAD)
+    if turn > TURN:
         return "left"
-    if there - here < -TURN:
-        return "right"
-    return "straight"
+    return "right" if turn < -TURN else "straight"

@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linprog
 
-from real2sim_server.scene.box import box_corners, box_penetration, boxes_overlap
+from real2sim_server.scene.box import box_corners, box_penetration
+from real2sim_server.scene.box_kernels import boxes_overlap
 from real2sim_server.scene.rotation import transform_from, yaw_quaternion
 
 sizes = arrays(np.float64, 3, elements=st.floats(0.1, 5))
@@ -14,6 +15,8 @@ poses = st.builds(
     arrays(np.float64, 3, elements=st.floats(-4, 4)),
     arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
+
+CUBE = np.full(3, 2.0)
 
 
 def overlap_by_linear_program(pose_a, size_a, pose_b, size_b) -> bool:
@@ -66,8 +69,8 @@ def test_a_box_overlaps_itself(pose, size):
 
 def test_boxes_that_only_touch_do_not_overlap():
     beside = transform_from([2.0, 0, 0], [1.0, 0, 0, 0])
-    assert not boxes_overlap(np.eye(4), (2, 2, 2), beside, (2, 2, 2))
-    assert boxes_overlap(np.eye(4), (2.001, 2, 2), beside, (2, 2, 2))
+    assert not boxes_overlap(np.eye(4), CUBE, beside, CUBE)
+    assert boxes_overlap(np.eye(4), np.array([2.001, 2, 2]), beside, CUBE)
 
 
 def test_penetration_is_the_depth_along_the_shallowest_axis():
@@ -81,12 +84,27 @@ def test_edges_that_cross_without_faces_meeting_are_apart():
     other = transform_from(
         [0, 0, 2 * np.sqrt(2) + 0.01], [np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]
     )
-    assert not boxes_overlap(tilted, (2, 2, 2), other, (2, 2, 2))
+    assert not boxes_overlap(tilted, CUBE, other, CUBE)
     other[2, 3] -= 0.02
-    assert boxes_overlap(tilted, (2, 2, 2), other, (2, 2, 2))
+    assert boxes_overlap(tilted, CUBE, other, CUBE)
 
 
 def test_one_box_against_many():
     many = np.stack([transform_from([x, 0, 0], [1.0, 0, 0, 0]) for x in (0.0, 1.5, 2.5, -9)])
-    answer = boxes_overlap(np.eye(4), (2, 2, 2), many, np.full((4, 3), 2.0))
-    assert answer.tolist() == [True, True, False, False]
+    depths = box_penetration(np.eye(4), (2, 2, 2), many, np.full((4, 3), 2.0))
+    np.testing.assert_allclose(depths[:3], [2.0, 0.5, -0.5])
+    assert depths[3] < 0
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_boxes_overlap_where_they_reach_into_each_other(flat):
+    rng = np.random.default_rng(3)
+    quaternions = rng.normal(size=(2, 400, 4))
+    if flat:
+        quaternions[..., 1:3] = 0.0
+    poses = transform_from(rng.normal(scale=1.5, size=(2, 400, 3)), quaternions)
+    sizes = rng.uniform(0.2, 4.0, size=(2, 400, 3))
+    deep = box_penetration(poses[0], sizes[0], poses[1], sizes[1]) > 0
+    assert 0.1 < deep.mean() < 0.9
+    pairs = zip(poses[0], sizes[0], poses[1], sizes[1], strict=True)
+    assert [boxes_overlap(*pair) for pair in pairs] == deep.tolist()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from real2sim_server.scene import Trajectory
@@ -34,6 +34,7 @@ def slope(*, pitch: float, roll: float) -> Trajectory:
     return along(positions, np.tile(attitude, (30, 1)))
 
 
+@settings(deadline=None)
 @given(s=st.floats(0.5, 28), offset=st.floats(-8, 8))
 def test_nearest_finds_distance_and_side(s, offset):
     path = LoggedPath(circle(20.0, 1.5))
@@ -94,6 +95,7 @@ def test_far_from_the_path_the_plane_is_not_extended():
     assert far == pytest.approx(near)
 
 
+@settings(deadline=None)
 @given(yaw=st.floats(-3.1, 3.1))
 def test_a_vehicle_stands_upright_on_the_slope_with_its_heading(yaw):
     trajectory = slope(pitch=0.15, roll=-0.1)

@@ -1,87 +1,14 @@
-"""Boxes on the plane, many at a time."""
+"""How two boxes met."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..path import Float
-from .instant import EgoSample, Instant, Others, ScoringContext, Side
-
-AHEAD, BEHIND = math.radians(30), math.radians(150)
-"""Bearings within which an object counts as ahead, beyond which as behind (nuPlan)."""
+from .hazard_kernels import BEHIND
+from .instant import Side
 
 STOPPED = 5e-2
 """Speed at which a vehicle counts as stopped (nuPlan) [m/s]."""
-
-
-def ego_centre(ego: EgoSample, context: ScoringContext) -> Float:
-    """Centre [2] of the ego box [m]."""
-    ahead = context.centre_ahead
-    return np.array([ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)])
-
-
-def ego_corners(ego: EgoSample, context: ScoringContext) -> Float:
-    """Corners [4, 2] of the ego box [m]: front left, front right, rear right, rear left."""
-    length, width, _ = context.ego_size
-    u, v = length / 2, width / 2
-    local = np.array([[u, v], [u, -v], [-u, -v], [-u, v]])
-    cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
-    corners: Float = local @ np.array([[cos, sin], [-sin, cos]]) + ego_centre(ego, context)
-    return corners
-
-
-def on_level(instant: Instant, context: ScoringContext) -> NDArray[np.bool_]:
-    """Which objects stand on the ego's level, not on a bridge above it."""
-    others, bottom = instant.others, instant.ego.z
-    low = others.centres[:, 2] - others.sizes[:, 2] / 2
-    level: NDArray[np.bool_] = (low < bottom + context.ego_size[2]) & (
-        low + others.sizes[:, 2] > bottom
-    )
-    return level
-
-
-def bearings(ego: EgoSample, others: Others) -> Float:
-    """Angles [K] from the ego's heading to the centres of objects, seen from its rear axle."""
-    dx, dy = others.centres[:, 0] - ego.x, others.centres[:, 1] - ego.y
-    angles: Float = np.abs(np.remainder(np.arctan2(dy, dx) - ego.yaw + math.pi, math.tau) - math.pi)
-    return angles
-
-
-class MovingBoxes(NamedTuple):
-    """K boxes over T times: centres [K, T, 2] [m], yaws [K] [rad], sizes [K, 2] [m]."""
-
-    centres: Float
-    yaws: Float
-    sizes: Float
-
-
-def overlap(
-    centres: Float, yaw: float, size: tuple[float, float], others: MovingBoxes
-) -> NDArray[np.bool_]:
-    """Whether one box over T times overlaps others on the plane, [K, T]: separating axes.
-
-    Args:
-        centres: [T, 2] of the box [m].
-        yaw: of it [rad].
-        size: its length and width [m].
-        others: at the same times.
-    """
-    d = others.centres - centres
-    cos_a, sin_a = math.cos(yaw), math.sin(yaw)
-    cos_b, sin_b = np.cos(others.yaws)[:, None], np.sin(others.yaws)[:, None]
-    turn = others.yaws - yaw
-    c, s = np.abs(np.cos(turn))[:, None], np.abs(np.sin(turn))[:, None]
-    (la, wa), lb, wb = size, others.sizes[:, :1], others.sizes[:, 1:2]
-    along_a = np.abs(d[..., 0] * cos_a + d[..., 1] * sin_a) < (la + lb * c + wb * s) / 2
-    across_a = np.abs(d[..., 1] * cos_a - d[..., 0] * sin_a) < (wa + lb * s + wb * c) / 2
-    along_b = np.abs(d[..., 0] * cos_b + d[..., 1] * sin_b) < (lb + la * c + wa * s) / 2
-    across_b = np.abs(d[..., 1] * cos_b - d[..., 0] * sin_b) < (wb + la * s + wa * c) / 2
-    hit: NDArray[np.bool_] = along_a & across_a & along_b & across_b
-    return hit
 
 
 def side_of_contact(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import savgol_coeffs
 
 from ..path import Float
+from .comfort_kernels import derivatives, plans_alike, slid
 from .instant import PlanNote
 
 WINDOW_S = 1.5
@@ -23,12 +24,6 @@ LON_JERK = 4.13
 YAW_RATE = 0.95
 YAW_ACCELERATION = 1.93
 """Bounds of nuPlan and NAVSIM [m/s^2], [m/s^3], [rad/s], [rad/s^2]."""
-
-PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
-"""Greatest RMS difference of successive plans in acceleration, jerk, yaw rate, yaw acceleration
-(NAVSIM v2, extended comfort)."""
-
-PLAN_STEP = 0.1
 
 
 class Felt(NamedTuple):
@@ -55,7 +50,7 @@ class Felt(NamedTuple):
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ride:
     """Comfort of a drive so far.
 
@@ -63,22 +58,22 @@ class Ride:
     middle of that window; so the first and last 0.75 s of a drive are not judged.
 
     Attributes:
-        samples: speed [m/s] and continuous yaw [rad] of the last 1.5 s.
+        samples: [n, 2] float64, speed [m/s] and continuous yaw [rad] of the last 1.5 s.
         comfortable: whether all bounds held so far.
         worst: greatest magnitudes so far, in the order of :class:`Felt`.
     """
 
-    samples: tuple[tuple[float, float], ...] = ()
+    samples: Float = field(default_factory=lambda: np.zeros((0, 2)))
     comfortable: bool = True
     worst: tuple[float, ...] = (0.0,) * 6
 
     def after(self, speed: float, yaw: float, dt: float) -> Ride:
         """The ride after one more clock step."""
         window = window_of(dt)
-        samples = (*self.samples, (speed, yaw))[-window:]
+        samples = slid(self.samples, speed, yaw, window)
         if len(samples) < window:
             return Ride(samples, self.comfortable, self.worst)
-        felt = felt_in(np.array(samples), dt)
+        felt = felt_in(samples, dt)
         worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, felt, strict=True))
         return Ride(samples, self.comfortable and felt.comfortable, worst)
 
@@ -98,10 +93,9 @@ def _coefficients(window: int, dt: float) -> Float:
 
 def felt_in(samples: Float, dt: float) -> Felt:
     """What is felt in the middle of samples [W, 2] of speed and yaw."""
-    (speed, yaw), (acceleration, rate), (lon_jerk, yaw_acceleration) = (
-        _coefficients(len(samples), dt) @ samples
-    ).tolist()
-    del yaw
+    speed, acceleration, lon_jerk, rate, yaw_acceleration = derivatives(
+        _coefficients(len(samples), dt), samples
+    )
     lateral = speed * rate
     # d/dt of the lateral acceleration v w, by the product rule.
     lat_jerk = acceleration * rate + speed * yaw_acceleration
@@ -115,25 +109,5 @@ def plans_agree(before: PlanNote, now: PlanNote) -> bool | None:
     RMS differences of acceleration, jerk, yaw rate and yaw acceleration over the overlap, by
     finite differences of the plans in steps of 0.1 s. None where they overlap for less than 0.5 s.
     """
-    first = max(before.times_us[0], now.times_us[0])
-    last = min(before.times_us[-1], now.times_us[-1])
-    count = int((last - first) * 1e-6 / PLAN_STEP + 1e-6) + 1
-    if count < 6:
-        return None
-    at = first * 1e-6 + PLAN_STEP * np.arange(count)
-    # [2, 3, count]: x, y, yaw of both plans; their rates [2, 3, count - 1].
-    poses = np.stack([before.sampled(at), now.sampled(at)])
-    rates = (poses[..., 1:] - poses[..., :-1]) / PLAN_STEP
-    speeds = np.sqrt(rates[:, 0] * rates[:, 0] + rates[:, 1] * rates[:, 1])
-    # Differences of derivatives are derivatives of differences.
-    speed, yaw_rate = speeds[0] - speeds[1], rates[0, 2] - rates[1, 2]
-    acceleration, yaw_acceleration = _slopes(speed), _slopes(yaw_rate)
-    unlike = (acceleration, _slopes(acceleration), yaw_rate, yaw_acceleration)
-    return all(
-        d.dot(d) <= len(d) * bound * bound for d, bound in zip(unlike, PLAN_BOUNDS, strict=True)
-    )
-
-
-def _slopes(values: Float) -> Float:
-    slopes: Float = (values[1:] - values[:-1]) / PLAN_STEP
-    return slopes
+    alike: int = plans_alike(*before.arrays, *now.arrays)
+    return None if alike < 0 else bool(alike)

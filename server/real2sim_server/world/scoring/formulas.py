@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from .instant import ScoringContext
 from .tally import Tally, kind_of
@@ -20,16 +19,15 @@ CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
 NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """One score; the fields of the wire's Score."""
 
     name: str
     version: str
     value: float | None
-    terms: dict[str, float] = field(default_factory=dict)
-    assumed: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
+    terms: dict[str, float]
+    assumed: tuple[str, ...]
+    missing: tuple[str, ...]
 
     def fields(self) -> dict[str, Any]:
         """As a plain map."""
@@ -66,6 +64,8 @@ def no_collision(tally: Tally) -> float:
 def nuplan_no_collision(tally: Tally) -> float:
     """NC of nuPlan: product of max(0, 1 - n/(m + 1)) with m = 0 for road users and vehicles, 1
     for objects."""
+    if not tally.at_fault:
+        return 1.0
     allowed = {"vru": 0, "vehicle": 0, "object": 1}
     return math.prod(
         max(0.0, 1 - tally.at_fault.get(kind, 0) / (m + 1)) for kind, m in allowed.items()
@@ -196,7 +196,7 @@ def carla(tally: Tally, context: ScoringContext) -> Score:
     counts = {"vru": 0, "vehicle": 0, "object": 0}
     for category, n in tally.contacts.items():
         counts[kind_of(category)] += n
-    penalty = math.prod(CARLA_PENALTIES[kind] ** n for kind, n in counts.items())
+    penalty = math.prod([CARLA_PENALTIES[kind] ** n for kind, n in counts.items()])
     share = completed(tally, context)
     terms = {"RC": share, "P": penalty} | {k: float(n) for k, n in counts.items()}
     if tally.distance > 0:

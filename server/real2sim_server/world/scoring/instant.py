@@ -6,12 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
 
 from ..path import Float
+from .comfort_kernels import make_continuous
+from .road_kernels import DENSITY, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
 """How ego and object met, after nuPlan's collision types."""
@@ -19,8 +22,8 @@ Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
 VRU = frozenset({"pedestrian", "cyclist", "motorcycle", "bicycle", "person"})
 VEHICLES = frozenset({"car", "vehicle", "van", "truck", "bus", "trailer", "tram"})
 
-DENSITY = 0.25
-"""Distance between points of the lines that corridors are made of [m]."""
+Lines = tuple[Float, NDArray[np.int64]]
+"""Points [P, 2] [m] of lines, one line after another, and the end of each among them."""
 
 
 class EgoSample(NamedTuple):
@@ -91,22 +94,11 @@ class PlanNote:
     poses: tuple[tuple[float, float, float], ...]
 
     @cached_property
-    def _curves(self) -> tuple[Float, Float]:
-        """Times [N] [s] and poses [3, N], yaw continuous."""
-        poses = np.array(self.poses).T
-        turns = poses[2, 1:] - poses[2, :-1]
-        if (np.abs(turns) > math.pi).any():
-            poses[2] = np.unwrap(poses[2])
-        return np.array(self.times_us) * 1e-6, poses
-
-    def sampled(self, at: Float) -> Float:
-        """x, y [m] and continuous yaw [rad] at times ``at`` [T] [s] within the plan, [3, T]."""
-        times, poses = self._curves
-        after = np.minimum(np.maximum(times.searchsorted(at), 1), len(times) - 1)
-        before = after - 1
-        share = (at - times[before]) / (times[after] - times[before])
-        found: Float = poses[:, before] * (1 - share) + poses[:, after] * share
-        return found
+    def arrays(self) -> tuple[NDArray[np.int64], Float]:
+        """Times [N] int64 [us] and poses [N, 3] float64, yaw continuous."""
+        poses = np.fromiter(chain.from_iterable(self.poses), np.float64).reshape(-1, 3)
+        make_continuous(poses)
+        return np.array(self.times_us, dtype=np.int64), poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,22 +166,27 @@ class ScoringContext:
         return self.ego_size[0] / 2 - self.rear_overhang
 
     @cached_property
-    def route_tree(self) -> cKDTree:
+    def _route_points(self) -> Lines:
         """Points of the route; straight on beyond both ends."""
-        return cKDTree(_dense(_extended(self.route)))
+        return _lines([_extended(self.route)])
 
     @cached_property
-    def lane_tree(self) -> cKDTree | None:
-        """Points of the lanes; None where there are none."""
-        lines = [_dense(line) for line in self.lanes if len(line) > 1]
-        return cKDTree(np.vstack(lines)) if lines else None
+    def _lane_points(self) -> Lines:
+        return _lines([line for line in self.lanes if len(line) > 1])
 
-    def outside(self, points: Float) -> Float:
-        """How far points [N, 2] [m] are out of the corridor, [N] [m]; 0 and less within it."""
-        beyond: Float = self.route_tree.query(points)[0] - self.corridor
-        if self.lane_tree is not None and beyond.max() > 0:
-            beyond = np.minimum(beyond, self.lane_tree.query(points)[0] - self.lane)
-        return beyond
+    def off_road(self, ego: EgoSample) -> tuple[float, int]:
+        """How far the worst corner of the ego box is off the road [m], 0 and less on it; and how
+        many of its quarters, 0 to 4, have their middle on the road."""
+        ahead = self.centre_ahead
+        x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
+        beyond, quarters = off_road(
+            (x, y, ego.yaw),
+            self.ego_size,
+            self._route_points,
+            self._lane_points,
+            (self.corridor, self.lane),
+        )
+        return beyond, quarters
 
     def fields(self) -> dict[str, Any]:
         """Plain values, for a recording."""
@@ -215,6 +212,12 @@ class ScoringContext:
                 "ego_size": tuple(fields["ego_size"]),
             }
         )
+
+
+def _lines(lines: Sequence[Float]) -> Lines:
+    dense = [_dense(line) for line in lines]
+    ends = np.cumsum([len(line) for line in dense], dtype=np.int64)
+    return np.concatenate([np.zeros((0, 2)), *dense]), ends
 
 
 def _extended(line: Float, *, back: float = 10.0, on: float = 60.0) -> Float:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..path import Float
-from .boxes import ego_centre, ego_corners
 from .comfort import Ride, plans_agree
+from .comfort_kernels import summed
 from .hazard import NEVER, time_to_collision
 from .instant import VEHICLES, VRU, ContactNote, EgoSample, Instant, PlanNote, ScoringContext
 
@@ -45,7 +45,7 @@ class Tally:
         ttc: time to collision now [s].
         min_ttc: smallest so far [s].
         ride, ride_with_history: comfort; with the log before the start prepended.
-        backward: ways made along the route in the steps of the last second [m].
+        backward: [n] float64, ways made against the route in the steps of the last second [m].
         oncoming: longest way against the route within a second [m].
         lane_run: how long the offset has been too large [s].
         left_lane: whether it was so for 2 s.
@@ -74,7 +74,7 @@ class Tally:
     min_ttc: float = NEVER
     ride: Ride = field(default_factory=Ride)
     ride_with_history: Ride = field(default_factory=Ride)
-    backward: tuple[float, ...] = ()
+    backward: Float = field(default_factory=lambda: np.zeros(0))
     oncoming: float = 0.0
     lane_run: float = 0.0
     left_lane: bool = False
@@ -117,21 +117,18 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
     ego, dt = instant.ego, context.dt
     assert tally.ego is not None
     before = tally.ego
-    corners = ego_corners(ego, context)
-    quarters = (corners + ego_centre(ego, context)) / 2
-    outside = context.outside(np.concatenate([corners, quarters]))
-    beyond = float(outside[:4].max())
+    beyond, quarters = context.off_road(ego)
     off_road = beyond > 0
     off_lane = off_road or bool(_in_several_lanes(ego, context))
     tally = _with_contacts(tally, instant, off_lane)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=tally.hit)
     ride = tally.ride.after(ego.speed, ego.yaw, dt)
-    way = ego.s - before.s
-    backward = (*tally.backward, max(-way, 0.0))[-max(round(ONCOMING_WINDOW_S / dt), 1) :]
+    backward, oncoming = summed(
+        tally.backward, max(before.s - ego.s, 0.0), max(round(ONCOMING_WINDOW_S / dt), 1)
+    )
     lane_run = tally.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
     limit = context.speed_limit
-    return replace(
-        tally,
+    changes = dict(
         **_of_plans(tally, instant.plan),
         steps=tally.steps + 1,
         distance=tally.distance + math.hypot(ego.x - before.x, ego.y - before.y),
@@ -145,14 +142,16 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
         ride=ride,
         ride_with_history=tally.ride_with_history.after(ego.speed, ego.yaw, dt),
         backward=backward,
-        oncoming=max(tally.oncoming, sum(backward)),
+        oncoming=max(tally.oncoming, oncoming),
         lane_run=lane_run,
         left_lane=tally.left_lane or lane_run >= LANE_SECONDS - 1e-9,
         overspeed=tally.overspeed + (max(ego.speed - limit, 0.0) * dt if limit else 0.0),
-        hugsim=tally.hugsim + _hugsim_step(instant, outside[4:], ttc, ride),
+        hugsim=tally.hugsim + _hugsim_step(instant, quarters / 4, ttc, ride),
         infeasible=tally.infeasible or _infeasible(before, ego, dt),
         ego=ego,
     )
+    # What ``replace`` does, in a fraction of its time.
+    return Tally(**vars(tally) | changes)
 
 
 def _in_several_lanes(ego: EgoSample, context: ScoringContext) -> bool:
@@ -210,27 +209,20 @@ def kind_of(category: str) -> str:
 
 
 def _of_plans(tally: Tally, plan: PlanNote | None) -> dict[str, Any]:
-    """What a new plan changes."""
-    if plan is None:
-        return {}
-    agree = plans_agree(tally.plan, plan) if tally.plan is not None else None
-    if agree is None:
-        return {"plan": plan}
-    return {
-        "plan": plan,
-        "plans_compared": tally.plans_compared + 1,
-        "plans_disagree": tally.plans_disagree or not agree,
-    }
+    """The newest plan, and how successive ones compare so far."""
+    compared, disagree = tally.plans_compared, tally.plans_disagree
+    if plan is not None and tally.plan is not None:
+        agree = plans_agree(tally.plan, plan)
+        compared += agree is not None
+        disagree = disagree or agree is False
+    newest = plan if plan is not None else tally.plan
+    return {"plan": newest, "plans_compared": compared, "plans_disagree": disagree}
 
 
-def _hugsim_step(instant: Instant, quarters: Float, ttc: float, ride: Ride) -> float:
-    """HUGSIM's score of one step: NC DAC (5 TTC + 2 C) / 7.
-
-    ``quarters`` [4] [m]: how far the middles of the footprint's quarters are off the road.
-    """
+def _hugsim_step(instant: Instant, share: float, ttc: float, ride: Ride) -> float:
+    """HUGSIM's score of one step: NC DAC (5 TTC + 2 C) / 7; ``share`` of the ego is on the road."""
     if instant.contacts:
         return 0.0
-    share = np.count_nonzero(quarters <= 0) / len(quarters)
     drivable = 0.0 if share < 0.3 else 0.5 if share < 0.5 else 1.0
     safe = float(ttc > HUGSIM_TTC + 1e-9)
     return drivable * (5 * safe + 2 * float(ride.comfortable)) / 7
