@@ -34,8 +34,8 @@ def warm_up() -> None:
         poses = [(x + 0.1 * k, y, yaw) for k in range(1, 11)]
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
-    # An edit looks at how the car stands to all others.
-    world.apply([Translate(object_id="ahead", x=0.1)])
+    # An edit that brings the cars near each other, for only then their boxes are compared.
+    world.apply([Translate(object_id="ahead", x=-9.0)])
 
 
 def _street() -> Scene:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numba.core.dispatcher import Dispatcher
 from scipy.spatial import cKDTree
 
+from real2sim_proto.operations import Translate
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import track_kernels
 from real2sim_server.scene import box_kernels
@@ -292,7 +293,7 @@ def test_plans_are_alike_when_their_derivatives_are(seed, scale):
 # --- all of them ------------------------------------------------------------------------------
 
 
-def test_a_step_after_the_warm_up_compiles_nothing(make_world, moving):
+def test_steps_and_edits_after_the_warm_up_compile_nothing(make_world, moving):
     warm_up()
     modules = (
         box_kernels,
@@ -308,6 +309,7 @@ def test_a_step_after_the_warm_up_compiles_nothing(make_world, moving):
     world = make_world(
         car=moving(25, 0, z=0.8), aside=moving(12, 3, z=0.8, speed=3.0), spec={"privileged": True}
     )
+    assert world.apply([Translate(object_id="car", x=-11.0, y=2.0)]).warnings
     while not world.over:
         plan = TrajectoryPlan(times_us=[world.t_us + SECOND], poses=[(10.0, 0.0, 0.1)])
         world.step(plan)
