@@ -1,17 +1,12 @@
-"""Overlap of two oriented boxes in compiled code, for those who test pair after pair.
-
-All in this file, for Numba's disk cache knows a kernel's own file and no other.
-
-Without ``nogil``: a test takes less than a microsecond, and whoever gives up the interpreter's
-lock may have to wait milliseconds to get it back.
-"""
+"""Overlap of two oriented boxes in compiled code, for those who test pair after pair."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import njit
+
+from .compiled import compiled
 
 LEAST_OVERLAP = 1e-9
 """Boxes that overlap by no more than this only touch [m]."""
@@ -20,7 +15,7 @@ PARALLEL = 1e-6
 """Sine of the angle below which two edges span no axis of their own."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def boxes_overlap(T_world_a, size_a, T_world_b, size_b):
     """Whether two boxes share volume; boxes that only touch do not.
 
@@ -46,7 +41,7 @@ def boxes_overlap(T_world_a, size_a, T_world_b, size_b):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def first_overlap(ways, sizes, covered, reach, standing):
     """Number of the first of S samples at which two boxes on their ways share volume; S for none.
 
@@ -72,7 +67,7 @@ def first_overlap(ways, sizes, covered, reach, standing):
     return len(one)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _faces_overlap(turn, centre, half_a, half_b):
     """Whether two boxes overlap along the normals of the faces of both.
 
@@ -93,7 +88,7 @@ def _faces_overlap(turn, centre, half_a, half_b):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _edges_overlap(turn, centre, half_a, half_b):
     """Whether two boxes overlap along the products of an edge of each; see above.
 

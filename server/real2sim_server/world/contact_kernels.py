@@ -1,8 +1,4 @@
-"""Which boxes the ego box may overlap, now or within a step, in one call.
-
-Without ``nogil``: the work takes microseconds, and whoever gives up the interpreter's lock may
-have to wait milliseconds to get it back.
-"""
+"""Which boxes the ego box may overlap, now or within a step, in one call."""
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 from __future__ import annotations
@@ -10,10 +6,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from ..scene.compiled import compiled
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def shifted(transform, ahead, up):
     """A transform [4, 4] whose origin is moved ``ahead`` and ``up`` along its own axes [m]."""
     found = transform.copy()
@@ -22,7 +19,7 @@ def shifted(transform, ahead, up):
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def within_reach(T_world_box, size, transforms, sizes):
     """Numbers [H] int64 of the boxes whose enclosing ball meets that of one box, of K boxes.
 
@@ -47,7 +44,7 @@ def within_reach(T_world_box, size, transforms, sizes):
     return near[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
     """Whether a vehicle could touch one of K boxes within a step, by boxes along its heading.
 
@@ -79,7 +76,7 @@ def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def headings(quaternions):
     """Headings [K] [rad] of quaternions [K, 4] wxyz, as ``scene.rotation.quaternion_yaw``."""
     found = np.empty(len(quaternions))
@@ -88,7 +85,7 @@ def headings(quaternions):
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def heading(quaternion):
     """Heading [rad] in (-pi, pi] of a quaternion [4] wxyz."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]

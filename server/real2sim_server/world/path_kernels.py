@@ -1,8 +1,5 @@
 """Questions to a path, each answered in one call.
 
-Without ``nogil``: the work takes microseconds, and whoever gives up the interpreter's lock may
-have to wait milliseconds to get it back.
-
 All take the path as ``knots`` [P, 11] float64, one row a pose: its distance from the start [m],
 position x, y, z [m], heading (continuous) [rad], floor normal [3], and for the segment to the next
 pose the two parts of the complex number whose product with (p - start) has the share of the
@@ -15,7 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from ..scene.compiled import compiled
 
 KNOT = 11
 
@@ -26,7 +24,7 @@ LOST = 10.0
 """Farther from the path than this, the whole of it is searched [m]."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def nearest_point(knots, x, y, near_s):
     """The nearest point of the path to (x, y) [m].
 
@@ -59,7 +57,7 @@ def nearest_point(knots, x, y, near_s):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def waypoints(knots, s, pose, count, spacing):
     """Places along the path, seen from a vehicle; beyond its end the path goes straight on.
 
@@ -87,13 +85,13 @@ def waypoints(knots, s, pose, count, spacing):
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def turn_between(knots, here, there):
     """Change of heading [rad] between two distances along the path [m]."""
     return _along(knots, there, 4) - _along(knots, here, 4)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _first_not_before(knots, s):
     """Number of the first pose at distance ``s`` or farther; that of poses where there is none."""
     low, high = 0, len(knots)
@@ -106,7 +104,7 @@ def _first_not_before(knots, s):
     return low
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _along(knots, s, column):
     """A column of the path at distance ``s``, linear between poses, constant beyond both ends."""
     after = _first_not_before(knots, s)
@@ -118,7 +116,7 @@ def _along(knots, s, column):
     return a[column] + (b[column] - a[column]) / (b[0] - a[0]) * (s - a[0])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _foot(knots, x, y, first, last):
     """Nearest segment from ``first`` to before ``last``, share of it, and the offset [m]."""
     nearest, least, share, left = first, math.inf, 0.0, 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -279,10 +280,7 @@ class World:
 
     def light_copy(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""
-        # What ``copy.copy`` does, in a fraction of its time.
-        twin = World.__new__(World)
-        twin.__dict__.update(self.__dict__)
-        return twin
+        return copy.copy(self)
 
     # --- one step ---------------------------------------------------------------------------
 

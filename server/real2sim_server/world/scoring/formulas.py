@@ -64,8 +64,6 @@ def no_collision(tally: Tally) -> float:
 def nuplan_no_collision(tally: Tally) -> float:
     """NC of nuPlan: product of max(0, 1 - n/(m + 1)) with m = 0 for road users and vehicles, 1
     for objects."""
-    if not tally.at_fault:
-        return 1.0
     allowed = {"vru": 0, "vehicle": 0, "object": 1}
     return math.prod(
         max(0.0, 1 - tally.at_fault.get(kind, 0) / (m + 1)) for kind, m in allowed.items()

@@ -1,15 +1,12 @@
-"""How far a box is off the road, in one call.
-
-Without ``nogil``: the work takes microseconds, and whoever gives up the interpreter's lock may
-have to wait milliseconds to get it back.
-"""
+"""How far a box is off the road, in one call."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import njit
+
+from ...scene.compiled import compiled
 
 DENSITY = 0.25
 """Distance between points of the lines that roads are made of [m]."""
@@ -18,7 +15,7 @@ LONGEST_SPACING = DENSITY * (1 + 1e-9)
 """Spacings exceed ``DENSITY`` by rounding; the margin keeps the search exact [m]."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def off_road(middle, size, route, lanes, half_widths):
     """How far a box is off the road, and how many of its quarters have their middle on it.
 
@@ -54,7 +51,7 @@ def off_road(middle, size, route, lanes, half_widths):
     return max(beyond[0], beyond[1], beyond[2], beyond[3]), inside
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _narrow(beyond, places, lines, half_width):
     """Lower ``beyond`` [P] [m] to how far places [P, 2] [m] are off the strips along lines."""
     distance = math.inf
@@ -68,7 +65,7 @@ def _narrow(beyond, places, lines, half_width):
         beyond[k] = min(beyond[k], distance - half_width)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _rough_distance(x, y, points):
     """Distance [m] from (x, y) to the nearest of every 64th point."""
     least = math.inf
@@ -78,7 +75,7 @@ def _rough_distance(x, y, points):
     return math.sqrt(least)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _distance(x, y, lines, bound):
     """Distance [m] from (x, y) to the nearest point of lines, which is at most ``bound``.
 

@@ -128,7 +128,8 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
     )
     lane_run = tally.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
     limit = context.speed_limit
-    changes = dict(
+    return replace(
+        tally,
         **_of_plans(tally, instant.plan),
         steps=tally.steps + 1,
         distance=tally.distance + math.hypot(ego.x - before.x, ego.y - before.y),
@@ -150,8 +151,6 @@ def after(tally: Tally, instant: Instant, context: ScoringContext) -> Tally:
         infeasible=tally.infeasible or _infeasible(before, ego, dt),
         ego=ego,
     )
-    # What ``replace`` does, in a fraction of its time.
-    return Tally(**vars(tally) | changes)
 
 
 def _in_several_lanes(ego: EgoSample, context: ScoringContext) -> bool:
