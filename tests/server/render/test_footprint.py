@@ -9,12 +9,13 @@ import pytest
 from real2sim_server.render.backends.cpu_footprint import (
     FIELD,
     FIELD_MASK,
-    NOWHERE,
     ellipse_columns,
-    footprint_of,
+    footprints_of_eight,
     tile_columns,
     tile_rows,
 )
+from real2sim_server.render.backends.cpu_lanes import LANES
+from real2sim_server.render.backends.cpu_project_lanes import PROJECTION
 from real2sim_server.render.backends.cpu_records import (
     EXPONENT_LIMIT,
     EXTENT_X,
@@ -38,18 +39,28 @@ class Size(NamedTuple):
     height: np.float32
 
 
+SIZE = Size(np.float32(WIDTH), np.float32(HEIGHT))
+
+
 @numba.njit
-def columns_by_row(values, index, size):
+def columns_by_row(values, first, lane, size):
     """Rows of tiles, and for each the columns by footprint and by ellipse; and the footprint."""
-    record = values[index]
-    footprint = footprint_of(size, record, record[EXTENT_X], record[EXTENT_Y])
+    planes = np.zeros(PROJECTION * LANES, np.float32)
+    for other in range(LANES):
+        for field in range(RECORD):
+            planes[field * LANES + other] = values[first + other, field]
+    footprints = np.zeros(LANES, np.int64)
+    lanes = footprints_of_eight(planes, 1 << lane, size, footprints)
+    footprint = footprints[lane]
+    index = first + lane
     found = []
-    if footprint != NOWHERE:
-        first, last = footprint & FIELD_MASK, (footprint >> FIELD) & FIELD_MASK
+    if lanes != 0:
+        first_column, last_column = footprint & FIELD_MASK, (footprint >> FIELD) & FIELD_MASK
         top, bottom = tile_rows(footprint)
         for row in range(top, bottom):
             short = tile_columns(values, footprint, index, row)
-            found.append((row, short, ellipse_columns(record, row, first, last)))
+            exact = ellipse_columns(values[index], row, first_column, last_column)
+            found.append((row, short, exact))
     return found, footprint
 
 
@@ -77,10 +88,10 @@ def random_records(count, largest, seed=0):
 
 @pytest.mark.parametrize("largest", [8, 30, 120])
 def test_short_answers_agree_with_the_ellipse(largest):
-    values, _ = random_records(300, largest)
+    values, _ = random_records(304, largest)
     small = 0
     for index in range(len(values)):
-        found, footprint = columns_by_row(values, index, Size(WIDTH, HEIGHT))
+        found, footprint = columns_by_row(values, index // LANES * LANES, index % LANES, SIZE)
         width = ((footprint >> FIELD) & FIELD_MASK) - (footprint & FIELD_MASK)
         for _, short, exact in found:
             empty = exact[1] <= exact[0]
@@ -94,13 +105,13 @@ def test_short_answers_agree_with_the_ellipse(largest):
 
 @pytest.mark.parametrize("largest", [8, 30, 120])
 def test_every_tile_with_a_pixel_in_the_ellipse_is_named(largest):
-    values, conics = random_records(100, largest, seed=1)
+    values, conics = random_records(104, largest, seed=1)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     for index, (record, conic) in enumerate(zip(values, conics, strict=True)):
         dx, dy = x - record[MEAN_X], y - record[MEAN_Y]
         exponent = conic[0, 0] * dx**2 + 2 * conic[0, 1] * dx * dy + conic[1, 1] * dy**2
         rows, columns = np.nonzero(exponent < EXPONENT_LIMIT * (1 - 1e-4))
         inside = set(zip((rows // TILE).tolist(), (columns // TILE).tolist(), strict=True))
-        found, _ = columns_by_row(values, index, Size(WIDTH, HEIGHT))
+        found, _ = columns_by_row(values, index // LANES * LANES, index % LANES, SIZE)
         named = {(row, column) for row, (a, b), _ in found for column in range(a, b)}
         assert inside <= named

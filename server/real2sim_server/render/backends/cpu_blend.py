@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from .cpu_lanes import LANES
 from .cpu_records import (
     BLUE,
     DEPTH,
@@ -27,7 +28,6 @@ from .cpu_records import (
     TILE,
 )
 from .cpu_simd import (
-    LANES,
     PLANES,
     blend_rgb,
     blend_rgb_depth,

@@ -16,6 +16,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from .cpu_blend import HALF, LOOK_AHEAD, TASKS
+from .cpu_lanes import LANES
 from .cpu_records import (
     BLUE,
     DEPTH,
@@ -29,7 +30,7 @@ from .cpu_records import (
     SLOPE,
     TILE,
 )
-from .cpu_simd import LANES, prefetch, touched_halves
+from .cpu_simd import prefetch, touched_halves
 from .cpu_simd_backward import (
     ABS_X,
     ABS_Y,

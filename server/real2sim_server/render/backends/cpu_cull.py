@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...scene import GaussianCloud
 from .base import Placement, RasterRequest
-from .cpu_project import REACH_MAX
+from .cpu_project_lanes import REACH_MAX
 from .cpu_records import CHUNK, View
 from .kernel import kernel
 
@@ -116,7 +116,7 @@ def seen_chunks(
 def _planes(view: View) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Six half spaces of the camera frame outside of which nothing is seen.
 
-    What project_gaussian tests, times depth: for x + reach > 0 that is
+    What place_eight tests, times depth: for x + reach > 0 that is
     ``fx X + (cx + reach blur) Z + reach fx (1 + |tx|) sigma > 0``, linear in the centre.
 
     Returns:

@@ -9,11 +9,18 @@ the records, which do not fit a cache.
 from __future__ import annotations
 
 import math
+from functools import reduce
+from typing import Any
 
 import numpy as np
+from numba import types
+from numba.extending import intrinsic
 
+from .cpu_lanes import I64, LONGS, Integers, Lanes, Planes, mask_bits, mask_of
+from .cpu_project_lanes import PROJECTION, Named
 from .cpu_records import (
     EXPONENT_LIMIT,
+    EXTENT_X,
     EXTENT_Y,
     FALLOFF,
     LEVEL,
@@ -37,34 +44,86 @@ MAX_TILES = FIELD_MASK
 """Most tiles in a row or column of an image."""
 SMALL = 4
 ROW_MASK = (1 << SMALL) - 1
-NOWHERE = np.int64(0)
-"""Footprint of what cannot be seen; no other has this value since x1 and y1 are at least 1."""
 
 LOWEST_BITS = np.uint64(sum((b & -b).bit_length() - 1 << 4 * b for b in range(1, 16)))
 BIT_LENGTHS = np.uint64(sum(b.bit_length() << 4 * b for b in range(1, 16)))
 """Answers for the sixteen values of a row of bits, four bits each."""
 
 
-@inlined()
-def footprint_of(view, record, reach_x, reach_y):
-    """Footprint of a record whose box reaches so far [px] from its centre; NOWHERE when none."""
-    x, y = record[MEAN_X], record[MEAN_Y]
-    reach_x, reach_y = reach_x + SLACK, reach_y + SLACK
-    x0 = np.int64(math.floor(max(x - reach_x - HALF, ZERO) * PER_TILE))
-    y0 = np.int64(math.floor(max(y - reach_y - HALF, ZERO) * PER_TILE))
-    x1 = np.int64(math.floor(min(x + reach_x - HALF, view.width - ONE) * PER_TILE)) + 1
-    y1 = np.int64(math.floor(min(y + reach_y - HALF, view.height - ONE) * PER_TILE)) + 1
-    if x1 <= x0 or y1 <= y0:
-        return NOWHERE
-    box = x0 | x1 << FIELD | y0 << 2 * FIELD | y1 << 3 * FIELD
-    if x1 - x0 == 1 or y1 - y0 == 1 or x1 - x0 > SMALL or y1 - y0 > SMALL:
-        return box
-    touched = np.int64(0)
-    for row in range(y0, y1):
-        left, right = ellipse_columns(record, row, x0, x1)
-        for column in range(left, right):
-            touched |= np.int64(1) << ((row - y0) * SMALL + column - x0)
-    return box | touched << 4 * FIELD
+@intrinsic
+def footprints_of_eight(typingctx, planes, lanes, view, found):  # type: ignore[no-untyped-def]
+    """Write the footprints of eight records to ``found`` [8] int64.
+
+    Args:
+        planes: see cpu_project_lanes.
+        lanes: bits of those that are in question.
+        view: View.
+
+    Returns:
+        Bits of those that may touch a tile.
+    """
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        data = context.make_array(planes)(context, builder, arguments[0]).data
+        eight = Planes(builder, data, I64(0), planes=PROJECTION)
+        named = Named(context, builder, view, arguments[2])
+        footprints, remaining = _footprints(eight, named)
+        target = context.make_array(found)(context, builder, arguments[3]).data
+        builder.store(footprints.value, builder.bitcast(target, LONGS.as_pointer()), align=8)
+        return mask_bits(builder, builder.and_(mask_of(builder, arguments[1]), remaining))
+
+    return types.int64(planes, types.int64, view, found), generate
+
+
+def _footprints(eight: Planes, view: Named) -> tuple[Integers, Any]:
+    """Emit the footprints of eight records, and the mask of those that touch a tile."""
+    x0, x1 = _tile_range(eight.load(MEAN_X), eight.load(EXTENT_X), view.number("width"))
+    y0, y1 = _tile_range(eight.load(MEAN_Y), eight.load(EXTENT_Y), view.number("height"))
+    columns, rows = x1 - x0, y1 - y0
+    one, touched = (Integers.filled(eight.builder, number) for number in (1, 0))
+    for row in range(SMALL):
+        left, right = _row_columns(eight, y0 + row, (x0, x1))
+        # A range of bits is a difference of powers of two.
+        bits = (one << (right - x0)) - (one << (left - x0))
+        here = eight.builder.and_(right.compare(">", left), rows.compare(">", row))
+        touched = touched | (bits.where(here, 0) << row * SMALL)
+    small = [n.compare(">", 1) for n in (columns, rows)]
+    small += [n.compare("<=", SMALL) for n in (columns, rows)]
+    touched = touched.where(reduce(eight.builder.and_, small), 0)
+    across, down = x0 | (x1 << FIELD), y0 | (y1 << FIELD)
+    footprints = across.longs() | (down.longs() << 2 * FIELD) | (touched.longs() << 4 * FIELD)
+    there = eight.builder.and_(columns.compare(">", 0), rows.compare(">", 0))
+    return footprints, there
+
+
+def _tile_range(centre: Lanes, reach: Lanes, size: Lanes) -> tuple[Integers, Integers]:
+    """Half-open range of the tiles with pixel centres within ``reach`` [px] of a centre."""
+    first = (centre - (reach + SLACK) - 0.5).at_least(0.0)
+    last = (centre + (reach + SLACK) - 0.5).at_most(size - 1.0)
+    return (first * PER_TILE).floor().integers(), (last * PER_TILE).floor().integers() + 1
+
+
+def _row_columns(
+    eight: Planes, row: Integers, columns: tuple[Integers, Integers]
+) -> tuple[Integers, Integers]:
+    """Part of the tile columns where the ellipses meet pixel centres of a row of tiles."""
+    first, last = columns
+    top = row.floats() * TILE + 0.5 - eight.load(MEAN_Y)
+    centre, tip = eight.load(MEAN_X) - 0.5, eight.load(TIP_Y)
+    right = (centre + _side_reach(eight, top, tip, 1) + SLACK) * PER_TILE
+    left = (centre + _side_reach(eight, top, -tip, -1) - SLACK) * PER_TILE
+    left_column = left.at_least(first.floats()).floor().integers()
+    right_column = right.at_most(last.floats()).floor().integers() + 1
+    return left_column, right_column.where(right_column.compare("<", last), last)
+
+
+def _side_reach(eight: Planes, top: Lanes, tip: Lanes, side: int) -> Lanes:
+    """Outermost dx of the ellipses on one side (±1) within the row of tiles from ``top`` on."""
+    reach = eight.load(EXTENT_Y)
+    dy = tip.at_least(top).at_most(top + (TILE - 1)).at_least(-reach).at_most(reach)
+    room = (-(dy * dy)).fused(eight.load(FALLOFF), -eight.load(LEVEL) + EXPONENT_LIMIT)
+    half = room.at_least(0.0).root() / eight.load(SHARPNESS)
+    return dy.fused(eight.load(SLOPE), half if side > 0 else -half)
 
 
 @inlined()

@@ -32,6 +32,7 @@ from .cpu_inputs import (
     timed,
     view_of,
 )
+from .cpu_lanes import LANES
 from .cpu_project_backward import (
     PLACEMENT,
     Gradients,
@@ -40,7 +41,6 @@ from .cpu_project_backward import (
     project_small_backward,
 )
 from .cpu_records import CHUNK, EXTENT_X, EXTENT_Y, MEMBER, TILE, Images, Records
-from .cpu_simd import LANES
 from .cpu_simd_backward import BACKWARD_PLANES
 from .cpu_sky import add_sky
 from .cpu_sky_backward import sample_sky, sky_backward

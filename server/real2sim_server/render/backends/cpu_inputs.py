@@ -71,7 +71,7 @@ def cluster_of(instance: Instance, placement: Placement, camera: int, index: int
         *cloud,
         covars=NO_COVARS if instance.covars is None else array_of(instance.covars),
         linear=np.ascontiguousarray(placement.linear[camera, index].numpy()),
-        offset=placement.offset[camera, index].numpy(),
+        offset=np.ascontiguousarray(placement.offset[camera, index].numpy()),
         camera_position=placement.camera_position[camera, index].numpy().astype(np.float32),
         scale=placement.scale[index].numpy().astype(np.float32),
         instance_id=np.float32(instance.instance_id),

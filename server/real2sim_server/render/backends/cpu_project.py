@@ -1,7 +1,8 @@
 """Projection of one cluster of Gaussians onto one image, fused with culling and colour.
 
-Nothing of the cluster is copied: what may be seen becomes one record. Chunks of fixed size write
-to regions of their own, so that the result does not depend on the number of threads.
+Nothing of the cluster is copied: what may be seen becomes one record, eight Gaussians at a time.
+Chunks of fixed size write to regions of their own, so that the result does not depend on the
+number of threads.
 """
 
 # Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
@@ -14,37 +15,28 @@ import math
 import numpy as np
 from numba import prange
 
-from .base import ALPHA_MIN
-from .cpu_footprint import NOWHERE, footprint_of
-from .cpu_records import (
-    BLUE,
-    CHUNK,
-    DEPTH,
-    EXPONENT_UNIT,
-    EXTENT_X,
-    EXTENT_Y,
-    FALLOFF,
-    GREEN,
-    INSTANCE,
-    LEVEL,
-    MEAN_X,
-    MEAN_Y,
-    MEMBER,
-    RED,
-    SHARPNESS,
-    SLOPE,
-    TIP_Y,
+from .cpu_footprint import footprints_of_eight
+from .cpu_lanes import LANES
+from .cpu_project_lanes import (
+    MEAN,
+    OPACITY,
+    PROJECTION,
+    SHAPE,
+    place_eight,
+    place_eight_deformed,
+    shape_eight,
+    shape_eight_deformed,
 )
+from .cpu_records import BLUE, CHUNK, DEPTH, GREEN, INSTANCE, MEMBER, RECORD, RED
+from .cpu_simd import lowest_bit
 from .kernel import inlined, kernel
 
 F32 = np.float32
 ZERO, HALF, ONE, TWO = F32(0), F32(0.5), F32(1), F32(2)
-LEAST_ALPHA = F32(ALPHA_MIN)
-REACH_MAX = F32(math.sqrt(2 * math.log(255.0)))
-LOG_255 = F32(math.log(255.0))
-HALF_UNIT = F32(0.5 / EXPONENT_UNIT)
-COVARIANCE_MAX = F32(1e30)
-"""Larger than any picture [px^2]; beyond it float32 gives out."""
+FIELDS = tuple(
+    field for field in range(RECORD) if field not in {RED, GREEN, BLUE, INSTANCE, MEMBER}
+)
+"""Fields of a record that come from the planes of eight."""
 FASTMATH = {"contract", "nsz", "arcp"}
 
 
@@ -62,178 +54,91 @@ def project_cluster(cluster, view, base, chunks, records):
     depths, counts = records.depths, records.counts
     for k in prange(chunks.shape[0]):
         first, start = base + k * CHUNK, chunks[k] * CHUNK
-        project_chunk(cluster, view, first, start, values, footprints, depths, counts)
+        planes = np.empty(PROJECTION * LANES, np.float32)
+        found = np.empty(LANES, np.int64)
+        counts[first // CHUNK] = project_chunk(
+            cluster, view, start, planes, found, values, footprints, depths, first
+        )
 
 
 @kernel(fastmath=FASTMATH)
 def project_small_cluster(cluster, view, base, chunks, records):
     """Like project_cluster for one chunk, where waking threads would take longer than the work."""
-    values, footprints = records.values, records.footprints
+    values, footprints, depths = records.values, records.footprints, records.depths
     start = chunks[0] * CHUNK
-    project_chunk(cluster, view, base, start, values, footprints, records.depths, records.counts)
+    planes = np.empty(PROJECTION * LANES, np.float32)
+    found = np.empty(LANES, np.int64)
+    records.counts[base // CHUNK] = project_chunk(
+        cluster, view, start, planes, found, values, footprints, depths, base
+    )
 
 
 @inlined(fastmath=FASTMATH)
-def project_chunk(cluster, view, first, start, values, footprints, depths, counts):
-    """Write the records of CHUNK Gaussians from ``start`` on to the region from ``first`` on."""
+def project_chunk(cluster, view, start, planes, found, values, footprints, depths, first):
+    """Write the records of CHUNK Gaussians from ``start`` on to the region from ``first`` on.
+
+    Args:
+        planes, found: work space, see cpu_project_lanes and footprints_of_eight.
+
+    Returns:
+        Records written.
+    """
     slot = first
-    for i in range(start, min(cluster.means.shape[0], start + CHUNK)):
-        footprint = project_gaussian(cluster, view, i, values, slot)
-        if footprint != NOWHERE:
-            values[slot, MEMBER] = F32(i - start)
-            footprints[slot] = footprint
-            depths[slot] = values[slot, DEPTH]
+    stop = min(cluster.means.shape[0], start + CHUNK)
+    for eight in range(start, stop, LANES):
+        lanes = project_eight(cluster, view, eight, min(stop - eight, LANES), planes, found)
+        while lanes != 0:
+            lane = lowest_bit(lanes)
+            lanes &= lanes - 1
+            out = values[slot]
+            for field in FIELDS:
+                out[field] = planes[field * LANES + lane]
+            out[INSTANCE] = cluster.instance_id
+            out[MEMBER] = F32(eight + lane - start)
+            write_color(cluster, eight + lane, out)
+            footprints[slot] = found[lane]
+            depths[slot] = out[DEPTH]
             slot += 1
-    counts[first // CHUNK] = slot - first
+    return slot - first
 
 
-@inlined(fastmath=FASTMATH)
-def project_gaussian(cluster, view, i, values, slot):  # noqa: PLR0911 - each test drops as early as it can
-    """Write the record of Gaussian ``i`` to ``slot``; returns its footprint."""
-    out = values[slot]
-    opacity = cluster.opacities[i]
-    if not opacity >= LEAST_ALPHA:
-        return NOWHERE
-    x, y, z = to_camera(cluster, i)
-    if not (z >= view.near_plane and z <= view.far_plane):
-        return NOWHERE
-    rz = ONE / z
-    tx, ty = x * rz, y * rz
-    mean_x, mean_y = view.fx * tx + view.cx, view.fy * ty + view.cy
-    tx = min(max(tx, view.left), view.right)
-    ty = min(max(ty, view.top), view.bottom)
-    scale_x, scale_y = view.fx * rz, view.fy * rz
-    sigma = largest_sigma(cluster, i)
-    reach_x = REACH_MAX * (scale_x * (ONE + abs(tx)) * sigma + view.blur)
-    reach_y = REACH_MAX * (scale_y * (ONE + abs(ty)) * sigma + view.blur)
-    if not on_image(view, mean_x, mean_y, reach_x, reach_y):
-        return NOWHERE
-
-    cxx, cxy, cyy, sharp = image_covariance(cluster, i, scale_x, scale_y, tx, ty)
-    determinant = sharp + view.eps2d * (cxx + cyy) + view.eps2d * view.eps2d
-    cxx += view.eps2d
-    cyy += view.eps2d
-    if not (determinant > ZERO and cxx < COVARIANCE_MAX and cyy < COVARIANCE_MAX):
-        return NOWHERE
-    if view.antialiased > ZERO:
-        opacity *= F32(math.sqrt(max(sharp, 0.0) / determinant))
-        if not opacity >= LEAST_ALPHA:
-            return NOWHERE
-    level = -math.log(opacity)
-    reach = math.sqrt(TWO * max(LOG_255 - level, ZERO))
-    reach_x = reach * math.sqrt(F32(cxx))
-    reach_y = reach * math.sqrt(F32(cyy))
-    clip = view.radius_clip
-    if clip > ZERO and math.ceil(reach_x) <= clip and math.ceil(reach_y) <= clip:
-        return NOWHERE
-    if not on_image(view, mean_x, mean_y, reach_x, reach_y):
-        return NOWHERE
-
-    inverse = ONE / F32(cyy)
-    out[MEAN_X] = mean_x
-    out[MEAN_Y] = mean_y
-    out[SHARPNESS] = math.sqrt(F32(cyy / determinant) * HALF_UNIT)
-    out[SLOPE] = F32(cxy) * inverse
-    out[FALLOFF] = HALF_UNIT * inverse
-    out[LEVEL] = level * F32(1 / EXPONENT_UNIT)
-    out[DEPTH] = z
-    out[INSTANCE] = cluster.instance_id
-    out[EXTENT_X] = reach_x
-    out[EXTENT_Y] = reach_y
-    out[TIP_Y] = reach_x * F32(cxy) / F32(cxx)
-    write_color(cluster, i, out)
-    return footprint_of(view, out, reach_x, reach_y)
-
-
-@inlined(fastmath=FASTMATH)
-def on_image(view, x, y, reach_x, reach_y):
-    """Whether a box about (x, y) meets the image; False for what is not finite."""
-    return (
-        x + reach_x > ZERO
-        and x - reach_x < view.width
-        and y + reach_y > ZERO
-        and y - reach_y < view.height
-    )
-
-
-@inlined(fastmath=FASTMATH)
-def to_camera(cluster, i):
-    """Centre in the camera frame; summed in float64 so that rounding cannot change the order."""
-    x, y, z = (
-        np.float64(cluster.means[i, 0]),
-        np.float64(cluster.means[i, 1]),
-        np.float64(cluster.means[i, 2]),
-    )
-    m, t = cluster.linear, cluster.offset
-    return (
-        F32(m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + t[0]),
-        F32(m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + t[1]),
-        F32(m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + t[2]),
-    )
-
-
-@inlined(fastmath=FASTMATH)
-def largest_sigma(cluster, i):
-    """Upper bound of the standard deviation along any direction of the world [m]."""
-    largest = max(cluster.scale[0], cluster.scale[1], cluster.scale[2])
+@inlined()
+def project_eight(cluster, view, first, count, planes, found):
+    """Project ``count`` Gaussians from ``first`` on; returns bits of those to be recorded."""
+    gather_eight(cluster, first, count, planes)
+    lanes = np.int64((1 << count) - 1)
     if cluster.covars.shape[0] > 0:
-        trace = cluster.covars[i, 0, 0] + cluster.covars[i, 1, 1] + cluster.covars[i, 2, 2]
-        return math.sqrt(trace) * largest
-    s = cluster.scales[i]
-    return largest * max(s[0], s[1], s[2])
+        lanes = place_eight_deformed(planes, lanes, view, cluster)
+        if lanes != 0:
+            lanes = shape_eight_deformed(planes, lanes, view, cluster)
+    else:
+        lanes = place_eight(planes, lanes, view, cluster)
+        if lanes != 0:
+            lanes = shape_eight(planes, lanes, view, cluster)
+    if lanes != 0:
+        lanes = footprints_of_eight(planes, lanes, view, found)
+    return lanes
 
 
-@inlined(fastmath=FASTMATH)
-def image_covariance(cluster, i, scale_x, scale_y, tx, ty):
-    """Covariance (xx, xy, yy) [px^2] on the image before blur, and its determinant, float64."""
-    m = cluster.linear
-    ax = scale_x * (F32(m[0, 0]) - tx * F32(m[2, 0]))
-    ay = scale_x * (F32(m[0, 1]) - tx * F32(m[2, 1]))
-    az = scale_x * (F32(m[0, 2]) - tx * F32(m[2, 2]))
-    bx = scale_y * (F32(m[1, 0]) - ty * F32(m[2, 0]))
-    by = scale_y * (F32(m[1, 1]) - ty * F32(m[2, 1]))
-    bz = scale_y * (F32(m[1, 2]) - ty * F32(m[2, 2]))
-    if cluster.covars.shape[0] > 0:
-        return transform_covariance(cluster.covars[i], ax, ay, az, bx, by, bz)
-    w, x, y, z = cluster.quats[i, 0], cluster.quats[i, 1], cluster.quats[i, 2], cluster.quats[i, 3]
-    norm = TWO / (w * w + x * x + y * y + z * z)
-    s0, s1, s2 = cluster.scales[i, 0], cluster.scales[i, 1], cluster.scales[i, 2]
-    xx, yy, zz = x * x * norm, y * y * norm, z * z * norm
-    xy, xz, yz = x * y * norm, x * z * norm, y * z * norm
-    wx, wy, wz = w * x * norm, w * y * norm, w * z * norm
-    u0 = np.float64(s0 * (ax * (ONE - yy - zz) + ay * (xy + wz) + az * (xz - wy)))
-    u1 = np.float64(s1 * (ax * (xy - wz) + ay * (ONE - xx - zz) + az * (yz + wx)))
-    u2 = np.float64(s2 * (ax * (xz + wy) + ay * (yz - wx) + az * (ONE - xx - yy)))
-    v0 = np.float64(s0 * (bx * (ONE - yy - zz) + by * (xy + wz) + bz * (xz - wy)))
-    v1 = np.float64(s1 * (bx * (xy - wz) + by * (ONE - xx - zz) + bz * (yz + wx)))
-    v2 = np.float64(s2 * (bx * (xz + wy) + by * (yz - wx) + bz * (ONE - xx - yy)))
-    # Lagrange's identity: |u|^2 |v|^2 - (u v)^2 without the cancellation that ruins needles.
-    c0, c1, c2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-    return (
-        u0 * u0 + u1 * u1 + u2 * u2,
-        u0 * v0 + u1 * v1 + u2 * v2,
-        v0 * v0 + v1 * v1 + v2 * v2,
-        c0 * c0 + c1 * c1 + c2 * c2,
-    )
-
-
-@inlined(fastmath=FASTMATH)
-def transform_covariance(covar, ax, ay, az, bx, by, bz):
-    """Like image_covariance, from rows a, b of the map and a covariance [3, 3]."""
-    sxx, sxy, sxz = np.float64(covar[0, 0]), np.float64(covar[0, 1]), np.float64(covar[0, 2])
-    syy, syz, szz = np.float64(covar[1, 1]), np.float64(covar[1, 2]), np.float64(covar[2, 2])
-    px, py, pz = (
-        sxx * ax + sxy * ay + sxz * az,
-        sxy * ax + syy * ay + syz * az,
-        sxz * ax + syz * ay + szz * az,
-    )
-    xx, xy = px * ax + py * ay + pz * az, px * bx + py * by + pz * bz
-    yy = (
-        bx * (sxx * bx + sxy * by + sxz * bz)
-        + by * (sxy * bx + syy * by + syz * bz)
-        + bz * (sxz * bx + syz * by + szz * bz)
-    )
-    return xx, xy, yy, xx * yy - xy * xy
+@inlined()
+def gather_eight(cluster, first, count, planes):
+    """Lay ``count`` Gaussians side by side in the planes."""
+    for lane in range(count):
+        i = first + lane
+        for k in range(3):
+            planes[(MEAN + k) * LANES + lane] = cluster.means[i, k]
+        planes[OPACITY * LANES + lane] = cluster.opacities[i]
+        if cluster.covars.shape[0] > 0:
+            covar, plane = cluster.covars[i], SHAPE * LANES + lane
+            for row in range(3):
+                for column in range(row, 3):
+                    planes[plane] = covar[row, column]
+                    plane += LANES
+        else:
+            for k in range(4):
+                planes[(SHAPE + k) * LANES + lane] = cluster.quats[i, k]
+            for k in range(3):
+                planes[(SHAPE + 4 + k) * LANES + lane] = cluster.scales[i, k]
 
 
 @inlined(fastmath=FASTMATH)

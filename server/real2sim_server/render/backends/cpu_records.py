@@ -42,7 +42,7 @@ EXPONENT_LIMIT = math.log(255.0) / EXPONENT_UNIT
 
 
 class Cluster(NamedTuple):
-    """Arrays of one cloud, float32 and contiguous; ``covars`` is [0, 3, 3] where not given.
+    """Arrays of one cloud, all contiguous; ``covars`` is [0, 3, 3] where not given.
 
     ``coefficients`` [N, F, 3] times ``tones`` [F] are added to ``sh[:, 0]``; F is 0 where colours
     do not change over time.

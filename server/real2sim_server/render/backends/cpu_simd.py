@@ -1,10 +1,5 @@
 """The innermost step of blending as explicit vector code: one record over eight pixels.
 
-LLVM's loop vectoriser needs checks for overlapping arrays that cost more than a row of pixels, so
-the eight lanes are spelled out as LLVM vectors. They run as one AVX register, as two SSE or NEON
-registers where those are all there is, and give the same bits in each case as long as the machine
-has fused multiply-add.
-
 State of eight pixels is PLANES vectors in a row: transmittance (negative once finished), red,
 green, blue, depth, instance.
 """
@@ -23,12 +18,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .base import ALPHA_MAX, TRANSMITTANCE_MIN
+from .cpu_lanes import LANES, VECTOR, Lanes, Planes, lane_numbers, splat
 from .cpu_records import EXPONENT_LIMIT, EXPONENT_UNIT
 
-LANES = 8
 PLANES = 6
-FLOAT = ir.FloatType()
-VECTOR = ir.VectorType(FLOAT, LANES)
 
 
 def _exponential_coefficients(degree: int) -> list[float]:
@@ -45,97 +38,6 @@ EXPONENTIAL = _exponential_coefficients(4)
 SQUARINGS = int(np.log2(EXPONENT_UNIT))
 
 
-class Lanes:
-    """Eight floats in a function under construction, so that formulas read like formulas."""
-
-    def __init__(self, builder: ir.IRBuilder, value: Any) -> None:
-        self.builder = builder
-        self.value = value
-
-    def _lift(self, other: Lanes | float) -> Any:
-        if isinstance(other, Lanes):
-            return other.value
-        return ir.Constant(VECTOR, [float(np.float32(other))] * LANES)
-
-    def __add__(self, other: Lanes | float) -> Lanes:
-        return Lanes(self.builder, self.builder.fadd(self.value, self._lift(other)))
-
-    def __sub__(self, other: Lanes | float) -> Lanes:
-        return Lanes(self.builder, self.builder.fsub(self.value, self._lift(other)))
-
-    def __mul__(self, other: Lanes | float) -> Lanes:
-        return Lanes(self.builder, self.builder.fmul(self.value, self._lift(other)))
-
-    def __truediv__(self, other: Lanes | float) -> Lanes:
-        return Lanes(self.builder, self.builder.fdiv(self.value, self._lift(other)))
-
-    def __neg__(self) -> Lanes:
-        return Lanes(self.builder, self.builder.fneg(self.value))
-
-    def fused(self, factor: Lanes | float, addend: Lanes | float) -> Lanes:
-        """self * factor + addend, rounded once where the machine can."""
-        return self._call("llvm.fmuladd", self._lift(factor), self._lift(addend))
-
-    def magnitude(self) -> Lanes:
-        """Absolute value."""
-        return self._call("llvm.fabs")
-
-    def negative_where(self, mask: Any) -> Lanes:
-        """Self with the sign bit set where ``mask`` holds."""
-        bits = ir.VectorType(ir.IntType(32), LANES)
-        sign = ir.Constant(bits, [-(2**31)] * LANES)
-        chosen = self.builder.and_(self.builder.sext(mask, bits), sign)
-        merged = self.builder.or_(self.builder.bitcast(self.value, bits), chosen)
-        return Lanes(self.builder, self.builder.bitcast(merged, VECTOR))
-
-    def _call(self, intrinsic_name: str, *others: Any) -> Lanes:
-        kind = ir.FunctionType(VECTOR, [VECTOR] * (1 + len(others)))
-        function = cgutils.get_or_insert_function(
-            self.builder.module, kind, f"{intrinsic_name}.v{LANES}f32"
-        )
-        return Lanes(self.builder, self.builder.call(function, [self.value, *others]))
-
-    def compare(self, operator: str, other: Lanes | float) -> Any:
-        """Mask of eight bits; false for NaN."""
-        return self.builder.fcmp_ordered(operator, self.value, self._lift(other))
-
-    def where(self, mask: Any, other: Lanes | float) -> Lanes:
-        """Self where ``mask`` holds, else ``other``."""
-        return Lanes(self.builder, self.builder.select(mask, self.value, self._lift(other)))
-
-
-class PixelState:
-    """The state vectors of eight pixels in memory."""
-
-    def __init__(self, builder: ir.IRBuilder, data: Any, half: Any, planes: int = PLANES) -> None:
-        self.builder = builder
-        first = builder.mul(half, ir.Constant(half.type, planes * LANES))
-        self.pointer = builder.gep(data, [first], source_etype=FLOAT)
-
-    def _plane(self, index: int) -> Any:
-        offset = ir.Constant(ir.IntType(64), index * LANES)
-        plane = self.builder.gep(self.pointer, [offset], source_etype=FLOAT)
-        return self.builder.bitcast(plane, VECTOR.as_pointer())
-
-    def load(self, index: int) -> Lanes:
-        """Vector of a plane."""
-        value = self.builder.load(self._plane(index), typ=VECTOR, align=4)
-        return Lanes(self.builder, value)
-
-    def store(self, index: int, lanes: Lanes) -> None:
-        """Write a plane."""
-        self.builder.store(lanes.value, self._plane(index), align=4)
-
-
-def splat(builder: ir.IRBuilder, scalar: Any) -> Lanes:
-    """One scalar in all lanes."""
-    undefined = ir.Constant(VECTOR, ir.Undefined)
-    zero = ir.Constant(ir.IntType(32), 0)
-    single = builder.insert_element(undefined, scalar, zero)
-    mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return Lanes(builder, builder.shuffle_vector(single, undefined, mask))
-
-
 def exponential(exponent: Lanes) -> Lanes:
     """exp(-EXPONENT_UNIT exponent)."""
     power = Lanes(exponent.builder, ir.Constant(VECTOR, [EXPONENTIAL[-1]] * LANES))
@@ -146,11 +48,10 @@ def exponential(exponent: Lanes) -> Lanes:
     return power
 
 
-def _build_blend(builder: ir.IRBuilder, state: PixelState, scalars: list[Any], extras: int) -> Any:
+def _build_blend(builder: ir.IRBuilder, state: Planes, scalars: list[Any], extras: int) -> Any:
     """Emit the blending of one record; returns eight bits, set where a pixel goes on."""
     sharpness, offset, rest, *values = (splat(builder, scalar) for scalar in scalars)
-    lanes = Lanes(builder, ir.Constant(VECTOR, [float(i) for i in range(LANES)]))
-    distance = (lanes + offset) * sharpness
+    distance = (lane_numbers(builder) + offset) * sharpness
     exponent = distance.fused(distance, rest)
     alpha = exponential(exponent)
     alpha = alpha.where(alpha.compare("<", ALPHA_MAX), ALPHA_MAX)
@@ -189,7 +90,7 @@ def _blend_intrinsic(extras: int) -> Any:
     ):
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
-            state = PixelState(builder, array.data, arguments[1])
+            state = Planes(builder, array.data, arguments[1], planes=PLANES)
             return _build_blend(builder, state, list(arguments[2:]), extras)
 
         floats = (types.float32,) * 8
@@ -215,7 +116,7 @@ def touched_halves(  # type: ignore[no-untyped-def]
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         x, y, sharpness, slope, falloff, level = (splat(builder, value) for value in arguments)
-        numbers = Lanes(builder, ir.Constant(VECTOR, [float(i) for i in range(LANES)]))
+        numbers = lane_numbers(builder)
         i64 = ir.IntType(64)
         touched = i64(0)
         for first_row in (0, LANES):

@@ -25,8 +25,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .base import ALPHA_MAX, TRANSMITTANCE_MIN
+from .cpu_lanes import FLOAT, LANES, VECTOR, Lanes, Planes, lane_numbers, splat
 from .cpu_records import EXPONENT_LIMIT, TILE
-from .cpu_simd import FLOAT, LANES, VECTOR, Lanes, PixelState, exponential, splat
+from .cpu_simd import exponential
 
 LEFT, REST, BY_RED, BY_GREEN, BY_BLUE, BY_DEPTH, BY_ALPHA = range(7)
 """Planes of eight pixels: transmittance (negative once finished), what is still to come of the sum
@@ -132,7 +133,7 @@ def _build(
 
         def row_step(row: Any, side: int = side, columns: Any = columns) -> None:
             half = builder.add(row, I64(side * TILE))
-            state = PixelState(builder, data, builder.add(first_half, half), BACKWARD_PLANES)
+            state = Planes(builder, data, builder.add(first_half, half), planes=BACKWARD_PLANES)
             done = _build_half(builder, state, record, row, side, columns, rest)
             bit = builder.shl(builder.zext(done, I64), half)
             builder.store(builder.or_(builder.load(finished, typ=I64), bit), finished)
@@ -199,7 +200,7 @@ def _for_each_bit(builder: ir.IRBuilder, mask: Any, body: Callable[[Any], None])
 
 def _build_half(
     builder: ir.IRBuilder,
-    state: PixelState,
+    state: Planes,
     record: _Splat,
     row: Any,
     side: int,
@@ -219,8 +220,7 @@ def _build_half(
     bend = builder.fmul(record.falloff, dy)
     level = builder.fadd(builder.fmul(bend, dy), record.level)
 
-    numbers = Lanes(builder, ir.Constant(VECTOR, [float(i) for i in range(LANES)]))
-    across = numbers + splat(builder, start)
+    across = lane_numbers(builder) + splat(builder, start)
     scaled = across * record.sharpness
     exponent = scaled.fused(scaled, splat(builder, level))
     alpha = exponential(exponent)
