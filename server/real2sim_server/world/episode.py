@@ -52,6 +52,24 @@ def plan_episode(scene: Scene, spec: ResetSpec) -> Clock:
     return clock
 
 
+def takes_effect_us(spec: ResetSpec, clock: Clock, t_us: int, latency_us: int) -> int:
+    """When a plan that comes at ``t_us`` takes effect [us]: after its latency and the warm-up.
+
+    Args:
+        spec: names the latency model.
+        clock: of the episode.
+        t_us: now [us].
+        latency_us: measured time to make the plan [us].
+    """
+    latency = spec.latency
+    wait_us = {
+        "zero": 0,
+        "fixed": latency.fixed_us,
+        "measured": min(max(latency_us, 0), latency.longest_us),
+    }[latency.model]
+    return max(t_us + wait_us, clock.start_us + spec.warmup_us)
+
+
 def _clock(scene: Scene, spec: ResetSpec) -> Clock:
     start = scene.start_us if spec.start_us is None else spec.start_us
     latest = scene.end_us - spec.dt_us

@@ -11,26 +11,21 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
-from ..edit import (
-    EditError,
-    EditOutcome,
-    ScenarioState,
-    apply_operations,
-    compose,
-)
+from ..edit import EditError, EditOutcome, ScenarioState, apply_operations, compose
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
+from .aftermath import Aftermath, after_impacts, after_overlaps
 from .agents import Agents
 from .contact import REAR_OVERHANG
 from .ego import logged_motion
-from .episode import plan_episode
+from .episode import plan_episode, takes_effect_us
 from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
 from .impact import Deformation, Dents, Impact, Wreck
 from .judging import ego_sample, others_of, plan_note, scoring_context
-from .meeting import BACKGROUND, Met, may_meet, met, notes_of, run_bout
+from .meeting import Met, may_meet, met, run_bout
 from .observation import Observation
 from .obstacles import Obstacles, obstacles_of
 from .path import Float, LoggedPath, PathPoint
@@ -169,13 +164,14 @@ class World:
             fallback = braking(pilot, self.motion, self.spec.ego)
             pilot = replace(pilot, controller=fallback, since_us=self.t_us, coming=())
         reacted = self._reacted()
-        contacts = self._move(pilot)
+        before = self.agents
+        impacts = self._move(pilot)
         self._near = self._path.nearest(self.motion.x, self.motion.y, near_s=self._near.s)
         self.T_world_vehicle = self._standing()
-        met_events, notes, secondary = self._consequences(contacts)
-        self.instant = self._instant(notes, secondary, note)
+        left = self._aftermath(impacts, before)
+        self.instant = self._instant(left.notes, left.secondary, note)
         self.tally = scoring.after(self.tally, self.instant, self._context)
-        events = [*self._edits, *late, *reacted, *met_events, *self._strayed(), *self._ended()]
+        events = [*self._edits, *late, *reacted, *left.events, *self._strayed(), *self._ended()]
         self._edits = ()
         self._events = tuple(events)
         return events
@@ -295,21 +291,14 @@ class World:
     def _told(self, plan: Plan | None, latency_us: int) -> Pilot:
         if plan is None:
             return self._pilot
-        latency = self.spec.latency
-        wait = {
-            "zero": 0,
-            "fixed": latency.fixed_us,
-            "measured": min(max(latency_us, 0), latency.longest_us),
-        }[latency.model]
-        warm_us = self._clock.start_us + self.spec.warmup_us
-        return self._pilot.told(plan, self.motion, self.t_us, max(self.t_us + wait, warm_us))
+        since_us = takes_effect_us(self.spec, self._clock, self.t_us, latency_us)
+        return self._pilot.told(plan, self.motion, self.t_us, since_us)
 
     def _move(self, pilot: Pilot) -> tuple[Impact, ...] | None:
         """Ego and objects one step on; impacts, or None where bodies pass through each other."""
         motion, t_us, dt_us = self.motion, self.t_us, self._clock.dt_us
         old, seen = self.agents, self._seen(self.agents)
         traffic = self.traffic.advance(self.state, seen)
-        self._old_agents = old
         self.steps += 1
         if t_us + dt_us <= self._clock.start_us + self.spec.warmup_us:
             recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
@@ -360,35 +349,21 @@ class World:
         ahead = size[0] / 2 - REAR_OVERHANG
         return may_meet(self.motion, traffic.placed, ego_size=size, centre_ahead=ahead, dt=dt)
 
-    def _consequences(
-        self, impacts: tuple[Impact, ...] | None
-    ) -> tuple[list[Event], tuple[ContactNote, ...], int]:
-        """Events and notes of contacts, and the number of secondary ones between objects."""
+    def _aftermath(self, impacts: tuple[Impact, ...] | None, before: Agents) -> Aftermath:
+        """Take in the impacts of the step, or look for overlaps where there can be none."""
         if impacts is None:
-            found = self._met(self._touching)
-            self._touching = found.touching
-            if found.begun and self.spec.on_collision == "terminate":
+            found = after_overlaps(self._met(self._touching), self.t_us)
+            if found.events and self.spec.on_collision == "terminate":
                 self.terminated, self.reason = True, "collision"
-            events = [
-                Event(
-                    "collision", self.t_us, c.object_id, data={"relative_speed": c.relative_speed}
-                )
-                for c in found.begun
-            ]
-            self.impacts = ()
-            return events, found.notes, 0
-        notes = notes_of(impacts, touched=self._touching, agents=self._old_agents)
-        fresh = [i for i in impacts if _key(i) not in self._touching]
-        events = [
-            Event("collision", self.t_us, i.object_id, i.other_id, i.figures()) for i in fresh
-        ]
-        self._touching = frozenset(_key(i) for i in impacts)
-        self.impacts = impacts
-        if self.deformation is not None:
-            subjects = {o.object_id: o for o in self.agents.objects}
-            for impact in impacts:
-                self.deformation = self.deformation.struck(impact, subjects)
-        return events, notes, sum(i.other_id is not None for i in fresh)
+        else:
+            found = after_impacts(impacts, self.t_us, touched=self._touching, before=before)
+            if self.deformation is not None:
+                subjects = {o.object_id: o for o in self.agents.objects}
+                for impact in impacts:
+                    self.deformation = self.deformation.struck(impact, subjects)
+        self.impacts = impacts or ()
+        self._touching = found.touching
+        return found
 
     def _met(self, before: frozenset[str]) -> Met:
         return met(
@@ -440,19 +415,7 @@ class World:
         return self.ground.height(x, y, self._path.nearest(x, y, near_s=self._near.s))
 
     def _seen(self, others: Agents) -> Surroundings:
-        motion, (length, width, _) = self.motion, self.scene.ego_size
-        ahead = length / 2 - REAR_OVERHANG
-        ego = EgoSeen(
-            x=motion.x + ahead * math.cos(motion.yaw),
-            y=motion.y + ahead * math.sin(motion.yaw),
-            yaw=motion.yaw,
-            speed=motion.speed,
-            length=length,
-            width=width,
-            s=self._near.s,
-            offset=self._near.offset,
-            front=length - REAR_OVERHANG,
-        )
+        ego = EgoSeen.of(self.motion, self._near, self.scene.ego_size)
         clock = self._clock
         return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
 
@@ -469,9 +432,3 @@ class World:
             secondary=secondary,
             plan=plan,
         )
-
-
-def _key(impact: Impact) -> str:
-    """Name of a pair in contact; of the ego's, that of the object."""
-    name = impact.object_id or BACKGROUND
-    return name if impact.other_id is None else f"{name}\n{impact.other_id}"

@@ -20,15 +20,14 @@ from torch import Tensor
 
 from ..types import RenderOutput, ScreenStatistics
 from .base import Placement, RasterRequest, direction_matrix, place_instances
-from .cpu_blend import blend_tiles
 from .cpu_blend_backward import HALVES, SLOT, Losses, blend_tiles_backward, open_pixels
-from .cpu_cull import all_chunks
+from .cpu_camera_pass import CameraPass, constant_behind, draw_camera, note_radii
 from .cpu_inputs import (
     NO_COVARS,
     Workspace,
     array_of,
     cluster_of,
-    project,
+    places_of,
     timed,
     view_of,
 )
@@ -40,36 +39,15 @@ from .cpu_project_backward import (
     project_backward,
     project_small_backward,
 )
-from .cpu_records import CHUNK, EXTENT_X, EXTENT_Y, MEMBER, TILE, Images, Records
+from .cpu_records import CHUNK, TILE, Images
 from .cpu_simd_backward import BACKWARD_PLANES
-from .cpu_sky import add_sky
 from .cpu_sky_backward import sample_sky, sky_backward
-from .cpu_sort import sort_records
-from .cpu_tile import TILE_CHUNKS, count_tiles, tile_starts
-from .cpu_tile_slots import scatter_slots
 from .screen import empty_statistics, screen_scale
 
 CLOUD_PARTS = ("means", "quats", "scales", "opacities", "sh")
 STAGES = ("project", "sort", "tile", "blend", "sky")
 NOTHING = np.zeros((0, 0), np.float32)
 NO_INSTANCES = np.zeros((0, 0), np.uint16)
-
-
-@dataclass(frozen=True, eq=False)
-class CameraPass:
-    """What the way back needs of one camera.
-
-    Attributes:
-        records: Records with the number of its regions.
-        lists, slots, spans: see scatter_slots.
-        starts: [tiles + 1] int64, where the list of each tile starts.
-    """
-
-    records: Records
-    lists: NDArray[np.int32]
-    slots: NDArray[np.int32]
-    spans: NDArray[np.int32]
-    starts: NDArray[np.int64]
 
 
 class TrainingPass:
@@ -138,10 +116,12 @@ class TrainingPasses:
             for camera in range(request.cameras):
                 spaces.append(self._idle.pop() if self._idle else Workspace())
                 images = Images(rgb[camera], alpha[camera], depth[camera], instance[camera])
-                seen = _draw(training, camera, images, spaces[-1])
+                seen = draw_camera(
+                    request, training.placement, training.timing, camera, images, spaces[-1]
+                )
                 training.cameras.append(seen)
                 if training.screen is not None:
-                    _note_radii(request, seen, training.screen, camera)
+                    note_radii(request, seen, training.screen, camera)
         weakref.finalize(training, self._idle.extend, spaces)
         if options.instance:
             training.instance = torch.from_numpy(instance)
@@ -247,82 +227,6 @@ def _cloud_tensors(request: RasterRequest) -> list[Tensor | None]:
     return tensors
 
 
-def _draw(training: TrainingPass, camera: int, images: Images, space: Workspace) -> CameraPass:
-    """Draw one camera and keep what was made on the way."""
-    request, timing = training.request, training.timing
-    with timed(timing, "project"):
-        records, regions = project(request, training.placement, camera, all_chunks(request), space)
-    with timed(timing, "sort"):
-        pairs = space.array("pairs", (int(records.counts[:regions].sum()),), np.uint64)
-        scratch = space.array("pairs_scratch", pairs.shape, np.uint64)
-        order = sort_records(records, regions, pairs, scratch)
-    with timed(timing, "tile"):
-        seen = _make_lists(request, records, order, space)
-    with timed(timing, "blend"):
-        tiles_x, tiles = -(-request.width // TILE), len(seen.starts) - 1
-        behind = _constant_behind(request)
-        blend_tiles(records.values, seen.lists, seen.starts, tiles_x, 0, tiles, behind, images)
-    if request.sky is not None:
-        with timed(timing, "sky"):
-            matrix = array_of(direction_matrix(request, camera))
-            add_sky(array_of(request.sky.faces), matrix, images.rgb, images.alpha)
-    return seen
-
-
-def _make_lists(
-    request: RasterRequest, records: Records, order: NDArray[np.uint64], space: Workspace
-) -> CameraPass:
-    tiles_x, tiles_y = -(-request.width // TILE), -(-request.height // TILE)
-    tiles = tiles_x * tiles_y
-    cursors = space.array("cursors", (TILE_CHUNKS, tiles), np.int64)
-    footprints = space.array("ordered_footprints", order.shape, np.int64)
-    starts = space.array("starts", (tiles + 1,), np.int64)
-    count_tiles(records.values, records.footprints, order, tiles_x, footprints, cursors)
-    by_chunk = cursors.sum(1)
-    first_slots = np.cumsum(by_chunk) - by_chunk
-    tile_starts(cursors, 0, tiles, starts)
-    length = int(by_chunk.sum())
-    seen = CameraPass(
-        records=records,
-        lists=space.array("lists", (length,), np.int32),
-        slots=space.array("slots", (length,), np.int32),
-        spans=space.array("spans", (len(records.footprints), 2), np.int32),
-        starts=starts,
-    )
-    scatter_slots(
-        records.values,
-        footprints,
-        order,
-        tiles_x,
-        first_slots,
-        cursors,
-        seen.lists,
-        seen.slots,
-        seen.spans,
-    )
-    return seen
-
-
-def _constant_behind(request: RasterRequest) -> NDArray[np.float32]:
-    """The colour that blending puts behind the picture."""
-    color = (0.0, 0.0, 0.0) if request.sky is not None else request.options.background
-    return np.array(color, np.float32)
-
-
-def _note_radii(
-    request: RasterRequest, seen: CameraPass, screen: ScreenStatistics, camera: int
-) -> None:
-    values, counts = seen.records.values, seen.records.counts
-    region = 0
-    for index, instance in enumerate(request.instances):
-        radii = screen.radii[index][camera].numpy()
-        for start in range(0, len(instance.cloud), CHUNK):
-            used = values[region * CHUNK : region * CHUNK + counts[region]]
-            extents = np.maximum(used[:, EXTENT_X], used[:, EXTENT_Y])
-            radii[start + used[:, MEMBER].astype(np.int64)] = np.ceil(extents)
-            region += 1
-
-
 def _camera_image(images: Tensor | None, camera: int) -> NDArray[np.float32]:
     return NOTHING if images is None else array_of(images[camera])
 
@@ -351,7 +255,7 @@ class _WayBack:
         """What is behind the picture; on the way, the gradient by the faces of the sky."""
         request = self.training.request
         if request.sky is None or not self.losses.rgb.shape[0]:
-            return _constant_behind(request)[None, None]
+            return constant_behind(request)[None, None]
         shape = (request.height, request.width)
         behind = self.space.array("behind", (*shape, 3), np.float32)
         rows = self.space.array("texel_rows", shape, np.int32)
@@ -387,11 +291,12 @@ class _WayBack:
         training, camera = self.training, self.camera
         request, records = training.request, training.cameras[camera].records
         view, scale = view_of(request, camera), screen_scale(request)
+        places = places_of(training.placement, camera)
         base = 0
         for index, instance in enumerate(request.instances):
             regions = -(-len(instance.cloud) // CHUNK)
             if regions:
-                cluster = cluster_of(instance, training.placement, camera, index)
+                cluster = cluster_of(instance, places, index)
                 sums = np.empty((regions, PLACEMENT))
                 out = result.clusters[index]
                 go_back = project_backward if regions > 1 else project_small_backward

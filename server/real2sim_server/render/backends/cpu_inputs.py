@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -52,28 +52,47 @@ def project(
         space.array("depths", (total * CHUNK,), np.float32),
         space.array("counts", (total,), np.int64),
     )
-    view = view_of(request, camera)
+    view, places = view_of(request, camera), places_of(placement, camera)
     base = 0
     for index, instance in enumerate(request.instances):
         count = len(chunks[index])
         if count:
-            cluster = cluster_of(instance, placement, camera, index)
+            cluster = cluster_of(instance, places, index)
             draw = project_cluster if count > 1 else project_small_cluster
             draw(cluster, view, base * CHUNK, chunks[index], records)
         base += count
     return records, total
 
 
-def cluster_of(instance: Instance, placement: Placement, camera: int, index: int) -> Cluster:
+class Places(NamedTuple):
+    """The part of a Placement that one camera needs, contiguous."""
+
+    linear: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    camera_position: NDArray[np.float32]
+    scale: NDArray[np.float32]
+
+
+def places_of(placement: Placement, camera: int) -> Places:
+    """Where all instances stand before one camera."""
+    return Places(
+        linear=np.ascontiguousarray(placement.linear[camera].numpy()),
+        offset=np.ascontiguousarray(placement.offset[camera].numpy()),
+        camera_position=placement.camera_position[camera].numpy().astype(np.float32, order="C"),
+        scale=placement.scale.numpy().astype(np.float32, order="C"),
+    )
+
+
+def cluster_of(instance: Instance, places: Places, index: int) -> Cluster:
     """The arrays of one instance as one camera needs them; nothing large is copied."""
     cloud, colour = arrays_of(instance.cloud), instance.colour
     return Cluster(
         *cloud,
         covars=NO_COVARS if instance.covars is None else array_of(instance.covars),
-        linear=np.ascontiguousarray(placement.linear[camera, index].numpy()),
-        offset=np.ascontiguousarray(placement.offset[camera, index].numpy()),
-        camera_position=placement.camera_position[camera, index].numpy().astype(np.float32),
-        scale=placement.scale[index].numpy().astype(np.float32),
+        linear=places.linear[index],
+        offset=places.offset[index],
+        camera_position=places.camera_position[index],
+        scale=places.scale[index],
         instance_id=np.float32(instance.instance_id),
         coefficients=NO_COEFFICIENTS if colour is None else array_of(colour.coefficients),
         tones=NO_TONES if colour is None else array_of(colour.tones(instance.t_us)),

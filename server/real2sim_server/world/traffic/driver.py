@@ -10,7 +10,9 @@ import numpy as np
 
 from ...edit import ObjectState
 from ..agents import Agents
-from ..path import Float, LoggedPath
+from ..contact import REAR_OVERHANG
+from ..ego import Motion
+from ..path import Float, LoggedPath, PathPoint
 
 
 class AgentPose(NamedTuple):
@@ -52,6 +54,23 @@ class EgoSeen:
     s: float
     offset: float
     front: float
+
+    @classmethod
+    def of(cls, motion: Motion, near: PathPoint, size: tuple[float, float, float]) -> Self:
+        """The ego in motion, ``near`` a point of its route; ``size`` of its box [m]."""
+        length, width, _ = size
+        ahead = length / 2 - REAR_OVERHANG
+        return cls(
+            x=motion.x + ahead * math.cos(motion.yaw),
+            y=motion.y + ahead * math.sin(motion.yaw),
+            yaw=motion.yaw,
+            speed=motion.speed,
+            length=length,
+            width=width,
+            s=near.s,
+            offset=near.offset,
+            front=length - REAR_OVERHANG,
+        )
 
 
 @dataclass(frozen=True, eq=False)
