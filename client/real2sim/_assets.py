@@ -9,6 +9,7 @@ from pathlib import Path
 from real2sim_proto.assets import AssetCut, AssetInfo, AssetUpload
 
 from . import _requests
+from ._call import checked
 from ._transport import AsyncTransport, Transport
 from .images import Image
 
@@ -36,7 +37,7 @@ class Assets:
         category: str | None = None,
     ) -> AssetInfo:
         """Cut an object out of a scene; default: under its own id and category."""
-        cut = _requests.checked(
+        cut = checked(
             AssetCut, scene=scene, object_id=object_id, asset_id=asset_id, category=category
         )
         return self._transport.send(_requests.cut_asset(cut))
@@ -68,7 +69,7 @@ class Assets:
             "yaw": yaw,
             "length": length,
         }
-        asked = _requests.checked(AssetUpload, **fields)
+        asked = checked(AssetUpload, **fields)
         return self._transport.send(_requests.upload_asset(Path(path), asked))
 
     def delete(self, asset_id: str) -> None:
@@ -103,7 +104,7 @@ class AsyncAssets:
         category: str | None = None,
     ) -> AssetInfo:
         """Cut an object out of a scene; default: under its own id and category."""
-        cut = _requests.checked(
+        cut = checked(
             AssetCut, scene=scene, object_id=object_id, asset_id=asset_id, category=category
         )
         return await self._transport.send(_requests.cut_asset(cut))
@@ -126,7 +127,7 @@ class AsyncAssets:
             "yaw": yaw,
             "length": length,
         }
-        asked = _requests.checked(AssetUpload, **fields)
+        asked = checked(AssetUpload, **fields)
         return await self._transport.send(_requests.upload_asset(Path(path), asked))
 
     async def delete(self, asset_id: str) -> None:

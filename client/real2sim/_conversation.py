@@ -51,8 +51,8 @@ from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 from real2sim_proto.plans import PLAN, Plan
 
+from ._call import checked
 from ._replies import describe
-from ._requests import checked
 from .errors import (
     MalformedReplyError,
     NotResetError,

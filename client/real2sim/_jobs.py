@@ -12,6 +12,7 @@ from typing import Any
 from real2sim_proto.jobs import ExportRequest, JobInfo, JobState
 
 from . import _requests
+from ._call import checked
 from ._transport import AsyncTransport, Transport
 from .errors import Real2SimError, Refusal, ReplyTimeoutError, error_for
 
@@ -66,7 +67,7 @@ class Jobs:
             "end_us": end_us,
             "fps": fps,
         }
-        call = _requests.create_export(_requests.checked(ExportRequest, **fields))
+        call = _requests.create_export(checked(ExportRequest, **fields))
         return Job(self._transport, self._transport.send(call))
 
 
@@ -143,7 +144,7 @@ class AsyncJobs:
 
     async def export_video(self, *, camera: str, **options: Any) -> AsyncJob:
         """Start making a video; options as of :meth:`Jobs.export_video`."""
-        asked = _requests.checked(ExportRequest, camera=camera, **options)
+        asked = checked(ExportRequest, camera=camera, **options)
         info = await self._transport.send(_requests.create_export(asked))
         return AsyncJob(self._transport, info)
 

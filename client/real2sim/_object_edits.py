@@ -34,7 +34,7 @@ from real2sim_proto.operations import (
 )
 from real2sim_proto.scenes import ObjectInfo
 
-from ._requests import checked
+from ._call import checked
 
 R = TypeVar("R")
 Vector = tuple[float, float, float]

@@ -16,6 +16,7 @@ from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument,
 from real2sim_proto.scenes import ObjectInfo
 
 from . import _requests
+from ._call import ViewRequest, checked
 from ._jobs import Job
 from ._object_edits import (
     UPRIGHT,
@@ -135,7 +136,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             preset: how objects become bodies: ``vehicle`` or ``paper``.
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         """
-        body = _requests.checked(
+        body = checked(
             SimulateRequest,
             start_us=start_us,
             end_us=end_us,
@@ -184,7 +185,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
     ) -> Image:
         """What a recorded camera would see now; arguments as of :meth:`Scenes.render`."""
         codec = image_codec(self._transport.target, codec, modality)
-        view = _requests.ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, t_us, width, modality, codec)
         return self._transport.send(_requests.preview(self.scenario_id, view))
 
     def _edit(self, operation: Operation) -> OperationResult:

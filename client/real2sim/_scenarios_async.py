@@ -11,6 +11,7 @@ from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument,
 from real2sim_proto.scenes import ObjectInfo
 
 from . import _requests
+from ._call import ViewRequest, checked
 from ._jobs import AsyncJob
 from ._object_edits import (
     UPRIGHT,
@@ -133,7 +134,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             preset: how objects become bodies: ``vehicle`` or ``paper``.
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         """
-        body = _requests.checked(
+        body = checked(
             SimulateRequest,
             start_us=start_us,
             end_us=end_us,
@@ -186,7 +187,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
     ) -> Image:
         """What a recorded camera would see now; arguments as of :meth:`Scenes.render`."""
         codec = image_codec(self._transport.target, codec, modality)
-        view = _requests.ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, t_us, width, modality, codec)
         return await self._transport.send(_requests.preview(self.scenario_id, view))
 
     def _edit(self, operation: Operation) -> Awaitable[OperationResult]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from real2sim_proto.scenes import SceneInfo, SceneState
 
 from . import _requests
+from ._call import ViewRequest
 from ._transport import AsyncTransport, Target, Transport
 from .errors import Real2SimError, ReplyTimeoutError
 from .images import Image
@@ -83,7 +84,7 @@ class Scenes:
             codec: ``raw``, ``jpeg``, ``png``, or ``auto``: raw on this machine, else jpeg.
         """
         codec = image_codec(self._transport.target, codec, modality)
-        view = _requests.ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, t_us, width, modality, codec)
         return self._transport.send(_requests.render_scene(scene, view))
 
 
@@ -136,7 +137,7 @@ class AsyncScenes:
     ) -> Image:
         """One image of a recorded camera; arguments as of :meth:`Scenes.render`."""
         codec = image_codec(self._transport.target, codec, modality)
-        view = _requests.ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, t_us, width, modality, codec)
         return await self._transport.send(_requests.render_scene(scene, view))
 
 

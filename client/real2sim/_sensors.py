@@ -15,7 +15,7 @@ from real2sim_proto.episode import (
     SensorSpec,
 )
 
-from ._requests import checked
+from ._call import checked
 
 Sensor: TypeAlias = str | SensorSpec | Mapping[str, Any]
 """A camera: its name, or a spec, or a spec's fields: ``{"camera": "front", "width": 640}``."""

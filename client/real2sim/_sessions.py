@@ -9,6 +9,7 @@ from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import SessionCreate, SessionInfo, SessionState, StepRequest
 
 from . import _requests
+from ._call import checked
 from ._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
 from ._transport import AsyncTransport, Transport
 from .observation import View
@@ -71,7 +72,7 @@ class Sessions:
         self, session_id: str, *, n: int = 1, plan: Plan | Mapping[str, Any] | None = None
     ) -> SessionState:
         """``n`` clock steps under one plan; default: the last plan, else along the log."""
-        body = _requests.checked(StepRequest, n=n, plan=plan)
+        body = checked(StepRequest, n=n, plan=plan)
         call = _requests.step_session(session_id, self._tokens.of(session_id), body)
         return self._transport.send(call)
 
@@ -126,7 +127,7 @@ class AsyncSessions:
         self, session_id: str, *, n: int = 1, plan: Plan | Mapping[str, Any] | None = None
     ) -> SessionState:
         """``n`` clock steps under one plan; default: the last plan, else along the log."""
-        body = _requests.checked(StepRequest, n=n, plan=plan)
+        body = checked(StepRequest, n=n, plan=plan)
         call = _requests.step_session(session_id, self._tokens.of(session_id), body)
         return await self._transport.send(call)
 

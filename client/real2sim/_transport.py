@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 
 import httpx2
 
+from ._call import Call, Request
 from ._replies import Reply, refusal_error
-from ._requests import Call, Request
 from ._retry import RETRYABLE_STATUS, RetryPolicy
 from .errors import Real2SimError, ReplyTimeoutError, StatusError, UnreachableError
 

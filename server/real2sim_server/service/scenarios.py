@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections import Counter, OrderedDict
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Sequence
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation
@@ -24,6 +22,7 @@ from real2sim_proto.scenarios import (
 from ..edit import AssetLookup, EditError, LogEntry, Planned, Scenario, ScenarioState
 from ..scene.io import SceneSummary
 from .disconnects import to_its_end
+from .held_scenarios import HeldScenario, HeldScenarios
 from .idempotency import Once
 from .library import BUNDLE_SUFFIX
 from .metrics import Metrics
@@ -45,24 +44,6 @@ from .scenario_replies import (
 from .snapshots import Snapshots
 from .store import ConflictError, ScenarioRow, Store, StoredReply, now_us
 
-KEPT_IN_MEMORY = 256
-"""Scenarios kept ready; others are rebuilt from the store when they are asked for."""
-
-
-@dataclass
-class _Held:
-    """A scenario in memory.
-
-    Attributes:
-        lock: one edit at a time; readers need none, for states are immutable.
-    """
-
-    row: ScenarioRow
-    scenario: Scenario
-    summary: SceneSummary
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-
-
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 
 
@@ -82,8 +63,7 @@ class Scenarios:
         self._residency = residency
         self._metrics = metrics
         self._snapshots = Snapshots(store)
-        self._held: OrderedDict[str, _Held] = OrderedDict()
-        self._opening: dict[str, asyncio.Lock] = {}
+        self._held = HeldScenarios(store, residency, self._snapshots, assets)
 
     # --- life -------------------------------------------------------------------------------
 
@@ -98,7 +78,7 @@ class Scenarios:
         Raises:
             ServiceError: UNKNOWN_SCENARIO, or INVALID_REQUEST for a revision that is not there.
         """
-        held = await self._hold(scenario_id)
+        held = await self._held.get(scenario_id)
         entries = list(held.scenario.entries)
         revision = len(entries) if request.revision is None else request.revision
         if revision > len(entries):
@@ -113,7 +93,7 @@ class Scenarios:
 
     async def export(self, scenario_id: str) -> ScenarioDocument:
         """The scenario as one file. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
-        held = await self._hold(scenario_id)
+        held = await self._held.get(scenario_id)
         return ScenarioDocument(
             name=held.row.name,
             scene=held.row.scene,
@@ -145,8 +125,8 @@ class Scenarios:
 
     async def delete(self, scenario_id: str) -> None:
         """Remove a scenario and its history. Raises ServiceError: UNKNOWN_SCENARIO."""
-        async with self._exclusive(scenario_id):
-            self._held.pop(scenario_id, None)
+        async with self._held.exclusive(scenario_id):
+            self._held.drop(scenario_id)
             self._snapshots.forget(scenario_id)
             await self._store.delete_scenario(scenario_id)
 
@@ -164,11 +144,11 @@ class Scenarios:
 
     async def view(self, scenario_id: str) -> ScenarioView:
         """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
-        return _view(await self._hold(scenario_id))
+        return _view(await self._held.get(scenario_id))
 
     async def state_at(self, scenario_id: str, revision: int) -> ScenarioState:
         """What the scenario was at a revision. Raises ServiceError: UNKNOWN_SCENARIO."""
-        held = await self._hold(scenario_id)
+        held = await self._held.get(scenario_id)
         if revision == held.scenario.revision:
             return held.scenario.state
         log = [history_entry(e) for e in held.scenario.entries[:revision]]
@@ -177,7 +157,7 @@ class Scenarios:
 
     async def history(self, scenario_id: str, *, after: int = 0) -> History:
         """Revisions behind ``after``, oldest first."""
-        scenario = (await self._hold(scenario_id)).scenario
+        scenario = (await self._held.get(scenario_id)).scenario
         return History(
             revision=scenario.revision,
             can_undo=scenario.can_undo,
@@ -187,9 +167,7 @@ class Scenarios:
 
     async def with_asset(self, asset_id: str) -> Sequence[str]:
         """Ids of the scenarios whose history names an asset, edits that are under way included."""
-        for held in list(self._held.values()):
-            async with held.lock:
-                pass
+        await self._held.settled()
         return await self._store.scenarios_naming(asset_id)
 
     @property
@@ -274,12 +252,12 @@ class Scenarios:
             created_us=now_us(),
         )
         scenario = await asyncio.to_thread(replayed, row, summary, log, self._assets)
-        held = _Held(row, scenario, summary)
+        held = HeldScenario(row, scenario, summary)
         info = _view(held).info(tracks=False)
         reply = once.reply(info, status=201, headers=created_headers(info))
         entries = [entry.model_dump(mode="json") for entry in log]
         await self._store.create_scenario(row, entries=entries, reply=reply)
-        self._keep(held)
+        self._held.keep(held)
         return info
 
     async def _summary_of(self, document: ScenarioDocument) -> SceneSummary:
@@ -303,7 +281,7 @@ class Scenarios:
         dry_run: bool = False,
         once: Once,
     ) -> OperationResult:
-        async with self._exclusive(scenario_id) as held:
+        async with self._held.exclusive(scenario_id) as held:
             scenario = held.scenario
             if expected is not None and expected != scenario.revision:
                 self._metrics.edit_conflicts.inc()
@@ -325,7 +303,7 @@ class Scenarios:
                 raise
             except Exception as error:
                 # Only the store knows whether the entry is in the log.
-                self._held.pop(scenario_id, None)
+                self._held.drop(scenario_id)
                 if isinstance(error, ConflictError):
                     raise changed_elsewhere(scenario_id) from error
                 raise
@@ -340,57 +318,8 @@ class Scenarios:
             scenario_id, entry.revision, fields, created_us=now_us(), reply=reply
         )
 
-    @asynccontextmanager
-    async def _exclusive(self, scenario_id: str) -> AsyncIterator[_Held]:
-        while True:
-            held = await self._hold(scenario_id)
-            async with held.lock:
-                # Whoever had the lock before may have dropped or deleted it.
-                if self._held.get(scenario_id) is held:
-                    yield held
-                    return
 
-    async def _hold(self, scenario_id: str) -> _Held:
-        held = self._held.get(scenario_id)
-        if held is None:
-            lock = self._opening.setdefault(scenario_id, asyncio.Lock())
-            try:
-                async with lock:
-                    held = self._held.get(scenario_id) or await self._rebuild(scenario_id)
-                    self._keep(held)
-            finally:
-                if not lock.locked():
-                    self._opening.pop(scenario_id, None)
-        self._held.move_to_end(scenario_id)
-        return held
-
-    async def _rebuild(self, scenario_id: str) -> _Held:
-        row = await self._store.scenario(scenario_id)
-        if row is None:
-            raise ServiceError(
-                ErrorCode.UNKNOWN_SCENARIO,
-                f"no scenario {scenario_id!r}",
-                hint="GET /v1/scenarios lists them",
-            )
-        summary = await self._residency.summary(row.scene)
-        if summary.content_hash != row.scene_hash:
-            raise ServiceError(
-                ErrorCode.SCENE_BROKEN,
-                f"scenario {scenario_id!r} was made on scene {row.scene!r} with hash "
-                f"{row.scene_hash[:12]}; the bundle now has {summary.content_hash[:12]}",
-                hint="put the old bundle back, or start a new scenario",
-            )
-        scenario = await self._snapshots.opened(row, summary, self._assets)
-        return _Held(row, scenario, summary)
-
-    def _keep(self, held: _Held) -> None:
-        self._held[held.row.scenario_id] = held
-        if len(self._held) > KEPT_IN_MEMORY:
-            for key in [k for k, h in self._held.items() if not h.lock.locked()][:-KEPT_IN_MEMORY]:
-                del self._held[key]
-
-
-def _view(held: _Held) -> ScenarioView:
+def _view(held: HeldScenario) -> ScenarioView:
     scenario = held.scenario
     return ScenarioView(
         row=held.row,

@@ -1,0 +1,132 @@
+"""What a REST call is made of: a request, and how its reply is read."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+from urllib.parse import quote
+
+from pydantic import BaseModel, ValidationError
+
+from ._replies import MEDIA_TYPES, Reply, describe, parse_image
+from .images import Image
+
+T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What goes out. ``idempotent`` requests may be sent again when no reply came."""
+
+    method: str
+    path: str
+    params: dict[str, str] = field(default_factory=dict)
+    headers: dict[str, str] = field(default_factory=dict)
+    body: bytes | None = None
+    form: dict[str, str] = field(default_factory=dict)
+    upload: Path | None = None
+    idempotent: bool = True
+    patient: bool = False
+    accepted: frozenset[int] = frozenset()
+
+    def __str__(self) -> str:
+        return f"{self.method} {self.path}"
+
+
+@dataclass(frozen=True)
+class Call(Generic[T]):
+    """A request and how its reply is read."""
+
+    request: Request
+    parse: Callable[[Reply], T]
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """One image of one camera at one instant; ``codec`` is never 'auto' here."""
+
+    camera: str
+    t_us: int | None
+    width: int | None
+    modality: str
+    codec: str
+
+
+def checked(model: type[M], /, **fields: Any) -> M:
+    """A model of these fields.
+
+    Raises:
+        ValueError: one sentence that names every field that is not allowed, and why.
+    """
+    try:
+        return model(**fields)
+    except ValidationError as error:
+        raise ValueError(f"{model.__name__}: {describe(error)}") from error
+
+
+def new_key() -> str:
+    """An Idempotency-Key: made once a call, the same for all its tries."""
+    return uuid.uuid4().hex
+
+
+def post(
+    path: str,
+    body: BaseModel | None,
+    *,
+    params: dict[str, str] | None = None,
+    if_match: str | None = None,
+    patient: bool = False,
+) -> Request:
+    """A POST that may be tried again: the worker knows it by its Idempotency-Key."""
+    headers = {"Idempotency-Key": new_key()}
+    if body is not None:
+        headers["Content-Type"] = "application/json"
+    if if_match is not None:
+        headers["If-Match"] = if_match
+    content = None if body is None else json_of(body)
+    return Request("POST", path, params or {}, headers, content, patient=patient)
+
+
+def upload(path: str, file: Path, form: dict[str, str]) -> Request:
+    """A POST of a file with form fields."""
+    key = new_key()
+    # The boundary follows from the key, so that every try sends the same bytes.
+    headers = {
+        "Idempotency-Key": key,
+        "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
+    }
+    return Request("POST", path, headers=headers, form=form, upload=file, patient=True)
+
+
+def json_of(body: BaseModel) -> bytes:
+    """The model as JSON, without what is None."""
+    return body.model_dump_json(exclude_none=True).encode()
+
+
+def segment(name: str) -> str:
+    """A name as one part of a path. Raises ValueError for what cannot be one."""
+    if not name or name in {".", ".."}:
+        raise ValueError(f"{name!r} is not a name that a path can hold")
+    return quote(name, safe="")
+
+
+def bearer(token: str | None) -> dict[str, str]:
+    """The header that shows a token."""
+    return {} if token is None else {"Authorization": f"Bearer {token}"}
+
+
+def image(path: str, view: ViewRequest) -> Call[Image]:
+    """A picture. Raises ValueError for an unknown codec."""
+    if view.codec not in MEDIA_TYPES:
+        allowed = ", ".join(("auto", *MEDIA_TYPES))
+        raise ValueError(f"codec {view.codec!r} is unknown; allowed are {allowed}")
+    params = {"camera": view.camera, "modality": view.modality}
+    params |= {} if view.t_us is None else {"t_us": str(view.t_us)}
+    params |= {} if view.width is None else {"width": str(view.width)}
+    headers = {"Accept": MEDIA_TYPES[view.codec]}
+    request = Request("GET", path, params, headers, patient=True)
+    return Call(request, lambda reply: parse_image(reply, view.modality))
