@@ -18,7 +18,7 @@ BY_STAGE = ("no_sensors", "one_raw_camera", "real_time")
 
 
 def print_report(console: Console, figures: Mapping[str, Any]) -> None:
-    """Print latencies, stages, lag of the event loop and memory."""
+    """Print latencies, stages, lag of the event loop, memory and the machine's own pauses."""
     console.print(_latencies(figures))
     for name in BY_STAGE:
         console.print(_stages(TITLES[name], figures[name]))
@@ -32,6 +32,12 @@ def print_report(console: Console, figures: Mapping[str, Any]) -> None:
         console.print(
             f"memory: {memory['per_session_mb']:.2f} MB for each of {memory['sessions']} sessions"
         )
+    machine = figures["machine"]
+    console.print(
+        f"machine: a program that only reads the clock, one on each of {machine['cores']} cores, "
+        f"is stopped {machine['per_second']:.1f} times a second for more than 1 ms, at most for "
+        f"{machine['longest_ms']:.1f} ms"
+    )
 
 
 def _latencies(figures: Mapping[str, Any]) -> Table:

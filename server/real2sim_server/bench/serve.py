@@ -24,6 +24,7 @@ from ..demo.worker import own_worker
 from ..scene.io import save_scene
 from .drive_probe import DriveProbe, straight_on
 from .loop_lag import loop_lag
+from .pauses import pauses
 from .report import print_report
 from .street import street
 
@@ -52,6 +53,7 @@ class Effort:
         steps, camera_steps: measured, without sensors and with one raw camera.
         heavy_seconds: how long large pictures are drawn while the event loop is watched.
         real_time_steps: measured on the demo's street with its three cameras; see ``REAL_TIME``.
+        pause_seconds: how long the machine itself is watched, with nothing else running.
     """
 
     gaussians: int = 200_000
@@ -61,6 +63,7 @@ class Effort:
     camera_steps: int = 200
     heavy_seconds: float = 15.0
     real_time_steps: int = 200
+    pause_seconds: float = 3.0
 
 
 def run(effort: Effort | None = None) -> Figures:
@@ -70,6 +73,8 @@ def run(effort: Effort | None = None) -> Figures:
     """
     effort = effort or Effort()
     console = Console()
+    with console.status("how often the machine stops a program"):
+        machine = pauses(effort.pause_seconds)
     with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder:
         root = Path(folder)
         with console.status(f"making a street of {effort.gaussians} Gaussians"):
@@ -80,6 +85,7 @@ def run(effort: Effort | None = None) -> Figures:
         log_file = root / "worker.log"
         with own_worker(scenes=root / "scenes", data=root, log_file=log_file) as worker:
             figures = _measure(console, effort, url=worker.url, pid=worker.process.pid)
+    figures["machine"] = machine
     print_report(console, figures)
     return figures
 

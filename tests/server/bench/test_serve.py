@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from real2sim_server.bench import serve
+from real2sim_server.bench import pauses, serve
 from real2sim_server.bench.loop_lag import _quantile_bound
 
 pytestmark = pytest.mark.network
@@ -24,10 +24,28 @@ def test_a_quantile_of_a_histogram_is_known_up_to_its_bucket():
     assert _quantile_bound({}, 0.99) is None
 
 
+def test_a_program_that_is_stopped_notes_the_pause(monkeypatch):
+    readings = iter([0.0, 0.0005, 0.0105, 0.0110, 0.0260, 1.0])
+    monkeypatch.setattr(pauses.time, "perf_counter", lambda: next(readings))
+    assert pauses._read_the_clock(0.02) == pytest.approx([0.01, 0.015])
+
+
+def test_pauses_are_those_of_all_cores():
+    figures = pauses.pauses(0.05)
+    assert figures["cores"] >= 1
+    assert figures["longest_ms"] == 0 or figures["longest_ms"] > 1
+    assert (figures["per_second"] > 0) == (figures["longest_ms"] > 0)
+
+
 @pytest.mark.slow
 def test_a_short_run_gives_all_figures_as_json(capsys):
     effort = serve.Effort(
-        gaussians=100_000, steps=50, camera_steps=5, heavy_seconds=1.0, real_time_steps=3
+        gaussians=100_000,
+        steps=50,
+        camera_steps=5,
+        heavy_seconds=1.0,
+        real_time_steps=3,
+        pause_seconds=0.2,
     )
     figures = serve.run(effort)
     assert json.loads(json.dumps(figures)) == figures
@@ -38,4 +56,5 @@ def test_a_short_run_gives_all_figures_as_json(capsys):
     overhead = figures["real_time"]["overhead_ms"]
     assert 0 < overhead["p50"] < figures["real_time"]["p50"]
     assert figures["memory"]["per_session_mb"] < 5
+    assert figures["machine"]["cores"] >= 1
     assert "drive step, no sensors" in capsys.readouterr().out

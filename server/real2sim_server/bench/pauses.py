@@ -1,0 +1,43 @@
+"""How often the machine itself stops a program: the floor of every latency measured on it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+NOTED_S = 1e-3
+"""Shorter ones are the ordinary ticks of a kernel."""
+
+
+def pauses(seconds: float) -> dict[str, Any]:
+    """What happens to a program that only reads the clock, one on every core.
+
+    Returns:
+        ``cores``; ``per_second``: pauses above 1 ms of one core; ``longest_ms``.
+    """
+    cores = os.cpu_count() or 1
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(cores, mp_context=spawn) as pool:
+        found = list(pool.map(_read_the_clock, [seconds] * cores))
+    noted = [pause for of_core in found for pause in of_core]
+    return {
+        "cores": cores,
+        "per_second": len(noted) / (cores * seconds),
+        "longest_ms": 1e3 * max(noted, default=0.0),
+    }
+
+
+def _read_the_clock(seconds: float) -> list[float]:
+    """Pauses above ``NOTED_S`` [s]."""
+    noted = []
+    before = time.perf_counter()
+    end = before + seconds
+    while before < end:
+        now = time.perf_counter()
+        if now - before > NOTED_S:
+            noted.append(now - before)
+        before = now
+    return noted
