@@ -73,6 +73,18 @@ def test_cpu_follows_the_reference_through_a_crash(material):
         assert b.heat == pytest.approx(a.heat, abs=1e-4)
 
 
+def test_many_substeps_at_once_are_the_same_substeps():
+    runs = [crash(SOFT, "cpu", "single") for _ in range(2)]
+    dt = runs[0].time_step()
+    for steps in (7, 5, 1, 11):
+        runs[0].simulation.advance(steps, dt, runs[0].colliders)
+        for _ in range(steps):
+            runs[1].simulation.advance(1, dt, runs[1].colliders)
+    together, one_by_one = (run.particles() for run in runs)
+    for name in STATE:
+        np.testing.assert_array_equal(getattr(together, name), getattr(one_by_one, name))
+
+
 def test_single_precision_stays_near_double():
     runs = [crash(SOFT, "cpu", precision) for precision in ("double", "single")]
     for run in runs:

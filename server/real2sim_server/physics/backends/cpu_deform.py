@@ -28,10 +28,10 @@ from ..laws.stress import (
     corotated_about,
     neo_hookean_at,
 )
+from .cpu_columns import BATCH, bring_back_nine, bring_back_six, lay_out
 from .kernel import inner
 from .particle import deform
 
-BATCH = 16
 _F, _L, _TAU, _ENERGY, _VOLUME, _MU, _LAMBDA, _ETA, _OFF = 0, 9, 18, 24, 25, 26, 27, 28, 29
 """Rows of the scratch space, BATCH numbers each; _OFF tells lanes that did not converge."""
 SCRATCH = 30 * BATCH
@@ -69,12 +69,17 @@ def common_kind(first: Any, count: Any, material: Any, table: Any) -> Any:
 @inner()
 def load(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
     """Lay particles out by component; lanes without one repeat the last."""
+    if count == BATCH:
+        lay_out(state.F, first, s, _F)
+        lay_out(state.L, first, s, _L)
+    else:
+        for lane in range(BATCH):
+            p = first + min(lane, count - 1)
+            for c in range(9):
+                s[(_F + c) * BATCH + lane] = state.F[p, c]
+                s[(_L + c) * BATCH + lane] = state.L[p, c]
     for lane in range(BATCH):
-        p = first + min(lane, count - 1)
-        for c in range(9):
-            s[(_F + c) * BATCH + lane] = state.F[p, c]
-            s[(_L + c) * BATCH + lane] = state.L[p, c]
-        row = table[state.material[p]]
+        row = table[state.material[first + min(lane, count - 1)]]
         s[_MU * BATCH + lane] = row[MU]
         s[_LAMBDA * BATCH + lane] = row[LAMBDA]
         s[_ETA * BATCH + lane] = row[VISCOSITY]
@@ -83,6 +88,15 @@ def load(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 @inner()
 def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> None:
     """Bring results back; lanes that are off are done again, one by one."""
+    off = ZERO
+    for lane in range(BATCH):
+        off = max(off, s[_OFF * BATCH + lane])
+    if count == BATCH and off == ZERO:
+        bring_back_nine(s, _F, state.F, first)
+        bring_back_six(s, _TAU, state.tau, first)
+        for lane in range(BATCH):
+            state.energy[first + lane] = s[_ENERGY * BATCH + lane]
+        return
     for lane in range(count):
         p = first + lane
         if s[_OFF * BATCH + lane] != ZERO:

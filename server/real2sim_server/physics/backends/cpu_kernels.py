@@ -33,11 +33,12 @@ def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, rules: Any)
     No steps at all find the stress and energy of the particles as they stand.
     """
     if steps == 0:
-        gather_homes(dt, state, layout, work, rules, False)
-    for done in range(steps):
+        gather_homes(dt, state, layout, work, rules, False, False)
+    else:
         scatter_homes(dt, state, layout, work, rules)
+    for done in range(steps):
         collect_fields(dt, layout, work, rules)
-        gather_homes(dt, state, layout, work, rules, True)
+        gather_homes(dt, state, layout, work, rules, True, done + 1 < steps)
         if work.strayed.any():
             return done + 1
     return steps
@@ -48,15 +49,21 @@ def scatter_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> No
     """Particles to tiles: momentum with APIC and stress (MLS-MPM, Hu et al. 2018), mass."""
     for chunk in prange(CHUNKS):
         for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
-            tile = work.tiles[home]
-            tile[:] = ZERO
-            begin, end = layout.home_start[home], layout.home_start[home + 1]
-            scatter_particles(begin, end, dt, rules.dx, state, tile.reshape(-1))
-            slot = layout.home_moment[home]
-            if slot >= 0:
-                moments = work.moments[slot]
-                moments[:] = ZERO
-                scatter_moments(begin, end, state, moments.reshape(-1))
+            scatter_home(home, dt, state, layout, work, rules)
+
+
+@inner()
+def scatter_home(home: Any, dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> None:
+    """Add the particles of one home to its tile, and their moments where they are asked for."""
+    tile = work.tiles[home]
+    tile[:] = ZERO
+    begin, end = layout.home_start[home], layout.home_start[home + 1]
+    scatter_particles(begin, end, dt, rules.dx, state, tile.reshape(-1))
+    slot = layout.home_moment[home]
+    if slot >= 0:
+        moments = work.moments[slot]
+        moments[:] = ZERO
+        scatter_moments(begin, end, state, moments.reshape(-1))
 
 
 @inner()
@@ -162,8 +169,11 @@ def to_velocity(field: Any, dt: Any, gravity: Any) -> None:
 
 
 @inner(parallel=True)
-def gather_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving: Any) -> None:
-    """Fields to particles when ``moving``, then stress for the next substep."""
+def gather_homes(
+    dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving: Any, going_on: Any
+) -> None:
+    """Fields to particles when ``moving``, then stress; when ``going_on``, already the scattering
+    of the next substep, while a home's particles are in the cache."""
     for chunk in prange(CHUNKS):
         for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
             tile = work.tiles[home]
@@ -173,6 +183,9 @@ def gather_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving
             gone = gather_particles(begin, end, dt, rules.dx, state, tile.reshape(-1), moving)
             deform_all(begin, end, dt, state, rules.table, work.scratch[chunk])
             note(work.strayed, home, gone)
+            # What has strayed does not fit the tile; all is sorted and scattered anew then.
+            if going_on and not gone:
+                scatter_home(home, dt, state, layout, work, rules)
 
 
 @inner()
