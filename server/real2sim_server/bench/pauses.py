@@ -10,6 +10,8 @@ from typing import Any
 
 NOTED_S = 1e-3
 """Shorter ones are the ordinary ticks of a kernel."""
+START_S = 1.0
+"""Long enough that no program that is up already takes the place of one that starts."""
 
 
 def pauses(seconds: float) -> dict[str, Any]:
@@ -21,6 +23,8 @@ def pauses(seconds: float) -> dict[str, Any]:
     cores = os.cpu_count() or 1
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(cores, mp_context=spawn) as pool:
+        # Nobody reads before all have started, which keeps every core busy.
+        list(pool.map(time.sleep, [START_S] * cores))
         found = list(pool.map(_read_the_clock, [seconds] * cores))
     noted = [pause for of_core in found for pause in of_core]
     return {
