@@ -12,7 +12,7 @@ import torch
 
 from real2sim_server.render import Instance, RenderOutput, rasterize
 from real2sim_server.render.backends.base import place_instances
-from real2sim_server.render.backends.cpu_inputs import cluster_of
+from real2sim_server.render.backends.cpu_inputs import cluster_of, places_of
 from real2sim_server.scene import GaussianCloud, Sky
 
 K = np.array([[[200.0, 0, 100], [0, 200, 75], [0, 0, 1]]])
@@ -91,8 +91,8 @@ def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: igno
 
 def test_clouds_are_read_where_they_lie() -> None:
     (instance, _) = scene()
-    placement = place_instances([instance], torch.eye(4, dtype=torch.float64)[None])
-    cluster = cluster_of(instance, placement, 0, 0)
+    places = places_of(place_instances([instance], torch.eye(4, dtype=torch.float64)[None]), 0)
+    cluster = cluster_of(instance, places, 0)
     for name in ("means", "quats", "scales", "opacities", "sh"):
         tensor = getattr(instance.cloud, name)
         assert np.shares_memory(getattr(cluster, name), tensor.numpy()), name
