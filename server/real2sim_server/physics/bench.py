@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -30,6 +31,7 @@ REPEATS = 8
 SECONDS_PER_RUN = 0.3
 REFERENCE_PARTICLES = 2_000
 PEER_PARTICLES = 100_000
+PEER_TURNS = 3
 PEER_STEPS = 30
 """After so many substeps peers must have fallen as far."""
 TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6}
@@ -88,7 +90,7 @@ def as_rows(figures: dict[str, Any]) -> dict[str, str]:
         name = f"{line['name']}, {line.get('particles', 0):,} particles"
         if "missing" in line:
             rows[line["name"]] = line["missing"]
-        elif "ratio" in line:
+        elif line["name"] != "this solver":
             rows[name] = f"{line['rate'] / 1e6:.2f} M/s; here {line['ratio']:.2f} times as fast"
         else:
             rows[name] = f"{line['rate'] / 1e6:.2f} M/s"
@@ -158,8 +160,8 @@ def _peers() -> list[dict[str, Any]]:
 
     own(PEER_STEPS)
     fallen = start - solver.simulation.particles().positions[:, 2].mean()
-    rate = n / _best(own)[0]
-    rows: list[dict[str, Any]] = [{"name": "this solver", "particles": n, "rate": rate}]
+    runs: dict[str, Callable[[int], None]] = {"this solver": own}
+    rows: list[dict[str, Any]] = [{"name": "this solver", "particles": n}]
     for peer in PEERS:
         reason = missing_reason(peer)
         if reason:
@@ -167,18 +169,24 @@ def _peers() -> list[dict[str, Any]]:
             continue
         other = start_peer(peer, _as_peer_block(body, dx, dt))
         other.advance(PEER_STEPS)
+        runs[peer] = other.advance
         error = start - other.positions().astype(np.float64)[:, 2].mean() - fallen
-        found = n / _best(other.advance)[0]
-        rows.append(
-            {
-                "name": peer,
-                "particles": n,
-                "rate": found,
-                "ratio": rate / found,
-                "fall_differs_by_m": abs(float(error)),
-            }
-        )
+        rows.append({"name": peer, "particles": n, "fall_differs_by_m": abs(float(error))})
+    rates = _rates_by_turns(runs, n)
+    for row in rows:
+        if row["name"] in rates:
+            row["rate"] = rates[row["name"]]
+            row["ratio"] = rates["this solver"] / row["rate"]
     return rows
+
+
+def _rates_by_turns(runs: dict[str, Callable[[int], None]], particles: int) -> dict[str, float]:
+    """Best rate of each; they take turns, so that a slow minute of the machine meets all."""
+    best = dict.fromkeys(runs, math.inf)
+    for _ in range(PEER_TURNS):
+        for name, advance in runs.items():
+            best[name] = min(best[name], _best(advance)[0])
+    return {name: particles / elapsed for name, elapsed in best.items()}
 
 
 def _as_peer_block(body: Body, dx: float, dt: float) -> PeerBlock:
