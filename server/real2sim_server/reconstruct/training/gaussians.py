@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ...scene import GaussianCloud, Scene
 from ...scene.colour import TimeColour
+from .activation import activated
 from .schedule import TrainOptions
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
@@ -68,29 +69,26 @@ class Gaussians:
     ) -> list[GaussianCloud]:
         """Activated clouds of background and objects; they carry gradients.
 
+        Their quaternions are of any length: every renderer normalises them.
+
         Args:
             degree: of the spherical harmonics.
             tones: [M, F] basis values by which each object's Fourier part counts; None for none.
             mirrored: objects to be reflected at their x z plane.
         """
-        k = (degree + 1) ** 2
-        background, objects = self.sh[:, :k].contiguous().tensor_split([self.counts[0]])
-        if tones is not None and self.fourier.numel():
-            counts = torch.tensor(self.counts[1:])
-            weights = torch.repeat_interleave(tones, counts, dim=0)
-            change = (self.fourier * weights[..., None]).sum(1)
-            objects = torch.cat([objects[:, :1] + change[:, None], objects[:, 1:]], dim=1)
-        parts = [
-            torch.split(tensor, self.counts)
-            for tensor in (
-                self.means,
-                torch.nn.functional.normalize(self.quats, dim=-1),
-                self.log_scales.exp(),
-                self.logits.sigmoid(),
-            )
-        ]
-        parts.append((background, *objects.split(self.counts[1:])))
-        clouds = [GaussianCloud(*columns) for columns in zip(*parts, strict=True)]
+        if tones is None:
+            tones = self.fourier.new_zeros(len(self.counts) - 1, 0)
+        drawn = activated(
+            self.log_scales,
+            self.logits,
+            self.sh,
+            self.fourier,
+            tones=tones,
+            counts=self.counts,
+            functions=(degree + 1) ** 2,
+        )
+        placed = self.means.split(self.counts), self.quats.split(self.counts)
+        clouds = [GaussianCloud(*columns) for columns in zip(*placed, *drawn, strict=True)]
         for index, flip in enumerate(mirrored):
             if flip:
                 clouds[index + 1] = mirror(clouds[index + 1])

@@ -215,7 +215,9 @@ class SceneModel:
 
 
 def _own(cloud: GaussianCloud) -> GaussianCloud:
-    return GaussianCloud(*(tensor.detach().clone() for tensor in vars(cloud).values()))
+    copies = {name: tensor.detach().clone() for name, tensor in vars(cloud).items()}
+    copies["quats"] = torch.nn.functional.normalize(copies["quats"], dim=-1)
+    return GaussianCloud(**copies)
 
 
 def _sky_faces(sky: Sky | None, resolution: int) -> Tensor:

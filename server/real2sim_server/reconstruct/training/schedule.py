@@ -68,6 +68,8 @@ class DensifyOptions:
         hidden_rounds: shares of all iterations at which Gaussians go that images hardly show.
         hidden_share: visible share up to which those of the background go.
         hidden_object_share: likewise of objects, whose inside shows a little through the glass.
+        buried_share: visible share up to which those go that lie deep behind what is seen.
+        buried_depth: how deep that is [m].
     """
 
     method: str = "gradient"
@@ -83,9 +85,11 @@ class DensifyOptions:
     reset_every: int = 3000
     noise: float = 5e5
     growth: float = 0.05
-    hidden_rounds: tuple[float, ...] = (0.35, 0.6)
+    hidden_rounds: tuple[float, ...] = (0.35, 0.6, 0.85)
     hidden_share: float = 0.005
     hidden_object_share: float = 0.01
+    buried_share: float = 0.03
+    buried_depth: float = 0.3
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from torch import Tensor
 from ...logs import DrivingLog
 from ...render.backends import Backend
 from ...scene import Scene
+from ...scene.harmonics import SH_C0
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -25,12 +26,14 @@ from .model import Rendered, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
 from .schedule import TrainOptions, from_values, rates_at
-from .visibility import Look, drop_hidden, visible_shares
+from .visibility import Look, drop_hidden, visibility
 
 SMOOTHING = 0.98
 """Share of the past in the running loss and PSNR."""
 LOOKS = 64
 """Views at which Gaussians are looked for before hidden ones go."""
+CONSTANT_SH = (-0.55 / SH_C0, 0.55 / SH_C0)
+"""Range of the constant coefficients: colours from -0.05 to 1.05."""
 CHECKPOINT = "checkpoint"
 
 
@@ -259,6 +262,8 @@ class Trainer:
         share = self.iteration / self.options.iterations
         rates = rates_at(self.options, share, functions=int(gaussians.sh.shape[1]))
         self.optimizer.step(parameters, rates, masks)
+        # A colour no surface has would make up for another one before it, and show when that goes.
+        gaussians.sh[:, 0].clamp_(*CONSTANT_SH)
         self.densifier.jitter(gaussians, float(rates["means"]), self.iteration)
         for parameter in parameters.values():
             parameter.grad = None
@@ -275,12 +280,11 @@ class Trainer:
             )
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
         if self.densifier.drops_hidden(i):
-            densify = self.options.densify
             self.model.gaussians = drop_hidden(
                 self.model.gaussians,
                 self.optimizer,
-                visible_shares(self.model, self._some_looks()),
-                limits=(densify.hidden_share, densify.hidden_object_share),
+                visibility(self.model, self._some_looks()),
+                self.options.densify,
             )
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
         if self.densifier.resets_opacity(i):

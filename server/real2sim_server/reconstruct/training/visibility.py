@@ -1,9 +1,10 @@
 """Which Gaussians the training images show, and what becomes of those that none shows.
 
 A Gaussian behind a surface gets gradients only through the thin gaps in that surface, and Adam
-takes full steps along them: it drifts into a shred that a turned or moved object reveals. Such
-Gaussians are dropped, and what stage 0 guessed for places that nobody saw (mirrored sides, paint,
-ground under cars) is put back at the end.
+takes full steps along them: it drifts into a shred that a turned or moved object reveals. Little of
+it is seen, and it lies deep behind what is; the layers of a surface are seen little each as well,
+but lie close together. Such Gaussians are dropped, and what stage 0 guessed for places that nobody
+saw (mirrored sides, paint, ground under cars) is put back at the end.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ from .densify import rearrange, rotations
 from .gaussians import Gaussians, joined
 from .model import SceneModel
 from .optimizer import SelectiveAdam
+from .schedule import DensifyOptions
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
@@ -37,40 +39,58 @@ Look = tuple[Camera, int]
 """A camera at the size of its training images, and when it looks [us]."""
 
 
-@torch.no_grad()
-def visible_shares(model: SceneModel, looks: Iterable[Look]) -> Tensor:
-    """[N] float32: of each Gaussian, how much reaches the images of what would without the others.
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """How much of N Gaussians some views show, and how deep behind what they show these lie.
 
-    The sum of its blending weights over all pixels, by what it would be over the whole image plane
-    if nothing stood before it; 0 for what is never before a camera. Where training shows vehicles
-    mirrored, they are looked at from both sides: what is hidden on one is learnt on the other.
+    Attributes:
+        shares: [N] float32, the sum of a Gaussian's blending weights over all pixels, by what it
+            would be over the whole image plane if nothing stood before it; 0 for what is never
+            before a camera.
+        depths: [N] float32, from the surface in the pixels that show it back to its centre, mean
+            by blending weight [m]; negative before the surface, 0 for what no pixel shows.
+    """
+
+    shares: Tensor
+    depths: Tensor
+
+
+@torch.no_grad()
+def visibility(model: SceneModel, looks: Iterable[Look]) -> Visibility:
+    """What ``looks`` show of each Gaussian of ``model``.
+
+    Where training shows vehicles mirrored, they are looked at from both sides: what is hidden on
+    one is learnt on the other.
     """
     gaussians = model.gaussians
     starts = [0]
     for count in gaussians.counts:
         starts.append(starts[-1] + count)
-    shown, bare = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    shown, bare, deep = (torch.zeros(len(gaussians)) for _ in range(3))
     sides = [(), model.mirrored] if any(model.mirrored) else [()]
     for (camera, t_us), mirrored in itertools.product(looks, sides):
         viewmat = model.viewmat(camera, t_us).detach()
         clouds = gaussians.clouds(degree=0, mirrored=mirrored)
         instances, drawn = model.instances(clouds, t_us)
         weights = blending_weights(instances, viewmat, camera, model)
-        for index, instance, weight in zip(drawn, instances, weights, strict=True):
+        for index, instance, (weight, inverse) in zip(drawn, instances, weights, strict=True):
             rows = slice(starts[index], starts[index + 1])
             alone = unhindered_weights(instance, viewmat, camera)
-            shown[rows] += torch.where(alone > 0, weight, 0)
+            surface = weight / inverse.clamp(min=1e-9)
+            counted = torch.where(alone > 0, weight, 0)
+            shown[rows] += counted
             bare[rows] += alone
-    return shown / bare.clamp(min=1e-9)
+            deep[rows] += counted * (_depths(instance, viewmat) - surface)
+    return Visibility(shown / bare.clamp(min=1e-9), deep / shown.clamp(min=1e-9))
 
 
 def blending_weights(
     instances: list[Instance], viewmat: Tensor, camera: Camera, model: SceneModel
-) -> list[Tensor]:
-    """[N] sums over pixels of each Gaussian's blending weight, by instance [px].
+) -> list[tuple[Tensor, Tensor]]:
+    """By instance: sums [N] over pixels of each Gaussian's blending weight, and of weight by depth.
 
-    An image is linear in the constant colours, so that its sum's gradient by them is what is
-    looked for.
+    In [px] and [px/m]; a pixel's depth is that of the surface it shows. An image is linear in the
+    constant colours, so that the gradients of two channels' sums by them are what is looked for.
     """
     colours, coloured = [], []
     for item in instances:
@@ -84,16 +104,16 @@ def blending_weights(
             camera.K[None],
             camera.width,
             camera.height,
-            options=RasterOptions(depth=False, instance=False),
+            options=RasterOptions(depth=True, instance=False),
             backend=model.backend,
         )
-        output.rgb[..., 0].sum().backward()
-    nothing = torch.zeros(0, 1, 3)
-    gradients = [nothing if c.grad is None else c.grad for c in colours]
-    return [
-        g[:, 0, 0].cpu() / SH_C0 if len(g) else torch.zeros(len(c))
-        for g, c in zip(gradients, colours, strict=True)
+        depth = output.depth.detach()
+        inverse = torch.where(depth > NEAR, 1 / depth, 0)
+        (output.rgb[..., 0].sum() + (output.rgb[..., 1] * inverse).sum()).backward()
+    sums = [
+        torch.zeros(len(c), 3) if c.grad is None else c.grad[:, 0].cpu() / SH_C0 for c in colours
     ]
+    return [(s[:, 0], s[:, 1]) for s in sums]
 
 
 def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> Tensor:
@@ -101,10 +121,7 @@ def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
 
     0 for Gaussians whose centre is not on the image.
     """
-    pose = torch.eye(4, dtype=torch.float64)
-    if instance.T_world_object is not None:
-        pose = torch.as_tensor(instance.T_world_object, dtype=torch.float64).detach()
-    to_camera = (viewmat.double() @ pose).float()
+    to_camera = _to_camera(instance, viewmat)
     turn, cloud = to_camera[:3, :3], instance.cloud
     x, y, z = (cloud.means @ turn.T + to_camera[:3, 3]).unbind(-1)
     ahead = z > NEAR
@@ -121,13 +138,28 @@ def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
     return torch.where(inside, area * cloud.opacities, 0)
 
 
+def _depths(instance: Instance, viewmat: Tensor) -> Tensor:
+    """[N] of the centres along the optical axis [m]."""
+    to_camera = _to_camera(instance, viewmat)
+    return instance.cloud.means @ to_camera[2, :3] + to_camera[2, 3]
+
+
+def _to_camera(instance: Instance, viewmat: Tensor) -> Tensor:
+    """``T_camera_object`` [4, 4] float32."""
+    pose = torch.eye(4, dtype=torch.float64)
+    if instance.T_world_object is not None:
+        pose = torch.as_tensor(instance.T_world_object, dtype=torch.float64).detach()
+    return (viewmat.double() @ pose).float()
+
+
 def drop_hidden(
-    gaussians: Gaussians, optimizer: SelectiveAdam, shares: Tensor, *, limits: tuple[float, float]
+    gaussians: Gaussians, optimizer: SelectiveAdam, seen: Visibility, options: DensifyOptions
 ) -> Gaussians:
-    """Without those whose visible share does not exceed the limit of background or objects."""
-    limit = torch.full((len(gaussians),), limits[1])
-    limit[: gaussians.counts[0]] = limits[0]
-    kept = (shares > limit).nonzero()[:, 0]
+    """Without those of which next to nothing is seen, or little and that deep behind the rest."""
+    limit = torch.full((len(gaussians),), options.hidden_object_share)
+    limit[: gaussians.counts[0]] = options.hidden_share
+    buried = (seen.depths > options.buried_depth) & (seen.shares <= options.buried_share)
+    kept = ((seen.shares > limit) & ~buried).nonzero()[:, 0]
     return rearrange(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
 
 
@@ -142,12 +174,12 @@ def put_back_guesses(
         looks: all training views.
         limit: visible share up to which a Gaussian counts as shown by no image.
     """
-    hidden = (visible_shares(first, looks) <= limit).nonzero()[:, 0]
+    hidden = (visibility(first, looks).shares <= limit).nonzero()[:, 0]
     guesses, trained = first.gaussians.take(hidden), model.gaussians
     # Faint, so that no guess hides another: several may stand behind one gap of the surface.
     faint = replace(guesses, logits=torch.full_like(guesses.logits, FAINT))
     model.gaussians, is_guess = joined(trained, faint)
-    behind = visible_shares(model, looks) <= GUESS_SHARE
+    behind = visibility(model, looks).shares <= GUESS_SHARE
     model.gaussians, _ = joined(trained, guesses)
     model.gaussians = model.gaussians.take((~is_guess | behind).nonzero()[:, 0])
     return len(model.gaussians) - len(trained)

@@ -10,11 +10,13 @@ import torch
 from real2sim_server.reconstruct.training import SceneModel, Trainer
 from real2sim_server.reconstruct.training.gaussians import joined
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+from real2sim_server.reconstruct.training.schedule import DensifyOptions
 from real2sim_server.reconstruct.training.visibility import (
+    Visibility,
     drop_hidden,
     put_back_guesses,
     unhindered_weights,
-    visible_shares,
+    visibility,
 )
 from real2sim_server.render import Instance
 from real2sim_server.scene import Camera, GaussianCloud
@@ -56,27 +58,31 @@ def model_of(model: SceneModel, clouds: list[GaussianCloud]) -> SceneModel:
     return SceneModel(scene, opaque, np.zeros(0, np.int64), backend="cpu")
 
 
+def shares_of(model: SceneModel, looks: list[tuple[Camera, int]]) -> torch.Tensor:
+    return visibility(model, looks).shares
+
+
 def test_a_gaussian_alone_is_all_visible(model, looks):
-    [share] = visible_shares(model_of(model, [ahead(model, 5, 0.2, 0.7)]), looks)
+    [share] = shares_of(model_of(model, [ahead(model, 5, 0.2, 0.7)]), looks)
     assert share == pytest.approx(1, abs=0.02)
 
 
 def test_one_behind_an_opaque_wall_is_hidden_and_the_wall_is_not(model, looks):
     wall = [ahead(model, 4 + 0.01 * k, 1.0, 0.99) for k in range(4)]
-    shares = visible_shares(model_of(model, [*wall, ahead(model, 8, 0.05, 0.7)]), looks)
+    shares = shares_of(model_of(model, [*wall, ahead(model, 8, 0.05, 0.7)]), looks)
     assert shares[0] > 0.8
     assert shares[-1] < 1e-3
 
 
 def test_half_of_what_stands_behind_a_half_transparent_wall_is_visible(model, looks):
-    shares = visible_shares(
+    shares = shares_of(
         model_of(model, [ahead(model, 4, 5.0, 0.5), ahead(model, 8, 0.1, 0.7)]), looks
     )
     assert shares[1] == pytest.approx(0.5, abs=0.03)
 
 
 def test_what_is_never_before_a_camera_has_no_share(model, looks):
-    [share] = visible_shares(model_of(model, [ahead(model, -5, 0.2, 0.7)]), looks)
+    [share] = shares_of(model_of(model, [ahead(model, -5, 0.2, 0.7)]), looks)
     assert share == 0
 
 
@@ -87,7 +93,7 @@ def test_sides_of_vehicles_that_training_shows_mirrored_count_as_seen(tiny_log, 
     def seen(mirror: float) -> torch.Tensor:
         options = replace(TINY, refine_poses=False, mirror=mirror)
         model = SceneModel(tiny_scene, options, times, backend="cpu")
-        return (visible_shares(model, looks) > 0.05)[model.gaussians.counts[0] :]
+        return (shares_of(model, looks) > 0.05)[model.gaussians.counts[0] :]
 
     plain, mirrored = seen(0.0), seen(0.5)
     assert bool((mirrored & ~plain).any())
@@ -106,10 +112,30 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     optimizer: SelectiveAdam = marked(gaussians)
     shares = torch.full((len(gaussians),), 0.03)
     shares[:5] = 0.001
-    left = drop_hidden(gaussians, optimizer, shares, limits=(0.005, 0.05))
+    options = DensifyOptions(hidden_share=0.005, hidden_object_share=0.05)
+    seen = Visibility(shares, torch.zeros(len(gaussians)))
+    left = drop_hidden(gaussians, optimizer, seen, options)
     assert left.counts == (COUNTS[0] - 5, 0, 0)
     torch.testing.assert_close(optimizer.first["means"], left.means.detach())
     torch.testing.assert_close(left.means, gaussians.means[5 : COUNTS[0]])
+
+
+def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
+    gaussians = some_gaussians()
+    shares, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
+    depths[2], depths[3], shares[3] = 0.5, 0.5, 0.5
+    seen = Visibility(shares, depths)
+    left = drop_hidden(gaussians, marked(gaussians), seen, DensifyOptions())
+    kept = [i for i in range(len(gaussians)) if i != 2]
+    torch.testing.assert_close(left.means, gaussians.means[kept])
+
+
+def test_depth_behind_the_surface_is_measured_along_the_axis(model, looks):
+    wall = [ahead(model, 4, 5.0, 0.9)]
+    seen = visibility(model_of(model, [*wall, ahead(model, 8, 0.1, 0.5)]), looks[:1])
+    surface = (4 * 0.9 + 8 * 0.1 * 0.5) / (0.9 + 0.1 * 0.5)
+    assert float(seen.depths[1]) == pytest.approx(8 - surface, abs=0.15)
+    assert float(seen.depths[0]) == pytest.approx(0, abs=0.1)
 
 
 def test_two_packs_are_joined_owner_by_owner():
