@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from types import TracebackType
 from typing import Any, Self
 
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.sessions import SessionInfo
+
+from .lean_socket import LeanSocket
 
 ANSWER_S = 60.0
 SPEED = 8.0
@@ -27,30 +30,27 @@ class DriveProbe:
         info: of the session.
         resume: of an earlier connection that this one goes on for: its resume token, and the step
             of the last observation it has.
+        lean: whether to read without threads between, which costs least time; pings that come
+            between two messages are then answered with the next one only.
 
     Attributes:
         resume_token: with which a further connection may go on.
         pushed: the last observation that nobody has asked for; None for none.
     """
 
-    def __init__(self, info: SessionInfo, *, resume: tuple[str, int] | None = None) -> None:
+    def __init__(
+        self, info: SessionInfo, *, resume: tuple[str, int] | None = None, lean: bool = False
+    ) -> None:
         self._info = info
         self._resume = resume
+        self._lean = lean
         self._id = 0
         self.resume_token = ""
         self.pushed: dict[str, Any] | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        connection = connect(
-            self._info.ws_url,
-            subprotocols=[DRIVE_SUBPROTOCOL],  # type: ignore[list-item]
-            compression=None,
-            max_size=None,
-            proxy=None,
-            ping_interval=None,
-        )
-        self.socket = self._stack.enter_context(connection)
+        self.socket: Any = self._stack.enter_context(self._connection())
         hello = {"type": "hello", "protocols": [DRIVE_SUBPROTOCOL], "token": self._info.token}
         if self._resume is not None:
             token, step = self._resume
@@ -108,6 +108,18 @@ class DriveProbe:
                 answer = decode(self.socket.recv(left, decode=False))
                 if answer["type"] == "obs":
                     self.pushed = answer
+
+    def _connection(self) -> AbstractContextManager[Any]:
+        if self._lean:
+            return LeanSocket(self._info.ws_url, subprotocol=DRIVE_SUBPROTOCOL)
+        return connect(
+            self._info.ws_url,
+            subprotocols=[Subprotocol(DRIVE_SUBPROTOCOL)],
+            compression=None,
+            max_size=None,
+            proxy=None,
+            ping_interval=None,
+        )
 
     def _accepted(self, fields: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
         answer, seconds = self.ask(fields)

@@ -88,10 +88,7 @@ def load(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 @inner()
 def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> None:
     """Bring results back; lanes that are off are done again, one by one."""
-    off = ZERO
-    for lane in range(BATCH):
-        off = max(off, s[_OFF * BATCH + lane])
-    if count == BATCH and off == ZERO:
+    if count == BATCH and all_converged(s):
         bring_back_nine(s, _F, state.F, first)
         bring_back_six(s, _TAU, state.tau, first)
         for lane in range(BATCH):
@@ -107,6 +104,15 @@ def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> No
         for c in range(6):
             state.tau[p, c] = s[(_TAU + c) * BATCH + lane]
         state.energy[p] = s[_ENERGY * BATCH + lane]
+
+
+@inner()
+def all_converged(s: Any) -> Any:
+    """Whether no lane of a full batch is off."""
+    off = ZERO
+    for lane in range(BATCH):
+        off = max(off, s[_OFF * BATCH + lane])
+    return off == ZERO
 
 
 @inner()

@@ -1,0 +1,152 @@
+"""A WebSocket client of one thread, to measure the worker and not its client.
+
+The library's own client passes what it reads from thread to thread and from buffer to buffer, which
+takes as long as half a step of the worker. Here only the handshake and what is sent are the
+library's; what comes is read by the thread that waits for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from types import TracebackType
+from typing import Self
+from urllib.parse import urlsplit
+
+from websockets.client import ClientProtocol
+from websockets.frames import Opcode
+from websockets.protocol import State
+from websockets.typing import Subprotocol
+from websockets.uri import parse_uri
+
+READ = 1 << 16
+LENGTHS = {126: 2, 127: 8}
+"""Bytes of a payload's length behind a header that holds one of these numbers (RFC 6455, 5.2)."""
+LAST, OPCODE, LENGTH = 0x80, 0x0F, 0x7F
+
+
+class LeanSocket:
+    """Use it in a ``with`` block; it speaks to servers that neither mask nor compress.
+
+    Args:
+        url: ws://host:port/path.
+        subprotocol: to ask for.
+
+    Raises:
+        OSError: nobody listens there.
+        websockets.exceptions.InvalidHandshake: the server refuses.
+    """
+
+    def __init__(self, url: str, *, subprotocol: str) -> None:
+        self._protocol = ClientProtocol(
+            parse_uri(url), subprotocols=[Subprotocol(subprotocol)], max_size=None
+        )
+        address = urlsplit(url)
+        self.socket = socket.create_connection((address.hostname, address.port or 80))
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._held = b""
+        try:
+            self._shake_hands()
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._protocol.send_close(1000)
+        with contextlib.suppress(OSError):  # The server may have been the first to go.
+            self._flush()
+        self.socket.close()
+
+    def send(self, message: bytes) -> None:
+        """One binary message."""
+        self._protocol.send_binary(message)
+        self._flush()
+
+    def recv(self, timeout_s: float | None = None, *, decode: bool = False) -> bytes | bytearray:
+        """The next message as it came; pings on the way are answered.
+
+        Args:
+            timeout_s: to wait for each part of it, None for ever.
+            decode: never; text is not read here.
+
+        Raises:
+            TimeoutError: nothing came.
+            ConnectionError: the server closed the connection.
+        """
+        assert not decode
+        while True:
+            opcode, payload = self._message(timeout_s)
+            if opcode in {Opcode.BINARY, Opcode.TEXT}:
+                return payload
+
+    def ping(self, timeout_s: float) -> float:
+        """Seconds until a ping is answered. Raises like :meth:`recv`."""
+        started = time.perf_counter()
+        self._protocol.send_ping(b"")
+        self._flush()
+        while self._message(timeout_s)[0] != Opcode.PONG:
+            pass
+        return time.perf_counter() - started
+
+    def _shake_hands(self) -> None:
+        self._protocol.send_request(self._protocol.connect())
+        self._flush()
+        while self._protocol.state is State.CONNECTING and self._protocol.handshake_exc is None:
+            # Byte by byte, for the first message may follow the handshake at once.
+            self._protocol.receive_data(self._read(1))
+        if self._protocol.handshake_exc is not None:
+            raise self._protocol.handshake_exc
+
+    def _flush(self) -> None:
+        for data in self._protocol.data_to_send():
+            self.socket.sendall(data)
+
+    def _message(self, timeout_s: float | None) -> tuple[int, bytes | bytearray]:
+        """Opcode and payload of the next message, its frames put together."""
+        self.socket.settimeout(timeout_s)
+        header, opcode, payload = 0, 0, bytearray()
+        while not header & LAST:
+            header, length = self._exactly(2)
+            size = length & LENGTH
+            if size in LENGTHS:
+                size = int.from_bytes(self._exactly(LENGTHS[size]), "big")
+            opcode = opcode or header & OPCODE
+            part = self._exactly(size)
+            payload = payload + part if payload else part
+        if opcode == Opcode.PING:
+            self._protocol.send_pong(bytes(payload))
+            self._flush()
+        elif opcode == Opcode.CLOSE:
+            raise ConnectionError(f"the server closed the connection: {bytes(payload[2:])!r}")
+        return opcode, payload
+
+    def _exactly(self, size: int) -> bytearray:
+        data = bytearray(size)
+        view, there = memoryview(data), min(size, len(self._held))
+        view[:there], self._held = self._held[:there], self._held[there:]
+        while there < size:
+            if size - there >= READ:
+                count = self.socket.recv_into(view[there:])
+                if not count:
+                    raise ConnectionError("the server is gone")
+            else:
+                read = self._read(READ)
+                count = min(len(read), size - there)
+                view[there : there + count], self._held = read[:count], read[count:]
+            there += count
+        return data
+
+    def _read(self, size: int) -> bytes:
+        read = self.socket.recv(size)
+        if not read:
+            raise ConnectionError("the server is gone")
+        return read
