@@ -17,17 +17,16 @@ from ..scene import Scene
 from . import scoring
 from .aftermath import Aftermath, after_impacts, after_overlaps
 from .agents import Agents
-from .contact import REAR_OVERHANG
+from .contacts import Contacts, Moved
 from .ego import logged_motion
 from .episode import plan_episode, takes_effect_us
 from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
-from .impact import Deformation, Dents, Impact, Wreck
+from .impact import Deformation, Dents, Impact
 from .judging import ego_sample, others_of, plan_note, scoring_context
-from .meeting import Met, may_meet, met, run_bout
 from .observation import Observation
-from .obstacles import Obstacles, obstacles_of
+from .obstacles import obstacles_of
 from .path import Float, LoggedPath, PathPoint
 from .pilot import Pilot, Plan, braking
 from .route import command_ahead, route_ahead
@@ -82,8 +81,6 @@ class World:
         self.steps = 0
         self.revision = revision
         self.deformation = deformation
-        if deformation is None and self._physical and spec.contact.dents:
-            self.deformation = Dents(scene)
         self.terminated = False
         self.truncated = False
         self.reason: str | None = None
@@ -94,15 +91,20 @@ class World:
         self._near: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._standing()
         self._pilot = Pilot(spec, scene.ego)
-        self._obstacles: Obstacles | None = (
-            obstacles_of(scene, self._path) if spec.contact.background else None
-        )
+        obstacles = obstacles_of(scene, self._path) if spec.contact.background else None
         seen = self._seen(state.tracks.at(self.t_us))
         self.traffic = Traffic.begin(state, spec.agents, seen)
-        self._sliding = False
         self._left_log = self._off_road = False
-        self._touching = self._met(frozenset()).touching
-        self._exempt = frozenset(frozenset(("", i)) for i in self._touching)
+        self._contacts = Contacts.begin(
+            spec,
+            scene.ego_size,
+            obstacles=obstacles,
+            T_world_vehicle=self.T_world_vehicle,
+            motion=self.motion,
+            agents=self.agents,
+        )
+        if deformation is None and self._contacts.physical and spec.contact.dents:
+            self.deformation = Dents(scene)
         self.impacts: tuple[Impact, ...] = ()
         self._events: tuple[Event, ...] = ()
         self._edits: tuple[Event, ...] = ()
@@ -296,85 +298,40 @@ class World:
 
     def _move(self, pilot: Pilot) -> tuple[Impact, ...] | None:
         """Ego and objects one step on; impacts, or None where bodies pass through each other."""
-        motion, t_us, dt_us = self.motion, self.t_us, self._clock.dt_us
-        old, seen = self.agents, self._seen(self.agents)
-        traffic = self.traffic.advance(self.state, seen)
+        motion, t_us, before = self.motion, self.t_us, self.agents
+        traffic = self.traffic.advance(self.state, self._seen(before))
         self.steps += 1
-        if t_us + dt_us <= self._clock.start_us + self.spec.warmup_us:
+        if self.t_us <= self._clock.start_us + self.spec.warmup_us:
             recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
-            acceleration = (recorded.speed - motion.speed) / (dt_us * 1e-6)
-            self.motion, self.traffic = recorded._replace(acceleration=acceleration), traffic
-            self._pilot = pilot
-            return None
-        if not self._physical or not self._may_meet(traffic):
-            self._pilot, moved = pilot.advance(motion, t_us, dt_us)
-            self.traffic = traffic
-            impacts = () if self._physical else None
+            moved = Moved(pilot, recorded, traffic, self._contacts, None)
         else:
-            wrecks = {i: d for i, d in traffic.drivers.items() if isinstance(d, Wreck)}
-            self._pilot, outcome = run_bout(
-                pilot,
-                motion,
-                t_us,
-                spec=self.spec,
-                sliding=self._sliding,
-                ego_size=self.scene.ego_size,
-                before=old,
-                after=traffic.placed,
-                wrecks=wrecks,
-                exempt=self._exempt,
-                obstacles=self._obstacles,
-                height=self._height,
+            moved = self._contacts.move(
+                pilot, motion, before, traffic, t_us=t_us, height=self._height
             )
-            moved, self._sliding = outcome.motion, outcome.sliding
-            self._exempt = outcome.exempt
-            self.traffic = traffic.with_drivers(outcome.wrecks, traffic.placed)
-            impacts = outcome.impacts
-        acceleration = (moved.speed - motion.speed) / (dt_us * 1e-6)
-        self.motion = moved._replace(acceleration=acceleration)
+        self._pilot, after, self.traffic, self._contacts, impacts = moved
+        acceleration = (after.speed - motion.speed) / (self._clock.dt_us * 1e-6)
+        self.motion = after._replace(acceleration=acceleration)
         return impacts
-
-    @property
-    def _physical(self) -> bool:
-        """Whether bodies push each other; one that is put somewhere by poses cannot be pushed."""
-        return self.spec.on_collision == "continue" and self.spec.action != "pose"
-
-    def _may_meet(self, traffic: Traffic) -> bool:
-        if self._sliding or self._obstacles is not None:
-            return True
-        if any(isinstance(d, Wreck) for d in traffic.drivers.values()):
-            return True
-        dt = self._clock.dt_us * 1e-6
-        size = self.scene.ego_size
-        ahead = size[0] / 2 - REAR_OVERHANG
-        return may_meet(self.motion, traffic.placed, ego_size=size, centre_ahead=ahead, dt=dt)
 
     def _aftermath(self, impacts: tuple[Impact, ...] | None, before: Agents) -> Aftermath:
         """Take in the impacts of the step, or look for overlaps where there can be none."""
         if impacts is None:
-            found = after_overlaps(self._met(self._touching), self.t_us)
+            found = after_overlaps(
+                self._contacts.met(self.T_world_vehicle, self.motion, self.agents), self.t_us
+            )
             if found.events and self.spec.on_collision == "terminate":
                 self.terminated, self.reason = True, "collision"
         else:
-            found = after_impacts(impacts, self.t_us, touched=self._touching, before=before)
+            found = after_impacts(
+                impacts, self.t_us, touched=self._contacts.touching, before=before
+            )
             if self.deformation is not None:
                 subjects = {o.object_id: o for o in self.agents.objects}
                 for impact in impacts:
                     self.deformation = self.deformation.struck(impact, subjects)
         self.impacts = impacts or ()
-        self._touching = found.touching
+        self._contacts = replace(self._contacts, touching=found.touching)
         return found
-
-    def _met(self, before: frozenset[str]) -> Met:
-        return met(
-            self.T_world_vehicle,
-            self.motion,
-            self.agents,
-            spec=self.spec,
-            ego_size=self.scene.ego_size,
-            obstacles=self._obstacles,
-            before=before,
-        )
 
     def _reacted(self) -> list[Event]:
         """Objects stop repeating the log once the ego is too far from where it was recorded."""
