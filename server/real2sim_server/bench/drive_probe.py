@@ -5,12 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
 from types import TracebackType
 from typing import Any, Self
-
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.sessions import SessionInfo
@@ -30,27 +26,24 @@ class DriveProbe:
         info: of the session.
         resume: of an earlier connection that this one goes on for: its resume token, and the step
             of the last observation it has.
-        lean: whether to read without threads between, which costs least time; pings that come
-            between two messages are then answered with the next one only.
+
+    Pings are answered with the next message that is read, so read before the worker gives up.
 
     Attributes:
+        socket: to the worker.
         resume_token: with which a further connection may go on.
         pushed: the last observation that nobody has asked for; None for none.
     """
 
-    def __init__(
-        self, info: SessionInfo, *, resume: tuple[str, int] | None = None, lean: bool = False
-    ) -> None:
+    def __init__(self, info: SessionInfo, *, resume: tuple[str, int] | None = None) -> None:
         self._info = info
         self._resume = resume
-        self._lean = lean
         self._id = 0
         self.resume_token = ""
         self.pushed: dict[str, Any] | None = None
-        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self.socket: Any = self._stack.enter_context(self._connection())
+        self.socket = LeanSocket(self._info.ws_url, subprotocol=DRIVE_SUBPROTOCOL)
         hello = {"type": "hello", "protocols": [DRIVE_SUBPROTOCOL], "token": self._info.token}
         if self._resume is not None:
             token, step = self._resume
@@ -64,7 +57,7 @@ class DriveProbe:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._stack.close()
+        self.socket.__exit__(kind, error, traceback)
 
     def reset(
         self, sensors: Sequence[Mapping[str, Any]], *, dt_us: int, **spec: Any
@@ -87,7 +80,7 @@ class DriveProbe:
         started = time.perf_counter()
         self.send(fields)
         while True:
-            received = self.socket.recv(ANSWER_S, decode=False)
+            received = self.socket.recv(ANSWER_S)
             seconds = time.perf_counter() - started
             answer = decode(received)
             if answer["type"] == "obs" and answer["id"] == 0:
@@ -105,21 +98,9 @@ class DriveProbe:
             if left <= 0:
                 return
             with contextlib.suppress(TimeoutError):
-                answer = decode(self.socket.recv(left, decode=False))
+                answer = decode(self.socket.recv(left))
                 if answer["type"] == "obs":
                     self.pushed = answer
-
-    def _connection(self) -> AbstractContextManager[Any]:
-        if self._lean:
-            return LeanSocket(self._info.ws_url, subprotocol=DRIVE_SUBPROTOCOL)
-        return connect(
-            self._info.ws_url,
-            subprotocols=[Subprotocol(DRIVE_SUBPROTOCOL)],
-            compression=None,
-            max_size=None,
-            proxy=None,
-            ping_interval=None,
-        )
 
     def _accepted(self, fields: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
         answer, seconds = self.ask(fields)

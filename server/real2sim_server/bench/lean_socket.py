@@ -21,6 +21,8 @@ from websockets.typing import Subprotocol
 from websockets.uri import parse_uri
 
 READ = 1 << 16
+STALLED_S = 60.0
+"""A message whose next part does not come within this time never will."""
 LENGTHS = {126: 2, 127: 8}
 """Bytes of a payload's length behind a header that holds one of these numbers (RFC 6455, 5.2)."""
 LAST, OPCODE, LENGTH = 0x80, 0x0F, 0x7F
@@ -71,18 +73,16 @@ class LeanSocket:
         self._protocol.send_binary(message)
         self._flush()
 
-    def recv(self, timeout_s: float | None = None, *, decode: bool = False) -> bytes | bytearray:
+    def recv(self, timeout_s: float) -> bytes | bytearray:
         """The next message as it came; pings on the way are answered.
 
         Args:
-            timeout_s: to wait for each part of it, None for ever.
-            decode: never; text is not read here.
+            timeout_s: to wait for something to come; a message that has begun is waited for.
 
         Raises:
-            TimeoutError: nothing came.
-            ConnectionError: the server closed the connection.
+            TimeoutError: nothing came; what comes later can still be read.
+            ConnectionError: the server closed the connection, or stopped within a message.
         """
-        assert not decode
         while True:
             opcode, payload = self._message(timeout_s)
             if opcode in {Opcode.BINARY, Opcode.TEXT}:
@@ -110,9 +110,24 @@ class LeanSocket:
         for data in self._protocol.data_to_send():
             self.socket.sendall(data)
 
-    def _message(self, timeout_s: float | None) -> tuple[int, bytes | bytearray]:
+    def _message(self, timeout_s: float) -> tuple[int, bytes | bytearray]:
         """Opcode and payload of the next message, its frames put together."""
-        self.socket.settimeout(timeout_s)
+        if not self._held:
+            self.socket.settimeout(timeout_s)
+            self._held = self._read(READ)
+        self.socket.settimeout(STALLED_S)
+        try:
+            opcode, payload = self._frames()
+        except TimeoutError as error:
+            raise ConnectionError("the server stopped within a message") from error
+        if opcode == Opcode.PING:
+            self._protocol.send_pong(bytes(payload))
+            self._flush()
+        elif opcode == Opcode.CLOSE:
+            raise ConnectionError(f"the server closed the connection: {bytes(payload[2:])!r}")
+        return opcode, payload
+
+    def _frames(self) -> tuple[int, bytes | bytearray]:
         header, opcode, payload = 0, 0, bytearray()
         while not header & LAST:
             header, length = self._exactly(2)
@@ -122,11 +137,6 @@ class LeanSocket:
             opcode = opcode or header & OPCODE
             part = self._exactly(size)
             payload = payload + part if payload else part
-        if opcode == Opcode.PING:
-            self._protocol.send_pong(bytes(payload))
-            self._flush()
-        elif opcode == Opcode.CLOSE:
-            raise ConnectionError(f"the server closed the connection: {bytes(payload[2:])!r}")
         return opcode, payload
 
     def _exactly(self, size: int) -> bytearray:

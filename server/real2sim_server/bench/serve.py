@@ -135,7 +135,7 @@ def _drive(
     info = client.sessions.create(scene=scene)
     latencies, stages = [], []
     try:
-        with DriveProbe(info, lean=True) as probe:
+        with DriveProbe(info) as probe:
             obs, _ = probe.reset(sensors, dt_us=dt_us)
             for k in range(WARM_UP_STEPS + steps):
                 if obs["terminated"] or obs["truncated"]:
@@ -183,7 +183,7 @@ def _drive_by_sdk(client: real2sim.Client, steps: int) -> Figures:
 def _event_loop(client: real2sim.Client, url: str, seconds: float) -> Figures:
     info = client.sessions.create(scene=SCENE)
     try:
-        with DriveProbe(info, lean=True) as probe:
+        with DriveProbe(info) as probe:
             return loop_lag(probe, url, scene=SCENE, camera=CAMERA, seconds=seconds)
     finally:
         client.sessions.delete(info.session_id)
@@ -200,7 +200,7 @@ def _memory(
         for _ in range(SESSIONS + 1):
             info = client.sessions.create(scene=SCENE)
             infos.append(info)
-            with DriveProbe(info, lean=True) as probe:
+            with DriveProbe(info) as probe:
                 obs, _ = probe.reset(sensors, dt_us=CAMERA_STEP_US)
                 for _ in range(3):
                     obs, _ = probe.act(obs)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from websockets.exceptions import InvalidHandshake
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.server import ServerConnection, serve
 
+from real2sim_server.bench import lean_socket
 from real2sim_server.bench.lean_socket import LeanSocket
 
 SUBPROTOCOL = "bench.v1"
@@ -87,13 +89,46 @@ def test_its_own_ping_takes_as_long_as_the_way_there_and_back():
         assert 0 < lean.ping(10) < 10
 
 
-def test_a_server_that_says_nothing_is_given_up():
-    with (
-        server(echo) as url,
-        LeanSocket(url, subprotocol=SUBPROTOCOL) as lean,
-        pytest.raises(TimeoutError),
-    ):
-        lean.recv(0.05)
+def test_a_server_that_says_nothing_is_given_up_and_heard_when_it_speaks_again():
+    with server(echo) as url, LeanSocket(url, subprotocol=SUBPROTOCOL) as lean:
+        with pytest.raises(TimeoutError):
+            lean.recv(0.05)
+        lean.send(b"late")
+        assert bytes(lean.recv(10)) == b"late"
+
+
+def test_a_message_that_has_begun_is_waited_for():
+    def talk(connection: ServerConnection) -> None:
+        connection.send(slowly([b"one ", b"two"]))
+        connection.recv()
+
+    def slowly(parts: list[bytes]) -> Iterator[bytes]:
+        for part in parts:
+            yield part
+            time.sleep(0.3)
+
+    with server(talk) as url, LeanSocket(url, subprotocol=SUBPROTOCOL) as lean:
+        assert bytes(lean.recv(0.2)) == b"one two"
+        lean.send(b"done")
+
+
+def test_a_server_that_stops_within_a_message_is_given_up(monkeypatch):
+    monkeypatch.setattr(lean_socket, "STALLED_S", 0.05)
+    go_on = threading.Event()
+
+    def talk(connection: ServerConnection) -> None:
+        def parts() -> Iterator[bytes]:
+            yield b"one "
+            go_on.wait(10)
+            yield b"two"
+
+        with contextlib.suppress(ConnectionClosed):
+            connection.send(parts())
+
+    with server(talk) as url, LeanSocket(url, subprotocol=SUBPROTOCOL) as lean:
+        with pytest.raises(ConnectionError, match="within a message"):
+            lean.recv(10)
+        go_on.set()
 
 
 def test_a_server_that_closes_is_said_to_have_closed():
