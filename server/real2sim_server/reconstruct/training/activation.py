@@ -6,6 +6,7 @@ done in one pass each way; :func:`activated_plain` says in plain torch what that
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -59,6 +60,11 @@ def activated(
     return Activated(*(tensor.split(list(counts)) for tensor in packed))
 
 
+def first_rows(counts: Sequence[int]) -> list[int]:
+    """First row of each owner of ``counts`` Gaussians, and the number of all."""
+    return [0, *itertools.accumulate(counts)]
+
+
 def activated_plain(
     log_scales: Tensor,
     logits: Tensor,
@@ -98,7 +104,7 @@ class _Activate(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         scales, opacities = torch.empty_like(log_scales), torch.empty_like(logits)
         colours = sh.new_empty(len(sh), functions, 3)
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        starts = np.array(first_rows(counts))
         arrays = (log_scales, logits, sh, fourier, tones)
         kernels.activate_rows(
             *(tensor.detach().contiguous().numpy() for tensor in arrays),

@@ -15,7 +15,7 @@ from ...scene.io.atomic import atomic_folder
 from ..options import ReconstructError
 
 FORMAT = "real2sim-training"
-VERSION = 2
+VERSION = 3
 STATE_FILE, TENSOR_FILE = "state.json", "state.safetensors"
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...scene import GaussianCloud, Scene
 from ...scene.colour import TimeColour
-from .activation import activated
+from .activation import activated, first_rows
 from .schedule import TrainOptions
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
@@ -41,6 +41,11 @@ class Gaussians:
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
+
+    @property
+    def starts(self) -> list[int]:
+        """First row of each owner, and N."""
+        return first_rows(self.counts)
 
     @property
     def owners(self) -> Tensor:

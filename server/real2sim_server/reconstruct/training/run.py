@@ -142,7 +142,7 @@ def _put_back(trainer: Trainer, scene: Scene, options: TrainOptions) -> None:
     times = np.array([scene.start_us, scene.end_us])
     opaque = replace(options, initial_opacity=0.99, refine_poses=False)
     first = SceneModel(scene, opaque, times, backend=trainer.model.backend)
-    limit = options.densify.hidden_share
+    limit = options.densify.background_limits.share
     put_back_guesses(trainer.model, first, trainer.views.looks(), limit=limit)
 
 

@@ -48,6 +48,21 @@ class LearningRates:
 
 
 @dataclass(frozen=True)
+class HiddenLimits:
+    """Which Gaussians count as hidden: see :mod:`.visibility`.
+
+    Attributes:
+        share: visible share up to which all are.
+        buried_share: visible share up to which those are that lie deep behind what is seen.
+        buried_depth: how deep that is [m].
+    """
+
+    share: float = 0.005
+    buried_share: float = 0.03
+    buried_depth: float = 0.3
+
+
+@dataclass(frozen=True)
 class DensifyOptions:
     """When and how Gaussians are added and removed.
 
@@ -66,10 +81,9 @@ class DensifyOptions:
         noise: of ``mcmc``: factor on the learning rate of means.
         growth: of ``mcmc``: share by which the number grows in a round.
         hidden_rounds: shares of all iterations at which Gaussians go that images hardly show.
-        hidden_share: visible share up to which those of the background go.
-        hidden_object_share: likewise of objects, whose inside shows a little through the glass.
-        buried_share: visible share up to which those go that lie deep behind what is seen.
-        buried_depth: how deep that is [m].
+        background_limits: of what counts as hidden in the background.
+        object_limits: likewise in objects; what a window shows of their inside is hardly ever
+            learnt well, and is better painted onto the window.
     """
 
     method: str = "gradient"
@@ -86,10 +100,10 @@ class DensifyOptions:
     noise: float = 5e5
     growth: float = 0.05
     hidden_rounds: tuple[float, ...] = (0.35, 0.6, 0.85)
-    hidden_share: float = 0.005
-    hidden_object_share: float = 0.01
-    buried_share: float = 0.03
-    buried_depth: float = 0.3
+    background_limits: HiddenLimits = field(default_factory=HiddenLimits)
+    object_limits: HiddenLimits = field(
+        default_factory=lambda: HiddenLimits(share=0.01, buried_share=0.3, buried_depth=0.2)
+    )
 
 
 @dataclass(frozen=True)

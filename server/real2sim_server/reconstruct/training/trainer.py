@@ -269,8 +269,8 @@ class Trainer:
             parameter.grad = None
 
     def _rows(self, drawn: tuple[int, ...]) -> list[slice]:
-        starts = np.concatenate([[0], np.cumsum(self.model.gaussians.counts)])
-        return [slice(int(starts[k]), int(starts[k + 1])) for k in drawn]
+        starts = self.model.gaussians.starts
+        return [slice(starts[k], starts[k + 1]) for k in drawn]
 
     def _change(self, i: int) -> None:
         """Add, remove and reset Gaussians where it is time to."""

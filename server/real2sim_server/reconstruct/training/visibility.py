@@ -24,7 +24,7 @@ from .densify import rearrange, rotations
 from .gaussians import Gaussians, joined
 from .model import SceneModel
 from .optimizer import SelectiveAdam
-from .schedule import DensifyOptions
+from .schedule import DensifyOptions, HiddenLimits
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
@@ -54,6 +54,11 @@ class Visibility:
     shares: Tensor
     depths: Tensor
 
+    def hidden(self, limits: HiddenLimits) -> Tensor:
+        """[N] bool."""
+        buried = (self.depths > limits.buried_depth) & (self.shares <= limits.buried_share)
+        return (self.shares <= limits.share) | buried
+
 
 @torch.no_grad()
 def visibility(model: SceneModel, looks: Iterable[Look]) -> Visibility:
@@ -63,9 +68,7 @@ def visibility(model: SceneModel, looks: Iterable[Look]) -> Visibility:
     one is learnt on the other.
     """
     gaussians = model.gaussians
-    starts = [0]
-    for count in gaussians.counts:
-        starts.append(starts[-1] + count)
+    starts = gaussians.starts
     shown, bare, deep = (torch.zeros(len(gaussians)) for _ in range(3))
     sides = [(), model.mirrored] if any(model.mirrored) else [()]
     for (camera, t_us), mirrored in itertools.product(looks, sides):
@@ -156,10 +159,12 @@ def drop_hidden(
     gaussians: Gaussians, optimizer: SelectiveAdam, seen: Visibility, options: DensifyOptions
 ) -> Gaussians:
     """Without those of which next to nothing is seen, or little and that deep behind the rest."""
-    limit = torch.full((len(gaussians),), options.hidden_object_share)
-    limit[: gaussians.counts[0]] = options.hidden_share
-    buried = (seen.depths > options.buried_depth) & (seen.shares <= options.buried_share)
-    kept = ((seen.shares > limit) & ~buried).nonzero()[:, 0]
+    hidden = torch.where(
+        gaussians.owners > 0,
+        seen.hidden(options.object_limits),
+        seen.hidden(options.background_limits),
+    )
+    kept = (~hidden).nonzero()[:, 0]
     return rearrange(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
 
 
@@ -168,14 +173,19 @@ def put_back_guesses(
 ) -> int:
     """Add to ``model`` what stage 0 guessed for places no image shows; how many these are.
 
+    A guess of the background must have been hidden in stage 0 too: where it was seen, training had
+    its reasons to remove it. Objects leave the place where they were seen, and are given everything
+    that their trained Gaussians hide.
+
     Args:
         model: trained; changed.
         first: of stage 0, with the same objects.
         looks: all training views.
-        limit: visible share up to which a Gaussian counts as shown by no image.
+        limit: visible share up to which a Gaussian of the background was hidden in stage 0.
     """
-    hidden = (visibility(first, looks).shares <= limit).nonzero()[:, 0]
-    guesses, trained = first.gaussians.take(hidden), model.gaussians
+    hidden = visibility(first, looks).shares <= limit
+    offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
+    guesses, trained = first.gaussians.take(offered), model.gaussians
     # Faint, so that no guess hides another: several may stand behind one gap of the surface.
     faint = replace(guesses, logits=torch.full_like(guesses.logits, FAINT))
     model.gaussians, is_guess = joined(trained, faint)

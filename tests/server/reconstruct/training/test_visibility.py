@@ -10,7 +10,7 @@ import torch
 from real2sim_server.reconstruct.training import SceneModel, Trainer
 from real2sim_server.reconstruct.training.gaussians import joined
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
-from real2sim_server.reconstruct.training.schedule import DensifyOptions
+from real2sim_server.reconstruct.training.schedule import DensifyOptions, HiddenLimits
 from real2sim_server.reconstruct.training.visibility import (
     Visibility,
     drop_hidden,
@@ -19,7 +19,7 @@ from real2sim_server.reconstruct.training.visibility import (
     visibility,
 )
 from real2sim_server.render import Instance
-from real2sim_server.scene import Camera, GaussianCloud
+from real2sim_server.scene import Camera, GaussianCloud, SceneObject, Trajectory
 
 from .conftest import TINY
 from .test_densify import COUNTS, marked, some_gaussians
@@ -50,9 +50,21 @@ def ahead(model: SceneModel, depth: float, scale: float, opacity: float) -> Gaus
     )
 
 
-def model_of(model: SceneModel, clouds: list[GaussianCloud]) -> SceneModel:
+def model_of(
+    model: SceneModel, clouds: list[GaussianCloud], *, subject: list[GaussianCloud] | None = None
+) -> SceneModel:
+    """Of ``clouds`` and of an object whose frame is the world."""
+    objects = {}
+    if subject is not None:
+        times = np.array([model.scene.start_us, model.scene.end_us])
+        still = Trajectory(times, np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+        cloud = GaussianCloud.concatenate(subject)
+        objects["car"] = SceneObject("car", "car", (4.0, 2.0, 1.5), cloud, still)
     scene = replace(
-        model.scene, background=GaussianCloud.concatenate(clouds), objects={}, content_hash=""
+        model.scene,
+        background=GaussianCloud.concatenate(clouds),
+        objects=objects,
+        content_hash="",
     )
     opaque = replace(model.options, initial_opacity=0.99)
     return SceneModel(scene, opaque, np.zeros(0, np.int64), backend="cpu")
@@ -112,7 +124,7 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     optimizer: SelectiveAdam = marked(gaussians)
     shares = torch.full((len(gaussians),), 0.03)
     shares[:5] = 0.001
-    options = DensifyOptions(hidden_share=0.005, hidden_object_share=0.05)
+    options = DensifyOptions(object_limits=HiddenLimits(share=0.05))
     seen = Visibility(shares, torch.zeros(len(gaussians)))
     left = drop_hidden(gaussians, optimizer, seen, options)
     assert left.counts == (COUNTS[0] - 5, 0, 0)
@@ -128,6 +140,13 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
     left = drop_hidden(gaussians, marked(gaussians), seen, DensifyOptions())
     kept = [i for i in range(len(gaussians)) if i != 2]
     torch.testing.assert_close(left.means, gaussians.means[kept])
+
+
+def test_inside_of_objects_goes_at_less_depth_and_more_share_than_in_the_background():
+    gaussians = some_gaussians()
+    shares, depths = (torch.full((len(gaussians),), value) for value in (0.2, 0.25))
+    left = drop_hidden(gaussians, marked(gaussians), Visibility(shares, depths), DensifyOptions())
+    assert left.counts == (COUNTS[0], 0, 0)
 
 
 def test_depth_behind_the_surface_is_measured_along_the_axis(model, looks):
@@ -159,6 +178,13 @@ def test_guesses_that_training_has_laid_open_stay_away(model, looks):
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     first = model_of(model, [*wall, ahead(model, 8, 0.2, 0.7)])
     assert put_back_guesses(trained, first, looks, limit=0.05) == 0
+
+
+def test_objects_get_back_what_they_hide_though_stage_0_showed_it(model, looks):
+    shown, wall = ahead(model, 8, 0.2, 0.7), [ahead(model, 4, 3.0, 0.99)] * 3
+    trained, first = model_of(model, wall, subject=wall), model_of(model, [shown], subject=[shown])
+    assert put_back_guesses(trained, first, looks, limit=0.05) == 1
+    assert trained.gaussians.counts == (3, 4)
 
 
 def test_a_guess_stays_away_though_another_stands_before_it(model, looks):
