@@ -16,6 +16,9 @@ from numba import njit
 NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
 """Half-width of the largest footprint in the depth image [px]."""
+GRAZING = 0.15
+"""Objects give no colour to a view that looks along their surface by less than this cosine: a few
+centimetres of error, and what it sees is the side next to it, a lamp on a wing for one."""
 
 
 @njit(cache=True, nogil=True)
@@ -157,6 +160,8 @@ def gather_samples(
         if weight == 0:
             continue
         cosine = abs(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
+        if instance[i] > 0 and cosine < GRAZING:
+            continue
         size = K[0] * footprints[i] / z
         weight *= (np.float32(0.05) + cosine) * size * size
         worst = 0

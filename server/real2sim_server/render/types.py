@@ -83,6 +83,10 @@ class ScreenStatistics:
     radii: tuple[Tensor, ...]
     gradients: tuple[Tensor, ...]
 
+    def first(self, count: int) -> ScreenStatistics:
+        """Of the first instances alone."""
+        return ScreenStatistics(self.radii[:count], self.gradients[:count])
+
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:

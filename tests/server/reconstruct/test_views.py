@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -85,3 +87,29 @@ def test_robust_mean_ignores_a_passing_car():
     kernels.robust_mean(colours, weights, result, known)
     assert known[0]
     np.testing.assert_allclose(result[0] * 255, 100.67, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("instance", "slant", "sampled"), [(1, 0.1, False), (1, 0.3, True), (0, 0.1, True)]
+)
+def test_objects_give_no_colour_to_views_along_their_surface(instance, slant, sampled):
+    normal = np.array([[math.sqrt(1 - slant**2), 0, -slant]], np.float32)
+    point, depth = np.array([[0, 0, 10]], np.float32), np.full((40, 40), 10, np.float32)
+    nothing = np.full((40, 40), np.inf, np.float32)
+    colours, weights = np.zeros((1, 2, 3), np.uint8), np.zeros((1, 2), np.float32)
+    kernels.gather_samples(
+        point,
+        normal,
+        np.array([0.05], np.float32),
+        np.array([instance], np.uint16),
+        K,
+        1,
+        depth,
+        nothing,
+        np.full((40, 40), -1, np.int32),
+        nothing,
+        (np.full((40, 40, 3), 200, np.uint8),),
+        colours,
+        weights,
+    )
+    assert bool(weights.any()) == sampled

@@ -6,8 +6,9 @@ from .held_out import HeldOutScore, score_held_out
 from .losses import LossWeights
 from .model import SceneModel
 from .run import TrainResult, train
+from .running import OnTraining, TrainingProgress
 from .schedule import PRESETS, DensifyOptions, LearningRates, TrainOptions, preset
-from .trainer import OnTraining, Trainer, TrainingProgress
+from .trainer import Trainer
 
 __all__ = [
     "PRESETS",

@@ -26,6 +26,7 @@ class Checkpoint:
     Attributes:
         iteration: steps done.
         counts: Gaussians of the background and of each object.
+        guess_counts: likewise of the guesses; empty as long as there are none.
         optimizer_steps: of the optimiser.
         options: of training, JSON values.
         log_name: of the log it learns from.
@@ -35,6 +36,7 @@ class Checkpoint:
 
     iteration: int
     counts: tuple[int, ...]
+    guess_counts: tuple[int, ...]
     optimizer_steps: int
     options: dict[str, Any]
     log_name: str
@@ -74,5 +76,6 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise ReconstructError(
             f"{path}: not a checkpoint of version {VERSION} of {FORMAT}; train from the start"
         )
-    state["counts"] = tuple(state["counts"])
+    for name in ("counts", "guess_counts"):
+        state[name] = tuple(state[name])
     return Checkpoint(**state, tensors=tensors)

@@ -63,6 +63,7 @@ class Densifier:
         self._seed = seed
         self._first = round(options.start * iterations)
         self._last = round(options.stop * iterations)
+        self._guess_round = round(options.guess_round * iterations)
         self._hidden_rounds = {round(share * iterations) for share in options.hidden_rounds}
 
     def is_due(self, iteration: int) -> bool:
@@ -83,6 +84,10 @@ class Densifier:
     def drops_hidden(self, iteration: int) -> bool:
         """Whether Gaussians that images hardly show go after the step ``iteration``."""
         return iteration + 1 in self._hidden_rounds
+
+    def takes_guesses(self, iteration: int) -> bool:
+        """Whether guesses take their places after the step ``iteration``."""
+        return iteration + 1 == self._guess_round
 
     @torch.no_grad()
     def round(

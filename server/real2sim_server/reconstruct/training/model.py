@@ -29,7 +29,8 @@ class Rendered:
     Attributes:
         output: images of one camera; carries gradients.
         rgb: [H, W, 3], with the camera's exposure.
-        drawn: indices of the instances drawn: 0 for the background, then 1 + object.
+        drawn: indices of the trained instances drawn: 0 for the background, then 1 + object;
+            those of guesses come behind them.
     """
 
     output: RenderOutput
@@ -42,6 +43,7 @@ class SceneModel:
 
     Attributes:
         mirrored: by object, whether training shows its other side now and then.
+        guesses: Gaussians that are drawn too but do not learn; None for none.
 
     Args:
         scene: of stage 0; its cameras, ego path, boxes and times stay as they are.
@@ -62,6 +64,7 @@ class SceneModel:
         self.options = options
         self.backend = backend
         self.gaussians = packing.from_scene(scene, options)
+        self.guesses: Gaussians | None = None
         self.poses = ObjectPoses(scene, key_times_us if options.refine_poses else None)
         self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution))
         cameras = len(scene.rig)
@@ -112,6 +115,10 @@ class SceneModel:
         degree = self.options.sh_degree if degree is None else degree
         clouds = self.gaussians.clouds(degree=degree, tones=self._tones(t_us), mirrored=mirrored)
         instances, drawn = self.instances(clouds, t_us)
+        if self.guesses is not None:
+            with torch.no_grad():
+                behind = self.guesses.clouds(degree=degree, mirrored=mirrored)
+                instances += self.instances(behind, t_us)[0]
         options = RasterOptions(depth=depth, instance=False, track_screen=True)
         output = rasterize(
             instances,
@@ -179,11 +186,14 @@ class SceneModel:
         return _small_motion(change) @ viewmat
 
     def export(self, **provenance: Any) -> Scene:
-        """The scene as it is now, immutable, on its own memory."""
+        """The scene as it is now with its guesses, immutable, on its own memory."""
+        gaussians = self.gaussians
+        if self.guesses is not None:
+            gaussians, _ = packing.joined(gaussians, self.guesses)
         with torch.no_grad():
-            clouds = self.gaussians.clouds(degree=self.options.sh_degree)
+            clouds = gaussians.clouds(degree=self.options.sh_degree)
         clouds = [_own(cloud) for cloud in clouds]
-        parts = torch.split(self.gaussians.fourier.detach(), self.gaussians.counts[1:])
+        parts = torch.split(gaussians.fourier.detach(), gaussians.counts[1:])
         objects = {}
         for index, (name, item) in enumerate(self.scene.objects.items()):
             varies = parts[index].numel() > 0

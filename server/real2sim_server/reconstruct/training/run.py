@@ -21,10 +21,10 @@ from .boxes import smoothed_boxes
 from .data import Views, held_out_frames, training_log
 from .held_out import HeldOutScore, score_held_out
 from .model import SceneModel
+from .running import OnTraining, TrainingProgress
 from .schedule import TrainOptions
 from .threads import one_torch_thread
-from .trainer import CHECKPOINT, OnTraining, Trainer, TrainingProgress
-from .visibility import put_back_guesses
+from .trainer import CHECKPOINT, Trainer
 
 INITIAL = "initial.r2s"
 PREVIEWS = "previews"
@@ -98,8 +98,6 @@ def train(
             on_preview=_previewer(log, options, folder / PREVIEWS),
         )
     seconds = time.perf_counter() - start
-    with stages("fill what no image shows"), one_torch_thread():
-        _put_back(trainer, scene, options)
     trainer.views.close()
     with stages("score"):
         score = score_held_out(trainer.model, log, options)
@@ -135,15 +133,6 @@ def _first_scene(
     )
     scene = replace(scene, frame_times_us=log.frame_times_us)
     return save_scene(scene, folder / INITIAL, overwrite=True)
-
-
-def _put_back(trainer: Trainer, scene: Scene, options: TrainOptions) -> None:
-    """Give the model stage 0's guesses for what no training image shows, as opaque as they were."""
-    times = np.array([scene.start_us, scene.end_us])
-    opaque = replace(options, initial_opacity=0.99, refine_poses=False)
-    first = SceneModel(scene, opaque, times, backend=trainer.model.backend)
-    limit = options.densify.background_limits.share
-    put_back_guesses(trainer.model, first, trainer.views.looks(), limit=limit)
 
 
 def _both(on_training: OnTraining | None, tell: Callable[[int, int], None]) -> OnTraining:

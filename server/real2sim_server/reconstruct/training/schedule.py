@@ -81,9 +81,12 @@ class DensifyOptions:
         noise: of ``mcmc``: factor on the learning rate of means.
         growth: of ``mcmc``: share by which the number grows in a round.
         hidden_rounds: shares of all iterations at which Gaussians go that images hardly show.
+        guess_round: share of all iterations at which they go once more, and stage 0's guesses take
+            their places; what stands before these closes up in the rest.
         background_limits: of what counts as hidden in the background.
-        object_limits: likewise in objects; what a window shows of their inside is hardly ever
-            learnt well, and is better painted onto the window.
+        object_limits: likewise in objects.
+        last_object_limits: likewise when guesses take their places; what a window shows of an
+            object's inside is hardly ever learnt well, and is better painted onto the window.
     """
 
     method: str = "gradient"
@@ -99,10 +102,14 @@ class DensifyOptions:
     reset_every: int = 3000
     noise: float = 5e5
     growth: float = 0.05
-    hidden_rounds: tuple[float, ...] = (0.35, 0.6, 0.85)
+    hidden_rounds: tuple[float, ...] = (0.35, 0.6)
+    guess_round: float = 0.85
     background_limits: HiddenLimits = field(default_factory=HiddenLimits)
     object_limits: HiddenLimits = field(
-        default_factory=lambda: HiddenLimits(share=0.01, buried_share=0.3, buried_depth=0.2)
+        default_factory=lambda: HiddenLimits(share=0.01, buried_share=0.03, buried_depth=0.3)
+    )
+    last_object_limits: HiddenLimits = field(
+        default_factory=lambda: HiddenLimits(share=0.03, buried_share=0.3, buried_depth=0.15)
     )
 
 

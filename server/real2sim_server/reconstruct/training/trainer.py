@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,71 +19,20 @@ from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .data import View, Views, held_out_frames, image_time
 from .densify import Densifier, ScreenSums, generator, reset_opacity
-from .gaussians import FIELDS, OBJECT_FIELDS
+from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
 from .model import Rendered, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
-from .schedule import TrainOptions, from_values, rates_at
-from .visibility import Look, drop_hidden, visibility
+from .running import Clock, OnTraining, Running, Stopwatch, TrainingProgress
+from .schedule import HiddenLimits, TrainOptions, from_values, rates_at
+from .visibility import Look, drop_hidden, guesses_behind, hidden_sky, visibility
 
-SMOOTHING = 0.98
-"""Share of the past in the running loss and PSNR."""
 LOOKS = 64
 """Views at which Gaussians are looked for before hidden ones go."""
 CONSTANT_SH = (-0.55 / SH_C0, 0.55 / SH_C0)
 """Range of the constant coefficients: colours from -0.05 to 1.05."""
 CHECKPOINT = "checkpoint"
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """How far a training run is.
-
-    Attributes:
-        iteration, iterations: steps done and in all.
-        rate: steps per second of late.
-        loss, psnr: smoothed over training images; PSNR in [dB].
-        gaussians: at the moment.
-        eta_s: seconds that are left at this rate.
-    """
-
-    iteration: int
-    iterations: int
-    rate: float
-    loss: float
-    psnr: float
-    gaussians: int
-    eta_s: float
-
-
-OnTraining = Callable[[TrainingProgress], None]
-
-
-@dataclass
-class Running:
-    """Smoothed figures and the time spent by stage [s]."""
-
-    loss: float = 0.0
-    squared: float = 0.0
-    weight: float = 0.0
-    stages: dict[str, float] = field(default_factory=dict)
-
-    def add(self, loss: float, squared: float) -> None:
-        """Take in one step."""
-        self.loss = SMOOTHING * self.loss + (1 - SMOOTHING) * loss
-        self.squared = SMOOTHING * self.squared + (1 - SMOOTHING) * squared
-        self.weight = SMOOTHING * self.weight + (1 - SMOOTHING)
-
-    @property
-    def mean_loss(self) -> float:
-        """Smoothed loss."""
-        return self.loss / max(self.weight, 1e-9)
-
-    @property
-    def psnr(self) -> float:
-        """Of the smoothed squared error [dB]."""
-        return losses.psnr_of(self.squared / max(self.weight, 1e-9))
 
 
 class Trainer:
@@ -141,7 +89,7 @@ class Trainer:
         """
         options = self.options
         last = options.iterations if until is None else min(until, options.iterations)
-        clock = _Clock(self.iteration)
+        clock = Clock(self.iteration)
         while self.iteration < last:
             terms = self.step()
             done = self.iteration
@@ -155,7 +103,7 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """One iteration; the terms of its loss."""
         i = self.iteration
-        timed = _Stopwatch(self.running.stages)
+        timed = Stopwatch(self.running.stages)
         with timed("data"):
             view = self.views.view(self.views.order(i), self.options.divisor(i))
             self.views.prefetch(i)
@@ -249,9 +197,10 @@ class Trainer:
         rows = self._rows(rendered.drawn)
         if rendered.output.screen is None:
             raise ReconstructError("this renderer does not count what it draws; choose another")
-        for part, radii in zip(rows, rendered.output.screen.radii, strict=True):
+        screen = rendered.output.screen.first(len(rows))
+        for part, radii in zip(rows, screen.radii, strict=True):
             seen[part] = (radii > 0).any(0)
-        self.sums.add(rows, rendered.output.screen)
+        self.sums.add(rows, screen)
         parameters = self.model.parameters()
         masks = {name: seen for name in FIELDS if name not in OBJECT_FIELDS}
         masks |= dict.fromkeys(OBJECT_FIELDS, seen[gaussians.counts[0] :])
@@ -279,16 +228,37 @@ class Trainer:
                 self.model.gaussians, self.optimizer, self.sums, i
             )
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
+        limits = self.options.densify
         if self.densifier.drops_hidden(i):
-            self.model.gaussians = drop_hidden(
-                self.model.gaussians,
-                self.optimizer,
-                visibility(self.model, self._some_looks()),
-                self.options.densify,
-            )
-            self.sums = ScreenSums.zeros(len(self.model.gaussians))
+            self._drop_hidden(limits.object_limits)
+        if self.densifier.takes_guesses(i):
+            # Guesses first: they are to stand behind what is dropped then, too.
+            self._take_guesses()
+            self._drop_hidden(limits.last_object_limits)
         if self.densifier.resets_opacity(i):
             reset_opacity(self.model.gaussians, self.optimizer)
+
+    def _drop_hidden(self, object_limits: HiddenLimits) -> None:
+        self.model.gaussians = drop_hidden(
+            self.model.gaussians,
+            self.optimizer,
+            visibility(self.model, self._some_looks()),
+            background_limits=self.options.densify.background_limits,
+            object_limits=object_limits,
+        )
+        self.sums = ScreenSums.zeros(len(self.model.gaussians))
+
+    def _take_guesses(self) -> None:
+        """Stage 0's, as opaque as they were, for what images hardly show, and its sky likewise."""
+        model, looks = self.model, self._some_looks()
+        opaque = replace(self.options, initial_opacity=0.99, refine_poses=False)
+        times = np.array([model.scene.start_us, model.scene.end_us])
+        first = SceneModel(model.scene, opaque, times, backend=model.backend)
+        hidden = hidden_sky(model, looks)
+        model.sky.data[hidden] = first.sky.data[hidden]
+        self.optimizer.forget("sky")
+        limit = self.options.densify.background_limits.share
+        model.guesses = guesses_behind(model, first, looks, limit=limit)
 
     def _some_looks(self) -> list[Look]:
         """Training views drawn at random, enough to tell what is hidden."""
@@ -296,7 +266,7 @@ class Trainer:
         return [looks[self.views.order(k)] for k in range(min(LOOKS, len(looks)))]
 
     def _report(
-        self, terms: dict[str, float], clock: _Clock, on_progress: OnTraining | None
+        self, terms: dict[str, float], clock: Clock, on_progress: OnTraining | None
     ) -> None:
         rate = clock.rate(self.iteration)
         progress = TrainingProgress(
@@ -318,12 +288,16 @@ class Trainer:
         if self.folder is None:
             return
         tensors = {f"model.{k}": v for k, v in self.model.parameters().items()}
+        guesses = self.model.guesses
+        if guesses is not None:
+            tensors |= {f"guesses.{k}": v for k, v in guesses.tensors().items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {"sums.gradients": self.sums.gradients, "sums.views": self.sums.views}
         running = self.running
         checkpoint = Checkpoint(
             iteration=self.iteration,
             counts=self.model.gaussians.counts,
+            guess_counts=() if guesses is None else guesses.counts,
             optimizer_steps=self.optimizer.steps,
             options=asdict(self.options),
             log_name=self.log.name,
@@ -349,48 +323,19 @@ class Trainer:
             raise ReconstructError(
                 f"{self.folder}: was begun with other options; resume with the same or start anew"
             )
-        parts: dict[str, dict[str, Tensor]] = {"model": {}, "adam": {}, "sums": {}}
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "guesses": {}, "adam": {}, "sums": {}}
         for name, tensor in held.tensors.items():
             group, key = name.split(".", 1)
             parts[group][key] = tensor
         self.model.load(parts["model"], held.counts)
+        if held.guess_counts:
+            self.model.guesses = Gaussians(**parts["guesses"], counts=held.guess_counts)
         self.optimizer.restore(parts["adam"], held.optimizer_steps)
         self.sums = ScreenSums(**parts["sums"])
         self.iteration = held.iteration
         self.running = Running(**held.running)
         if self.metrics is not None:
             self.metrics.cut(held.iteration)
-
-
-class _Clock:
-    """Steps per second since the last look."""
-
-    def __init__(self, iteration: int) -> None:
-        self._iteration, self._time = iteration, time.perf_counter()
-
-    def rate(self, iteration: int) -> float:
-        now = time.perf_counter()
-        rate = max(iteration - self._iteration, 1) / max(now - self._time, 1e-6)
-        self._iteration, self._time = iteration, now
-        return rate
-
-
-class _Stopwatch:
-    """Adds the seconds of a block to a stage."""
-
-    def __init__(self, stages: dict[str, float]) -> None:
-        self._stages = stages
-
-    def __call__(self, name: str) -> _Stopwatch:
-        self._name = name
-        return self
-
-    def __enter__(self) -> None:
-        self._start = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        spent = time.perf_counter() - self._start
-        self._stages[self._name] = self._stages.get(self._name, 0.0) + spent
 
 
 def _is_due(done: int, every: int) -> bool:

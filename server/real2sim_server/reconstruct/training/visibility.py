@@ -4,7 +4,8 @@ A Gaussian behind a surface gets gradients only through the thin gaps in that su
 takes full steps along them: it drifts into a shred that a turned or moved object reveals. Little of
 it is seen, and it lies deep behind what is; the layers of a surface are seen little each as well,
 but lie close together. Such Gaussians are dropped, and what stage 0 guessed for places that nobody
-saw (mirrored sides, paint, ground under cars) is put back at the end.
+saw (mirrored sides, paint, ground under cars) takes their place while the surfaces before it finish
+learning, so that these close up.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ import torch
 from torch import Tensor
 
 from ...render import Instance, RasterOptions, rasterize
-from ...scene import Camera
+from ...scene import Camera, Sky
 from ...scene.harmonics import SH_C0
 from .densify import rearrange, rotations
 from .gaussians import Gaussians, joined
 from .model import SceneModel
 from .optimizer import SelectiveAdam
-from .schedule import DensifyOptions, HiddenLimits
+from .schedule import HiddenLimits
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
@@ -33,6 +34,8 @@ FAINT = -3.0
 GUESS_SHARE = 0.01
 """Visible share behind what was trained up to which a guess comes back: more costs what logged
 views show, less leaves holes in sides that only a turned object shows."""
+SKY_SHARE = 0.1
+"""Visible share up to which a texel of the sky counts as hidden."""
 EPS2D = RasterOptions().eps2d
 
 Look = tuple[Camera, int]
@@ -141,6 +144,30 @@ def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
     return torch.where(inside, area * cloud.opacities, 0)
 
 
+@torch.no_grad()
+def hidden_sky(model: SceneModel, looks: Iterable[Look]) -> Tensor:
+    """[6, R, R] bool, texels of the sky of which next to nothing is seen wherever cameras look."""
+    shown, bare = (torch.zeros_like(model.sky) for _ in range(2))
+    for camera, t_us in looks:
+        viewmat = model.viewmat(camera, t_us).detach()
+        instances, _ = model.instances(model.gaussians.clouds(degree=0), t_us)
+        for drawn, total in ((instances, shown), ([], bare)):
+            faces = torch.zeros_like(model.sky).requires_grad_()
+            with torch.enable_grad():
+                rasterize(
+                    drawn,
+                    viewmat[None],
+                    camera.K[None],
+                    camera.width,
+                    camera.height,
+                    sky=Sky(faces),
+                    options=RasterOptions(depth=False, instance=False),
+                    backend=model.backend,
+                ).rgb.sum().backward()
+            total.add_(faces.grad)
+    return shown.sum(-1) <= SKY_SHARE * bare.sum(-1)
+
+
 def _depths(instance: Instance, viewmat: Tensor) -> Tensor:
     """[N] of the centres along the optical axis [m]."""
     to_camera = _to_camera(instance, viewmat)
@@ -156,31 +183,34 @@ def _to_camera(instance: Instance, viewmat: Tensor) -> Tensor:
 
 
 def drop_hidden(
-    gaussians: Gaussians, optimizer: SelectiveAdam, seen: Visibility, options: DensifyOptions
+    gaussians: Gaussians,
+    optimizer: SelectiveAdam,
+    seen: Visibility,
+    *,
+    background_limits: HiddenLimits,
+    object_limits: HiddenLimits,
 ) -> Gaussians:
     """Without those of which next to nothing is seen, or little and that deep behind the rest."""
     hidden = torch.where(
-        gaussians.owners > 0,
-        seen.hidden(options.object_limits),
-        seen.hidden(options.background_limits),
+        gaussians.owners > 0, seen.hidden(object_limits), seen.hidden(background_limits)
     )
     kept = (~hidden).nonzero()[:, 0]
     return rearrange(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
 
 
-def put_back_guesses(
+def guesses_behind(
     model: SceneModel, first: SceneModel, looks: list[Look], *, limit: float
-) -> int:
-    """Add to ``model`` what stage 0 guessed for places no image shows; how many these are.
+) -> Gaussians:
+    """What stage 0 guessed for places that ``model`` hides; nothing of it is to learn.
 
     A guess of the background must have been hidden in stage 0 too: where it was seen, training had
     its reasons to remove it. Objects leave the place where they were seen, and are given everything
     that their trained Gaussians hide.
 
     Args:
-        model: trained; changed.
+        model: trained.
         first: of stage 0, with the same objects.
-        looks: all training views.
+        looks: training views.
         limit: visible share up to which a Gaussian of the background was hidden in stage 0.
     """
     hidden = visibility(first, looks).shares <= limit
@@ -189,7 +219,6 @@ def put_back_guesses(
     # Faint, so that no guess hides another: several may stand behind one gap of the surface.
     faint = replace(guesses, logits=torch.full_like(guesses.logits, FAINT))
     model.gaussians, is_guess = joined(trained, faint)
-    behind = visibility(model, looks).shares <= GUESS_SHARE
-    model.gaussians, _ = joined(trained, guesses)
-    model.gaussians = model.gaussians.take((~is_guess | behind).nonzero()[:, 0])
-    return len(model.gaussians) - len(trained)
+    behind = visibility(model, looks).shares[is_guess] <= GUESS_SHARE
+    model.gaussians = trained
+    return guesses.take(behind.nonzero()[:, 0])

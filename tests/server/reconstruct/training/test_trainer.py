@@ -94,20 +94,45 @@ def test_a_scene_that_was_exported_shares_nothing_with_the_model(trained):
     assert torch.equal(scene.background.means, before)
 
 
+def test_guesses_are_drawn_from_their_round_on_stay_as_they_are_and_are_exported(
+    tiny_log, tiny_scene
+):
+    options = replace(TINY, iterations=20)
+    trainer = Trainer(tiny_log, tiny_scene, options)
+    trainer.run(until=16)
+    assert trainer.model.guesses is None
+    trainer.run(until=17)
+    guesses = trainer.model.guesses
+    given = {name: tensor.detach().clone() for name, tensor in guesses.tensors().items()}
+    trainer.run()
+    trainer.views.close()
+    assert len(guesses) > 0
+    for name, tensor in given.items():
+        assert torch.equal(guesses.tensors()[name], tensor), name
+    exported = trainer.model.export().background
+    assert len(exported) == trainer.model.gaussians.counts[0] + guesses.counts[0]
+    torch.testing.assert_close(exported.means[-1], given["means"][guesses.counts[0] - 1])
+
+
 def losses_of(folder) -> list[tuple[int, float]]:
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     return [(line["iteration"], line["loss"]) for line in map(json.loads, lines)]
 
 
-def test_a_run_that_was_broken_off_goes_on_bit_for_bit(tiny_log, tiny_scene, tmp_path):
-    options = replace(TINY, iterations=40, mirror=0.5)
+@pytest.mark.parametrize(
+    ("every", "until", "since"), [(20, 33, 20), (12, 38, 36)], ids=["early", "among guesses"]
+)
+def test_a_run_that_was_broken_off_goes_on_bit_for_bit(
+    tiny_log, tiny_scene, tmp_path, every, until, since
+):
+    options = replace(TINY, iterations=40, mirror=0.5, checkpoint_every=every)
     whole = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "whole")
     whole.run()
     broken = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "broken")
-    broken.run(until=33)
+    broken.run(until=until)
     resumed = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "broken")
     resumed.resume()
-    assert resumed.iteration == 20
+    assert resumed.iteration == since
     resumed.run()
     for name, tensor in whole.model.parameters().items():
         assert torch.equal(tensor, resumed.model.parameters()[name]), name

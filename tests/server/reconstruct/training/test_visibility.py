@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from real2sim_server.reconstruct.training import SceneModel, Trainer
-from real2sim_server.reconstruct.training.gaussians import joined
+from real2sim_server.reconstruct.training.gaussians import Gaussians, joined
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.reconstruct.training.schedule import DensifyOptions, HiddenLimits
 from real2sim_server.reconstruct.training.visibility import (
     Visibility,
     drop_hidden,
-    put_back_guesses,
+    guesses_behind,
+    hidden_sky,
     unhindered_weights,
     visibility,
 )
@@ -23,6 +24,8 @@ from real2sim_server.scene import Camera, GaussianCloud, SceneObject, Trajectory
 
 from .conftest import TINY
 from .test_densify import COUNTS, marked, some_gaussians
+
+LIMITS = DensifyOptions()
 
 
 @pytest.fixture
@@ -68,6 +71,22 @@ def model_of(
     )
     opaque = replace(model.options, initial_opacity=0.99)
     return SceneModel(scene, opaque, np.zeros(0, np.int64), backend="cpu")
+
+
+def dropped(
+    gaussians: Gaussians,
+    optimizer: SelectiveAdam,
+    seen: Visibility,
+    *,
+    object_limits: HiddenLimits = LIMITS.object_limits,
+) -> Gaussians:
+    return drop_hidden(
+        gaussians,
+        optimizer,
+        seen,
+        background_limits=LIMITS.background_limits,
+        object_limits=object_limits,
+    )
 
 
 def shares_of(model: SceneModel, looks: list[tuple[Camera, int]]) -> torch.Tensor:
@@ -124,9 +143,8 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     optimizer: SelectiveAdam = marked(gaussians)
     shares = torch.full((len(gaussians),), 0.03)
     shares[:5] = 0.001
-    options = DensifyOptions(object_limits=HiddenLimits(share=0.05))
     seen = Visibility(shares, torch.zeros(len(gaussians)))
-    left = drop_hidden(gaussians, optimizer, seen, options)
+    left = dropped(gaussians, optimizer, seen, object_limits=HiddenLimits(share=0.05))
     assert left.counts == (COUNTS[0] - 5, 0, 0)
     torch.testing.assert_close(optimizer.first["means"], left.means.detach())
     torch.testing.assert_close(left.means, gaussians.means[5 : COUNTS[0]])
@@ -137,15 +155,15 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
     shares, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
     depths[2], depths[3], shares[3] = 0.5, 0.5, 0.5
     seen = Visibility(shares, depths)
-    left = drop_hidden(gaussians, marked(gaussians), seen, DensifyOptions())
+    left = dropped(gaussians, marked(gaussians), seen)
     kept = [i for i in range(len(gaussians)) if i != 2]
     torch.testing.assert_close(left.means, gaussians.means[kept])
 
 
 def test_inside_of_objects_goes_at_less_depth_and_more_share_than_in_the_background():
     gaussians = some_gaussians()
-    shares, depths = (torch.full((len(gaussians),), value) for value in (0.2, 0.25))
-    left = drop_hidden(gaussians, marked(gaussians), Visibility(shares, depths), DensifyOptions())
+    seen = Visibility(*(torch.full((len(gaussians),), value) for value in (0.2, 0.25)))
+    left = dropped(gaussians, marked(gaussians), seen, object_limits=LIMITS.last_object_limits)
     assert left.counts == (COUNTS[0], 0, 0)
 
 
@@ -155,6 +173,14 @@ def test_depth_behind_the_surface_is_measured_along_the_axis(model, looks):
     surface = (4 * 0.9 + 8 * 0.1 * 0.5) / (0.9 + 0.1 * 0.5)
     assert float(seen.depths[1]) == pytest.approx(8 - surface, abs=0.15)
     assert float(seen.depths[0]) == pytest.approx(0, abs=0.1)
+
+
+def test_the_sky_is_hidden_behind_what_covers_it_and_where_no_camera_looks(model, looks):
+    wall = [ahead(model, 4, 30.0, 0.99)]
+    bare, walled = model_of(model, [ahead(model, -5, 0.1, 0.5)]), model_of(model, wall)
+    open_to_view = ~hidden_sky(bare, looks)
+    assert 0 < int(open_to_view.sum()) < open_to_view.numel()
+    assert int((~hidden_sky(walled, looks)).sum()) < 0.8 * int(open_to_view.sum())
 
 
 def test_two_packs_are_joined_owner_by_owner():
@@ -169,22 +195,22 @@ def test_guesses_come_back_where_nothing_shows_them_and_nowhere_else(model, look
     wall = [ahead(model, 4, 3.0, 0.99), ahead(model, 4.1, 3.0, 0.99)]
     behind, beside = ahead(model, 8, 0.2, 0.7), ahead(model, 3, 0.2, 0.7)
     trained, first = model_of(model, wall), model_of(model, [*wall, behind, beside])
-    assert put_back_guesses(trained, first, looks, limit=0.05) == 1
-    torch.testing.assert_close(trained.gaussians.means[-1], behind.means[0])
+    guesses = guesses_behind(trained, first, looks, limit=0.05)
+    torch.testing.assert_close(guesses.means, behind.means)
+    assert len(trained.gaussians) == len(wall)
 
 
 def test_guesses_that_training_has_laid_open_stay_away(model, looks):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     first = model_of(model, [*wall, ahead(model, 8, 0.2, 0.7)])
-    assert put_back_guesses(trained, first, looks, limit=0.05) == 0
+    assert len(guesses_behind(trained, first, looks, limit=0.05)) == 0
 
 
 def test_objects_get_back_what_they_hide_though_stage_0_showed_it(model, looks):
     shown, wall = ahead(model, 8, 0.2, 0.7), [ahead(model, 4, 3.0, 0.99)] * 3
     trained, first = model_of(model, wall, subject=wall), model_of(model, [shown], subject=[shown])
-    assert put_back_guesses(trained, first, looks, limit=0.05) == 1
-    assert trained.gaussians.counts == (3, 4)
+    assert guesses_behind(trained, first, looks, limit=0.05).counts == (0, 1)
 
 
 def test_a_guess_stays_away_though_another_stands_before_it(model, looks):
@@ -192,7 +218,7 @@ def test_a_guess_stays_away_though_another_stands_before_it(model, looks):
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     pair = [ahead(model, 8, 0.2, 0.99), ahead(model, 8.5, 0.1, 0.99)]
     first = model_of(model, [*wall, *pair])
-    assert put_back_guesses(trained, first, looks, limit=0.05) == 0
+    assert len(guesses_behind(trained, first, looks, limit=0.05)) == 0
 
 
 def test_training_drops_what_is_hidden_at_its_rounds(tiny_log, tiny_scene):
