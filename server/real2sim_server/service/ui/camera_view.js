@@ -46,6 +46,8 @@ function show(head, blob) {
   $("picture").onload = () => old && URL.revokeObjectURL(old);
   $("picture").src = url;
   $("picture").dataset.seq = head.seq;
+  // A picture may be the first to tell of somebody else's edit; nothing else tells of it again.
+  if (head.revision > model.scenario.revision) attempt(refresh)();
   const now = performance.now();
   arrivals = [...arrivals.filter((t) => now - t < 1000), now];
   $("rate").textContent = arrivals.length > 2 ? `${arrivals.length} fps · ${head.width}×${head.height}` : `${head.width}×${head.height}`;

@@ -134,6 +134,20 @@ def test_what_is_copied_as_curl_makes_the_same_changes(studio):
     assert field(studio, "pose-x") == pytest.approx(x + 3, abs=0.02)
 
 
+def test_a_picture_that_shows_an_edit_of_somebody_else_brings_the_panels_up_to_date(
+    studio, running
+):
+    target = first(studio)
+    x = field(studio, "pose-x")
+    scenario = shown(studio, "model.scenario.scenario_id")
+    with real2sim.connect(running.url) as sim:
+        sim.scenarios.get(scenario).objects[target].translate(x=3)
+    at(studio, 0.5)
+    until(lambda: shown(studio, "model.scenario.revision") == 1)
+    at(studio, 0)
+    assert field(studio, "pose-x") == pytest.approx(x + 3, abs=0.02)
+
+
 def edited(page: Any) -> None:
     first(page)
     enter(page, "pose-x", field(page, "pose-x") + 3)
