@@ -157,7 +157,7 @@ def _parts(latencies: Sequence[float], stages: Sequence[Mapping[str, float]]) ->
     device = sum(
         (by_stage[name] for name in DEVICE_STAGES if name in by_stage), np.zeros(len(total))
     )
-    by_stage["socket, log and rest"] = total - sum(by_stage.values())
+    by_stage["socket and rest"] = total - sum(by_stage.values())
     spread = {name: percentiles(ms.tolist()) for name, ms in by_stage.items()}
     return {
         "p50_by_stage_ms": {name: row["p50"] for name, row in spread.items()},

@@ -225,6 +225,12 @@ class Store:
         if rows:
             self._written([_added(t.session_log, *rows)])
 
+    async def withdraw(self, session_id: str, *, from_seq: int) -> None:
+        """Remove the end of a session's log: what was recorded ahead and never took effect."""
+        log = t.session_log
+        end = (log.c.session_id == session_id) & (log.c.seq >= from_seq)
+        await self._write(Write(sa.delete(log).where(end)))
+
     async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
         """The log of a session behind ``after``, oldest first."""
         log = t.session_log

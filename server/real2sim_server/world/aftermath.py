@@ -21,9 +21,9 @@ class Aftermath(NamedTuple):
         secondary: contacts between objects that began.
     """
 
-    events: tuple[Event, ...]
-    notes: tuple[ContactNote, ...]
-    touching: frozenset[str]
+    events: tuple[Event, ...] = ()
+    notes: tuple[ContactNote, ...] = ()
+    touching: frozenset[str] = frozenset()
     secondary: int = 0
 
 

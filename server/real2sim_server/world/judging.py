@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from real2sim_proto.episode import ResetSpec
@@ -9,15 +11,33 @@ from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit.tracks import sample
 from ..scene import Scene
+from .aftermath import Aftermath
 from .agents import Agents
 from .contact import REAR_OVERHANG
 from .contact_kernels import headings
 from .ego import Motion, logged_motion
 from .episode import Clock
+from .events import Event
 from .path import LoggedPath, PathPoint
+from .pilot import Plan
 from .scoring import EgoSample, Others, PlanNote, ScoringContext
 from .scoring.comfort import window_of
 from .scoring.instant import VEHICLES
+
+
+class Unjudged(NamedTuple):
+    """A step that has been made and not judged yet.
+
+    Attributes:
+        plan: given to the ego, in the world; None for none.
+        events: that led to it.
+        left: by its contacts.
+    """
+
+    plan: Plan | None
+    events: tuple[Event, ...]
+    left: Aftermath
+
 
 LANE_WAY = 5.0
 """Recorded vehicles that moved less than this show no lane [m]."""

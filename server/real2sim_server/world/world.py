@@ -24,13 +24,13 @@ from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
 from .impact import Deformation, Dents, Impact
-from .judging import ego_sample, others_of, plan_note, scoring_context
+from .judging import Unjudged, ego_sample, others_of, plan_note, scoring_context
 from .observation import Observation
 from .obstacles import obstacles_of
 from .path import Float, LoggedPath, PathPoint
 from .pilot import Pilot, Plan, braking
 from .route import command_ahead, route_ahead
-from .scoring import ContactNote, Instant, PlanNote, Score, Tally
+from .scoring import Instant, PlanNote, Score, Tally
 from .traffic import EgoSeen, Surroundings, Traffic
 
 LEFT_LOG = 10.0
@@ -108,8 +108,9 @@ class World:
         self.impacts: tuple[Impact, ...] = ()
         self._events: tuple[Event, ...] = ()
         self._edits: tuple[Event, ...] = ()
+        self._moved: Unjudged | None = None
         self._context = scoring_context(scene, spec, self._clock, self._path, self._near.s)
-        self.instant = self._instant((), 0, None)
+        self.instant = self._instant(Aftermath())
         self.tally: Tally = scoring.begin(self.instant, self._context)
 
     @property
@@ -145,9 +146,15 @@ class World:
     def step(
         self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False
     ) -> list[Event]:
-        """Move the clock by one ``dt_us``; what happened, also part of the next observation.
+        """Move the clock by one ``dt_us`` as :meth:`move` does; what happened, also part of the
+        next observation."""
+        self.move(plan, latency_us=latency_us, missed=missed)
+        return self.judge()
 
-        Order: edits made since the last step are in effect, then ego, objects, contact, commit.
+    def move(self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False) -> None:
+        """The first half of a step: all that images show. Let :meth:`judge` follow.
+
+        Order: edits made since the last step are in effect, then ego, objects, contact.
 
         Args:
             plan: what the ego does. None keeps the last plan; before any, the ego follows the log.
@@ -160,7 +167,7 @@ class World:
         """
         self._check_running()
         pilot = self._told(plan, latency_us)
-        note = plan_note(pilot.coming[-1].plan) if plan is not None else None
+        given = pilot.coming[-1].plan if plan is not None else None
         late = [Event("deadline_missed", self.t_us)] if missed else []
         if missed and self.spec.on_timeout == "brake":
             fallback = braking(pilot, self.motion, self.spec.ego)
@@ -171,19 +178,23 @@ class World:
         self._near = self._path.nearest(self.motion.x, self.motion.y, near_s=self._near.s)
         self.T_world_vehicle = self._standing()
         left = self._aftermath(impacts, before)
-        self.instant = self._instant(left.notes, left.secondary, note)
-        self.tally = scoring.after(self.tally, self.instant, self._context)
-        events = [*self._edits, *late, *reacted, *left.events, *self._strayed(), *self._ended()]
+        self._moved = Unjudged(given, (*self._edits, *late, *reacted), left)
         self._edits = ()
-        self._events = tuple(events)
-        return events
+
+    def judge(self) -> list[Event]:
+        """The second half, if it is still to come: scores, and what happened. All that images
+        show stays as it is, so they may be drawn meanwhile."""
+        if self._moved is not None:
+            given, events, left = self._moved
+            self._moved = None
+            self.instant = self._instant(left, plan_note(given))
+            self.tally = scoring.after(self.tally, self.instant, self._context)
+            self._events = (*events, *left.events, *self._strayed(), *self._ended())
+        return list(self._events)
 
     def stop(self, reason: str) -> None:
-        """End the episode where it is, without a step: ``deadline`` or ``wall_clock``.
-
-        Raises:
-            WorldError: EPISODE_OVER.
-        """
+        """End the episode where it is, without a step: ``deadline`` or ``wall_clock``. Raises
+        WorldError: EPISODE_OVER."""
         self._check_running()
         self.truncated, self.reason = True, reason
         self._events = (*self._events, Event("stopped", self.t_us))
@@ -376,16 +387,14 @@ class World:
         clock = self._clock
         return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
 
-    def _instant(
-        self, notes: tuple[ContactNote, ...], secondary: int, plan: PlanNote | None
-    ) -> Instant:
+    def _instant(self, left: Aftermath, plan: PlanNote | None = None) -> Instant:
         z = float(self.T_world_vehicle[2, 3])
         return Instant(
             step=self.steps,
             t_us=self.t_us,
             ego=ego_sample(self.motion, self._near, z),
             others=others_of(self.agents),
-            contacts=notes,
-            secondary=secondary,
+            contacts=left.notes,
+            secondary=left.secondary,
             plan=plan,
         )

@@ -276,6 +276,33 @@ def test_same_actions_give_the_same_bits(make_world, moving):
     assert drive_somewhere(first) == drive_somewhere(second)
 
 
+def test_a_step_can_be_drawn_before_it_is_judged(make_world, moving):
+    def drawn(world: World) -> bytes:
+        poses = [i.T_world_object for i in world.instances()[1:]]
+        return encode({"ego": world.T_world_vehicle, "objects": poses, "t_us": world.t_us})
+
+    spec = {"privileged": True, "on_collision": "continue"}
+    world = make_world(car=moving(30, 0, z=0.8, speed=2.0), spec=spec)
+    stepped = world.light_copy()
+    while not world.over:
+        world.move()
+        before = drawn(world)
+        world.judge()
+        stepped.step()
+        assert drawn(world) == before
+        assert observed(world) == observed(stepped)
+    assert world.metrics()["collisions"] > 0
+
+
+def test_judging_again_changes_nothing(make_world):
+    world = make_world()
+    events = world.step()
+    before = observed(world)
+
+    assert world.judge() == events
+    assert observed(world) == before
+
+
 def test_a_copy_goes_on_alike_and_on_its_own(make_world, moving):
     spec = {"privileged": True, "on_collision": "continue"}
     world = make_world(car=moving(60, 5, speed=2.0), spec=spec)

@@ -218,7 +218,10 @@ class Sessions:
 
     async def entries(self, session: Session) -> list[Entry]:
         """Everything that has happened to a session, oldest first."""
-        return entries_of(await self._store.session_entries(session.session_id))
+        # A step on its way is in the log already; it may be withdrawn again.
+        end = session.next_seq
+        rows = await self._store.session_entries(session.session_id)
+        return entries_of(row for row in rows if row.seq < end)
 
     async def scores(self, session: Session) -> list[Score]:
         """Final scores of the running episode; empty before the first reset.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -20,7 +20,15 @@ from ..engine import Engine
 from ..metrics import Metrics
 from ..pictures import Image, Pictures, Shot, check_sensors
 from ..problems import ServiceError
-from .wire import EncodedFrame, Message, Stopwatch, encode_frame, pack_with_frames
+from .wire import (
+    EncodedFrame,
+    Members,
+    Message,
+    Stopwatch,
+    encode_frame,
+    pack_members,
+    pack_with_frames,
+)
 
 T = TypeVar("T")
 
@@ -30,10 +38,6 @@ MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
 
-def _not_recorded() -> None:
-    pass
-
-
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """An instant on its way into a message.
@@ -41,19 +45,17 @@ class Drawn:
     Attributes:
         world: at that instant.
         images: in the order of sensors and modalities.
-        kind, fields: of the message, without frames and timing.
+        kind, members: of the message, without frames and timing.
         reply_to: id of the message that it answers.
         watch: runs on.
-        record: called once the message is made.
     """
 
     world: World
     images: Sequence[Image]
     kind: str
-    fields: Mapping[str, Any]
+    members: Members
     reply_to: int
     watch: Stopwatch
-    record: Callable[[], None] = _not_recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +81,9 @@ class Show:
     """Makes messages of instants.
 
     A world without sensors moves on a thread of its own: it needs no device, and its planner
-    should not wait while other sessions are drawn. All else is one job of the engine. Raw images
-    are packed there at once; others are encoded beside it.
+    should not wait while other sessions are drawn. All else is one job of the engine. While it
+    draws, another thread settles whatever images do not show. Raw images are packed on the engine
+    at once; others are encoded beside it.
 
     Args:
         engine: runs what is drawn.
@@ -97,10 +100,12 @@ class Show:
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
+        self._aside = ThreadPoolExecutor(1, thread_name_prefix="aside")
 
     def close(self) -> None:
-        """End the thread of the worlds."""
+        """End its threads."""
         self._worlds.shutdown(cancel_futures=True)
+        self._aside.shutdown(cancel_futures=True)
 
     def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
@@ -117,16 +122,17 @@ class Show:
         cameras: Mapping[str, Camera],
         *,
         reply_to: int,
-        record: Callable[[], None] = _not_recorded,
+        settle: Callable[[World], object] = World.judge,
     ) -> Shown:
         """The world that ``change`` makes, and the observation of it.
 
         Args:
-            change: makes the new world; runs on another thread and leaves the present one alone.
+            change: makes the new world, complete as far as images show it; runs on another thread
+                and leaves the present one alone.
             cameras: of the world's sensors, by name, at the sizes asked for.
             reply_to: id of the message that is answered.
-            record: puts the change on record once its message is made, on the thread that made it;
-                where it raises, nothing has happened.
+            settle: completes that world and puts it on record; runs beside the drawing, and has
+                ended when this method returns or raises. Where it raises, nothing has happened.
 
         Raises:
             QueueFullError: too much waits for the engine.
@@ -136,15 +142,19 @@ class Show:
         def work() -> Drawn | Shown:
             watch.stage("queue")
             world = change()
-            fields = world.observe().obs_fields()
-            watch.stage("world")
-            sensors = world.due_sensors()
-            if sensors and world.deformation is not None:
-                world.deformation.work_out()
-                watch.stage("physics")
-            images = self._images(world, sensors, [cameras[s.camera] for s in sensors])
+            if sensors := world.due_sensors():
+                watch.stage("world")
+                settling = self._aside.submit(_settled, world, settle)
+                try:
+                    images = self._deformed_and_drawn(world, sensors, cameras, watch)
+                finally:
+                    wait([settling])
+                members = settling.result()
+            else:
+                images, members = (), _settled(world, settle)
+                watch.stage("world")
             watch.stage("render")
-            drawn = Drawn(world, images, "obs", fields, reply_to, watch, record)
+            drawn = Drawn(world, images, "obs", members, reply_to, watch)
             return _packed(drawn, list(map(encode_frame, images))) if _is_raw(images) else drawn
 
         if cameras:
@@ -169,8 +179,8 @@ class Show:
             watch.stage("queue")
             images = self._images(world, sensors, cameras)
             watch.stage("render")
-            fields = {"t_us": world.t_us, "revision": world.revision}
-            return Drawn(world, images, "view", fields, reply_to, watch)
+            members = pack_members({"t_us": world.t_us, "revision": world.revision})
+            return Drawn(world, images, "view", members, reply_to, watch)
 
         return await self._finish(await self._engine.call(work, label="view"))
 
@@ -200,6 +210,18 @@ class Show:
                 hint="ask for smaller or fewer images, or for codec 'jpeg' or 'png'",
             )
         return cameras
+
+    def _deformed_and_drawn(
+        self,
+        world: World,
+        sensors: Sequence[SensorSpec],
+        cameras: Mapping[str, Camera],
+        watch: Stopwatch,
+    ) -> Sequence[Image]:
+        if world.deformation is not None:
+            world.deformation.work_out()
+            watch.stage("physics")
+        return self._images(world, sensors, [cameras[s.camera] for s in sensors])
 
     def _images(
         self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]
@@ -231,6 +253,12 @@ class Show:
             self._metrics.frames.labels("drive", frame.codec).inc()
 
 
+def _settled(world: World, settle: Callable[[World], object]) -> Members:
+    """What there is to tell of a world, apart from images, once it is settled."""
+    settle(world)
+    return pack_members(world.observe().obs_fields())
+
+
 def _is_raw(images: Sequence[Image]) -> bool:
     return all(image.sensor.codec == "raw" for image in images)
 
@@ -238,7 +266,6 @@ def _is_raw(images: Sequence[Image]) -> bool:
 def _packed(drawn: Drawn, frames: Sequence[EncodedFrame]) -> Shown:
     watch = drawn.watch
     watch.stage("encode")
-    message = pack_with_frames(drawn.kind, drawn.fields, frames, watch)
+    message = pack_with_frames(drawn.kind, drawn.members, frames, watch)
     wire = message.with_id(drawn.reply_to)
-    drawn.record()
     return Shown(drawn.world, frames, message, wire, watch.timing_ms)

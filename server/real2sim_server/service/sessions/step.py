@@ -1,8 +1,8 @@
 """From one committed instant to the next, and to the bytes that show it.
 
-A change is made on a light copy of the world, drawn, encoded and packed, then written to the
-session's log, and only then it takes effect. Whatever goes wrong before leaves the session as it
-was, and leaves no trace in its log.
+A change is made on a light copy of the world. While that is drawn, the change is written ahead to
+the session's log; it takes effect once its observation is encoded and packed. Whatever goes wrong
+before leaves the session as it was, and what is in its log already is withdrawn.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class Stepper:
 
         def moved() -> World:
             world = now.light_copy()
-            world.step(plan, latency_us=latency_us, missed=missed)
+            world.move(plan, latency_us=latency_us, missed=missed)
             return world
 
         shown = await self._show_and_record(
@@ -263,12 +263,20 @@ class Stepper:
         reply_to: int,
     ) -> Shown:
         entries = _entries(session, [thing])
-        shown = await self._show.observe(
-            change,
-            cameras,
-            reply_to=reply_to,
-            record=lambda: self._store.record(session.session_id, entries),
-        )
+        recorded = False
+
+        def settle(world: World) -> None:
+            nonlocal recorded
+            world.judge()
+            self._store.record(session.session_id, entries)
+            recorded = True
+
+        try:
+            shown = await self._show.observe(change, cameras, reply_to=reply_to, settle=settle)
+        except Exception:
+            if recorded:
+                await self._store.withdraw(session.session_id, from_seq=session.next_seq)
+            raise
         session.next_seq += len(entries)
         return shown
 

@@ -34,6 +34,19 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, eq=False)
+class Members:
+    """Members of a message, encoded.
+
+    Attributes:
+        count: how many.
+        encoded: their names and values, without a map's header.
+    """
+
+    count: int
+    encoded: bytes
+
+
+@dataclass(frozen=True, eq=False)
 class Message:
     """An encoded message that lacks only its id, so that one encoding serves all who get it.
 
@@ -68,28 +81,30 @@ class EncodedFrame:
         return str(self.fields["codec"])
 
 
+def pack_members(fields: Mapping[str, Any]) -> Members:
+    """Members of plain values and arrays."""
+    return Members(len(fields), _pairs(fields))
+
+
 def pack_message(kind: str, fields: Mapping[str, Any]) -> Message:
     """A message of plain values and arrays."""
     return Message(_head(kind, len(fields)), (_pairs(fields),))
 
 
 def pack_with_frames(
-    kind: str,
-    fields: Mapping[str, Any],
-    frames: Sequence[EncodedFrame],
-    watch: Stopwatch,
+    kind: str, members: Members, frames: Sequence[EncodedFrame], watch: Stopwatch
 ) -> Message:
-    """A message with the members ``frames`` and ``timing`` besides ``fields``.
+    """A message with the members ``frames`` and ``timing`` besides ``members``.
 
     What it takes to join the parts is not in ``timing``, for it happens when a message is sent.
     """
-    parts: list[Part] = [_pairs(fields), _packed("frames"), _array_header(len(frames))]
+    parts: list[Part] = [members.encoded, _packed("frames"), _array_header(len(frames))]
     for frame in frames:
-        members = _map_header(len(frame.fields) + 1) + _pairs(frame.fields) + _packed("data")
-        parts += [members, _bin_header(len(frame.data)), frame.data]
+        pairs = _map_header(len(frame.fields) + 1) + _pairs(frame.fields) + _packed("data")
+        parts += [pairs, _bin_header(len(frame.data)), frame.data]
     watch.stage("pack")
     parts.append(_pairs({"timing": watch.timing_ms}))
-    return Message(_head(kind, len(fields) + 2), tuple(parts))
+    return Message(_head(kind, members.count + 2), tuple(parts))
 
 
 def encode_frame(image: Image) -> EncodedFrame:

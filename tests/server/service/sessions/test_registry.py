@@ -9,6 +9,7 @@ import tracemalloc
 import pytest
 
 from real2sim_proto import decode, encode
+from real2sim_server.render import RenderError
 
 pytestmark = pytest.mark.network
 
@@ -16,11 +17,7 @@ CAMERA = {"camera": "front"}
 
 
 def entries(site, info) -> list:
-    loop = asyncio.new_event_loop()
-    try:
-        return loop.run_until_complete(site.worker.store.session_entries(info["session_id"]))
-    finally:
-        loop.close()
+    return asyncio.run(site.worker.store.session_entries(info["session_id"]))
 
 
 def test_beyond_the_limit_creation_is_refused_with_a_time_to_come_back(own_site):
@@ -119,9 +116,10 @@ def test_steps_by_request_are_on_record_one_by_one(site):
     assert [decode(e.payload)["plan"] is None for e in log[1:]] == [False] + [True] * 44
 
 
-def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeypatch):
+@pytest.mark.parametrize("sensors", [[], [CAMERA]])
+def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeypatch, sensors):
     planner = join(site.create())
-    planner.reset()
+    planner.reset(sensors=sensors)
 
     def full_disk(*_: object) -> None:
         raise OSError("no space left on device")
@@ -131,6 +129,44 @@ def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeyp
         assert planner.act(0)["code"] == "INTERNAL"
     obs = planner.act(0)
     assert (obs["step"], obs["type"]) == (1, "obs")
+
+
+@pytest.mark.parametrize("codec", ["raw", "jpeg"])
+def test_a_step_that_cannot_be_shown_is_taken_off_the_record(site, join, monkeypatch, codec):
+    info = site.create()
+    planner = join(info)
+    planner.reset(sensors=[CAMERA | {"codec": codec}])
+
+    def fail(*_: object) -> None:
+        raise RenderError("no memory for this picture")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("real2sim_server.service.sessions.show.encode_frame", fail)
+        assert planner.act(0)["type"] == "error"
+    assert [e.kind for e in entries(site, info)] == ["reset"]
+    assert planner.act(0, acceleration=0.2)["step"] == 1
+    assert [(e.seq, e.kind) for e in entries(site, info)] == [(0, "reset"), (1, "action")]
+
+
+def test_a_step_on_its_way_is_on_record_and_told_to_nobody(site, join, monkeypatch):
+    info = site.create()
+    planner = join(info)
+    planner.reset(sensors=[CAMERA])
+    session, pictures, seen = site.session(info), site.worker.pictures, []
+    draw = pictures.draw
+
+    def look(*given: object) -> object:
+        give_up = time.monotonic() + 30
+        while len(entries(site, info)) < 2 and time.monotonic() < give_up:
+            time.sleep(0.001)
+        seen.append([e.kind for e in entries(site, info)])
+        seen.append([e.kind for e in asyncio.run(site.worker.sessions.entries(session))])
+        return draw(*given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pictures, "draw", look)
+        planner.act(0)
+    assert seen == [["reset", "action"], ["reset"]]
 
 
 def test_ten_sessions_on_one_scene_are_light(site, join):
