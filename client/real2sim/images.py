@@ -85,9 +85,10 @@ class Image:
 
             encoded: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(self.array), quality=92)
             return encoded
+        fitting = {SUFFIX[self.codec], ".npy"} | ({".jpg"} if self.modality == "rgb" else set())
         raise ValueError(
             f"a {self.modality} image of codec {self.codec!r} cannot be written as {suffix!r}; "
-            f"use {SUFFIX[self.codec]!r} or '.npy'"
+            f"use {' or '.join(map(repr, sorted(fitting)))}"
         )
 
 

@@ -113,9 +113,14 @@ def test_depth_is_saved_as_numbers(tmp_path):
 
 def test_a_suffix_that_would_lose_something_is_refused(tmp_path):
     image = raw_image(np.zeros((2, 2), np.float32), "depth", "float32")
-    with pytest.raises(ValueError, match=r"cannot be written as '\.jpg'"):
+    with pytest.raises(ValueError, match=r"cannot be written as '\.jpg'; use '\.npy'$"):
         image.save(tmp_path / "a.jpg")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_refused_suffix_names_each_that_would_do_once(tmp_path):
+    with pytest.raises(ValueError, match=r"as '\.png'; use '\.jpg' or '\.npy'$"):
+        raw_image(IMAGE, "rgb", "uint8").save(tmp_path / "a.png")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

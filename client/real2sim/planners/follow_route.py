@@ -67,15 +67,13 @@ class FollowRoute:
             horizon: length of a plan [s].
             spacing: time between its poses [s].
             comfort: accelerations and gaps; default: ``Comfort()``.
+
+        Raises:
+            ValueError: as :func:`delays_of_poses` does.
         """
-        if not (speed > 0 and 0 < spacing <= horizon):
-            raise ValueError(
-                f"speed {speed!r}, horizon {horizon!r}, spacing {spacing!r}: give a speed "
-                "above 0 and a spacing above 0 that fits the horizon"
-            )
+        self._delays = delays_of_poses(speed=speed, horizon=horizon, spacing=spacing)
         self.speed = speed
         self.comfort = comfort or Comfort()
-        self._delays = np.arange(1, int(horizon / spacing + 1e-9) + 1) * spacing
 
     def reset(self, obs: Observation) -> None:
         """Nothing is remembered between plans."""
@@ -93,6 +91,21 @@ class FollowRoute:
             times_us=[obs.t_us + round(delay * 1e6) for delay in self._delays],
             poses=[tuple(pose) for pose in path.poses(travelled, self.comfort.recovery).tolist()],
         )
+
+
+def delays_of_poses(*, speed: float, horizon: float, spacing: float) -> Array:
+    """[K] float64 seconds from now at which a plan has poses.
+
+    Raises:
+        ValueError: a speed, a horizon or a spacing with which no plan can be made.
+    """
+    if not (speed > 0 and 0 < spacing <= horizon):
+        raise ValueError(
+            f"speed {speed!r}, horizon {horizon!r}, spacing {spacing!r}: give a speed "
+            "above 0 and a spacing above 0 that fits the horizon"
+        )
+    delays: Array = np.arange(1, int(horizon / spacing + 1e-9) + 1) * spacing
+    return delays
 
 
 @dataclass(frozen=True)

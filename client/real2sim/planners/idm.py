@@ -10,7 +10,15 @@ import numpy as np
 
 from real2sim_proto.plans import TrajectoryPlan
 
-from .follow_route import Array, Comfort, Hindrance, Path, hindrances, speed_limits
+from .follow_route import (
+    Array,
+    Comfort,
+    Hindrance,
+    Path,
+    delays_of_poses,
+    hindrances,
+    speed_limits,
+)
 from .planner import Needs
 
 if TYPE_CHECKING:
@@ -80,10 +88,13 @@ class Idm:
             spacing: time between its poses [s].
             follower: parameters of the model; default: ``Follower()``.
             comfort: of bends and of the way back to the route; default: ``Comfort()``.
+
+        Raises:
+            ValueError: as :func:`~.follow_route.delays_of_poses` does.
         """
+        self._delays = delays_of_poses(speed=speed, horizon=horizon, spacing=spacing)
         self.speed = speed
         self.follower, self.comfort = follower or Follower(), comfort or Comfort()
-        self._delays = np.arange(1, int(horizon / spacing + 1e-9) + 1) * spacing
 
     def reset(self, obs: Observation) -> None:
         """Nothing is remembered between plans."""

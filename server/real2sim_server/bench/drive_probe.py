@@ -22,12 +22,12 @@ PLAN_PERIOD_US = 100_000
 class DriveProbe:
     """Controls a session by messages made by hand; use it in a ``with`` block.
 
+    Pings are answered with the next message that is read, so read before the worker gives up.
+
     Args:
         info: of the session.
         resume: of an earlier connection that this one goes on for: its resume token, and the step
             of the last observation it has.
-
-    Pings are answered with the next message that is read, so read before the worker gives up.
 
     Attributes:
         socket: to the worker.
@@ -48,7 +48,11 @@ class DriveProbe:
         if self._resume is not None:
             token, step = self._resume
             hello["resume"] = {"token": token, "last_step": step}
-        self.resume_token = self._accepted(hello)[0]["resume_token"]
+        try:
+            self.resume_token = self._accepted(hello)[0]["resume_token"]
+        except BaseException:
+            self.socket.close()
+            raise
         return self
 
     def __exit__(
@@ -57,7 +61,7 @@ class DriveProbe:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.socket.__exit__(kind, error, traceback)
+        self.socket.close()
 
     def reset(
         self, sensors: Sequence[Mapping[str, Any]], *, dt_us: int, **spec: Any

@@ -63,6 +63,10 @@ class LeanSocket:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave; the server's own goodbye is not waited for."""
         self._protocol.send_close(1000)
         with contextlib.suppress(OSError):  # The server may have been the first to go.
             self._flush()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from real2sim.planners import Idm
+from real2sim.planners import FollowRoute, Idm
 from real2sim.planners.idm import Follower
 
 from .road import STRAIGHT, agent, observation
@@ -56,3 +56,12 @@ def test_a_leader_that_drives_lets_it_go_on_farther_than_one_that_stands():
     stands = Idm().plan(observation(STRAIGHT, speed=8.0, agents=[agent(20.0, 0.0)]))
     drives = Idm().plan(observation(STRAIGHT, speed=8.0, agents=[agent(20.0, 0.0, speed=8.0)]))
     assert distances(drives)[-1] > distances(stands)[-1] + 5.0
+
+
+@pytest.mark.parametrize("planner", [FollowRoute, Idm])
+@pytest.mark.parametrize(
+    "given", [{"speed": 0.0}, {"spacing": 0.0}, {"horizon": 0.2, "spacing": 0.25}]
+)
+def test_a_planner_that_could_plan_nothing_is_refused(planner, given):
+    with pytest.raises(ValueError, match="give a speed above 0 and a spacing"):
+        planner(**given)

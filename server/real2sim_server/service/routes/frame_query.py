@@ -22,7 +22,9 @@ from ..pictures import Shot
 class FrameQuery:
     """Query and headers of a render or preview."""
 
-    camera: Annotated[Identifier, Query(description="camera of the rig")]
+    camera: Annotated[
+        Identifier | None, Query(description="camera of the rig; default: its first one")
+    ] = None
     t_us: Annotated[
         Microseconds | None, Query(description="simulation time; default: start of the scenario")
     ] = None
@@ -52,7 +54,7 @@ class FrameQuery:
     ) -> Shot:
         """The same for instances that are there already."""
         sensor = SensorSpec(
-            camera=self.camera,
+            camera=self.camera or scene.rig.names[0],
             modalities=[self.modality],
             width=self.width,
             codec=CODEC_OF[media_type],

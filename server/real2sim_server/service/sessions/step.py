@@ -109,11 +109,11 @@ class Stepper:
             QueueFullError: too much waits for the engine; the same action may be sent again.
         """
         measured = session.spec.latency.model == "measured"
-        latency_us = latency_us if measured else 0
-        late, recorded = session.late, payload
-        if latency_us or late:
-            recorded = action_payload(plan, latency_us=latency_us, missed=late)
-        shown = await self._step(session, plan, latency_us, late, recorded, reply_to=reply_to)
+        told = {"latency_us": latency_us if measured else 0, "missed": session.late}
+        recorded = action_payload(plan, **told) if any(told.values()) else payload
+        shown = await self._step(
+            session, lambda world: world.move(plan, **told), recorded, reply_to=reply_to
+        )
         session.lockstep.advance(payload, shown.message, over=shown.world.over)
         return shown.wire
 
@@ -123,7 +123,9 @@ class Stepper:
         Whoever sends that action later is told that it is stale.
         """
         recorded = action_payload(None, missed=True)
-        shown = await self._step(session, None, 0, True, recorded, reply_to=0)
+        shown = await self._step(
+            session, lambda world: world.move(missed=True), recorded, reply_to=0
+        )
         session.lockstep.skip(1, over=shown.world.over)
         return shown.message
 
@@ -144,20 +146,13 @@ class Stepper:
         return shown.message
 
     async def _step(
-        self,
-        session: Session,
-        plan: Plan | None,
-        latency_us: int,
-        missed: bool,
-        payload: bytes,
-        *,
-        reply_to: int,
+        self, session: Session, move: Callable[[World], None], payload: bytes, *, reply_to: int
     ) -> Shown:
         now = session.running_world()
 
         def moved() -> World:
             world = now.light_copy()
-            world.move(plan, latency_us=latency_us, missed=missed)
+            move(world)
             return world
 
         shown = await self._show_and_record(
