@@ -26,7 +26,8 @@ class PathPoint(NamedTuple):
 
     Attributes:
         s: distance from the start of the path [m].
-        offset: distance of the place from the path, positive on its left [m].
+        offset: distance of the place from the path, positive on its left; from the straight line
+            on where that is beyond an end of the path [m].
         position: the point itself, world [m].
         yaw: heading of the recorded vehicle there [rad].
         up: unit normal of the recorded vehicle's floor there, world.

@@ -34,8 +34,9 @@ def nearest_point(knots, x, y, near_s):
         near_s: distance along the path of the part to look at first [m]; NaN for none.
 
     Returns:
-        Distance along the path [m], distance from it, positive on its left [m], position (x, y, z)
-        [m], heading [rad], unit normal of the floor.
+        Distance along the path [m], distance from it, positive on its left and beyond its ends
+        from the straight line on [m], position (x, y, z) [m], heading [rad], unit normal of the
+        floor.
     """
     segments = len(knots) - 1
     k, share, offset = 0, 0.0, math.inf
@@ -46,6 +47,8 @@ def nearest_point(knots, x, y, near_s):
     if not abs(offset) <= LOST:
         k, share, offset = _foot(knots, x, y, 0, segments)
     a, b, rest = knots[k], knots[k + 1], 1.0 - share
+    if (k == 0 and share == 0.0) or (k == segments - 1 and share == 1.0):
+        offset = ((x - a[1]) * a[9] + (y - a[2]) * a[8]) * math.sqrt(a[10])
     ux, uy, uz = rest * a[5] + share * b[5], rest * a[6] + share * b[6], rest * a[7] + share * b[7]
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     return (
@@ -118,7 +121,8 @@ def _along(knots, s, column):
 
 @compiled
 def _foot(knots, x, y, first, last):
-    """Nearest segment from ``first`` to before ``last``, share of it, and the offset [m]."""
+    """Nearest segment from ``first`` to before ``last``, share of it, and the distance from there,
+    positive on the left [m]."""
     nearest, least, share, left = first, math.inf, 0.0, 0.0
     for k in range(first, last):
         dx, dy = x - knots[k, 1], y - knots[k, 2]

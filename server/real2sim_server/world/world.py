@@ -358,7 +358,7 @@ class World:
 
     def _strayed(self) -> list[Event]:
         events = []
-        distance = abs(self._near.offset)
+        distance = math.dist(self._near.position[:2], (self.motion.x, self.motion.y))
         was_off, self._left_log = self._left_log, distance > LEFT_LOG
         if self._left_log and not was_off:
             events.append(Event("left_log", self.t_us, data={"distance": distance}))

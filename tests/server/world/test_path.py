@@ -47,6 +47,14 @@ def test_nearest_finds_distance_and_side(s, offset):
     assert found.yaw == pytest.approx(angle, abs=0.01)
 
 
+@pytest.mark.parametrize("x", [-30.0, 45.0])
+def test_beyond_its_ends_a_path_goes_straight_on_to_either_side(x):
+    path = LoggedPath(along([(k, 0.0, 0.0) for k in range(21)], yaw_quaternion(np.zeros(21))))
+    near = path.nearest(x, 1.5)
+    assert near.offset == pytest.approx(1.5)
+    assert near.s == pytest.approx(min(max(x, 0.0), 20.0))
+
+
 def test_a_path_that_crosses_itself_is_followed_in_order():
     eight = np.linspace(0, 2 * np.pi, 400)
     x, y = 40 * np.sin(eight), 40 * np.sin(eight) * np.cos(eight)

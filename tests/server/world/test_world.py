@@ -212,6 +212,16 @@ def test_leaving_the_recorded_path_is_an_event_once(make_world):
     assert events == [[], ["left_log"], [], [], ["left_log"]]
 
 
+def test_whoever_drives_on_past_the_end_of_the_log_keeps_its_lane(make_world):
+    world = make_world(spec=POSE)
+    events = [e.type for k in range(40) for e in world.step(PoseCommand(x=3.5 * k, y=0.3, yaw=0))]
+
+    assert world.motion.x > world.scene.ego.positions[-1, 0] + 15
+    assert events == ["left_log"]
+    assert world.metrics()["lateral_offset"] == pytest.approx(0.3)
+    assert not world.tally.left_lane
+
+
 def test_an_edit_shows_at_once_and_is_an_event_of_the_next_step(make_world, moving):
     world = make_world(car=moving(30, 5), spec={"privileged": True})
     outcome = world.apply([Translate(object_id="car", y=3), Duplicate(object_id="car", x=20)])

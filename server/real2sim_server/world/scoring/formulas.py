@@ -243,13 +243,13 @@ FORMULAS: tuple[Callable[[Tally, ScoringContext], Score], ...] = (
 )
 
 VERSIONS = {
-    "pdms": "1",
-    "epdms": "1",
-    "nuplan_cls": "1",
-    "hugsim_hd": "1",
+    "pdms": "2",
+    "epdms": "2",
+    "nuplan_cls": "2",
+    "hugsim_hd": "2",
     "neuroncap": "1",
     "carla_ds": "1",
-    "alpasim": "1",
+    "alpasim": "2",
     "kinematic_infeasibility": "1",
     "delta_v": "1",
 }

@@ -127,9 +127,8 @@ class HardBrake:
         ego, (x, y, _), yaw = seen.ego, self.pose.position, self.pose.yaw
         dx, dy = x - ego.x, y - ego.y
         ahead_of = dx * math.cos(yaw) + dy * math.sin(yaw)
-        # Beside its path, or beside the line straight back from it: the path may begin here.
-        on_line = abs(dy * math.cos(yaw) - dx * math.sin(yaw))
-        aside = min(abs(self.path.nearest(ego.x, ego.y).offset), on_line)
+        # The path may begin here; then the line straight back from it counts.
+        aside = abs(self.path.nearest(ego.x, ego.y).offset)
         gap = ahead_of - (self.subject.scaled_size[0] + ego.length) / 2
         return aside < 3.0 and 0.0 <= gap <= self.spec.gap
 
