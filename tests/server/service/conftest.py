@@ -74,7 +74,7 @@ def postgres() -> Iterator[Postgres]:
 
 @pytest.fixture(autouse=True, scope="session")
 def quiet_log() -> None:
-    _log_from(logging.CRITICAL)
+    _log_from(logging.ERROR)
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def logged() -> Iterator[list[dict[str, Any]]]:
     _log_from(logging.DEBUG)
     with structlog.testing.capture_logs() as entries:
         yield entries
-    _log_from(logging.CRITICAL)
+    _log_from(logging.ERROR)
 
 
 def _log_from(level: int) -> None:

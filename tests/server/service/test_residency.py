@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from contextlib import asynccontextmanager
 from dataclasses import replace
 
@@ -159,13 +160,18 @@ def test_a_scene_above_the_budget_is_refused_and_nothing_leaves(folder, one_scen
     assert run(folder, work, budget_bytes=one_scene + 10) == (ErrorCode.OUT_OF_MEMORY, ["a"])
 
 
-def test_loads_under_way_count_against_the_budget(folder, one_scene):
-    async def work(residency):
-        return await asyncio.gather(*map(residency.get, NAMES), return_exceptions=True)
+def test_loads_under_way_count_against_the_budget(folder, one_scene, monkeypatch):
+    go_on, load = threading.Event(), residency_module.load_scene
+    monkeypatch.setattr(residency_module, "load_scene", lambda path: go_on.wait(60) and load(path))
 
-    outcomes = run(folder, work, budget_bytes=2 * one_scene)
-    refused = [outcome for outcome in outcomes if isinstance(outcome, ServiceError)]
-    assert [error.code for error in refused] == [ErrorCode.OUT_OF_MEMORY]
+    async def work(residency):
+        asked = [asyncio.create_task(residency.get(name)) for name in NAMES]
+        (refused,), loading = await asyncio.wait(asked, return_when=asyncio.FIRST_COMPLETED)
+        go_on.set()
+        await asyncio.gather(*loading)
+        return refused.exception()
+
+    assert run(folder, work, budget_bytes=2 * one_scene).code == ErrorCode.OUT_OF_MEMORY
 
 
 def test_a_scene_in_use_is_not_unloaded(folder):

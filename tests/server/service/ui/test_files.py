@@ -29,7 +29,8 @@ def test_the_page_needs_no_token_and_its_data_does(start_worker):
 
 @pytest.mark.parametrize("name", ["../app.py", "..%2fapp.py", "nothing.js", "/etc/passwd"])
 def test_other_files_are_not_served(client, name):
-    assert client.get(f"/ui/{name}").status_code == 404
+    answer = client.get(f"/ui/{name}")
+    assert answer.status_code == 404, answer.text
 
 
 @pytest.mark.parametrize("name", MODULES)
