@@ -255,6 +255,8 @@ class Engine:
             job.future.set_result(result)
         finally:
             self._running = None
+        # Whoever waits has been woken, and gets the interpreter before books are kept.
+        time.sleep(0)
         if self._on_job is not None:
             self._on_job(job.label, started - job.queued_at, time.perf_counter() - started)
 
