@@ -23,6 +23,11 @@ MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
 """A worker accepts messages up to this size from a client; plans and edits are small."""
 
 
+_LITTLE = {np.dtype(name): name for name in ARRAY_DTYPES}
+_SENT_AS = _LITTLE | {dtype.newbyteorder(">"): name for dtype, name in _LITTLE.items()}
+"""On the wire all are little-endian."""
+
+
 class CodecError(ValueError):
     """Bytes that are not a valid message. The sentence says what was found and what is allowed."""
 
@@ -71,8 +76,8 @@ def _pack_array(value: object) -> msgpack.ExtType:
         value = np.asarray(value)
     if not isinstance(value, np.ndarray):
         raise TypeError(f"values of type {type(value).__name__} have no place on the wire")
-    dtype = value.dtype.newbyteorder("<").str
-    if dtype not in ARRAY_DTYPES:
+    dtype = _SENT_AS.get(value.dtype)
+    if dtype is None:
         raise TypeError(f"arrays of dtype {value.dtype} have no place on the wire")
     array = np.ascontiguousarray(value, dtype=dtype)
     payload = msgpack.packb([dtype, list(value.shape), array.data.cast("B") if array.size else b""])

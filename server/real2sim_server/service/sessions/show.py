@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -142,18 +142,21 @@ class Show:
         def work() -> Drawn | Shown:
             watch.stage("queue")
             world = change()
-            if sensors := world.due_sensors():
-                watch.stage("world")
+            sensors = world.due_sensors()
+            watch.stage("world")
+            if sensors:
                 settling = self._aside.submit(_settled, world, settle)
                 try:
                     images = self._deformed_and_drawn(world, sensors, cameras, watch)
                 finally:
-                    wait([settling])
+                    settling.exception()  # waits
                 members = settling.result()
             else:
-                images, members = (), _settled(world, settle)
-                watch.stage("world")
-            watch.stage("render")
+                images = ()
+                watch.stage("render")
+                members = _settled(world, settle)
+            # Of settling only what did not happen beside the drawing.
+            watch.stage("settle")
             drawn = Drawn(world, images, "obs", members, reply_to, watch)
             return _packed(drawn, list(map(encode_frame, images))) if _is_raw(images) else drawn
 
@@ -221,7 +224,9 @@ class Show:
         if world.deformation is not None:
             world.deformation.work_out()
             watch.stage("physics")
-        return self._images(world, sensors, [cameras[s.camera] for s in sensors])
+        images = self._images(world, sensors, [cameras[s.camera] for s in sensors])
+        watch.stage("render")
+        return images
 
     def _images(
         self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]

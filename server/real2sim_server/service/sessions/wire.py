@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,9 @@ from ..pictures import Image
 
 Part = bytes | memoryview
 FIXMAP = 16
+FRAMES, DATA = (msgpack.packb(name) for name in ("frames", "data"))
+RAW_NAMES = {"rgb": "uint8", "depth": "float32", "instance": "uint16"}
+RAW_DTYPES = {modality: np.dtype(name).newbyteorder("<") for modality, name in RAW_NAMES.items()}
 
 
 @dataclass(eq=False)
@@ -98,9 +102,9 @@ def pack_with_frames(
 
     What it takes to join the parts is not in ``timing``, for it happens when a message is sent.
     """
-    parts: list[Part] = [members.encoded, _packed("frames"), _array_header(len(frames))]
+    parts: list[Part] = [members.encoded, FRAMES, _array_header(len(frames))]
     for frame in frames:
-        pairs = _map_header(len(frame.fields) + 1) + _pairs(frame.fields) + _packed("data")
+        pairs = _map_header(len(frame.fields) + 1) + _pairs(frame.fields) + DATA
         parts += [pairs, _bin_header(len(frame.data)), frame.data]
     watch.stage("pack")
     parts.append(_pairs({"timing": watch.timing_ms}))
@@ -117,8 +121,9 @@ def encode_frame(image: Image) -> EncodedFrame:
         "K": image.K,
     }
     if image.sensor.codec == "raw":
-        pixels = np.ascontiguousarray(image.pixels, dtype=image.pixels.dtype.newbyteorder("<"))
-        form = {"codec": "raw", "dtype": pixels.dtype.name, "shape": list(pixels.shape)}
+        dtype = RAW_DTYPES[image.modality]
+        pixels = np.ascontiguousarray(image.pixels, dtype=dtype)
+        form = {"codec": "raw", "dtype": RAW_NAMES[image.modality], "shape": list(pixels.shape)}
         return EncodedFrame(fields | form, pixels.data.cast("B"))
     encoded = encode_image(
         image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality
@@ -127,6 +132,7 @@ def encode_frame(image: Image) -> EncodedFrame:
     return EncodedFrame(fields | form, encoded.data)
 
 
+@functools.cache
 def _head(kind: str, members: int) -> bytes:
     return _map_header(members + 3) + _pairs({"v": PROTOCOL_VERSION, "type": kind}) + _packed("id")
 

@@ -41,7 +41,7 @@ def test_the_first_observation_shows_step_0(planner):
     assert (obs.step, obs.t_us, obs.revision) == (0, 0, 0)
     assert {a.object_id for a in obs.agents} == {"car_red", "car_blue", "post"}
     assert [f.sensor for f in obs.frames] == ["front"]
-    assert {"queue", "world", "render", "encode", "pack"} <= set(obs.timing)
+    assert {"queue", "world", "render", "settle", "encode", "pack"} <= set(obs.timing)
 
 
 def test_all_frames_of_an_observation_are_of_its_instant(planner):
