@@ -230,27 +230,28 @@ class Trainer:
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
         limits = self.options.densify
         if self.densifier.drops_hidden(i):
-            self._drop_hidden(limits.object_limits)
+            self._drop_hidden(self._some_looks(), limits.object_limits)
         if self.densifier.takes_guesses(i):
+            looks = self._some_looks()
             # Guesses first: they are to stand behind what is dropped then, too.
-            self._take_guesses()
-            self._drop_hidden(limits.last_object_limits)
+            self._take_guesses(looks)
+            self._drop_hidden(looks, limits.last_object_limits)
         if self.densifier.resets_opacity(i):
             reset_opacity(self.model.gaussians, self.optimizer)
 
-    def _drop_hidden(self, object_limits: HiddenLimits) -> None:
+    def _drop_hidden(self, looks: list[Look], object_limits: HiddenLimits) -> None:
         self.model.gaussians = drop_hidden(
             self.model.gaussians,
             self.optimizer,
-            visibility(self.model, self._some_looks()),
+            visibility(self.model, looks),
             background_limits=self.options.densify.background_limits,
             object_limits=object_limits,
         )
         self.sums = ScreenSums.zeros(len(self.model.gaussians))
 
-    def _take_guesses(self) -> None:
+    def _take_guesses(self, looks: list[Look]) -> None:
         """Stage 0's, as opaque as they were, for what images hardly show, and its sky likewise."""
-        model, looks = self.model, self._some_looks()
+        model = self.model
         opaque = replace(self.options, initial_opacity=0.99, refine_poses=False)
         times = np.array([model.scene.start_us, model.scene.end_us])
         first = SceneModel(model.scene, opaque, times, backend=model.backend)

@@ -73,10 +73,10 @@ def visibility(model: SceneModel, looks: Iterable[Look]) -> Visibility:
     gaussians = model.gaussians
     starts = gaussians.starts
     shown, bare, deep = (torch.zeros(len(gaussians)) for _ in range(3))
-    sides = [(), model.mirrored] if any(model.mirrored) else [()]
-    for (camera, t_us), mirrored in itertools.product(looks, sides):
+    turns = [(), model.mirrored] if any(model.mirrored) else [()]
+    sides = [gaussians.clouds(degree=0, mirrored=mirrored) for mirrored in turns]
+    for (camera, t_us), clouds in itertools.product(looks, sides):
         viewmat = model.viewmat(camera, t_us).detach()
-        clouds = gaussians.clouds(degree=0, mirrored=mirrored)
         instances, drawn = model.instances(clouds, t_us)
         weights = blending_weights(instances, viewmat, camera, model)
         for index, instance, (weight, inverse) in zip(drawn, instances, weights, strict=True):
@@ -148,9 +148,10 @@ def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
 def hidden_sky(model: SceneModel, looks: Iterable[Look]) -> Tensor:
     """[6, R, R] bool, texels of the sky of which next to nothing is seen wherever cameras look."""
     shown, bare = (torch.zeros_like(model.sky) for _ in range(2))
+    clouds = model.gaussians.clouds(degree=0)
     for camera, t_us in looks:
         viewmat = model.viewmat(camera, t_us).detach()
-        instances, _ = model.instances(model.gaussians.clouds(degree=0), t_us)
+        instances, _ = model.instances(clouds, t_us)
         for drawn, total in ((instances, shown), ([], bare)):
             faces = torch.zeros_like(model.sky).requires_grad_()
             with torch.enable_grad():
