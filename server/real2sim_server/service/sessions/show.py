@@ -231,8 +231,6 @@ class Show:
     def _images(
         self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]
     ) -> Sequence[Image]:
-        if not sensors:
-            return ()
         shot = Shot(
             scene=world.scene,
             instances=world.instances(),

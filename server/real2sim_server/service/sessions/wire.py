@@ -19,8 +19,8 @@ from ..pictures import Image
 Part = bytes | memoryview
 FIXMAP = 16
 FRAMES, DATA = (msgpack.packb(name) for name in ("frames", "data"))
-RAW_NAMES = {"rgb": "uint8", "depth": "float32", "instance": "uint16"}
-RAW_DTYPES = {modality: np.dtype(name).newbyteorder("<") for modality, name in RAW_NAMES.items()}
+RAW_NAMES = {np.dtype(name).newbyteorder("<"): name for name in ("uint8", "uint16", "float32")}
+"""Names of the dtypes of raw images; NumPy takes longer to tell them."""
 
 
 @dataclass(eq=False)
@@ -92,7 +92,8 @@ def pack_members(fields: Mapping[str, Any]) -> Members:
 
 def pack_message(kind: str, fields: Mapping[str, Any]) -> Message:
     """A message of plain values and arrays."""
-    return Message(_head(kind, len(fields)), (_pairs(fields),))
+    members = pack_members(fields)
+    return Message(_head(kind, members.count), (members.encoded,))
 
 
 def pack_with_frames(
@@ -121,9 +122,8 @@ def encode_frame(image: Image) -> EncodedFrame:
         "K": image.K,
     }
     if image.sensor.codec == "raw":
-        dtype = RAW_DTYPES[image.modality]
-        pixels = np.ascontiguousarray(image.pixels, dtype=dtype)
-        form = {"codec": "raw", "dtype": RAW_NAMES[image.modality], "shape": list(pixels.shape)}
+        pixels = np.ascontiguousarray(image.pixels, dtype=image.pixels.dtype.newbyteorder("<"))
+        form = {"codec": "raw", "dtype": RAW_NAMES[pixels.dtype], "shape": list(pixels.shape)}
         return EncodedFrame(fields | form, pixels.data.cast("B"))
     encoded = encode_image(
         image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality

@@ -47,7 +47,7 @@ function show(head, blob) {
   $("picture").src = url;
   $("picture").dataset.seq = head.seq;
   // A picture may be the first to tell of somebody else's edit; nothing else tells of it again.
-  if (head.revision > model.scenario.revision) attempt(refresh)();
+  if (head.revision > model.scenario.revision) socket.onChanged();
   const now = performance.now();
   arrivals = [...arrivals.filter((t) => now - t < 1000), now];
   $("rate").textContent = arrivals.length > 2 ? `${arrivals.length} fps · ${head.width}×${head.height}` : `${head.width}×${head.height}`;
