@@ -102,7 +102,7 @@ def _frames(
             rgb=rgb[c],
             depth=None if depth is None else depth[c],
             instance=None if instance is None else instance[c],
-            T_world_camera=vehicle @ camera.T_vehicle_camera,
+            T_world_camera=camera.pose(vehicle),
             timing_ms=dict(share),
         )
         for c, camera in enumerate(cameras)

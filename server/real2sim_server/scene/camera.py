@@ -66,7 +66,11 @@ class Camera:
 
     def viewmat(self, T_world_vehicle: Float) -> Float:
         """``T_camera_world`` [4, 4] when the vehicle stands at ``T_world_vehicle``."""
-        return invert_transform(T_world_vehicle @ self.T_vehicle_camera)
+        return invert_transform(self.pose(T_world_vehicle))
+
+    def pose(self, T_world_vehicle: Float) -> Float:
+        """``T_world_camera`` [4, 4] when the vehicle stands at ``T_world_vehicle``."""
+        return T_world_vehicle @ self.T_vehicle_camera
 
 
 @dataclass(frozen=True, eq=False)

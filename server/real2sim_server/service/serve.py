@@ -23,6 +23,7 @@ from ..settings import Settings
 from .app import create_app
 from .auth import check_bind
 from .logging_setup import configure_logging
+from .websocket import PartedProtocol
 from .worker import Worker
 
 PING_INTERVAL_S = 10.0
@@ -113,7 +114,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         lifespan="on",
-        ws="websockets-sansio",
+        ws=PartedProtocol,
         # Deflating a frame takes 20 ms and gains nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,

@@ -77,8 +77,8 @@ def drive(motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int) -> Motion:
         asked = driver(motion, k * h)
         now = Command(motion.drive, motion.steering)
         command, pending = at_wheels(asked, motion.pending, now, spec, h)
-        motion = model(motion, command, spec, h)._replace(drive=command.acceleration)
-        if pending or motion.pending:
+        motion = model(motion, command, spec, h)
+        if pending:
             motion = motion._replace(pending=pending)
     acceleration = (motion.speed - start.speed) / (dt_us * 1e-6)
     return motion._replace(acceleration=acceleration)
@@ -99,6 +99,7 @@ def _roll(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
         speed=speed,
         steering=steering,
         yaw_rate=speed * math.tan(steering) / spec.wheelbase,
+        drive=command.acceleration,
     )
 
 
@@ -106,8 +107,8 @@ def _slip(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
     """Dynamic bicycle; fades into the kinematic one where it is slow."""
     vehicle = vehicle_of(spec)
     most = vehicle.friction * GRAVITY
-    command = command._replace(acceleration=min(max(command.acceleration, -most), most))
-    rolled = _roll(motion, command, spec, h)
+    limited = command._replace(acceleration=min(max(command.acceleration, -most), most))
+    rolled = _roll(motion, limited, spec, h)._replace(drive=command.acceleration)
     share = dynamic.tyre_share(min(motion.speed, rolled.speed))
     if share == 0.0:
         return rolled
@@ -132,6 +133,7 @@ def _slip(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
         steering=rolled.steering,
         yaw_rate=share * turn + rest * rolled.yaw_rate,
         lateral_speed=share * (vy - vehicle.rear * turn),
+        drive=command.acceleration,
     )
     if rest == 0.0:
         return slipped

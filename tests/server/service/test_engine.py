@@ -56,6 +56,21 @@ def test_a_call_returns_what_the_function_returns(make_engine):
     assert engine.call_sync(int, "ff", base=16) == 255
 
 
+def test_an_engine_goes_on_when_the_loop_that_asked_is_gone(make_engine):
+    engine, gate = make_engine(), Gate()
+
+    async def ask_and_leave() -> None:
+        # Held by nobody else, and never cancelled, as when a loop is stopped at once.
+        asyncio.ensure_future(engine.call(gate.job))  # noqa: RUF006
+        await until_entered(gate)
+
+    loop = asyncio.new_event_loop()
+    loop.run_until_complete(ask_and_leave())
+    loop.close()
+    gate.open()
+    assert engine.call_sync(int, "7") == 7
+
+
 def test_all_jobs_run_on_the_same_thread_and_none_on_the_callers(make_engine):
     engine = make_engine()
 

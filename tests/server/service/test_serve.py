@@ -16,6 +16,7 @@ import pytest
 import real2sim
 from real2sim_server.service.auth import OpenBindError
 from real2sim_server.service.serve import run, running_worker, server_config
+from real2sim_server.service.websocket import PartedProtocol
 
 pytestmark = pytest.mark.network
 
@@ -97,7 +98,7 @@ def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
     from real2sim_server.service.app import create_app
 
     config = server_config(create_app(make_settings()), make_settings())
-    assert config.ws == "websockets-sansio"
+    assert config.ws is PartedProtocol
     assert config.ws_per_message_deflate is False
     assert config.ws_max_size == MAX_CLIENT_MESSAGE_BYTES
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from typing import Any, assert_never
 
 import structlog
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
 from real2sim_proto.drive import (
@@ -26,13 +26,14 @@ from real2sim_proto.drive import (
 
 from ..auth import opens, same_secret, unauthorized
 from ..problems import ServiceError, service_error
+from ..websocket import send
 from .describe import welcome_fields
 from .messages import BadMessageError, Incoming, bad_message, read_message, unsupported_protocol
 from .observers import Mailbox
 from .patience import Patience
 from .registry import Sessions
 from .session import Session, controller_taken
-from .wire import pack_message
+from .wire import Message, pack_message
 
 GREETING_S = 10.0
 PROGRESS_S = 1.0
@@ -90,9 +91,7 @@ class Connection:
         self._worker_token = worker_token
         self._ws_base = ws_base
         self._sending = asyncio.Lock()
-        self._patience = Patience(
-            session, sessions.stepper, lambda message: self._send(message.with_id(0))
-        )
+        self._patience = Patience(session, sessions.stepper, self._send)
 
     async def serve(self) -> None:
         """Talk until one of both leaves. A client that vanishes disturbs nobody."""
@@ -158,13 +157,13 @@ class Connection:
         warming.add_done_callback(lambda task: task.cancelled() or task.exception())
         while not (await asyncio.wait({warming}, timeout=PROGRESS_S))[0]:
             fields = {"phase": "warming up: kernels and first render", "eta_s": None}
-            await self._send(pack_message("progress", fields).with_id(hello.id))
+            await self._send(pack_message("progress", fields), hello.id)
         try:
             await warming
         except Exception as error:
             raise FatalError(_told(error), message_id=hello.id) from error
         fields = await asyncio.to_thread(welcome_fields, self._session, hello.role)
-        await self._send(pack_message("welcome", fields).with_id(hello.id))
+        await self._send(pack_message("welcome", fields), hello.id)
 
     @contextlib.asynccontextmanager
     async def _as_controller(self, hello: Hello) -> AsyncIterator[None]:
@@ -196,7 +195,7 @@ class Connection:
             newest, step = session.newest, session.lockstep.step
             missing = hello.resume is not None and hello.resume.last_step != step
             if missing and newest is not None:
-                await self._send(newest.with_id(0))
+                await self._send(newest)
         self._patience.begin()
 
     @contextlib.asynccontextmanager
@@ -216,8 +215,7 @@ class Connection:
         # A client that left is noticed by whoever receives from it.
         with contextlib.suppress(WebSocketDisconnect):
             while True:
-                message = await mailbox.take()
-                await self._send(await self._sessions.show.on_world_thread(message.with_id, 0))
+                await self._send(await mailbox.take())
 
     # --- conversation -----------------------------------------------------------------------
 
@@ -226,19 +224,19 @@ class Connection:
         while True:
             try:
                 incoming = await self._receive()
-                await self._send(await self._answer(incoming, role))
+                await self._send(await self._answer(incoming, role), incoming.message.id)
                 if role == "controller" and not self._patience.waiting:
                     self._patience.begin()
             except BadMessageError as error:
                 if error.fatal:
                     raise FatalError(error.refusal, message_id=error.message_id) from error
-                await self._send(self._error(error.refusal, error.message_id))
+                await self._send(self._error(error.refusal), error.message_id)
             else:
                 if isinstance(incoming.message, Bye):
                     await self._socket.close(NORMAL_CLOSURE)
                     return
 
-    async def _answer(self, incoming: Incoming, role: str) -> bytes:
+    async def _answer(self, incoming: Incoming, role: str) -> Message:
         message = incoming.message
         allowed = MAY_SEND[role]
         if not isinstance(message, allowed):
@@ -248,13 +246,13 @@ class Connection:
                 f"send {', '.join(kind.__name__.lower() for kind in allowed)}",
                 hint="connect with role 'controller' to drive",
             )
-            return self._error(refusal, message.id)
+            return self._error(refusal)
         try:
             return await self._obey(incoming, role)
         except Exception as error:
-            return self._error(_told(error), message.id)
+            return self._error(_told(error))
 
-    async def _obey(self, incoming: Incoming, role: str) -> bytes:
+    async def _obey(self, incoming: Incoming, role: str) -> Message:
         message, session, stepper = incoming.message, self._session, self._sessions.stepper
         match message:
             case Action():
@@ -263,26 +261,25 @@ class Connection:
                 self._patience.end()
                 async with session.lock:
                     session.check_open()
-                    return await stepper.reset(session, message.spec, reply_to=message.id)
+                    return await stepper.reset(session, message.spec)
             case Edit():
                 return await self._edit(message)
             case Render():
                 session.check_open()
-                show = self._sessions.show
                 world = session.running_world()
-                return (await show.view(world, message.sensors, reply_to=message.id)).wire
+                return (await self._sessions.show.view(world, message.sensors)).message
             case Agent() | Snapshot() | Restore() | Fork():
                 async with session.lock:
                     session.check_open()
                     return await self._change(message)
             case Bye():
-                return await self._leave(message, role)
+                return await self._leave(role)
             case Hello():
                 raise bad_message("hello has been said already")
             case _:
                 assert_never(message)
 
-    async def _act(self, action: Action, content: bytes) -> bytes:
+    async def _act(self, action: Action, content: bytes) -> Message:
         session = self._session
         waited_us = self._patience.waited_us
         if action.step == session.lockstep.step:
@@ -290,37 +287,35 @@ class Connection:
         async with session.lock:
             session.check_open()
             cached = session.lockstep.cached_answer(action.step, content)
-            if cached is None:
-                stepper = self._sessions.stepper
-                return await stepper.act(
-                    session, action.plan, content, reply_to=action.id, latency_us=waited_us
-                )
-        return await self._sessions.show.on_world_thread(cached.with_id, action.id)
+            if cached is not None:
+                return cached
+            stepper = self._sessions.stepper
+            return await stepper.act(session, action.plan, content, latency_us=waited_us)
 
-    async def _change(self, asked: Agent | Snapshot | Restore | Fork) -> bytes:
+    async def _change(self, asked: Agent | Snapshot | Restore | Fork) -> Message:
         """Everything that is rare, for whoever holds the session's lock."""
         session, stepper = self._session, self._sessions.stepper
         match asked:
             case Agent():
                 await stepper.steer(session, asked)
                 fields = {"object_id": asked.object_id, "step": session.running_world().steps}
-                return pack_message("driven", fields).with_id(asked.id)
+                return pack_message("driven", fields)
             case Snapshot():
                 kept = await stepper.snapshot(session, asked.name)
                 fields = {"name": asked.name, "step": kept.steps, "t_us": kept.t_us}
-                return pack_message("kept", fields).with_id(asked.id)
+                return pack_message("kept", fields)
             case Restore():
                 self._patience.end()
-                return await stepper.restore(session, asked.name, reply_to=asked.id)
+                return await stepper.restore(session, asked.name)
             case Fork():
                 info = await self._sessions.fork(session, ws_base=self._ws_base)
                 fields = info.model_dump(include={"session_id", "token", "ws_url"})
                 fields["step"] = session.running_world().steps
-                return pack_message("forked", fields).with_id(asked.id)
+                return pack_message("forked", fields)
             case _:
                 assert_never(asked)
 
-    async def _edit(self, edit: Edit) -> bytes:
+    async def _edit(self, edit: Edit) -> Message:
         session = self._session
         async with session.lock:
             session.check_open()
@@ -333,9 +328,9 @@ class Connection:
             "created": list(outcome.created),
             "warnings": [w.model_dump(mode="json", exclude_none=True) for w in outcome.warnings],
         }
-        return pack_message("edited", fields).with_id(edit.id)
+        return pack_message("edited", fields)
 
-    async def _leave(self, bye: Bye, role: str) -> bytes:
+    async def _leave(self, role: str) -> Message:
         """The result; a controller that says bye ends the session."""
         session = self._session
         scores = await self._sessions.scores(session)
@@ -351,7 +346,7 @@ class Connection:
             "metrics": world.metrics() if world else {},
             "scores": [score.fields() for score in scores],
         }
-        return pack_message("result", fields).with_id(bye.id)
+        return pack_message("result", fields)
 
     # --- bytes ------------------------------------------------------------------------------
 
@@ -367,21 +362,19 @@ class Connection:
             return read_message(data)
         return await asyncio.to_thread(read_message, data)
 
-    async def _send(self, data: bytes) -> None:
+    async def _send(self, message: Message, message_id: int = 0) -> None:
         # Whoever ends the session may send too.
         async with self._sending:
-            if self._socket.application_state is WebSocketState.DISCONNECTED:
-                raise WebSocketDisconnect
-            await self._socket.send_bytes(data)
+            await send(self._socket, message.parts(message_id))
 
     async def _hang_up(self, refusal: ServiceError, *, message_id: int = 0) -> None:
         """Tell the client why this is over and close; one that does not listen is left alone."""
         with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
             async with asyncio.timeout(FAREWELL_S):
-                await self._send(self._error(refusal, message_id, fatal=True))
+                await self._send(self._error(refusal, fatal=True), message_id)
                 await self._socket.close(POLICY_VIOLATION, refusal.code.value)
 
-    def _error(self, refusal: ServiceError, message_id: int, *, fatal: bool = False) -> bytes:
+    def _error(self, refusal: ServiceError, *, fatal: bool = False) -> Message:
         fields: dict[str, Any] = {
             "code": refusal.code.value,
             "detail": refusal.detail,
@@ -390,7 +383,7 @@ class Connection:
             "fatal": fatal,
             "step": self._session.lockstep.step,
         }
-        return pack_message("error", fields).with_id(message_id)
+        return pack_message("error", fields)
 
 
 def _told(error: Exception) -> ServiceError:

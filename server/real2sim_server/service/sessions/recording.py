@@ -89,4 +89,5 @@ async def _drawn(show: Show, world: World) -> list[EncodedFrame]:
 
 def _name(frame: EncodedFrame, step: int) -> str:
     suffix = "jpg" if frame.codec == "jpeg" else "png"
-    return f"frames/{frame.fields['sensor']}/{frame.fields['modality']}/{step:06d}.{suffix}"
+    fields = frame.head.fields
+    return f"frames/{fields['sensor']}/{fields['modality']}/{step:06d}.{suffix}"

@@ -42,7 +42,7 @@ async def rebuild(row: SessionRow, start: Start, *, store: Store, show: Show) ->
     session.snapshots = retold.snapshots
     if last.kind == "action":
         cameras = show.cameras(start.scene, _world(retold).spec.sensors)
-        shown = await show.observe(lambda: retold.tell(last), cameras, reply_to=0)
+        shown = await show.observe(lambda: retold.tell(last), cameras)
         session.begin(shown.world, cameras)
         session.lockstep.reset(shown.world.steps, over=shown.world.over)
         if not decode(last.payload).get("missed"):

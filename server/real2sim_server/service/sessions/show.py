@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Modality
 from real2sim_proto.codec import DEFAULT_MAX_BYTES
 from real2sim_proto.drive import SensorSpec
 
@@ -22,18 +21,21 @@ from ..pictures import Image, Pictures, Shot, check_sensors
 from ..problems import ServiceError
 from .wire import (
     EncodedFrame,
+    FrameHead,
     Members,
     Message,
     Stopwatch,
     encode_frame,
     pack_members,
     pack_with_frames,
+    raw_bytes,
+    raw_heads,
+    with_pixels,
 )
 
 T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
-BYTES_PER_PIXEL: dict[Modality, int] = {"rgb": 3, "depth": 4, "instance": 2}
 MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
@@ -46,7 +48,6 @@ class Drawn:
         world: at that instant.
         images: in the order of sensors and modalities.
         kind, members: of the message, without frames and timing.
-        reply_to: id of the message that it answers.
         watch: runs on.
     """
 
@@ -54,7 +55,6 @@ class Drawn:
     images: Sequence[Image]
     kind: str
     members: Members
-    reply_to: int
     watch: Stopwatch
 
 
@@ -65,15 +65,13 @@ class Shown:
     Attributes:
         world: at that instant; it has not taken effect by being shown.
         frames: the images of the message.
-        message: for whoever else gets it.
-        wire: bytes of the answer.
+        message: for all who get it.
         timing_ms: by stage.
     """
 
     world: World
     frames: Sequence[EncodedFrame]
     message: Message
-    wire: bytes
     timing_ms: Mapping[str, float]
 
 
@@ -82,8 +80,8 @@ class Show:
 
     A world without sensors moves on a thread of its own: it needs no device, and its planner
     should not wait while other sessions are drawn. All else is one job of the engine. While it
-    draws, another thread settles whatever images do not show. Raw images are packed on the engine
-    at once; others are encoded beside it.
+    draws, another thread settles whatever images do not show, and says in advance what raw images
+    will be. Those are packed on the engine at once; others are encoded beside it.
 
     Args:
         engine: runs what is drawn.
@@ -121,7 +119,6 @@ class Show:
         change: Callable[[], World],
         cameras: Mapping[str, Camera],
         *,
-        reply_to: int,
         settle: Callable[[World], object] = World.judge,
     ) -> Shown:
         """The world that ``change`` makes, and the observation of it.
@@ -130,7 +127,6 @@ class Show:
             change: makes the new world, complete as far as images show it; runs on another thread
                 and leaves the present one alone.
             cameras: of the world's sensors, by name, at the sizes asked for.
-            reply_to: id of the message that is answered.
             settle: completes that world and puts it on record; runs beside the drawing, and has
                 ended when this method returns or raises. Where it raises, nothing has happened.
 
@@ -143,22 +139,26 @@ class Show:
             watch.stage("queue")
             world = change()
             sensors = world.due_sensors()
+            shot = [cameras[s.camera] for s in sensors]
             watch.stage("world")
             if sensors:
-                settling = self._aside.submit(_settled, world, settle)
+                settling = self._aside.submit(_settled, world, settle, sensors, shot)
                 try:
-                    images = self._deformed_and_drawn(world, sensors, cameras, watch)
+                    images = self._deformed_and_drawn(world, sensors, shot, watch)
                 finally:
                     settling.exception()  # waits
-                members = settling.result()
+                members, heads = settling.result()
             else:
                 images = ()
                 watch.stage("render")
-                members = _settled(world, settle)
+                members, heads = _settled(world, settle, sensors, shot)
             # Of settling only what did not happen beside the drawing.
             watch.stage("settle")
-            drawn = Drawn(world, images, "obs", members, reply_to, watch)
-            return _packed(drawn, list(map(encode_frame, images))) if _is_raw(images) else drawn
+            drawn = Drawn(world, images, "obs", members, watch)
+            if heads is None:
+                return drawn
+            frames = [with_pixels(h, i.pixels) for h, i in zip(heads, images, strict=True)]
+            return _packed(drawn, frames)
 
         if cameras:
             made = await self._engine.call(work, label="drive")
@@ -166,9 +166,7 @@ class Show:
             made = await self.on_world_thread(work)
         return await self._finish(made)
 
-    async def view(
-        self, world: World, sensors: Sequence[SensorSpec], *, reply_to: int = 0
-    ) -> Shown:
+    async def view(self, world: World, sensors: Sequence[SensorSpec]) -> Shown:
         """Images of a committed instant, from cameras of the vehicle; time does not move.
 
         Raises:
@@ -183,7 +181,7 @@ class Show:
             images = self._images(world, sensors, cameras)
             watch.stage("render")
             members = pack_members({"t_us": world.t_us, "revision": world.revision})
-            return Drawn(world, images, "view", members, reply_to, watch)
+            return Drawn(world, images, "view", members, watch)
 
         return await self._finish(await self._engine.call(work, label="view"))
 
@@ -200,16 +198,16 @@ class Show:
 
     def _checked(self, scene: Scene, sensors: Sequence[SensorSpec]) -> list[Camera]:
         cameras = check_sensors(scene.rig, sensors, max_pixels=self._max_pixels)
-        raw_bytes = sum(
-            camera.width * camera.height * BYTES_PER_PIXEL[modality]
+        size = sum(
+            raw_bytes(modality, camera.width, camera.height)
             for camera, sensor in zip(cameras, sensors, strict=True)
             for modality in sensor.modalities
             if sensor.codec == "raw"
         )
-        if raw_bytes > MAX_IMAGE_BYTES:
+        if size > MAX_IMAGE_BYTES:
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
-                f"{raw_bytes} bytes of raw images in one message; readers allow {MAX_IMAGE_BYTES}",
+                f"{size} bytes of raw images in one message; readers allow {MAX_IMAGE_BYTES}",
                 hint="ask for smaller or fewer images, or for codec 'jpeg' or 'png'",
             )
         return cameras
@@ -218,13 +216,13 @@ class Show:
         self,
         world: World,
         sensors: Sequence[SensorSpec],
-        cameras: Mapping[str, Camera],
+        cameras: Sequence[Camera],
         watch: Stopwatch,
     ) -> Sequence[Image]:
         if world.deformation is not None:
             world.deformation.work_out()
             watch.stage("physics")
-        images = self._images(world, sensors, [cameras[s.camera] for s in sensors])
+        images = self._images(world, sensors, cameras)
         watch.stage("render")
         return images
 
@@ -256,19 +254,23 @@ class Show:
             self._metrics.frames.labels("drive", frame.codec).inc()
 
 
-def _settled(world: World, settle: Callable[[World], object]) -> Members:
-    """What there is to tell of a world, apart from images, once it is settled."""
+def _settled(
+    world: World,
+    settle: Callable[[World], object],
+    sensors: Sequence[SensorSpec],
+    cameras: Sequence[Camera],
+) -> tuple[Members, list[FrameHead] | None]:
+    """What there is to tell of a world, apart from images, once it is settled; and heads of its
+    images, where all of them are raw."""
     settle(world)
-    return pack_members(world.observe().obs_fields())
-
-
-def _is_raw(images: Sequence[Image]) -> bool:
-    return all(image.sensor.codec == "raw" for image in images)
+    members = pack_members(world.observe().obs_fields())
+    if any(sensor.codec != "raw" for sensor in sensors):
+        return members, None
+    return members, raw_heads(sensors, cameras, world.T_world_vehicle, world.t_us)
 
 
 def _packed(drawn: Drawn, frames: Sequence[EncodedFrame]) -> Shown:
     watch = drawn.watch
     watch.stage("encode")
     message = pack_with_frames(drawn.kind, drawn.members, frames, watch)
-    wire = message.with_id(drawn.reply_to)
-    return Shown(drawn.world, frames, message, wire, watch.timing_ms)
+    return Shown(drawn.world, frames, message, watch.timing_ms)

@@ -53,20 +53,18 @@ class Stepper:
         self._show = show
         self._store = store
 
-    async def reset(self, session: Session, spec: ResetSpec, *, reply_to: int) -> bytes:
-        """Begin an episode; its first observation, ready to be sent.
+    async def reset(self, session: Session, spec: ResetSpec) -> Message:
+        """Begin an episode; its first observation.
 
         Raises:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
         cameras = self._show.cameras(session.start.scene, spec.sensors)
         thing = ("reset", 0, reset_payload(spec))
-        shown = await self._show_and_record(
-            session, _beginning(session, spec), cameras, thing, reply_to=reply_to
-        )
+        shown = await self._show_and_record(session, _beginning(session, spec), cameras, thing)
         session.begin(shown.world, cameras)
         session.publish(shown.message)
-        return shown.wire
+        return shown.message
 
     async def restart(self, session: Session, spec: ResetSpec) -> None:
         """Begin an episode of which nobody needs the first observation. Raises like reset()."""
@@ -92,16 +90,14 @@ class Stepper:
         plan: Plan | None,
         payload: bytes,
         *,
-        reply_to: int,
         latency_us: int = 0,
-    ) -> bytes:
-        """Take the action that is due; the next observation, ready to be sent.
+    ) -> Message:
+        """Take the action that is due; the next observation.
 
         Args:
             session: its lock step wants this action now.
             plan: what the ego does.
             payload: canonical bytes of the plan.
-            reply_to: id of the message that is answered.
             latency_us: wall-clock time from the observation to this action.
 
         Raises:
@@ -111,11 +107,9 @@ class Stepper:
         measured = session.spec.latency.model == "measured"
         told = {"latency_us": latency_us if measured else 0, "missed": session.late}
         recorded = action_payload(plan, **told) if any(told.values()) else payload
-        shown = await self._step(
-            session, lambda world: world.move(plan, **told), recorded, reply_to=reply_to
-        )
+        shown = await self._step(session, lambda world: world.move(plan, **told), recorded)
         session.lockstep.advance(payload, shown.message, over=shown.world.over)
-        return shown.wire
+        return shown.message
 
     async def miss(self, session: Session) -> Message:
         """Go on without the action that is due, by the episode's fallback; what to tell.
@@ -123,9 +117,7 @@ class Stepper:
         Whoever sends that action later is told that it is stale.
         """
         recorded = action_payload(None, missed=True)
-        shown = await self._step(
-            session, lambda world: world.move(missed=True), recorded, reply_to=0
-        )
+        shown = await self._step(session, lambda world: world.move(missed=True), recorded)
         session.lockstep.skip(1, over=shown.world.over)
         return shown.message
 
@@ -139,15 +131,13 @@ class Stepper:
             return world
 
         thing = ("stop", now.steps, stop_payload(reason))
-        shown = await self._show_and_record(session, stopped, session.cameras, thing, reply_to=0)
+        shown = await self._show_and_record(session, stopped, session.cameras, thing)
         session.world = shown.world
         session.lockstep.end()
         session.publish(shown.message)
         return shown.message
 
-    async def _step(
-        self, session: Session, move: Callable[[World], None], payload: bytes, *, reply_to: int
-    ) -> Shown:
+    async def _step(self, session: Session, move: Callable[[World], None], payload: bytes) -> Shown:
         now = session.running_world()
 
         def moved() -> World:
@@ -155,9 +145,8 @@ class Stepper:
             move(world)
             return world
 
-        shown = await self._show_and_record(
-            session, moved, session.cameras, ("action", now.steps, payload), reply_to=reply_to
-        )
+        thing = ("action", now.steps, payload)
+        shown = await self._show_and_record(session, moved, session.cameras, thing)
         session.world, session.late = shown.world, False
         session.publish(shown.message)
         return shown
@@ -224,8 +213,8 @@ class Stepper:
         session.snapshots[name] = now
         return now
 
-    async def restore(self, session: Session, name: str, *, reply_to: int) -> bytes:
-        """Go back to a snapshot; its observation, ready to be sent.
+    async def restore(self, session: Session, name: str) -> Message:
+        """Go back to a snapshot; its observation.
 
         Raises:
             ServiceError: NOT_FOUND.
@@ -240,13 +229,11 @@ class Stepper:
             )
         cameras = self._show.cameras(kept.scene, kept.spec.sensors)
         thing = ("restore", kept.steps, name_payload(name))
-        shown = await self._show_and_record(
-            session, lambda: kept, cameras, thing, reply_to=reply_to
-        )
+        shown = await self._show_and_record(session, lambda: kept, cameras, thing)
         session.begin(kept, cameras)
         session.lockstep.reset(kept.steps, over=kept.over)
         session.publish(shown.message)
-        return shown.wire
+        return shown.message
 
     async def _show_and_record(
         self,
@@ -254,8 +241,6 @@ class Stepper:
         change: Callable[[], World],
         cameras: Mapping[str, Camera],
         thing: Thing,
-        *,
-        reply_to: int,
     ) -> Shown:
         entries = _entries(session, [thing])
         recorded = False
@@ -267,7 +252,7 @@ class Stepper:
             recorded = True
 
         try:
-            shown = await self._show.observe(change, cameras, reply_to=reply_to, settle=settle)
+            shown = await self._show.observe(change, cameras, settle=settle)
         except Exception:
             if recorded:
                 await self._store.withdraw(session.session_id, from_seq=session.next_seq)

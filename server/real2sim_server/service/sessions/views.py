@@ -41,5 +41,8 @@ async def view_response(
         "Cache-Control": "no-store",
         "X-Real2Sim-Revision": etag(world.revision),
     }
-    content = shown.wire if media_type == MSGPACK else bytes(shown.frames[0].data)
+    if media_type == MSGPACK:
+        content = await show.on_world_thread(shown.message.joined)
+    else:
+        content = bytes(shown.frames[0].data)
     return Response(content, media_type=media_type, headers=headers)

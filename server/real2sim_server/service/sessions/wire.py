@@ -1,8 +1,9 @@
-"""Server messages as bytes, images joined in without a copy on the way."""
+"""Server messages as bytes, with images that are never copied on the way."""
 
 from __future__ import annotations
 
 import functools
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,17 +11,26 @@ from typing import Any
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
 from real2sim_proto import PROTOCOL_VERSION, encode
+from real2sim_proto.base import Modality
+from real2sim_proto.drive import SensorSpec
 
 from ...render import encode_image
+from ...scene import Camera
 from ..pictures import Image
+from ..websocket import Part
 
-Part = bytes | memoryview
 FIXMAP = 16
 FRAMES, DATA = (msgpack.packb(name) for name in ("frames", "data"))
-RAW_NAMES = {np.dtype(name).newbyteorder("<"): name for name in ("uint8", "uint16", "float32")}
-"""Names of the dtypes of raw images; NumPy takes longer to tell them."""
+RAW_DTYPES: dict[Modality, np.dtype[Any]] = {
+    "rgb": np.dtype(np.uint8),
+    "depth": np.dtype("<f4"),
+    "instance": np.dtype("<u2"),
+}
+RAW_CHANNELS: dict[Modality, tuple[int, ...]] = {"rgb": (3,), "depth": (), "instance": ()}
+"""Shape of one pixel."""
 
 
 @dataclass(eq=False)
@@ -56,15 +66,32 @@ class Message:
 
     Attributes:
         head: bytes up to the id.
-        parts: everything behind it; views of images among them.
+        rest: everything behind it; views of images among them.
     """
 
     head: bytes
-    parts: tuple[Part, ...]
+    rest: tuple[Part, ...]
 
-    def with_id(self, message_id: int = 0) -> bytes:
-        """The whole message; the only copy that an image makes."""
-        return b"".join((self.head, _packed(message_id), *self.parts))
+    def parts(self, message_id: int = 0) -> list[Part]:
+        """The whole message, to be sent one part after the other."""
+        return [self.head + _packed(message_id), *self.rest]
+
+    def joined(self, message_id: int = 0) -> bytes:
+        """The whole message in one piece, a copy of all its images."""
+        return b"".join(self.parts(message_id))
+
+
+@dataclass(frozen=True, eq=False)
+class FrameHead:
+    """A frame up to the bytes of its image.
+
+    Attributes:
+        fields: of the wire's Frame, without ``data``.
+        encoded: those fields, and the beginning of ``data``.
+    """
+
+    fields: dict[str, Any]
+    encoded: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +99,17 @@ class EncodedFrame:
     """One image, encoded.
 
     Attributes:
-        fields: of the wire's Frame, without ``data``.
+        head: everything but its bytes.
         data: its bytes.
     """
 
-    fields: dict[str, Any]
+    head: FrameHead
     data: Part
 
     @property
     def codec(self) -> str:
         """``raw``, ``jpeg`` or ``png``."""
-        return str(self.fields["codec"])
+        return str(self.head.fields["codec"])
 
 
 def pack_members(fields: Mapping[str, Any]) -> Members:
@@ -101,12 +128,11 @@ def pack_with_frames(
 ) -> Message:
     """A message with the members ``frames`` and ``timing`` besides ``members``.
 
-    What it takes to join the parts is not in ``timing``, for it happens when a message is sent.
+    What it takes to send the parts is not in ``timing``, for that comes later.
     """
-    parts: list[Part] = [members.encoded, FRAMES, _array_header(len(frames))]
+    parts: list[Part] = [members.encoded + FRAMES + _array_header(len(frames))]
     for frame in frames:
-        pairs = _map_header(len(frame.fields) + 1) + _pairs(frame.fields) + DATA
-        parts += [pairs, _bin_header(len(frame.data)), frame.data]
+        parts += [frame.head.encoded, frame.data]
     watch.stage("pack")
     parts.append(_pairs({"timing": watch.timing_ms}))
     return Message(_head(kind, members.count + 2), tuple(parts))
@@ -114,22 +140,92 @@ def pack_with_frames(
 
 def encode_frame(image: Image) -> EncodedFrame:
     """The frame of an image; raw ones are views of its pixels. On any thread."""
-    fields: dict[str, Any] = {
-        "sensor": image.sensor.camera,
-        "modality": image.modality,
-        "t_us": image.t_us,
-        "T_world_sensor": image.T_world_sensor,
-        "K": image.K,
-    }
+    fields = _placed(image.sensor, image.modality, image.t_us, image.T_world_sensor, image.K)
     if image.sensor.codec == "raw":
-        pixels = np.ascontiguousarray(image.pixels, dtype=image.pixels.dtype.newbyteorder("<"))
-        form = {"codec": "raw", "dtype": RAW_NAMES[pixels.dtype], "shape": list(pixels.shape)}
-        return EncodedFrame(fields | form, pixels.data.cast("B"))
+        return with_pixels(_raw_head(fields, image.pixels.shape[:2]), image.pixels)
     encoded = encode_image(
         image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality
     )
-    form = {"codec": encoded.codec, "dtype": encoded.dtype, "shape": list(encoded.shape)}
-    return EncodedFrame(fields | form, encoded.data)
+    fields |= {"codec": encoded.codec, "dtype": encoded.dtype, "shape": list(encoded.shape)}
+    return EncodedFrame(_frame_head(fields, len(encoded.data)), encoded.data)
+
+
+def raw_heads(
+    sensors: Sequence[SensorSpec],
+    cameras: Sequence[Camera],
+    T_world_vehicle: NDArray[np.float64],
+    t_us: int,
+) -> list[FrameHead]:
+    """Heads of the raw images of ``sensors``, which need not be drawn yet.
+
+    Args:
+        sensors: S of them.
+        cameras: of the sensors, S of them.
+        T_world_vehicle: [4, 4], where the cameras' vehicle stands.
+        t_us: the instant [us].
+    """
+    return [
+        _raw_head(
+            _placed(sensor, modality, t_us, camera.pose(T_world_vehicle), camera.K),
+            (camera.height, camera.width),
+        )
+        for sensor, camera in zip(sensors, cameras, strict=True)
+        for modality in sensor.modalities
+    ]
+
+
+def with_pixels(head: FrameHead, pixels: NDArray[Any]) -> EncodedFrame:
+    """The frame of a raw image; a view of its pixels.
+
+    Raises:
+        TypeError: the image was drawn in another dtype or shape than its head says.
+    """
+    fields = head.fields
+    if list(pixels.shape) != fields["shape"] or pixels.dtype != RAW_DTYPES[fields["modality"]]:
+        raise TypeError(
+            f"an image of {pixels.dtype} {pixels.shape} instead of {fields['dtype']} "
+            f"{fields['shape']}"
+        )
+    return EncodedFrame(head, np.ascontiguousarray(pixels).data.cast("B"))
+
+
+def raw_bytes(modality: Modality, width: int, height: int) -> int:
+    """Of an image of that size."""
+    channels = math.prod(RAW_CHANNELS[modality])
+    return width * height * channels * RAW_DTYPES[modality].itemsize
+
+
+def _placed(
+    sensor: SensorSpec,
+    modality: Modality,
+    t_us: int,
+    T_world_sensor: NDArray[np.float64],
+    K: NDArray[np.float64],
+) -> dict[str, Any]:
+    """What a frame says of when and from where."""
+    return {
+        "sensor": sensor.camera,
+        "modality": modality,
+        "t_us": t_us,
+        "T_world_sensor": T_world_sensor,
+        "K": K,
+    }
+
+
+def _raw_head(placed: dict[str, Any], size: tuple[int, ...]) -> FrameHead:
+    """Of a raw image of ``size`` (height, width)."""
+    modality = placed["modality"]
+    form = {
+        "codec": "raw",
+        "dtype": RAW_DTYPES[modality].name,
+        "shape": [*size, *RAW_CHANNELS[modality]],
+    }
+    return _frame_head(placed | form, raw_bytes(modality, size[1], size[0]))
+
+
+def _frame_head(fields: dict[str, Any], size: int) -> FrameHead:
+    packed = _map_header(len(fields) + 1) + _pairs(fields) + DATA + _bin_header(size)
+    return FrameHead(fields, packed)
 
 
 @functools.cache

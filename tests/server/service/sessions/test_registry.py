@@ -131,8 +131,10 @@ def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeyp
     assert (obs["step"], obs["type"]) == (1, "obs")
 
 
-@pytest.mark.parametrize("codec", ["raw", "jpeg"])
-def test_a_step_that_cannot_be_shown_is_taken_off_the_record(site, join, monkeypatch, codec):
+@pytest.mark.parametrize(("codec", "encoding"), [("raw", "with_pixels"), ("jpeg", "encode_frame")])
+def test_a_step_that_cannot_be_shown_is_taken_off_the_record(
+    site, join, monkeypatch, codec, encoding
+):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA | {"codec": codec}])
@@ -141,7 +143,7 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(site, join, monkeyp
         raise RenderError("no memory for this picture")
 
     with monkeypatch.context() as patch:
-        patch.setattr("real2sim_server.service.sessions.show.encode_frame", fail)
+        patch.setattr(f"real2sim_server.service.sessions.show.{encoding}", fail)
         assert planner.act(0)["type"] == "error"
     assert [e.kind for e in entries(site, info)] == ["reset"]
     assert planner.act(0, acceleration=0.2)["step"] == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,8 @@ from hypothesis import strategies as st
 
 from real2sim_proto import decode
 from real2sim_proto.drive import SERVER_MESSAGE, SensorSpec
+from real2sim_server.scene import Camera
+from real2sim_server.scene.rotation import transform_from
 from real2sim_server.service.pictures import Image
 from real2sim_server.service.sessions.wire import (
     Stopwatch,
@@ -16,7 +20,11 @@ from real2sim_server.service.sessions.wire import (
     pack_members,
     pack_message,
     pack_with_frames,
+    raw_heads,
+    with_pixels,
 )
+
+MOUNTED = transform_from(np.array([1.5, 0.0, 1.6]), np.array([0.5, -0.5, 0.5, -0.5]))
 
 
 def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) -> Image:
@@ -33,18 +41,18 @@ def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) 
 def view(frames: int, codec: str = "raw") -> bytes:
     encoded = [encode_frame(image(codec)) for _ in range(frames)]
     fields = {"t_us": 7, "revision": 2}
-    return pack_with_frames("view", pack_members(fields), encoded, Stopwatch()).with_id(5)
+    return pack_with_frames("view", pack_members(fields), encoded, Stopwatch()).joined(5)
 
 
 @given(st.integers(min_value=0, max_value=2**53))
 def test_the_id_of_a_message_is_filled_in_last(message_id):
-    assert decode(pack_message("progress", {"phase": "x"}).with_id(message_id))["id"] == message_id
+    assert decode(pack_message("progress", {"phase": "x"}).joined(message_id))["id"] == message_id
 
 
 @pytest.mark.parametrize("members", [0, 1, 12, 13, 14, 40])
 def test_maps_of_any_size_are_joined(members):
     fields = {f"f{i}": i for i in range(members)}
-    message = decode(pack_message("error", fields).with_id(1))
+    message = decode(pack_message("error", fields).joined(1))
     assert message == {"v": 1, "type": "error", "id": 1, **fields}
 
 
@@ -59,8 +67,28 @@ def test_any_number_of_frames_makes_a_valid_message(frames):
 def test_raw_pixels_arrive_as_they_were(modality):
     drawn = image("raw", modality)
     frame = encode_frame(drawn)
-    pixels = np.frombuffer(frame.data, frame.fields["dtype"]).reshape(frame.fields["shape"])
+    pixels = np.frombuffer(frame.data, frame.head.fields["dtype"]).reshape(
+        frame.head.fields["shape"]
+    )
     np.testing.assert_array_equal(pixels, drawn.pixels)
+
+
+@pytest.mark.parametrize("modality", ["rgb", "depth", "instance"])
+def test_what_is_said_of_a_raw_image_before_it_is_drawn_is_what_it_says_itself(modality):
+    camera = Camera("front", 30, 20, np.array([[8.0, 0, 15], [0, 8, 10], [0, 0, 1]]), MOUNTED)
+    stands = transform_from(np.array([3.0, 4.0, 0.5]), np.array([0.6, 0.0, 0.0, 0.8]))
+    sensor = SensorSpec(camera="front", modalities=[modality], codec="raw")
+    drawn = replace(image("raw", modality), K=camera.K, T_world_sensor=camera.pose(stands), t_us=50)
+    (head,) = raw_heads([sensor], [camera], stands, 50)
+    assert head.encoded == encode_frame(drawn).head.encoded
+
+
+def test_an_image_that_is_not_as_it_was_announced_is_refused():
+    head = encode_frame(image("raw", "depth")).head
+    with pytest.raises(TypeError, match=r"float64 \(20, 30\) instead of float32 \[20, 30\]"):
+        with_pixels(head, np.zeros((20, 30)))
+    with pytest.raises(TypeError, match="instead of"):
+        with_pixels(head, np.zeros((30, 20), np.float32))
 
 
 def test_raw_pixels_are_not_copied_before_they_are_joined():

@@ -1,0 +1,85 @@
+"""WebSocket connections of megabytes a message: written in parts, unpaced on the way to oneself.
+
+ASGI knows messages of one piece only; servers may offer more as an extension of it. Where a server
+does not offer this one, or the client is slow to read, the parts are joined and sent as ever.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import socket
+from collections.abc import Sequence
+
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from uvicorn.protocols.websockets.websockets_sansio_impl import Request, WebSocketsSansIOProtocol
+from websockets.frames import Opcode
+from websockets.protocol import State
+
+Part = bytes | memoryview
+
+EXTENSION = "real2sim.websocket.write"
+"""Holds a function that writes the parts of a binary message, or returns False."""
+
+FIN = 0x80
+SHORT, LONG = 126, 127
+"""Stand for a length of 2 and of 8 bytes behind the first two of a frame (RFC 6455, 5.2)."""
+
+
+async def send(websocket: WebSocket, parts: Sequence[Part]) -> None:
+    """Send one binary message. Raises WebSocketDisconnect when the client is gone."""
+    if websocket.application_state is WebSocketState.DISCONNECTED:
+        raise WebSocketDisconnect
+    write = websocket.scope.get("extensions", {}).get(EXTENSION)
+    if write is None or not write(parts):
+        await websocket.send_bytes(b"".join(parts))
+
+
+class PartedProtocol(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket protocol with that extension, for connections without compression."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take over a connection on which a handshake has begun."""
+        super().connection_made(transport)
+        if self.client is not None and _is_loopback(self.client[0]):
+            _send_unpaced(transport.get_extra_info("socket"))
+
+    def handle_connect(self, event: Request) -> None:
+        """Offer the extension in the scope of an accepted connection."""
+        super().handle_connect(event)
+        if not self.close_sent and not self.config.ws_per_message_deflate:
+            self.scope["extensions"][EXTENSION] = self._write
+
+    def _write(self, parts: Sequence[Part]) -> bool:
+        """Write one binary message, if nothing has to be waited for."""
+        if self.disconnected or self.conn.state is not State.OPEN or not self.writable.is_set():
+            return False
+        self.transport.writelines([_header(sum(map(len, parts))), *parts])
+        return True
+
+
+def _header(size: int) -> bytes:
+    """Of an unmasked frame that is a whole binary message."""
+    first = FIN | Opcode.BINARY
+    if size < SHORT:
+        return bytes([first, size])
+    if size < 1 << 16:
+        return bytes([first, SHORT]) + size.to_bytes(2, "big")
+    return bytes([first, LONG]) + size.to_bytes(8, "big")
+
+
+def _is_loopback(address: str) -> bool:
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return False
+
+
+def _send_unpaced(connection: socket.socket) -> None:
+    """Where the system's congestion control paces what it sends, a timer runs for every 64 kB: a
+    tenth of a millisecond for three images that never leave the machine."""
+    if hasattr(socket, "TCP_CONGESTION"):
+        # Reno is part of every Linux and open to every process.
+        with contextlib.suppress(OSError):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"reno")
