@@ -52,11 +52,15 @@ class _Awaited:
     :func:`asyncio.wrap_future` would do, but takes three calls more to wake the coroutine, and some
     of its work just when the engine wants to begin.
 
+    Args:
+        first: called on the event loop with the result before the coroutine is woken.
+
     Attributes:
         outcome: what is awaited.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: Callable[[Any], object] | None) -> None:
+        self._first = first
         self._loop = asyncio.get_running_loop()
         self.outcome: asyncio.Future[Any] = self._loop.create_future()
 
@@ -70,19 +74,30 @@ class _Awaited:
         return self.outcome.cancel()
 
     def set_result(self, result: Any) -> None:
-        self._settle(self.outcome.set_result, result)
+        self._on_loop(self._succeed, result)
 
     def set_exception(self, error: BaseException) -> None:
-        self._settle(self.outcome.set_exception, error)
+        self._on_loop(self._fail, error)
 
-    def _settle(self, settle: Callable[[Any], None], value: Any) -> None:
-        def settled() -> None:
-            if not self.outcome.done():
-                settle(value)
-
+    def _on_loop(self, settle: Callable[[Any], None], value: Any) -> None:
         # Nobody waits on a loop that has been closed meanwhile.
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(settled)
+            self._loop.call_soon_threadsafe(settle, value)
+
+    def _succeed(self, result: Any) -> None:
+        if self.outcome.done():
+            return
+        try:
+            if self._first is not None:
+                self._first(result)
+        except Exception as error:
+            self.outcome.set_exception(error)
+        else:
+            self.outcome.set_result(result)
+
+    def _fail(self, error: BaseException) -> None:
+        if not self.outcome.done():
+            self.outcome.set_exception(error)
 
 
 @dataclass(eq=False)
@@ -156,18 +171,30 @@ class Engine:
 
     # --- work -------------------------------------------------------------------------------
 
-    async def call(self, fn: Callable[..., T], *args: Any, label: str = "work", **kwargs: Any) -> T:
+    async def call(
+        self,
+        fn: Callable[..., T],
+        *args: Any,
+        label: str = "work",
+        first: Callable[[T], object] | None = None,
+        **kwargs: Any,
+    ) -> T:
         """``fn(*args, **kwargs)`` on the engine thread, awaited.
 
         When the awaiting task is cancelled, a job that still waits is dropped; one that runs
         finishes, and its result is thrown away.
+
+        Args:
+            fn: with ``args`` and ``kwargs``.
+            label: for metrics and messages.
+            first: called with the result on the event loop, just before the awaiting task is woken.
 
         Raises:
             QueueFullError: ``queue_length`` jobs wait already.
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
-        awaited = _Awaited()
+        awaited = _Awaited(first)
         job = self._submit(lambda: fn(*args, **kwargs), label, awaited)
         try:
             result: T = await awaited.outcome

@@ -31,9 +31,14 @@ async def send(websocket: WebSocket, parts: Sequence[Part]) -> None:
     """Send one binary message. Raises WebSocketDisconnect when the client is gone."""
     if websocket.application_state is WebSocketState.DISCONNECTED:
         raise WebSocketDisconnect
-    write = websocket.scope.get("extensions", {}).get(EXTENSION)
-    if write is None or not write(parts):
+    if not written(websocket, parts):
         await websocket.send_bytes(b"".join(parts))
+
+
+def written(websocket: WebSocket, parts: Sequence[Part]) -> bool:
+    """Whether one binary message could be written, with nothing to wait for. On the event loop."""
+    write = websocket.scope.get("extensions", {}).get(EXTENSION)
+    return write is not None and bool(write(parts))
 
 
 class PartedProtocol(WebSocketsSansIOProtocol):

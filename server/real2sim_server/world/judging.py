@@ -31,12 +31,12 @@ class Unjudged(NamedTuple):
     Attributes:
         plan: given to the ego, in the world; None for none.
         events: that led to it.
-        left: by its contacts.
+        left: by its impacts; None where bodies pass through each other.
     """
 
     plan: Plan | None
     events: tuple[Event, ...]
-    left: Aftermath
+    left: Aftermath | None
 
 
 LANE_WAY = 5.0

@@ -177,7 +177,8 @@ class World:
         impacts = self._move(pilot)
         self._near = self._path.nearest(self.motion.x, self.motion.y, near_s=self._near.s)
         self.T_world_vehicle = self._standing()
-        left = self._aftermath(impacts, before)
+        left = None if impacts is None else self._struck(impacts, before)
+        self.impacts = impacts or ()
         self._moved = Unjudged(given, (*self._edits, *late, *reacted), left)
         self._edits = ()
 
@@ -187,6 +188,8 @@ class World:
         if self._moved is not None:
             given, events, left = self._moved
             self._moved = None
+            left = self._overlapped() if left is None else left
+            self._contacts = replace(self._contacts, touching=left.touching)
             self.instant = self._instant(left, plan_note(given))
             self.tally = scoring.after(self.tally, self.instant, self._context)
             self._events = (*events, *left.events, *self._strayed(), *self._ended())
@@ -304,13 +307,14 @@ class World:
     def _told(self, plan: Plan | None, latency_us: int) -> Pilot:
         if plan is None:
             return self._pilot
-        since_us = takes_effect_us(self.spec, self._clock, self.t_us, latency_us)
-        return self._pilot.told(plan, self.motion, self.t_us, since_us)
+        from_us = takes_effect_us(self.spec, self._clock, self.t_us, latency_us)
+        return self._pilot.told(plan, self.motion, self.t_us, from_us)
 
     def _move(self, pilot: Pilot) -> tuple[Impact, ...] | None:
         """Ego and objects one step on; impacts, or None where bodies pass through each other."""
         motion, t_us, before = self.motion, self.t_us, self.agents
-        traffic = self.traffic.advance(self.state, self._seen(before))
+        end_us = t_us + self._clock.dt_us
+        traffic = self.traffic.advance(self.state, end_us, lambda: self._seen(before))
         self.steps += 1
         if self.t_us <= self._clock.start_us + self.spec.warmup_us:
             recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
@@ -324,25 +328,21 @@ class World:
         self.motion = after._replace(acceleration=acceleration)
         return impacts
 
-    def _aftermath(self, impacts: tuple[Impact, ...] | None, before: Agents) -> Aftermath:
-        """Take in the impacts of the step, or look for overlaps where there can be none."""
-        if impacts is None:
-            found = after_overlaps(
-                self._contacts.met(self.T_world_vehicle, self.motion, self.agents), self.t_us
-            )
-            if found.events and self.spec.on_collision == "terminate":
-                self.terminated, self.reason = True, "collision"
-        else:
-            found = after_impacts(
-                impacts, self.t_us, touched=self._contacts.touching, before=before
-            )
-            if self.deformation is not None:
-                subjects = {o.object_id: o for o in self.agents.objects}
-                for impact in impacts:
-                    self.deformation = self.deformation.struck(impact, subjects)
-        self.impacts = impacts or ()
-        self._contacts = replace(self._contacts, touching=found.touching)
-        return found
+    def _struck(self, impacts: tuple[Impact, ...], before: Agents) -> Aftermath:
+        """What the impacts of the step leave, dents among it."""
+        if self.deformation is not None:
+            subjects = {o.object_id: o for o in self.agents.objects}
+            for impact in impacts:
+                self.deformation = self.deformation.struck(impact, subjects)
+        return after_impacts(impacts, self.t_us, touched=self._contacts.touching, before=before)
+
+    def _overlapped(self) -> Aftermath:
+        """What overlaps leave where bodies pass through each other."""
+        met = self._contacts.met(self.T_world_vehicle, self.motion, self.agents)
+        left = after_overlaps(met, self.t_us)
+        if left.events and self.spec.on_collision == "terminate":
+            self.terminated, self.reason = True, "collision"
+        return left
 
     def _reacted(self) -> list[Event]:
         """Objects stop repeating the log once the ego is too far from where it was recorded."""

@@ -71,6 +71,33 @@ def test_an_engine_goes_on_when_the_loop_that_asked_is_gone(make_engine):
     assert engine.call_sync(int, "7") == 7
 
 
+def test_whoever_is_to_know_first_is_told_on_the_loop_before_the_caller(make_engine):
+    engine, told = make_engine(), []
+
+    async def ask() -> None:
+        def first(result: int) -> None:
+            told.append((result, threading.get_ident()))
+
+        assert await engine.call(int, "7", first=first) == 7
+        assert told == [(7, threading.get_ident())]
+
+    asyncio.run(ask())
+
+
+def test_an_error_of_whoever_is_told_first_reaches_the_caller(make_engine):
+    engine = make_engine()
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(engine.call(int, "0", first=lambda result: 1 // result))
+    assert engine.call_sync(int, "7") == 7
+
+
+def test_nobody_is_told_first_of_a_job_that_failed(make_engine):
+    engine, told = make_engine(), []
+    with pytest.raises(ValueError, match="invalid literal"):
+        asyncio.run(engine.call(int, "seven", first=told.append))
+    assert told == []
+
+
 def test_all_jobs_run_on_the_same_thread_and_none_on_the_callers(make_engine):
     engine = make_engine()
 

@@ -26,7 +26,7 @@ from real2sim_proto.drive import (
 
 from ..auth import opens, same_secret, unauthorized
 from ..problems import ServiceError, service_error
-from ..websocket import send
+from ..websocket import send, written
 from .describe import welcome_fields
 from .messages import BadMessageError, Incoming, bad_message, read_message, unsupported_protocol
 from .observers import Mailbox
@@ -224,7 +224,8 @@ class Connection:
         while True:
             try:
                 incoming = await self._receive()
-                await self._send(await self._answer(incoming, role), incoming.message.id)
+                if (answer := await self._answer(incoming, role)) is not None:
+                    await self._send(answer, incoming.message.id)
                 if role == "controller" and not self._patience.waiting:
                     self._patience.begin()
             except BadMessageError as error:
@@ -236,9 +237,9 @@ class Connection:
                     await self._socket.close(NORMAL_CLOSURE)
                     return
 
-    async def _answer(self, incoming: Incoming, role: str) -> Message:
-        message = incoming.message
-        allowed = MAY_SEND[role]
+    async def _answer(self, incoming: Incoming, role: str) -> Message | None:
+        """The answer; None where it has been sent already."""
+        message, allowed = incoming.message, MAY_SEND[role]
         if not isinstance(message, allowed):
             refusal = ServiceError(
                 ErrorCode.NOT_CONTROLLER,
@@ -252,7 +253,7 @@ class Connection:
         except Exception as error:
             return self._error(_told(error))
 
-    async def _obey(self, incoming: Incoming, role: str) -> Message:
+    async def _obey(self, incoming: Incoming, role: str) -> Message | None:
         message, session, stepper = incoming.message, self._session, self._sessions.stepper
         match message:
             case Action():
@@ -266,8 +267,8 @@ class Connection:
                 return await self._edit(message)
             case Render():
                 session.check_open()
-                world = session.running_world()
-                return (await self._sessions.show.view(world, message.sensors)).message
+                shown = await self._sessions.show.view(session.running_world(), message.sensors)
+                return shown.message
             case Agent() | Snapshot() | Restore() | Fork():
                 async with session.lock:
                     session.check_open()
@@ -279,8 +280,13 @@ class Connection:
             case _:
                 assert_never(message)
 
-    async def _act(self, action: Action, content: bytes) -> Message:
-        session = self._session
+    async def _act(self, action: Action, content: bytes) -> Message | None:
+        session, told = self._session, False
+
+        def tell(message: Message) -> None:
+            nonlocal told
+            told = not self._sending.locked() and written(self._socket, message.parts(action.id))
+
         waited_us = self._patience.waited_us
         if action.step == session.lockstep.step:
             self._patience.end()
@@ -289,8 +295,10 @@ class Connection:
             cached = session.lockstep.cached_answer(action.step, content)
             if cached is not None:
                 return cached
-            stepper = self._sessions.stepper
-            return await stepper.act(session, action.plan, content, latency_us=waited_us)
+            message = await self._sessions.stepper.act(
+                session, action.plan, content, latency_us=waited_us, tell=tell
+            )
+            return None if told else message
 
     async def _change(self, asked: Agent | Snapshot | Restore | Fork) -> Message:
         """Everything that is rare, for whoever holds the session's lock."""
@@ -323,11 +331,8 @@ class Connection:
                 session, edit.operations, base_rev=edit.base_rev
             )
             revision = session.running_world().revision
-        fields = {
-            "revision": revision,
-            "created": list(outcome.created),
-            "warnings": [w.model_dump(mode="json", exclude_none=True) for w in outcome.warnings],
-        }
+        warnings = [w.model_dump(mode="json", exclude_none=True) for w in outcome.warnings]
+        fields = {"revision": revision, "created": list(outcome.created), "warnings": warnings}
         return pack_message("edited", fields)
 
     async def _leave(self, role: str) -> Message:

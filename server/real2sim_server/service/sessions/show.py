@@ -35,6 +35,8 @@ from .wire import (
 
 T = TypeVar("T")
 
+Tell = Callable[[Message], object]
+
 WARM_UP_WIDTH = 320
 MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
@@ -120,6 +122,7 @@ class Show:
         cameras: Mapping[str, Camera],
         *,
         settle: Callable[[World], object] = World.judge,
+        tell: Tell | None = None,
     ) -> Shown:
         """The world that ``change`` makes, and the observation of it.
 
@@ -129,6 +132,9 @@ class Show:
             cameras: of the world's sensors, by name, at the sizes asked for.
             settle: completes that world and puts it on record; runs beside the drawing, and has
                 ended when this method returns or raises. Where it raises, nothing has happened.
+            tell: called on the event loop with an observation of raw images as soon as it is there,
+                before this method returns; nothing fails after it, and no request of a client that
+                has been told is looked at before the caller goes on.
 
         Raises:
             QueueFullError: too much waits for the engine.
@@ -160,8 +166,12 @@ class Show:
             frames = [with_pixels(h, i.pixels) for h, i in zip(heads, images, strict=True)]
             return _packed(drawn, frames)
 
+        def told(made: Drawn | Shown) -> None:
+            if tell is not None and isinstance(made, Shown):
+                tell(made.message)
+
         if cameras:
-            made = await self._engine.call(work, label="drive")
+            made = await self._engine.call(work, label="drive", first=told)
         else:
             made = await self.on_world_thread(work)
         return await self._finish(made)

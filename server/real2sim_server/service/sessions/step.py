@@ -29,7 +29,7 @@ from ...world.history import (
 from ..problems import ServiceError
 from ..store import SessionEntry, Store, now_us
 from .session import Session
-from .show import Show, Shown
+from .show import Show, Shown, Tell
 from .wire import Message
 
 Thing = tuple[str, int, bytes]
@@ -91,6 +91,7 @@ class Stepper:
         payload: bytes,
         *,
         latency_us: int = 0,
+        tell: Tell | None = None,
     ) -> Message:
         """Take the action that is due; the next observation.
 
@@ -99,6 +100,7 @@ class Stepper:
             plan: what the ego does.
             payload: canonical bytes of the plan.
             latency_us: wall-clock time from the observation to this action.
+            tell: may get the observation before it is returned, see :meth:`Show.observe`.
 
         Raises:
             WorldError: the plan is refused.
@@ -107,7 +109,9 @@ class Stepper:
         measured = session.spec.latency.model == "measured"
         told = {"latency_us": latency_us if measured else 0, "missed": session.late}
         recorded = action_payload(plan, **told) if any(told.values()) else payload
-        shown = await self._step(session, lambda world: world.move(plan, **told), recorded)
+        shown = await self._step(
+            session, lambda world: world.move(plan, **told), recorded, tell=tell
+        )
         session.lockstep.advance(payload, shown.message, over=shown.world.over)
         return shown.message
 
@@ -137,7 +141,14 @@ class Stepper:
         session.publish(shown.message)
         return shown.message
 
-    async def _step(self, session: Session, move: Callable[[World], None], payload: bytes) -> Shown:
+    async def _step(
+        self,
+        session: Session,
+        move: Callable[[World], None],
+        payload: bytes,
+        *,
+        tell: Tell | None = None,
+    ) -> Shown:
         now = session.running_world()
 
         def moved() -> World:
@@ -146,7 +157,7 @@ class Stepper:
             return world
 
         thing = ("action", now.steps, payload)
-        shown = await self._show_and_record(session, moved, session.cameras, thing)
+        shown = await self._show_and_record(session, moved, session.cameras, thing, tell=tell)
         session.world, session.late = shown.world, False
         session.publish(shown.message)
         return shown
@@ -241,6 +252,8 @@ class Stepper:
         change: Callable[[], World],
         cameras: Mapping[str, Camera],
         thing: Thing,
+        *,
+        tell: Tell | None = None,
     ) -> Shown:
         entries = _entries(session, [thing])
         recorded = False
@@ -252,7 +265,7 @@ class Stepper:
             recorded = True
 
         try:
-            shown = await self._show.observe(change, cameras, settle=settle)
+            shown = await self._show.observe(change, cameras, settle=settle, tell=tell)
         except Exception:
             if recorded:
                 await self._store.withdraw(session.session_id, from_seq=session.next_seq)

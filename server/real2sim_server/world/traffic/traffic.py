@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import assert_never
@@ -80,19 +80,22 @@ class Traffic:
         none: Mapping[str, AgentDriver] = MappingProxyType({})
         return cls(spec, none, seen.others)._joined(state, seen.others, seen)
 
-    def advance(self, state: ScenarioState, seen: Surroundings) -> Traffic:
+    def advance(self, state: ScenarioState, t_us: int, seen: Callable[[], Surroundings]) -> Traffic:
         """Objects one step later.
 
         Args:
             state: objects after all edits.
-            seen: the instant before; its ``others`` are those of ``placed``.
+            t_us: the instant after the step [us].
+            seen: tells of the instant before, whose ``others`` are those of ``placed``; only asked
+                where somebody drives.
         """
-        base = state.tracks.at(seen.t_us + seen.dt_us)
+        base = state.tracks.at(t_us)
         if not (self.drivers or self._drives):
             return Traffic(self.spec, self.drivers, base, self.reacting)
-        drivers = {i: d.advance(seen) for i, d in self.drivers.items()}
+        before = seen()
+        drivers = {i: d.advance(before) for i, d in self.drivers.items()}
         moved = replace(self, drivers=MappingProxyType(drivers))
-        return moved._joined(state, base, replace(seen, t_us=seen.t_us + seen.dt_us))
+        return moved._joined(state, base, replace(before, t_us=t_us))
 
     def edited(self, state: ScenarioState, seen: Surroundings) -> Traffic:
         """Objects after an edit: drivers of objects whose trajectory was edited begin anew."""
