@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import socket
 from collections.abc import Sequence
 
@@ -16,6 +15,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from uvicorn.protocols.websockets.websockets_sansio_impl import Request, WebSocketsSansIOProtocol
 from websockets.frames import Opcode
 from websockets.protocol import State
+
+from .auth import is_loopback
 
 Part = bytes | memoryview
 
@@ -47,7 +48,7 @@ class PartedProtocol(WebSocketsSansIOProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection on which a handshake has begun."""
         super().connection_made(transport)
-        if self.client is not None and _is_loopback(self.client[0]):
+        if self.client is not None and is_loopback(self.client[0]):
             _send_unpaced(transport.get_extra_info("socket"))
 
     def handle_connect(self, event: Request) -> None:
@@ -72,13 +73,6 @@ def _header(size: int) -> bytes:
     if size < 1 << 16:
         return bytes([first, SHORT]) + size.to_bytes(2, "big")
     return bytes([first, LONG]) + size.to_bytes(8, "big")
-
-
-def _is_loopback(address: str) -> bool:
-    try:
-        return ipaddress.ip_address(address).is_loopback
-    except ValueError:
-        return False
 
 
 def _send_unpaced(connection: socket.socket) -> None:

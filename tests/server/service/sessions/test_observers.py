@@ -1,0 +1,66 @@
+"""Those who look on while another client drives."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.network
+
+CAMERA = {"camera": "front"}
+
+
+def test_observers_get_every_observation_with_id_0(site, join):
+    info = site.create()
+    controller = join(info)
+    watching = [join(info, "observer") for _ in range(2)]
+    sent = [controller.reset(sensors=[CAMERA]), controller.act(0)]
+    for observer in watching:
+        for expected in sent:
+            got = observer.receive()
+            assert got["id"] == 0
+            np.testing.assert_equal(got | {"id": expected["id"]}, expected)
+
+
+@pytest.mark.parametrize(
+    ("type_", "fields"),
+    [
+        ("reset", {"spec": {}}),
+        ("action", {"step": 0, "plan": {"kind": "control", "acceleration": 0, "steering": 0}}),
+        ("edit", {"operations": [{"op": "delete", "object_id": "post"}]}),
+    ],
+)
+def test_observers_may_not_change_anything(site, join, type_, fields):
+    info = site.create()
+    controller, observer = join(info), join(info, "observer")
+    controller.reset()
+    assert observer.receive()["type"] == "obs"
+    assert observer.ask(type_, **fields)["code"] == "NOT_CONTROLLER"
+    assert controller.act(0)["revision"] == 0
+
+
+def test_observers_may_render_and_leave(site, join):
+    info = site.create()
+    controller, observer = join(info), join(info, "observer")
+    controller.reset()
+    observer.receive()
+    assert observer.ask("render", sensors=[CAMERA])["type"] == "view"
+    assert observer.ask("bye")["type"] == "result"
+    assert observer.wait_closed() == 1000
+    assert controller.act(0)["step"] == 1
+
+
+def test_an_observer_that_does_not_read_never_holds_up_the_controller(site, join):
+    info = site.create()
+    controller = join(info)
+    # A client stops reading from its socket while its queue is full.
+    join(info, "observer", max_queue=1)
+    controller.reset(sensors=[CAMERA | {"width": 1024, "modalities": ["rgb", "depth"]}], dt_us=1000)
+    started = time.perf_counter()
+    for step in range(20):
+        controller.act(step)
+    assert time.perf_counter() - started < 20
+    (mailbox,) = site.session(info).observers
+    assert mailbox.dropped > 0
