@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +11,14 @@ from real2sim_proto.episode import EgoSpec
 
 from ..scene import Trajectory
 from ..scene.rotation import quaternion_yaw
-from . import dynamic
-from .actuators import Command, at_wheels
-from .vehicle import GRAVITY, vehicle_of
+from .driving import HOLD, Command, asked_of, driven, vehicle_of
+from .path import Float
 
-SUBSTEP_US = 10_000
 SLOW = 0.1
 """Below this speed the steering angle cannot be told from the motion [m/s]."""
+
+NO_PLAN = np.empty((0, 6))
+NOTHING_PENDING = np.empty((0, 2))
 
 
 class Motion(NamedTuple):
@@ -56,112 +56,57 @@ class Motion(NamedTuple):
             self.speed * sin + self.lateral_speed * cos,
         )
 
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All but the pending commands, as :mod:`.driving` takes a state."""
+        return tuple(map(float, self[:9]))
 
-Driver = Callable[[Motion, float], Command]
-"""What to do in a motion, so many seconds after the start of the step."""
 
+class Driver(NamedTuple):
+    """Who drives: see :func:`.driving.driven`.
 
-def drive(motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int) -> Motion:
-    """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
-
-    Within a substep the steering angle moves at most at its rate limit. The kinematic bicycle
-    follows the arc of its mean exactly; speed changes linearly until it meets 0 or the greatest
-    speed. The dynamic bicycle does the same at walking pace and slips on its tyres above, see
-    :mod:`.dynamic`. Braking never ends in reversing.
+    Attributes:
+        kind: HOLD, PURSUIT, LQR or ILQR.
+        knots, turn_rate: the plan that trackers follow.
+        hold: the command of who holds one.
     """
-    substeps = -(-dt_us // SUBSTEP_US)
-    h = dt_us * 1e-6 / substeps
-    model = _roll if spec.dynamics == "kinematic_bicycle" else _slip
-    start = motion
-    for k in range(substeps):
-        asked = driver(motion, k * h)
-        now = Command(motion.drive, motion.steering)
-        command, pending = at_wheels(asked, motion.pending, now, spec, h)
-        motion = model(motion, command, spec, h)
-        if pending:
-            motion = motion._replace(pending=pending)
-    acceleration = (motion.speed - start.speed) / (dt_us * 1e-6)
-    return motion._replace(acceleration=acceleration)
+
+    kind: int
+    knots: Float = NO_PLAN
+    turn_rate: float = 0.0
+    hold: tuple[float, float] = (0.0, 0.0)
+
+    def after(self, since: float) -> tuple[int, Float, float, float, tuple[float, float]]:
+        """The driver ``since`` seconds after the plan began, as :mod:`.driving` takes it."""
+        return self.kind, self.knots, self.turn_rate, since, self.hold
 
 
-def _roll(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
-    """Kinematic bicycle: wheels go where they point."""
-    steering = _steered(motion.steering, command.steering, spec, h)
-    speed, distance = _sped_up(motion.speed, command.acceleration, spec, h)
-    curvature = math.tan((motion.steering + steering) / 2) / spec.wheelbase
-    turn = distance * curvature
-    chord = distance * _sinc(turn / 2)
-    heading = motion.yaw + turn / 2
-    return Motion(
-        x=motion.x + chord * math.cos(heading),
-        y=motion.y + chord * math.sin(heading),
-        yaw=motion.yaw + turn,
-        speed=speed,
-        steering=steering,
-        yaw_rate=speed * math.tan(steering) / spec.wheelbase,
-        drive=command.acceleration,
-    )
+def holding(command: Command) -> Driver:
+    """Who gives the same command all the time."""
+    return Driver(HOLD, hold=(float(command.acceleration), float(command.steering)))
 
 
-def _slip(motion: Motion, command: Command, spec: EgoSpec, h: float) -> Motion:
-    """Dynamic bicycle; fades into the kinematic one where it is slow."""
-    vehicle = vehicle_of(spec)
-    most = vehicle.friction * GRAVITY
-    limited = command._replace(acceleration=min(max(command.acceleration, -most), most))
-    rolled = _roll(motion, limited, spec, h)._replace(drive=command.acceleration)
-    share = dynamic.tyre_share(min(motion.speed, rolled.speed))
-    if share == 0.0:
-        return rolled
-    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
-    centre = (
-        motion.x + vehicle.rear * cos,
-        motion.y + vehicle.rear * sin,
-        motion.yaw,
-        motion.speed,
-        motion.lateral_speed + vehicle.rear * motion.yaw_rate,
-        motion.yaw_rate,
-    )
-    acceleration = (rolled.speed - motion.speed) / h
-    steering = (motion.steering, rolled.steering)
-    x, y, yaw, vx, vy, turn = dynamic.integrate(vehicle, centre, steering, acceleration, h)
-    rest = 1 - share
-    slipped = Motion(
-        x=x - vehicle.rear * math.cos(yaw),
-        y=y - vehicle.rear * math.sin(yaw),
-        yaw=yaw,
-        speed=max(vx, 0.0),
-        steering=rolled.steering,
-        yaw_rate=share * turn + rest * rolled.yaw_rate,
-        lateral_speed=share * (vy - vehicle.rear * turn),
-        drive=command.acceleration,
-    )
-    if rest == 0.0:
-        return slipped
-    return slipped._replace(
-        x=share * slipped.x + rest * rolled.x,
-        y=share * slipped.y + rest * rolled.y,
-        yaw=share * slipped.yaw + rest * rolled.yaw,
-        speed=share * slipped.speed + rest * rolled.speed,
-    )
+def drive(
+    motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int, *, since: float = 0.0
+) -> Motion:
+    """The vehicle ``dt_us`` later, see :func:`.driving.driven`.
+
+    Args:
+        motion: now.
+        driver: of it.
+        spec: of the vehicle.
+        dt_us: how far to go [us].
+        since: time since the driver's plan began [s].
+    """
+    pending = np.array(motion.pending) if motion.pending else NOTHING_PENDING
+    vehicle = tuple(vehicle_of(spec))
+    state, waiting = driven(motion.numbers, pending, driver.after(since), vehicle, dt_us)
+    return Motion(*state, tuple(Command(*row) for row in waiting.tolist()))
 
 
-def _steered(steering: float, wanted: float, spec: EgoSpec, h: float) -> float:
-    wanted = min(max(wanted, -spec.max_steer), spec.max_steer)
-    most = spec.max_steer_rate * h
-    return steering + min(max(wanted - steering, -most), most)
-
-
-def _sped_up(speed: float, wanted: float, spec: EgoSpec, h: float) -> tuple[float, float]:
-    """Speed after ``h`` seconds and distance covered; linear in time until a limit is met."""
-    acceleration = min(max(wanted, -spec.max_braking), spec.max_acceleration)
-    limit = max(spec.max_speed, speed) if acceleration > 0 else min(0.0, speed)
-    if acceleration == 0.0:
-        return speed, speed * h
-    until_limit = (limit - speed) / acceleration
-    if until_limit >= h:
-        end = speed + acceleration * h
-        return end, (speed + end) / 2 * h
-    return limit, (speed + limit) / 2 * until_limit + limit * (h - until_limit)
+def asked(motion: Motion, driver: Driver, spec: EgoSpec, *, since: float = 0.0) -> Command:
+    """What the driver would do, ``since`` seconds after its plan began."""
+    return Command(*asked_of(motion.numbers, driver.after(since), tuple(vehicle_of(spec))))
 
 
 def placed(motion: Motion, pose: tuple[float, float, float], spec: EgoSpec, dt_us: int) -> Motion:
@@ -175,7 +120,7 @@ def placed(motion: Motion, pose: tuple[float, float, float], spec: EgoSpec, dt_u
     turn = math.remainder(yaw - motion.yaw, math.tau)
     middle = motion.yaw + turn / 2
     chord = (x - motion.x) * math.cos(middle) + (y - motion.y) * math.sin(middle)
-    speed = chord / _sinc(turn / 2) / seconds
+    speed = chord / float(np.sinc(turn / math.tau)) / seconds
     return Motion(
         x=x,
         y=y,
@@ -223,10 +168,3 @@ def _steering_of(speed: float, yaw_rate: float, spec: EgoSpec) -> float:
         return 0.0
     angle = math.atan(spec.wheelbase * yaw_rate / speed)
     return min(max(angle, -spec.max_steer), spec.max_steer)
-
-
-def _sinc(angle: float) -> float:
-    """sin(angle) / angle, by its series near 0 where the quotient loses its digits."""
-    if abs(angle) < 1e-4:
-        return 1.0 - angle * angle / 6.0
-    return math.sin(angle) / angle

@@ -12,10 +12,10 @@ from real2sim_proto.episode import ResetSpec
 
 from ..edit import ObjectState
 from ..scene.rotation import quaternion_yaw
-from .actuators import Command
 from .agents import Agents
 from .contact import Contact, ego_box, touching
 from .contact_kernels import may_overlap
+from .driving import Command
 from .ego import Motion
 from .impact import Bout, Impact, Outcome, Wreck, ego_body, ego_solid, resolve
 from .obstacles import Obstacles

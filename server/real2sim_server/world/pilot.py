@@ -16,8 +16,8 @@ from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 
 from ..edit.tracks import sample
 from ..scene import Trajectory
-from .actuators import Command
-from .ego import Motion, drive, placed
+from .driving import Command
+from .ego import Motion, drive, holding, placed
 from .errors import WorldError
 from .reference import Pose, Reference
 from .trackers import make_tracker
@@ -50,7 +50,7 @@ class Hold:
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
         """The vehicle ``dt_us`` later."""
-        return drive(motion, lambda _m, _t: self.asked, self.spec, dt_us)
+        return drive(motion, holding(self.asked), self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
         """That command."""

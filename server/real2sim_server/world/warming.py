@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from real2sim_proto.episode import ContactSpec, ResetSpec
+from real2sim_proto.episode import ContactSpec, EgoSpec, ResetSpec
 from real2sim_proto.operations import Translate
 from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit import ScenarioState
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
+from .reference import Reference
+from .trackers import make_tracker
 from .world import World
 
 PERIOD_US = 100_000
@@ -34,6 +36,11 @@ def warm_up() -> None:
         poses = [(x + 0.1 * k, y, yaw) for k in range(1, 11)]
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
+    # What only perfect tracking and vehicles that were pushed call.
+    ego = EgoSpec(tracker="perfect")
+    ahead = Reference(world.motion, start_us=0, times_us=[PERIOD_US], poses=[(1.0, 0, 0)], spec=ego)
+    tracker = make_tracker(ahead, ego)
+    tracker.command(tracker.advance(world.motion, 0.0, PERIOD_US // 2), 0.0)
     # An edit that brings the cars near each other, for only then their boxes are compared.
     world.apply([Translate(object_id="ahead", x=-9.0)])
 

@@ -8,13 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from real2sim_proto.episode import EgoSpec
-from real2sim_server.world.ego import Command, Motion, drive, logged_motion, placed
+from real2sim_server.world.driving import Command
+from real2sim_server.world.ego import Motion, drive, holding, logged_motion, placed
 
 SPEC = EgoSpec()
 
 
 def hold(acceleration: float = 0.0, steering: float = 0.0):
-    return lambda _motion, _t: Command(acceleration, steering)
+    return holding(Command(acceleration, steering))
 
 
 def drive_for(motion: Motion, seconds: float, *, dt_us: int = 100_000, **command: float) -> Motion:

@@ -12,12 +12,13 @@ from numba.core.dispatcher import Dispatcher
 from scipy.spatial import cKDTree
 
 from real2sim_proto.operations import Translate
-from real2sim_proto.plans import TrajectoryPlan
+from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import track_kernels
 from real2sim_server.scene import box_kernels
 from real2sim_server.scene.box import box_penetration
 from real2sim_server.scene.rotation import quaternion_yaw, transform_from, yaw_quaternion
 from real2sim_server.world import contact_kernels, path_kernels, warm_up
+from real2sim_server.world.driving import entries
 from real2sim_server.world.scoring import PlanNote, comfort_kernels, hazard_kernels, road_kernels
 from real2sim_server.world.scoring.comfort import plans_agree
 
@@ -297,9 +298,26 @@ def test_plans_are_alike_when_their_derivatives_are(seed, scale):
 # --- all of them ------------------------------------------------------------------------------
 
 
-def test_steps_and_edits_after_the_warm_up_compile_nothing(make_world, moving):
+DELAYED = {"dynamics": "dynamic_bicycle", "actuators": {"drive_delay_us": 50_000}}
+EGOS = [{}, DELAYED, {"tracker": "lqr"}, {"tracker": "ilqr"}, {"tracker": "perfect"}]
+PLANS = {
+    "trajectory": lambda t_us: TrajectoryPlan(times_us=[t_us + SECOND], poses=[(10.0, 0.0, 0.1)]),
+    "control": lambda _: Control(acceleration=1, steering=0),
+    "pose": lambda t_us: PoseCommand(x=(t_us - NOW) // 100_000, y=0, yaw=0),
+}
+
+
+@pytest.mark.parametrize(
+    ("action", "ego"),
+    [*(("trajectory", ego) for ego in EGOS), ("control", {}), ("control", DELAYED), ("pose", {})],
+)
+@pytest.mark.parametrize("on_collision", ["continue", "terminate"])
+def test_steps_and_edits_after_the_warm_up_compile_nothing(
+    make_world, moving, action, ego, on_collision
+):
     warm_up()
     modules = (
+        entries,
         box_kernels,
         track_kernels,
         path_kernels,
@@ -311,12 +329,13 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(make_world, moving):
     kernels = [v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)]
     before = [len(k.signatures) for k in kernels]
     world = make_world(
-        car=moving(25, 0, z=0.8), aside=moving(12, 3, z=0.8, speed=3.0), spec={"privileged": True}
+        car=moving(25, 0, z=0.8),
+        aside=moving(12, 3, z=0.8, speed=3.0),
+        spec={"privileged": True, "action": action, "ego": ego, "on_collision": on_collision},
     )
     assert world.apply([Translate(object_id="car", x=-11.0, y=2.0)]).warnings
     while not world.over:
-        plan = TrajectoryPlan(times_us=[world.t_us + SECOND], poses=[(10.0, 0.0, 0.1)])
-        world.step(plan)
+        world.step(PLANS[action](world.t_us))
         world.observe()
 
     assert [len(k.signatures) for k in kernels] == before

@@ -9,20 +9,21 @@ import pytest
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_proto.plans import TrajectoryPlan
-from real2sim_server.world.actuators import Command
-from real2sim_server.world.dynamic import axle_forces, fiala
-from real2sim_server.world.ego import Motion, drive
+from real2sim_server.world.driving import GRAVITY, Command, vehicle_of
+from real2sim_server.world.driving.tyres import axle_forces, fiala
+from real2sim_server.world.ego import Motion, drive, holding
 from real2sim_server.world.reference import Reference
 from real2sim_server.world.trackers import make_tracker
-from real2sim_server.world.vehicle import GRAVITY, vehicle_of
 
 DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
 
 
 def driven(spec: EgoSpec, motion: Motion, seconds: float, driver) -> list[Motion]:
+    """Motions every 100 ms; the driver looks every 10 ms."""
     motions = []
     for _ in range(round(seconds * 10)):
-        motion = drive(motion, driver, spec, 100_000)
+        for _ in range(10):
+            motion = drive(motion, holding(driver(motion)), spec, 10_000)
         motions.append(motion)
     return motions
 
@@ -30,7 +31,7 @@ def driven(spec: EgoSpec, motion: Motion, seconds: float, driver) -> list[Motion
 def cornering(spec: EgoSpec, speed: float, steering: float) -> Motion:
     """Steady state at a speed that the driver keeps."""
 
-    def keep(motion: Motion, _t: float) -> Command:
+    def keep(motion: Motion) -> Command:
         return Command(5.0 * (speed - motion.speed), steering)
 
     return driven(spec, Motion(0, 0, 0, speed), 10.0, keep)[-1]
@@ -73,7 +74,7 @@ def test_oversteer_loses_the_car_above_its_critical_speed():
 
     def yaw_after(speed: float) -> float:
         nudged = Motion(0, 0, 0, speed, yaw_rate=0.01)
-        straight = driven(spec, nudged, 4.0, lambda m, _t: Command(5 * (speed - m.speed), 0.0))
+        straight = driven(spec, nudged, 4.0, lambda m: Command(5 * (speed - m.speed), 0.0))
         return abs(straight[-1].yaw_rate)
 
     assert yaw_after(0.8 * critical) < 0.002
@@ -89,21 +90,21 @@ def test_lateral_acceleration_ends_at_the_friction_limit():
 @pytest.mark.parametrize(("friction", "expected"), [(0.9, 8.0), (0.5, 0.5 * GRAVITY)])
 def test_braking_distance_is_that_of_brakes_or_of_friction(friction, expected):
     spec = EgoSpec(dynamics="dynamic_bicycle", vehicle={"friction": friction})
-    motions = driven(spec, Motion(0, 0, 0, 20.0), 6.0, lambda _m, _t: Command(-50.0, 0.0))
+    motions = driven(spec, Motion(0, 0, 0, 20.0), 6.0, lambda _m: Command(-50.0, 0.0))
 
     assert motions[-1].speed == 0.0
     assert motions[-1].x == pytest.approx(20.0**2 / (2 * expected), rel=0.01)
 
 
 def test_slow_dynamic_cars_are_kinematic_ones():
-    kinematic = driven(EgoSpec(), Motion(0, 0, 0, 1.5), 5.0, lambda _m, _t: Command(0.0, 0.3))
-    dynamic = driven(DYNAMIC, Motion(0, 0, 0, 1.5), 5.0, lambda _m, _t: Command(0.0, 0.3))
+    kinematic = driven(EgoSpec(), Motion(0, 0, 0, 1.5), 5.0, lambda _m: Command(0.0, 0.3))
+    dynamic = driven(DYNAMIC, Motion(0, 0, 0, 1.5), 5.0, lambda _m: Command(0.0, 0.3))
 
     assert dynamic[-1] == kinematic[-1]
 
 
 def test_the_model_is_smooth_through_walking_pace():
-    motions = driven(DYNAMIC, Motion(0, 0, 0, 8.0), 6.0, lambda _m, _t: Command(-1.5, 0.1))
+    motions = driven(DYNAMIC, Motion(0, 0, 0, 8.0), 6.0, lambda _m: Command(-1.5, 0.1))
     rates = np.array([m.yaw_rate for m in motions[5:]])
 
     assert np.abs(np.diff(rates)).max() < 0.05
@@ -135,7 +136,7 @@ def test_braking_in_a_bend_takes_cornering_force():
 
 def test_a_delayed_brake_acts_after_its_dead_time():
     spec = EgoSpec(actuators={"drive_delay_us": 250_000})
-    motions = driven(spec, Motion(0, 0, 0, 10.0), 1.0, lambda _m, _t: Command(-4.0, 0.0))
+    motions = driven(spec, Motion(0, 0, 0, 10.0), 1.0, lambda _m: Command(-4.0, 0.0))
 
     assert [m.speed for m in motions[:2]] == [10.0, 10.0]
     assert motions[-1].speed == pytest.approx(10.0 - 4.0 * 0.75)
@@ -143,7 +144,7 @@ def test_a_delayed_brake_acts_after_its_dead_time():
 
 def test_a_lagging_steering_gear_approaches_its_command():
     spec = EgoSpec(actuators={"steering_lag": 0.2}, max_steer_rate=10.0)
-    motions = driven(spec, Motion(0, 0, 0, 5.0), 0.4, lambda _m, _t: Command(0.0, 0.1))
+    motions = driven(spec, Motion(0, 0, 0, 5.0), 0.4, lambda _m: Command(0.0, 0.1))
 
     assert motions[1].steering == pytest.approx(0.1 * (1 - math.exp(-1)), rel=0.01)
     assert motions[3].steering == pytest.approx(0.1 * (1 - math.exp(-2)), rel=0.01)

@@ -8,13 +8,13 @@ point carries a fingerprint of all sources.
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
 
+from ...scene.compiled import fingerprint
 from ..laws.shared import FASTMATH
 
 FOLDERS = (Path(__file__).parent, Path(__file__).parents[1] / "laws")
@@ -38,8 +38,4 @@ def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 @functools.cache
 def source_fingerprint() -> str:
     """Eight hexadecimal digits that change with any source a kernel is made of."""
-    digest = hashlib.sha256()
-    for folder in FOLDERS:
-        for path in sorted(folder.glob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]
+    return fingerprint(path for folder in FOLDERS for path in sorted(folder.glob("*.py")))

@@ -8,12 +8,13 @@ So the name of each kernel carries a fingerprint of all kernel sources.
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
+
+from ...scene.compiled import fingerprint
 
 FOLDER = Path(__file__).parent
 
@@ -40,7 +41,4 @@ def inlined(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 @functools.cache
 def source_fingerprint() -> str:
     """Eight hexadecimal digits that change with any source a kernel is made of."""
-    digest = hashlib.sha256()
-    for path in (FOLDER / "base.py", *sorted(FOLDER.glob("cpu_*.py"))):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]
+    return fingerprint((FOLDER / "base.py", *sorted(FOLDER.glob("cpu_*.py"))))

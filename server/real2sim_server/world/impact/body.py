@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ..vehicle import GRAVITY
+from ..driving import GRAVITY
 
 SLIDING_SLIP = 0.1
 """Slip angle from which on a tyre of a sliding car gives all its friction [rad]."""

@@ -13,10 +13,10 @@ from ...edit import ObjectState
 from ...physics.masses import default_mass
 from ...render.types import Instance
 from ..contact import REAR_OVERHANG
+from ..driving import vehicle_of
 from ..ego import Motion
 from ..scoring.instant import Side
 from ..traffic.driver import AgentPose, Surroundings
-from ..vehicle import vehicle_of
 from .body import Body, Solid
 
 ROLLING = frozenset({"car", "vehicle", "van", "truck", "bus"})

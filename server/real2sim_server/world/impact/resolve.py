@@ -12,8 +12,8 @@ import numpy as np
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ...scene.rotation import multiply_quaternions, quaternion_yaw, yaw_quaternion
-from ..actuators import Command
 from ..agents import Agents
+from ..driving import Command
 from ..ego import Motion
 from ..scoring.boxes import side_of_contact
 from ..scoring.instant import Side

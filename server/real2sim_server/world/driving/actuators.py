@@ -1,0 +1,87 @@
+"""What lies between a command and the wheels: dead times, then lags of the first order."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...scene.compiled import inner
+from .state import Command, clamped
+
+
+@inner
+def begun(pending, vehicle, h):
+    """Room for the commands that are on their way in substeps of ``h`` seconds, and one more.
+
+    Args:
+        pending: [W, 2] float64, on their way, newest first.
+        vehicle: constants.
+        h: [s].
+
+    Returns:
+        Line [D + 1, 2] float64 for delays of D substeps, and how many of its rows are in use.
+    """
+    longest = max(_waits(vehicle.drive_delay, h), _waits(vehicle.steering_delay, h))
+    line = np.empty((longest + 1, 2))
+    waiting = min(len(pending), longest)
+    for k in range(waiting):
+        line[k, 0], line[k, 1] = pending[k, 0], pending[k, 1]
+    return line, waiting
+
+
+@inner
+def left(line, waiting):
+    """The commands still on their way: [W, 2] float64, newest first."""
+    pending = np.empty((min(waiting, len(line) - 1), 2))
+    for k in range(len(pending)):
+        pending[k, 0], pending[k, 1] = line[k, 0], line[k, 1]
+    return pending
+
+
+@inner
+def sent(line, waiting, asked):
+    """Puts a command at the head of those on their way; how many they are now.
+
+    Args:
+        line: [W, 2] float64, commands newest first; the last drops out where it is full.
+        waiting: rows of it in use.
+        asked: by the driver, now.
+    """
+    waiting = min(waiting + 1, len(line))
+    for k in range(waiting - 1, 0, -1):
+        line[k, 0], line[k, 1] = line[k - 1, 0], line[k - 1, 1]
+    line[0, 0], line[0, 1] = asked.acceleration, asked.steering
+    return waiting
+
+
+@inner
+def at_wheels(line, waiting, state, vehicle, h):
+    """What engine, brakes and steering gear aim at in this substep of ``h`` seconds.
+
+    Until the first command arrives they keep what they do.
+    """
+    drive, steering = state.drive, state.steering
+    k = _waits(vehicle.drive_delay, h)
+    if k < waiting:
+        drive = clamped(line[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
+    k = _waits(vehicle.steering_delay, h)
+    if k < waiting:
+        steering = line[k, 1]
+    return Command(
+        _approached(state.drive, drive, h, vehicle.drive_lag),
+        _approached(state.steering, steering, h, vehicle.steering_lag),
+    )
+
+
+@inner
+def _waits(delay, h):
+    return math.floor(delay / h + 0.5)
+
+
+@inner
+def _approached(value, wanted, h, lag):
+    """Where a first-order lag is ``h`` seconds later."""
+    if lag == 0.0:
+        return wanted
+    return value - (wanted - value) * math.expm1(-h / lag)

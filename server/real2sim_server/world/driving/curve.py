@@ -1,0 +1,223 @@
+"""A planned trajectory as a smooth curve over time.
+
+Cubic Hermite through the vehicle's pose when it got the plan, and the plan's poses. Tangents are
+finite differences of the plan, turned into the planned headings. After its last pose the curve
+goes on with its last speed and turn rate, so that there is something to aim at.
+
+Its knots are [K, 6] float64, one row a pose, the first that of the vehicle: time from the start
+[s], x, y [m], yaw [rad], and the tangent, a velocity x, y [m/s], all in the world.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...scene.compiled import inner
+from .state import clamped, wrapped
+
+T, X, Y, YAW, VX, VY = range(6)
+
+MOVING = 0.5
+"""Below this speed the direction between plan poses is mostly noise [m/s]."""
+
+DENSE = 0.25
+"""Plans that begin within this time say where they come from, too [s]."""
+
+TRUSTED_YAW = 0.5
+"""A planned heading that differs more from the planned way is not used as its tangent [rad]."""
+
+
+class Curve(NamedTuple):
+    """A plan to be followed.
+
+    Attributes:
+        knots: see above.
+        turn_rate: at the last pose, and from there on [rad/s].
+    """
+
+    knots: np.ndarray
+    turn_rate: float
+
+
+@inner
+def curve_through(state, seconds, poses, vehicle):
+    """The plan of a vehicle in a state.
+
+    Args:
+        state: of the vehicle at the start.
+        seconds: [N] float64, increasing, above 0, times of the poses from the start [s].
+        poses: [N, 3] float64, x, y [m], yaw [rad], world.
+        vehicle: constants.
+    """
+    last = len(seconds)
+    knots = np.empty((last + 1, 6))
+    knots[0, T], knots[0, X], knots[0, Y], knots[0, YAW] = 0.0, state.x, state.y, state.yaw
+    knots[0, VX] = state.speed * math.cos(state.yaw)
+    knots[0, VY] = state.speed * math.sin(state.yaw)
+    for i in range(last):
+        knots[i + 1, T] = seconds[i]
+        knots[i + 1, X], knots[i + 1, Y], knots[i + 1, YAW] = poses[i, 0], poses[i, 1], poses[i, 2]
+    for i in range(1, last + 1):
+        slope = _slope(knots, i) if last > 1 else _arrival(knots, state.speed, vehicle)
+        knots[i, VX], knots[i, VY] = _along_heading(slope, knots[i, YAW])
+    return Curve(knots, _last_turn_rate(knots, state, vehicle))
+
+
+@inner
+def end_of(curve):
+    """Time of the last pose [s]."""
+    return curve.knots[len(curve.knots) - 1, T]
+
+
+@inner
+def at(curve, t):
+    """x, y [m] and velocity x, y [m/s] in the world, ``t`` >= 0 seconds after the start."""
+    knots = curve.knots
+    last = len(knots) - 1
+    if t >= knots[last, T]:
+        return _along_arc(knots[last], curve.turn_rate, t - knots[last, T])
+    j = 1
+    while knots[j, T] <= t:
+        j += 1
+    a, b = knots[j - 1], knots[j]
+    h, since = b[T] - a[T], t - a[T]
+    x, vx = _hermite((a[X], a[VX]), (b[X], b[VX]), h, since)
+    y, vy = _hermite((a[Y], a[VY]), (b[Y], b[VY]), h, since)
+    return x, y, vx, vy
+
+
+@inner
+def planned(curve, t):
+    """Like :func:`at`, but where the plan itself would be before its first pose: on the arc that
+    leads there. The vehicle's distance from it is its error, which :func:`at` hides.
+
+    A plan that begins late says nothing about the way to it; there the two are the same.
+    """
+    knots = curve.knots
+    first = knots[1, T]
+    if t >= first or first > DENSE:
+        return at(curve, t)
+    rate = curve.turn_rate
+    if len(knots) > 2:
+        rate = wrapped(knots[2, YAW] - knots[1, YAW]) / (knots[2, T] - first)
+    return _along_arc(knots[1], rate, t - first)
+
+
+@inner
+def heading(curve, t):
+    """Planned heading [rad] at the first pose not before ``t``, or at the last one."""
+    i = 0
+    while i < len(curve.knots) - 1 and curve.knots[i, T] < t:
+        i += 1
+    return curve.knots[i, YAW]
+
+
+@inner
+def _slope(knots, i):
+    """Velocity [m/s] at a pose after the vehicle's own: the slope there of the parabola through
+    three neighbours.
+
+    The vehicle's own pose is no neighbour: where it is off the plan, its way onto it says nothing
+    about the plan's speed.
+    """
+    last = len(knots) - 1
+    if last == 2:
+        return _chord(knots, 1)
+    if i == 1:
+        return _far_slope(_chord(knots, 1), _mean_slope(knots, 2))
+    if i == last:
+        return _far_slope(_chord(knots, last - 1), _mean_slope(knots, last - 1))
+    return _mean_slope(knots, i)
+
+
+@inner
+def _chord(knots, i):
+    """Mean velocity [m/s] from pose ``i`` to the next."""
+    a, b = knots[i], knots[i + 1]
+    h = b[T] - a[T]
+    return (b[X] - a[X]) / h, (b[Y] - a[Y]) / h
+
+
+@inner
+def _mean_slope(knots, i):
+    """Velocity [m/s] at pose ``i`` of the parabola through it and its two neighbours."""
+    (ax, ay), (bx, by) = _chord(knots, i - 1), _chord(knots, i)
+    before, after = knots[i, T] - knots[i - 1, T], knots[i + 1, T] - knots[i, T]
+    share = before / (before + after)
+    return ax + share * (bx - ax), ay + share * (by - ay)
+
+
+@inner
+def _far_slope(chord, slope):
+    """Slope at the far end of a parabola's chord, from that at its near end."""
+    return 2 * chord[0] - slope[0], 2 * chord[1] - slope[1]
+
+
+@inner
+def _arrival(knots, speed, vehicle):
+    """Velocity [m/s] at a single planned pose: that of the way there, as far as in reach.
+
+    Without the limit a few centimetres over a short step would count as metres per second.
+    """
+    seconds = knots[1, T]
+    dx, dy = knots[1, X] - knots[0, X], knots[1, Y] - knots[0, Y]
+    length = math.hypot(dx, dy)
+    change = clamped(
+        length / seconds - speed,
+        -vehicle.max_braking * seconds,
+        vehicle.max_acceleration * seconds,
+    )
+    share = max(speed + change, 0.0) / max(length, 1e-9)
+    return dx * share, dy * share
+
+
+@inner
+def _along_heading(velocity, yaw):
+    """The velocity turned into the planned heading, where that is roughly where it goes."""
+    vx, vy = velocity
+    speed = math.hypot(vx, vy)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    if speed > MOVING and vx * cos + vy * sin > math.cos(TRUSTED_YAW) * speed:
+        return speed * cos, speed * sin
+    return velocity
+
+
+@inner
+def _last_turn_rate(knots, state, vehicle):
+    """Turn rate [rad/s] at the last pose, as far as the vehicle can turn."""
+    last = len(knots) - 1
+    h = knots[last, T] - knots[last - 1, T]
+    rate = wrapped(knots[last, YAW] - knots[last - 1, YAW]) / h
+    if last == 1:
+        reach = abs(state.speed) / vehicle.wheelbase * vehicle.max_steer_rate * h
+        rate = clamped(rate, state.yaw_rate - reach, state.yaw_rate + reach)
+    speed = math.hypot(knots[last, VX], knots[last, VY])
+    most = speed * math.tan(vehicle.max_steer) / vehicle.wheelbase
+    return clamped(rate, -most, most)
+
+
+@inner
+def _along_arc(knot, rate, since):
+    """Place and velocity on an arc, ``since`` seconds after a knot; before it where negative."""
+    vx, vy = knot[VX], knot[VY]
+    half = rate * since / 2
+    cos, sin = math.cos(half), math.sin(half)
+    chord = since * (sin / half if abs(half) > 1e-6 else 1.0)
+    x = knot[X] + chord * (cos * vx - sin * vy)
+    y = knot[Y] + chord * (sin * vx + cos * vy)
+    cos, sin = math.cos(2 * half), math.sin(2 * half)
+    return x, y, cos * vx - sin * vy, sin * vx + cos * vy
+
+
+@inner
+def _hermite(start, end, h, t):
+    """Value and slope at ``t`` in [0, h] of the cubic with these values and slopes at its ends."""
+    (a, a_slope), (b, b_slope) = start, end
+    u = t / h
+    chord = (b - a) / h
+    c2 = 3 * chord - 2 * a_slope - b_slope
+    c3 = a_slope + b_slope - 2 * chord
+    return a + t * (a_slope + u * (c2 + u * c3)), a_slope + u * (2 * c2 + 3 * u * c3)

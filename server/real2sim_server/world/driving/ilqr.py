@@ -1,0 +1,223 @@
+"""Iterative LQR: the commands that follow the plan best over the next seconds, within limits.
+
+Gauss-Newton (Li & Todorov 2004) with the kinematic bicycle over 1.5 s in steps of 0.1 s, on the
+state (x, y, yaw, speed, road-wheel angle) and the inputs (acceleration, steering rate). Limits are
+held in the rollout of each iteration. A schedule is one state a row, [STEPS + 1, 5], and one pair
+of inputs a row, [STEPS, 2].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...scene.compiled import inner
+from .lqr import point_at
+from .state import Command, clamped, wrapped
+
+STEP = 0.1
+STEPS = 15
+ITERATIONS = 5
+GAINS = (1.0, 0.5, 0.2, 0.05)
+"""Shares of the step that the line search tries."""
+
+ENOUGH = 1e-4
+"""Iterations end where one gains less than this share of the cost."""
+
+STATE_COST = np.array([4.0, 4.0, 10.0, 1.0, 0.0])
+"""Per squared error of x, y [m], yaw [rad], speed [m/s], road-wheel angle [rad]."""
+INPUT_COST = np.array([0.05, 0.5])
+"""Per squared acceleration [m/s^2] and steering rate [rad/s]."""
+
+NX, NU = 5, 2
+
+
+@inner
+def played(schedule, state, t, vehicle):
+    """What to do, ``t`` seconds after the schedule was made."""
+    states, inputs = schedule
+    k = min(int(t / STEP + 1e-9), STEPS - 1)
+    share = t / STEP - k
+    steering = (1 - share) * states[k, 4] + share * states[k + 1, 4]
+    # The angle at the end of the substep is what its mean must lead to.
+    ahead = steering + 0.01 * inputs[k, 1]
+    if vehicle.slips:
+        curvature = math.tan(ahead) / vehicle.wheelbase
+        ahead += vehicle.understeer * state.speed**2 * curvature
+    return Command(inputs[k, 0], ahead)
+
+
+@inner
+def scheduled(state, curve, since, vehicle):
+    """The schedule of a vehicle that is ``since`` seconds into its plan."""
+    wanted = _wanted(state, curve, since)
+    states, inputs = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
+    tried = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
+    for first in (states[0], tried[0][0]):
+        first[0], first[1], first[2] = state.x, state.y, state.yaw
+        first[3], first[4] = state.speed, state.steering
+    for k in range(STEPS):
+        inputs[k, 0], inputs[k, 1] = (wanted[k + 1, 3] - wanted[k, 3]) / STEP, 0.0
+        _step(states, inputs, k, vehicle)
+    cost = _cost((states, inputs), wanted)
+    for _ in range(ITERATIONS):
+        forward, feedback = _backward(states, inputs, wanted, vehicle.wheelbase)
+        gained = -1.0
+        for gain in GAINS:
+            _rollout(tried, (states, inputs), (gain, forward, feedback), vehicle)
+            gained = cost - _cost(tried, wanted)
+            if gained > 0.0:
+                break
+        if gained <= 0.0:
+            break
+        cost -= gained
+        (states, inputs), tried = tried, (states, inputs)
+        if gained < ENOUGH * cost:
+            break
+    return states, inputs
+
+
+@inner
+def _wanted(state, curve, since):
+    """Wanted states [STEPS + 1, 5]; yaws continuous from the vehicle's."""
+    wanted = np.zeros((STEPS + 1, NX))
+    yaw = state.yaw
+    for k in range(STEPS + 1):
+        # After its end the plan is taken to go on; the vehicle brakes once it gets there.
+        point = point_at(curve, since + k * STEP)
+        yaw += wrapped(point.yaw - yaw)
+        wanted[k, 0], wanted[k, 1], wanted[k, 2], wanted[k, 3] = point.x, point.y, yaw, point.speed
+    return wanted
+
+
+@inner
+def _rollout(tried, schedule, change, vehicle):
+    """Writes to ``tried`` the schedule that a share of the change of the inputs leads to, within
+    limits."""
+    (tried_states, tried_inputs), (states, inputs) = tried, schedule
+    gain, forward, feedback = change
+    for k in range(STEPS):
+        for i in range(NU):
+            asked = inputs[k, i] + gain * forward[k, i]
+            for j in range(NX):
+                asked += feedback[k, i, j] * (tried_states[k, j] - states[k, j])
+            tried_inputs[k, i] = asked
+        _step(tried_states, tried_inputs, k, vehicle)
+
+
+@inner
+def _step(states, inputs, k, vehicle):
+    """Holds the limits of a row of inputs and writes the state that it leads to."""
+    before, after = states[k], states[k + 1]
+    x, y, yaw, speed, steering = before[0], before[1], before[2], before[3], before[4]
+    a = clamped(inputs[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
+    rate = clamped(inputs[k, 1], -vehicle.max_steer_rate, vehicle.max_steer_rate)
+    end = clamped(steering + rate * STEP, -vehicle.max_steer, vehicle.max_steer)
+    later = max(speed + a * STEP, 0.0)
+    way = (speed + later) / 2 * STEP
+    turn = way * math.tan((steering + end) / 2) / vehicle.wheelbase
+    middle = yaw + turn / 2
+    after[0], after[1] = x + way * math.cos(middle), y + way * math.sin(middle)
+    after[2], after[3], after[4] = yaw + turn, later, end
+    inputs[k, 0], inputs[k, 1] = a, (end - steering) / STEP
+
+
+@inner
+def _cost(schedule, wanted):
+    states, inputs = schedule
+    cost = 0.0
+    for k in range(STEPS + 1):
+        for i in range(NX):
+            cost += STATE_COST[i] * (states[k, i] - wanted[k, i]) ** 2
+    for k in range(STEPS):
+        for i in range(NU):
+            cost += INPUT_COST[i] * inputs[k, i] ** 2
+    return cost
+
+
+@inner
+def _backward(states, inputs, wanted, wheelbase):
+    """Changes of the inputs [STEPS, 2] and feedback gains [STEPS, 2, 5]."""
+    forward, feedback = np.empty((STEPS, NU)), np.empty((STEPS, NU, NX))
+    V, v = np.zeros((NX, NX)), np.empty(NX)
+    for i in range(NX):
+        V[i, i] = STATE_COST[i]
+        v[i] = STATE_COST[i] * (states[STEPS, i] - wanted[STEPS, i])
+    for k in range(STEPS - 1, -1, -1):
+        A, B = _linearised(states[k], states[k + 1], wheelbase)
+        VA, VB = _product(V, A), _product(V, B)
+        Hxx, Hux, Huu = _dual(A, VA), _dual(B, VA), _dual(B, VB)
+        hx, hu = np.empty(NX), np.empty(NU)
+        for i in range(NX):
+            Hxx[i, i] += STATE_COST[i]
+            hx[i] = STATE_COST[i] * (states[k, i] - wanted[k, i])
+            for j in range(NX):
+                hx[i] += A[j, i] * v[j]
+        for i in range(NU):
+            Huu[i, i] += INPUT_COST[i]
+            hu[i] = INPUT_COST[i] * inputs[k, i]
+            for j in range(NX):
+                hu[i] += B[j, i] * v[j]
+        p, q, s = Huu[0, 0], Huu[0, 1], Huu[1, 1]
+        determinant = p * s - q * q
+        forward[k, 0] = (q * hu[1] - s * hu[0]) / determinant
+        forward[k, 1] = (q * hu[0] - p * hu[1]) / determinant
+        for j in range(NX):
+            feedback[k, 0, j] = (q * Hux[1, j] - s * Hux[0, j]) / determinant
+            feedback[k, 1, j] = (q * Hux[0, j] - p * Hux[1, j]) / determinant
+        for i in range(NX):
+            v[i] = hx[i] + Hux[0, i] * forward[k, 0] + Hux[1, i] * forward[k, 1]
+            for j in range(NX):
+                V[i, j] = Hxx[i, j] + Hux[0, i] * feedback[k, 0, j] + Hux[1, i] * feedback[k, 1, j]
+        for i in range(NX):
+            for j in range(i):
+                V[i, j] = V[j, i] = (V[i, j] + V[j, i]) / 2
+    return forward, feedback
+
+
+@inner
+def _linearised(state, after, wheelbase):
+    """Derivatives of the next state by state [5, 5] and by input [5, 2]."""
+    way = (state[3] + after[3]) / 2 * STEP
+    middle = (state[2] + after[2]) / 2
+    cos, sin, tan = math.cos(middle), math.sin(middle), math.tan((state[4] + after[4]) / 2)
+    by_steering = way * (1 + tan * tan) / wheelbase
+    by_speed = STEP * tan / wheelbase
+    A, B = np.zeros((NX, NX)), np.zeros((NX, NU))
+    for i in range(NX):
+        A[i, i] = 1.0
+    A[0, 2], A[1, 2] = -way * sin, way * cos
+    A[0, 3] = STEP * cos - way * sin * by_speed / 2
+    A[1, 3] = STEP * sin + way * cos * by_speed / 2
+    A[2, 3] = by_speed
+    A[0, 4] = -way * sin * by_steering / 2
+    A[1, 4] = way * cos * by_steering / 2
+    A[2, 4] = by_steering
+    # An input acts over the step: on average it has changed speed and angle by half of itself.
+    for i in range(3):
+        B[i, 0], B[i, 1] = A[i, 3] * STEP / 2, A[i, 4] * STEP / 2
+    B[3, 0] = B[4, 1] = STEP
+    return A, B
+
+
+@inner
+def _product(M, N):
+    """M N."""
+    result = np.zeros((M.shape[0], N.shape[1]))
+    for i in range(M.shape[0]):
+        for j in range(N.shape[1]):
+            for k in range(M.shape[1]):
+                result[i, j] += M[i, k] * N[k, j]
+    return result
+
+
+@inner
+def _dual(M, N):
+    """M^T N."""
+    result = np.zeros((M.shape[1], N.shape[1]))
+    for i in range(M.shape[1]):
+        for j in range(N.shape[1]):
+            for k in range(M.shape[0]):
+                result[i, j] += M[k, i] * N[k, j]
+    return result

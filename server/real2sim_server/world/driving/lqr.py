@@ -1,0 +1,83 @@
+"""Linear-quadratic regulators along and across a plan."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from ...scene.compiled import inner
+from .curve import MOVING, YAW, X, Y, end_of, heading, planned
+from .state import GENTLE_BRAKING, Command, wrapped
+
+TIME = 0.6
+"""Time scale of the regulator along the plan [s]: (r/q)^(1/4) of its weights."""
+
+HEADWAY, SHORTEST = 0.55, 2.0
+"""Length scale of the regulator across the plan: this many seconds of way, at least metres."""
+
+DIFFERENCE = 0.05
+"""Acceleration and curvature of the plan are taken over this time [s]."""
+
+
+class Point(NamedTuple):
+    """A plan at one time: pose [m], [rad], speed [m/s], acceleration, curvature [1/m]."""
+
+    x: float
+    y: float
+    yaw: float
+    speed: float
+    acceleration: float
+    curvature: float
+
+
+@inner
+def regulate(state, curve, t, vehicle):
+    """What to do, ``t`` seconds after the plan's start.
+
+    Two decoupled regulators, with the plan's own acceleration and curvature fed forward. Along
+    the plan the error obeys e'' = a - a_ref in time; across it e'' = k - k_ref in path length,
+    for small heading errors. Both are double integrators, whose Riccati equation for the cost
+    q e^2 + r u^2 has the solution u = -(e/l^2 + sqrt(2) e'/l) with l = (r/q)^(1/4) (Anderson &
+    Moore 1990, Optimal Control, ch. 3).
+    """
+    if t >= end_of(curve):
+        last = curve.knots[len(curve.knots) - 1]
+        point = Point(last[X], last[Y], last[YAW], 0.0, 0.0, 0.0)
+        return Command(-GENTLE_BRAKING, _steering_onto(point, state, vehicle))
+    point = point_at(curve, t)
+    along = (point.x - state.x) * math.cos(point.yaw) + (point.y - state.y) * math.sin(point.yaw)
+    speed = state.speed * math.cos(state.yaw - point.yaw)
+    acceleration = (
+        point.acceleration + along / TIME**2 + math.sqrt(2.0) * (point.speed - speed) / TIME
+    )
+    return Command(acceleration, _steering_onto(point, state, vehicle))
+
+
+@inner
+def point_at(curve, t):
+    """The plan ``t`` seconds after its start, with derivatives."""
+    x, y, vx, vy = planned(curve, t)
+    _, _, wx, wy = planned(curve, t + DIFFERENCE)
+    speed, later = math.hypot(vx, vy), math.hypot(wx, wy)
+    acceleration = (later - speed) / DIFFERENCE
+    if speed < MOVING:
+        return Point(x, y, heading(curve, t), speed, acceleration, 0.0)
+    yaw = math.atan2(vy, vx)
+    turn = wrapped(math.atan2(wy, wx) - yaw) if later > MOVING else 0.0
+    return Point(x, y, yaw, speed, acceleration, turn / (speed * DIFFERENCE))
+
+
+@inner
+def _steering_onto(point, state, vehicle):
+    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``."""
+    dx, dy = state.x - point.x, state.y - point.y
+    across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
+    # Where the vehicle really goes: with slipping tyres not quite where it points.
+    course = state.yaw + math.atan2(state.lateral_speed, max(state.speed, 1.0))
+    off = wrapped(course - point.yaw)
+    scale = max(HEADWAY * state.speed, SHORTEST)
+    curvature = point.curvature - across / scale**2 - math.sqrt(2.0) * off / scale
+    rolling = math.atan(vehicle.wheelbase * curvature)
+    if not vehicle.slips:
+        return rolling
+    return rolling + vehicle.understeer * state.speed**2 * curvature

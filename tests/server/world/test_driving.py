@@ -1,0 +1,290 @@
+"""Kernels of the vehicle against other ways to the same figures."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
+from scipy.linalg import solve_continuous_are
+from scipy.optimize import minimize
+
+from real2sim_proto.episode import EgoSpec
+from real2sim_server.world.driving import (
+    GRAVITY,
+    ILQR,
+    LQR,
+    PURSUIT,
+    Command,
+    asked_of,
+    curve_at,
+    driven,
+    plan_curve,
+    vehicle_of,
+)
+from real2sim_server.world.driving.curve import Curve
+from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS, scheduled
+from real2sim_server.world.driving.lqr import HEADWAY, TIME
+from real2sim_server.world.driving.state import PlanarState
+from real2sim_server.world.driving.tyres import integrate
+from real2sim_server.world.ego import Motion
+
+VEHICLE = vehicle_of(EgoSpec())
+SLIPPING = vehicle_of(EgoSpec(dynamics="dynamic_bicycle"))
+SECOND = 1_000_000
+NOTHING = np.empty((0, 2))
+seeds = st.integers(0, 10_000)
+compiling = settings(deadline=None)
+"""The first example waits for the compiler."""
+
+
+def state_of(*, speed: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> PlanarState:
+    return PlanarState(x, y, yaw, speed, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def some_plan(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times [us] and poses of a winding way at about 8 m/s, from near the origin."""
+    times = np.cumsum(rng.integers(50_000, 500_000, count))
+    yaws = np.cumsum(rng.normal(scale=0.05, size=count))
+    steps = np.diff(times, prepend=0)[:, None] * 8e-6
+    places = np.cumsum(steps * np.stack([np.cos(yaws), np.sin(yaws)], axis=1), axis=0)
+    return times, np.column_stack([places, yaws])
+
+
+def planned(state: PlanarState, times: np.ndarray, poses: np.ndarray, vehicle=VEHICLE):
+    return plan_curve(tuple(state), times, 0, poses, tuple(vehicle))
+
+
+# --- tyres ------------------------------------------------------------------------------------
+
+
+def bicycle(_t: float, state: np.ndarray, steering: float, acceleration: float) -> list[float]:
+    """Two-axle car on Fiala tyres, in the words of Pacejka (2012), ch. 1 and 3: brush model by
+    its sliding share, forces by axle, written without the kernel."""
+    v = SLIPPING
+    _, _, yaw, u, w, r = state
+    weight = v.mass * GRAVITY
+    transfer = v.mass * acceleration * v.height / v.wheelbase
+    loads = np.array([weight * v.rear / v.wheelbase, weight * v.front / v.wheelbase])
+    loads += [-transfer, transfer]
+    stiffness = loads * [v.front_cornering, v.rear_cornering]
+    grip = loads * math.sqrt(v.friction**2 - (acceleration / GRAVITY) ** 2)
+    slips = np.array([steering - math.atan2(w + v.front * r, u), -math.atan2(w - v.rear * r, u)])
+    adhering = np.clip(1 - stiffness * np.abs(np.tan(slips)) / (3 * grip), 0, 1)
+    forces = np.sign(slips) * grip * (1 - adhering**3)
+    fx = v.mass * acceleration - forces[0] * math.sin(steering)
+    fy = forces[0] * math.cos(steering) + forces[1]
+    moment = v.front * forces[0] * math.cos(steering) - v.rear * forces[1]
+    return [
+        u * math.cos(yaw) - w * math.sin(yaw),
+        u * math.sin(yaw) + w * math.cos(yaw),
+        r,
+        fx / v.mass + w * r,
+        fy / v.mass - u * r,
+        moment / v.inertia,
+    ]
+
+
+@compiling
+@given(
+    speed=st.floats(5, 40),
+    sideways=st.floats(-3, 3),
+    turn=st.floats(-1, 1),
+    steering=st.floats(-0.5, 0.5),
+    acceleration=st.floats(-8, 4),
+)
+def test_slipping_tyres_move_the_car_as_a_fine_integration_does(
+    speed, sideways, turn, steering, acceleration
+):
+    state = np.array([3.0, -2.0, 0.4, speed, sideways, turn])
+    exact = solve_ivp(
+        bicycle, (0, 0.01), state, args=(steering, acceleration), rtol=1e-10, atol=1e-12
+    )
+    found = integrate(SLIPPING, tuple(state.tolist()), (steering, steering), acceleration, 0.01)
+
+    np.testing.assert_allclose(found, exact.y[:, -1], atol=1e-4)
+
+
+# --- plans as curves --------------------------------------------------------------------------
+
+
+@compiling
+@given(seed=seeds, count=st.integers(3, 12))
+def test_a_plans_tangents_are_slopes_of_parabolas_through_its_poses(seed, count):
+    times, poses = some_plan(np.random.default_rng(seed), count)
+    # Headings against the way are not trusted, so that the slopes stay as they are.
+    poses[:, 2] += math.pi
+    knots, _ = planned(state_of(speed=8.0), times, poses)
+
+    for axis in (0, 1):
+        slopes = np.gradient(poses[:, axis], times * 1e-6, edge_order=2)
+        np.testing.assert_allclose(knots[1:, 4 + axis], slopes, atol=1e-9)
+
+
+@compiling
+@given(seed=seeds, count=st.integers(1, 12), share=st.floats(0, 0.999))
+def test_a_plan_is_the_hermite_spline_of_its_knots(seed, count, share):
+    times, poses = some_plan(np.random.default_rng(seed), count)
+    state = state_of(speed=7.0, y=0.3, yaw=0.1)
+    knots, turn_rate = planned(state, times, poses)
+    t = share * knots[-1, 0]
+    x, y, vx, vy, _ = curve_at((knots, turn_rate), t)
+
+    spline = CubicHermiteSpline(knots[:, 0], knots[:, 1:3], knots[:, 4:6])
+    np.testing.assert_allclose([x, y], spline(t), atol=1e-9)
+    np.testing.assert_allclose([vx, vy], spline(t, 1), atol=1e-8)
+    np.testing.assert_allclose(knots[0, 1:], [0, 0.3, 0.1, 7 * math.cos(0.1), 7 * math.sin(0.1)])
+    np.testing.assert_array_equal(knots[1:, 1:4], poses)
+
+
+def test_beyond_its_end_a_plan_goes_on_along_its_circle():
+    radius, times = 25.0, np.arange(1, 11) * 100_000
+    angles = 8.0 * times * 1e-6 / radius
+    poses = np.column_stack([radius * np.sin(angles), radius * (1 - np.cos(angles)), angles])
+    curve = planned(state_of(speed=8.0), times, poses)
+
+    for t in (1.0, 1.5, 3.0):
+        x, y, vx, vy, _ = curve_at(curve, t)
+        assert math.hypot(x, y - radius) == pytest.approx(radius, abs=0.02)
+        assert math.hypot(vx, vy) == pytest.approx(8.0, abs=0.01)
+
+
+# --- trackers ---------------------------------------------------------------------------------
+
+
+def straight_plan(speed: float):
+    times = np.arange(1, 41) * 100_000
+    poses = np.column_stack([speed * times * 1e-6, 0 * times, 0 * times])
+    return planned(state_of(speed=speed), times, poses)
+
+
+def test_the_regulator_has_the_gains_of_the_riccati_equation():
+    speed, off = 12.0, 1e-4
+    knots, turn_rate = straight_plan(speed)
+    driver = (LQR, knots, turn_rate, 1.0, (0.0, 0.0))
+    chain, push = np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]])
+
+    def gains(scale: float) -> np.ndarray:
+        weight = np.diag([1.0, 0.0])
+        riccati = solve_continuous_are(chain, push, weight, np.array([[scale**4]]))
+        return push.T @ riccati / scale**4
+
+    def response(**change: float) -> np.ndarray:
+        at = {"x": speed, "speed": speed}
+        moved = state_of(**{**at, **{k: at.get(k, 0.0) + v for k, v in change.items()}})
+        acceleration, steering = asked_of(tuple(moved), driver, tuple(VEHICLE))
+        return np.array([acceleration, math.tan(steering) / VEHICLE.wheelbase]) / off
+
+    along = gains(TIME)[0]
+    across = gains(HEADWAY * speed)[0]
+    assert response(x=off)[0] == pytest.approx(-along[0], rel=1e-4)
+    assert response(speed=off)[0] == pytest.approx(-along[1], rel=1e-4)
+    assert response(y=off)[1] == pytest.approx(-across[0], rel=1e-4)
+    assert response(yaw=off)[1] == pytest.approx(-across[1], rel=1e-4)
+
+
+@compiling
+@given(offset=st.floats(-2, 2), ahead=st.floats(0.5, 3))
+def test_pursuit_steers_the_arc_through_a_place_of_the_plan(offset, ahead):
+    speed = 12.0
+    knots, turn_rate = straight_plan(speed)
+    state = state_of(x=speed * ahead, y=offset, speed=speed)
+    driver = (PURSUIT, knots, turn_rate, ahead, (0.0, 0.0))
+    _, steering = asked_of(tuple(state), driver, tuple(VEHICLE))
+
+    curvature = math.tan(steering) / VEHICLE.wheelbase
+    aim = 0.4 * speed
+    # (aim, -offset) lies on the circle that leaves the rear axle along x with this curvature.
+    assert -offset == pytest.approx(curvature * (aim**2 + offset**2) / 2, abs=1e-9)
+
+
+def cost_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> float:
+    """What iLQR minimises, by a rollout of the kinematic bicycle."""
+    x, y, yaw, speed, steering = start.x, start.y, start.yaw, start.speed, start.steering
+    errors = [np.array([x, y, yaw, speed, steering]) - wanted[0]]
+    for (a, rate), aim in zip(inputs.reshape(STEPS, 2), wanted[1:], strict=True):
+        end, later = steering + rate * STEP, speed + a * STEP
+        way = (speed + later) / 2 * STEP
+        turn = way * math.tan((steering + end) / 2) / VEHICLE.wheelbase
+        x, y = x + way * math.cos(yaw + turn / 2), y + way * math.sin(yaw + turn / 2)
+        yaw, speed, steering = yaw + turn, later, end
+        errors.append(np.array([x, y, yaw, speed, steering]) - aim)
+    commands = inputs.reshape(STEPS, 2)
+    return float((np.array(errors) ** 2 @ STATE_COST).sum() + (commands**2 @ INPUT_COST).sum())
+
+
+@pytest.mark.parametrize(("y", "speed"), [(0.3, 10.0), (-0.6, 9.0), (0.0, 11.0)])
+def test_ilqr_finds_the_commands_that_a_general_optimiser_finds(y, speed):
+    start = state_of(x=3.0, y=y, speed=speed)
+    knots, turn_rate = straight_plan(10.0)
+    states, inputs = scheduled(start, Curve(knots, turn_rate), 0.3, VEHICLE)
+    wanted = np.zeros((STEPS + 1, 5))
+    wanted[:, 0], wanted[:, 3] = 10.0 * (0.3 + STEP * np.arange(STEPS + 1)), 10.0
+
+    best = minimize(
+        cost_of,
+        np.zeros(2 * STEPS),
+        args=(start, wanted),
+        method="L-BFGS-B",
+        bounds=[(-8.0, 4.0), (-0.8, 0.8)] * STEPS,
+    )
+    assert cost_of(inputs.ravel(), start, wanted) <= best.fun * 1.01
+    assert np.abs(inputs[:, 1]).max() <= VEHICLE.max_steer_rate + 1e-9
+    assert states[0, :2].tolist() == [3.0, y]
+
+
+# --- as they are written ----------------------------------------------------------------------
+
+
+def some_drives() -> list[list[float]]:
+    """Vehicles of both kinds with and without delays, driven by every tracker."""
+    rng = np.random.default_rng(0)
+    delays = {"steering_delay_us": 120_000, "steering_lag": 0.1, "drive_delay_us": 50_000}
+    found = []
+    for kind in (PURSUIT, LQR, ILQR):
+        for dynamics in ("kinematic_bicycle", "dynamic_bicycle"):
+            for actuators in ({}, delays):
+                spec = EgoSpec(dynamics=dynamics, actuators=actuators)
+                vehicle = tuple(vehicle_of(spec))
+                state, pending = tuple(state_of(speed=8.0, y=0.5)), NOTHING
+                curve = plan_curve(state, *_at_zero(some_plan(rng, 10)), vehicle)
+                for k in range(5):
+                    driver = (kind, *curve, 0.1 * k, (0.0, 0.0))
+                    state, pending = driven(state, pending, driver, vehicle, 100_000)
+                found.append([*state, *pending.ravel().tolist()])
+    return found
+
+
+def _at_zero(plan: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, int, np.ndarray]:
+    return plan[0], 0, plan[1]
+
+
+def test_compiled_they_drive_as_they_do_in_plain_python():
+    code = (
+        f"import sys; sys.path.insert(0, {os.path.dirname(__file__)!r}); import test_driving, json"
+    )
+    plain = subprocess.run(
+        [sys.executable, "-c", f"{code}; print(json.dumps(test_driving.some_drives()))"],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+
+    for found, expected in zip(some_drives(), json.loads(plain.stdout), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_motion_begins_as_a_planar_state_does():
+    assert Motion._fields[: len(PlanarState._fields)] == PlanarState._fields
+    assert Motion(1, 2, 3).numbers == tuple(PlanarState(1, 2, 3, 0, 0, 0, 0, 0, 0))
+    assert Command._fields == ("acceleration", "steering")
