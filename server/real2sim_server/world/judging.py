@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from real2sim_proto.episode import ResetSpec
-from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit.tracks import sample
 from ..scene import Scene
@@ -20,6 +19,7 @@ from .episode import Clock
 from .events import Event
 from .path import LoggedPath, PathPoint
 from .pilot import Plan
+from .reference import Course
 from .scoring import EgoSample, Others, PlanNote, ScoringContext
 from .scoring.comfort import window_of
 from .scoring.instant import VEHICLES
@@ -117,7 +117,5 @@ def others_of(agents: Agents) -> Others:
 
 
 def plan_note(plan: object) -> PlanNote | None:
-    """A trajectory in the world for the scores; None for other plans."""
-    if not isinstance(plan, TrajectoryPlan) or plan.frame != "world":
-        return None
-    return PlanNote(tuple(plan.times_us), tuple(plan.poses))
+    """A trajectory for the scores; None for other plans."""
+    return PlanNote(plan.times_us, plan.poses) if isinstance(plan, Course) else None

@@ -210,7 +210,7 @@ def _plan(instant: Instant, stamp: dict[str, int]) -> dict[str, Any]:
     assert instant.plan is not None
     poses = [
         {"position": _vector((x, y, instant.ego.z)), "orientation": _rotation(yaw)}
-        for x, y, yaw in instant.plan.poses
+        for x, y, yaw in instant.plan.poses.tolist()
     ]
     return {"timestamp": stamp, "frame_id": "world", "poses": poses}
 

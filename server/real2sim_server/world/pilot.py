@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_right
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, assert_never
 
@@ -19,10 +16,11 @@ from ..scene import Trajectory
 from .driving import Command
 from .ego import Motion, drive, holding, placed
 from .errors import WorldError
-from .reference import Pose, Reference
+from .reference import Course, Pose, Reference
 from .trackers import make_tracker
 
 Plan = TrajectoryPlan | Control | PoseCommand
+Planned = Course | Control | PoseCommand
 
 LOG_SPACING_US = 100_000
 """Where there is no plan, the log is followed by poses this far apart at most [us]."""
@@ -79,11 +77,11 @@ class Coming:
 
     Attributes:
         from_us: when it does [us].
-        plan: with its poses in the world.
+        plan: in the world.
     """
 
     from_us: int
-    plan: Plan
+    plan: Planned
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,18 +122,14 @@ class Pilot:
                 f"{self.spec.action!r}",
                 hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}",
             )
-        if isinstance(plan, TrajectoryPlan):
-            if plan.times_us[0] <= t_us:
-                raise WorldError(
-                    ErrorCode.INVALID_ACTION,
-                    f"the plan begins at {plan.times_us[0]} us; it is {t_us} us already",
-                    hint="times_us are absolute simulation times after t_us of the observation",
-                )
-            if plan.frame == "vehicle":
-                poses = to_world(plan.poses, motion)
-                plan = plan.model_copy(update={"poses": poses, "frame": "world"})
+        if isinstance(plan, TrajectoryPlan) and plan.times_us[0] <= t_us:
+            raise WorldError(
+                ErrorCode.INVALID_ACTION,
+                f"the plan begins at {plan.times_us[0]} us; it is {t_us} us already",
+                hint="times_us are absolute simulation times after t_us of the observation",
+            )
         kept = tuple(c for c in self.coming if c.from_us < from_us)
-        coming = (*kept, Coming(from_us, plan))
+        coming = (*kept, Coming(from_us, _in_world(plan, motion)))
         return Pilot(self.spec, self.ego, self.controller, self.since_us, coming)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[Pilot, Motion]:
@@ -165,14 +159,10 @@ class Pilot:
             pilot = replace(pilot, controller=log, since_us=t_us)
         return pilot
 
-    def _controller(self, plan: Plan, motion: Motion, t_us: int) -> Controller:
+    def _controller(self, plan: Planned, motion: Motion, t_us: int) -> Controller:
         match plan:
-            case TrajectoryPlan():
-                over = bisect_right(plan.times_us, t_us)
-                if over == len(plan.times_us):
-                    # All of it is over by the time it takes effect: stop where it ends.
-                    return self._tracker(motion, t_us, [t_us + 1], [plan.poses[-1]])
-                return self._tracker(motion, t_us, plan.times_us[over:], plan.poses[over:])
+            case Course():
+                return self._tracker(motion, t_us, plan.after(t_us))
             case Control():
                 return Hold(Command(plan.acceleration, plan.steering), self.spec.ego)
             case PoseCommand():
@@ -188,16 +178,11 @@ class Pilot:
         transforms, _ = sample(self.ego, times)
         yaws = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
         poses = np.column_stack([transforms[:, :2, 3], yaws])
-        return self._tracker(
-            motion, t_us, times.tolist(), [(x, y, yaw) for x, y, yaw in poses.tolist()]
-        )
+        return self._tracker(motion, t_us, Course(times, poses))
 
-    def _tracker(
-        self, motion: Motion, t_us: int, times_us: Sequence[int], poses: Sequence[Pose]
-    ) -> Controller:
+    def _tracker(self, motion: Motion, t_us: int, course: Course) -> Controller:
         spec = self.spec.ego
-        reference = Reference(motion, start_us=t_us, times_us=times_us, poses=poses, spec=spec)
-        return make_tracker(reference, spec)
+        return make_tracker(Reference(motion, start_us=t_us, course=course, spec=spec), spec)
 
 
 def braking(pilot: Pilot, motion: Motion, spec: EgoSpec) -> Controller:
@@ -207,10 +192,8 @@ def braking(pilot: Pilot, motion: Motion, spec: EgoSpec) -> Controller:
     return Hold(Command(-min(EMERGENCY_BRAKING, spec.max_braking), motion.steering), spec)
 
 
-def to_world(poses: Sequence[Pose], motion: Motion) -> list[Pose]:
-    """Poses x, y, yaw of the vehicle frame in the world."""
-    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
-    return [
-        (motion.x + cos * x - sin * y, motion.y + sin * x + cos * y, motion.yaw + yaw)
-        for x, y, yaw in poses
-    ]
+def _in_world(plan: Plan, motion: Motion) -> Planned:
+    if not isinstance(plan, TrajectoryPlan):
+        return plan
+    frame = (motion.x, motion.y, motion.yaw) if plan.frame == "vehicle" else None
+    return Course.of(plan.times_us, plan.poses, frame)

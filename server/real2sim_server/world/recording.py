@@ -302,8 +302,7 @@ def _row(instant: Instant, found: str) -> dict[str, Any]:
         "digest": found,
     }
     if instant.plan is not None:
-        plan = instant.plan
-        row["plan"] = [list(plan.times_us), [list(p) for p in plan.poses]]
+        row["plan"] = [instant.plan.times_us.tolist(), instant.plan.poses.tolist()]
     return row
 
 
@@ -311,7 +310,7 @@ def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
     plan = None
     if "plan" in row:
         times, poses = row["plan"]
-        plan = PlanNote(tuple(times), tuple((x, y, yaw) for x, y, yaw in poses))
+        plan = PlanNote(np.array(times, np.int64), np.array(poses, np.float64))
     instant = Instant(
         step=row["step"],
         t_us=row["t_us"],

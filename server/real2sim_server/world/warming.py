@@ -11,7 +11,7 @@ from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit import ScenarioState
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
-from .reference import Reference
+from .reference import Course, Reference
 from .trackers import make_tracker
 from .world import World
 
@@ -38,7 +38,8 @@ def warm_up() -> None:
         world.observe()
     # What only perfect tracking and vehicles that were pushed call.
     ego = EgoSpec(tracker="perfect")
-    ahead = Reference(world.motion, start_us=0, times_us=[PERIOD_US], poses=[(1.0, 0, 0)], spec=ego)
+    course = Course.of([PERIOD_US], [(1.0, 0.0, 0.0)], (0.0, 0.0, 0.0))
+    ahead = Reference(world.motion, start_us=0, course=course, spec=ego)
     tracker = make_tracker(ahead, ego)
     tracker.command(tracker.advance(world.motion, 0.0, PERIOD_US // 2), 0.0)
     # An edit that brings the cars near each other, for only then their boxes are compared.

@@ -262,7 +262,7 @@ def test_yaws_become_continuous_as_by_unwrapping(yaws):
 
 
 def plans_alike_by_numpy(before: PlanNote, now: PlanNote) -> bool | None:
-    times = [np.array(p.times_us) * 1e-6 for p in (before, now)]
+    times = [p.times_us * 1e-6 for p in (before, now)]
     first, last = max(t[0] for t in times), min(t[-1] for t in times)
     count = int((last - first) / 0.1 + 1e-6) + 1
     if count < 6:
@@ -270,7 +270,7 @@ def plans_alike_by_numpy(before: PlanNote, now: PlanNote) -> bool | None:
     at = first + 0.1 * np.arange(count)
     felt = []
     for t, plan in zip(times, (before, now), strict=True):
-        x, y, yaw = np.array(plan.poses).T
+        x, y, yaw = plan.poses.T
         poses = [np.interp(at, t, values) for values in (x, y, np.unwrap(yaw))]
         vx, vy, rate = np.diff(poses, axis=1) / 0.1
         acceleration = np.diff(np.hypot(vx, vy)) / 0.1
@@ -290,7 +290,7 @@ def test_plans_are_alike_when_their_derivatives_are(seed, scale):
         poses = np.stack([8 * t, 0.1 * t, 3.0 + 0.1 * t], axis=1)
         poses += scale * rng.normal(size=poses.shape)
         poses[:, 2] = np.remainder(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
-        notes.append(PlanNote(tuple(times.tolist()), tuple(map(tuple, poses.tolist()))))
+        notes.append(PlanNote(times, poses))
 
     assert plans_agree(*notes) == plans_alike_by_numpy(*notes)
 

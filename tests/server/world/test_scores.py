@@ -320,8 +320,10 @@ def test_a_stop_no_car_can_make_is_infeasible():
 def with_plans(instants: list[Instant], speed_of) -> list[Instant]:
     planned = []
     for i in instants:
-        times = tuple(i.t_us + 100_000 * (k + 1) for k in range(20))
-        poses = tuple((i.ego.x + speed_of(i.step) * DT * (k + 1), 0.0, 0.0) for k in range(20))
+        ahead = np.arange(1, 21)
+        times = i.t_us + 100_000 * ahead
+        poses = np.zeros((20, 3))
+        poses[:, 0] = i.ego.x + speed_of(i.step) * DT * ahead
         planned.append(replace(i, plan=PlanNote(times, poses)))
     return planned
 
@@ -343,10 +345,9 @@ def test_plans_that_jump_cost_extended_comfort():
 
     instants = with_plans(drive([10.0] * 41), braking)
     plan = instants[20].plan
-    poses = tuple(
-        (instants[20].ego.x + 10.0 * t - 1.5 * t * t, 0.0, 0.0)
-        for t in (DT * (k + 1) for k in range(20))
-    )
+    poses = plan.poses.copy()
+    t = DT * np.arange(1, 21)
+    poses[:, 0] = instants[20].ego.x + 10.0 * t - 1.5 * t * t
     instants[20] = replace(instants[20], plan=replace(plan, poses=poses))
     found = scores(instants, context(40))["epdms"]
     assert found.terms["EC"] == 0.0

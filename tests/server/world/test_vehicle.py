@@ -12,7 +12,7 @@ from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.world.driving import GRAVITY, Command, vehicle_of
 from real2sim_server.world.driving.tyres import axle_forces, fiala
 from real2sim_server.world.ego import Motion, drive, holding
-from real2sim_server.world.reference import Reference
+from real2sim_server.world.reference import Course, Reference
 from real2sim_server.world.trackers import make_tracker
 
 DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
@@ -171,7 +171,7 @@ def worst_offset(spec: EgoSpec, speed: float) -> float:
     errors = []
     for k in range(70):
         reference = Reference(
-            motion, start_us=k * 100_000, times_us=times[k:], poses=poses[k:], spec=spec
+            motion, start_us=k * 100_000, course=Course.of(times[k:], poses[k:]), spec=spec
         )
         motion = make_tracker(reference, spec).advance(motion, 0.0, 100_000)
         x, y, yaw = poses[k]
@@ -209,8 +209,7 @@ def test_trackers_obey_the_limits_of_the_vehicle(tracker):
     reference = Reference(
         motion,
         start_us=0,
-        times_us=[500_000, 1_000_000],
-        poses=[(-20.0, 30.0, 2.0), (60.0, -50.0, -2.0)],
+        course=Course.of([500_000, 1_000_000], [(-20.0, 30.0, 2.0), (60.0, -50.0, -2.0)]),
         spec=spec,
     )
     tracker_ = make_tracker(reference, spec)

@@ -5,7 +5,7 @@ other files hold what that is made of.
 """
 
 from .curve import MOVING
-from .entries import HOLD, ILQR, LQR, PURSUIT, asked_of, curve_at, driven, plan_curve
+from .entries import HOLD, ILQR, LQR, PURSUIT, asked_of, curve_at, driven, plan_curve, world_poses
 from .state import Command
 from .vehicle import GRAVITY, Vehicle, vehicle_of
 
@@ -23,4 +23,5 @@ __all__ = [
     "driven",
     "plan_curve",
     "vehicle_of",
+    "world_poses",
 ]

@@ -11,7 +11,7 @@ from .vehicle import GRAVITY
 
 
 @inner
-def moved(state, command, vehicle, h):
+def moved_on(state, command, vehicle, h):
     """The vehicle ``h`` seconds later."""
     if not vehicle.slips:
         return _rolled(state, command, command.acceleration, vehicle, h)

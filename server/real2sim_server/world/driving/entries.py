@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from ...scene.compiled import compiled_from, inner
 from .actuators import at_wheels, begun, left, sent
-from .bicycle import moved
+from .bicycle import moved_on
 from .curve import Curve, at, curve_through, end_of, heading
 from .ilqr import played, scheduled
 from .lqr import regulate
@@ -22,6 +23,27 @@ HOLD, PURSUIT, LQR, ILQR = range(4)
 SUBSTEP_US = 10_000
 
 entry = compiled_from(Path(__file__).parent)
+
+
+@entry
+def world_poses(poses, frame):
+    """Poses x, y [m], yaw [rad] of a frame in the world.
+
+    Args:
+        poses: [N, 3] float64, in the frame.
+        frame: x, y [m], yaw [rad] of the frame in the world.
+
+    Returns:
+        [N, 3] float64.
+    """
+    x, y, yaw = frame
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    moved = np.empty_like(poses)
+    for k in range(len(poses)):
+        px, py = poses[k, 0], poses[k, 1]
+        moved[k, 0], moved[k, 1] = x + cos * px - sin * py, y + sin * px + cos * py
+        moved[k, 2] = yaw + poses[k, 2]
+    return moved
 
 
 @entry
@@ -88,7 +110,7 @@ def driven(state, pending, driver, vehicle, dt_us):
         else:
             asked = _asked(driver, now, since + k * h, car)
         waiting = sent(line, waiting, asked)
-        now = moved(now, at_wheels(line, waiting, now, car, h), car, h)
+        now = moved_on(now, at_wheels(line, waiting, now, car, h), car, h)
     return _numbers(now, start.speed, substeps * h), left(line, waiting)
 
 

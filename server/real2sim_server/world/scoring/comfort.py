@@ -109,5 +109,5 @@ def plans_agree(before: PlanNote, now: PlanNote) -> bool | None:
     RMS differences of acceleration, jerk, yaw rate and yaw acceleration over the overlap, by
     finite differences of the plans in steps of 0.1 s. None where they overlap for less than 0.5 s.
     """
-    alike: int = plans_alike(*before.arrays, *now.arrays)
+    alike: int = plans_alike(before.times_us, before.continuous, now.times_us, now.continuous)
     return None if alike < 0 else bool(alike)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -88,17 +87,22 @@ class ContactNote:
 
 @dataclass(frozen=True, eq=False)
 class PlanNote:
-    """A trajectory that the planner sent: absolute times [us], poses x, y [m], yaw [rad], world."""
+    """A trajectory that the planner sent.
 
-    times_us: tuple[int, ...]
-    poses: tuple[tuple[float, float, float], ...]
+    Attributes:
+        times_us: [N] int64, absolute [us].
+        poses: [N, 3] float64, x, y [m], yaw [rad], world.
+    """
+
+    times_us: NDArray[np.int64]
+    poses: Float
 
     @cached_property
-    def arrays(self) -> tuple[NDArray[np.int64], Float]:
-        """Times [N] int64 [us] and poses [N, 3] float64, yaw continuous."""
-        poses = np.fromiter(chain.from_iterable(self.poses), np.float64).reshape(-1, 3)
+    def continuous(self) -> Float:
+        """Its poses with yaws continuous."""
+        poses = self.poses.copy()
         make_continuous(poses)
-        return np.array(self.times_us, dtype=np.int64), poses
+        return poses
 
 
 @dataclass(frozen=True, eq=False)
