@@ -7,7 +7,7 @@ import importlib.util
 import io
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 DEPTH_PNG_UNIT = 1 / 256
 """Metres of one level of depth sent as 16-bit png."""
-SUFFIX = {"jpeg": ".jpg", "png": ".png", "raw": ".npy"}
+AS_SENT = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
+"""Suffixes of files that hold the bytes of a codec."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,23 +74,31 @@ class Image:
         return target
 
     def _bytes_for(self, suffix: str) -> bytes:
-        as_sent = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
-        if suffix in as_sent[self.codec]:
-            return self.data
-        if suffix == ".npy":
-            buffer = io.BytesIO()
-            np.save(buffer, self.array)
-            return buffer.getvalue()
-        if suffix in {".jpg", ".jpeg"} and self.modality == "rgb":
-            import simplejpeg
+        writers = self._writers()
+        if suffix not in writers:
+            raise ValueError(
+                f"a {self.modality} image of codec {self.codec!r} cannot be written as "
+                f"{suffix!r}; use {' or '.join(map(repr, sorted(writers)))}"
+            )
+        return writers[suffix]()
 
-            encoded: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(self.array), quality=92)
-            return encoded
-        fitting = {SUFFIX[self.codec], ".npy"} | ({".jpg"} if self.modality == "rgb" else set())
-        raise ValueError(
-            f"a {self.modality} image of codec {self.codec!r} cannot be written as {suffix!r}; "
-            f"use {' or '.join(map(repr, sorted(fitting)))}"
-        )
+    def _writers(self) -> dict[str, Callable[[], bytes]]:
+        """Who writes the image, by each suffix that would do."""
+        writers: dict[str, Callable[[], bytes]] = {".npy": self._as_npy}
+        if self.modality == "rgb":
+            writers |= {".jpg": self._as_jpeg, ".jpeg": self._as_jpeg}
+        return writers | dict.fromkeys(AS_SENT[self.codec], lambda: self.data)
+
+    def _as_npy(self) -> bytes:
+        buffer = io.BytesIO()
+        np.save(buffer, self.array)
+        return buffer.getvalue()
+
+    def _as_jpeg(self) -> bytes:
+        import simplejpeg
+
+        encoded: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(self.array), quality=92)
+        return encoded
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -119,7 +119,7 @@ def test_a_suffix_that_would_lose_something_is_refused(tmp_path):
 
 
 def test_a_refused_suffix_names_each_that_would_do_once(tmp_path):
-    with pytest.raises(ValueError, match=r"as '\.png'; use '\.jpg' or '\.npy'$"):
+    with pytest.raises(ValueError, match=r"as '\.png'; use '\.jpeg' or '\.jpg' or '\.npy'$"):
         raw_image(IMAGE, "rgb", "uint8").save(tmp_path / "a.png")
 
 

@@ -76,7 +76,7 @@ class SyntheticSource:
         """RGB uint8 [H, W, 3] of a camera."""
         lens = self.rig[camera]
         t_us = int(self.drive.frame_times_us[frame])
-        pose = self.drive.ego.transform(t_us) @ lens.T_vehicle_camera
+        pose = lens.pose(self.drive.ego.transform(t_us))
         return self.render(pose, lens.K, lens.width, lens.height, t_us)[0]
 
     def render(

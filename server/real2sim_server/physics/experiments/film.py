@@ -52,7 +52,7 @@ def views(playback: Playback, experiment: Experiment) -> list[View]:
     """The scene's first camera where it stood at the start, and one near the subjects."""
     scene = playback.scene
     recorded = scene.rig.cameras[0]
-    stood = scene.ego.transform(experiment.options.start_us) @ recorded.T_vehicle_camera
+    stood = recorded.pose(scene.ego.transform(experiment.options.start_us))
     viewer = experiment.focus + experiment.distance * experiment.side / np.linalg.norm(
         experiment.side
     )

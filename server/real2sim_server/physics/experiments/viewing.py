@@ -44,7 +44,7 @@ def seen(scene: Scene, subject: PlacedObject) -> Seen:
         for camera in scene.rig.cameras:
             if not in_view(camera, ego, pose[:3, 3], farthest=np.inf):
                 continue
-            eye = (ego @ camera.T_vehicle_camera)[:3, 3]
+            eye = camera.pose(ego)[:3, 3]
             towards = (eye - pose[:3, 3]) @ pose[:3, :3]
             distance = float(np.linalg.norm(towards))
             angle = subject.scaled_size[1] * subject.scaled_size[2] / distance**2

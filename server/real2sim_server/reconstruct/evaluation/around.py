@@ -96,7 +96,7 @@ def logged_azimuths(log: SyntheticLog, track: ObjectTrack) -> list[float]:
             pose = track.transform_near(t_us)
             if pose is None:
                 continue
-            T_world_camera = log.ego.transform(t_us) @ camera.T_vehicle_camera
+            T_world_camera = camera.pose(log.ego.transform(t_us))
             u, v, depth = camera.K @ (invert_transform(T_world_camera) @ pose)[:3, 3]
             if depth > 0 and 0 < u < depth * camera.width and 0 < v < depth * camera.height:
                 x, y, _ = (invert_transform(pose) @ T_world_camera)[:3, 3]

@@ -9,7 +9,6 @@ from ...logs import DrivingLog
 from ...render import encode_rgb
 from ...scene import Camera
 from ...scene.box import box_corners
-from ...scene.rotation import invert_transform
 from ..training.data import image_time
 from .object_regions import box_outline, moving_tracks
 
@@ -51,7 +50,7 @@ def object_crops(
     not those whose middle is behind another one.
     """
     t_us = image_time(log, camera.name, frame)
-    T_camera_world = invert_transform(log.ego.transform(t_us) @ camera.T_vehicle_camera)
+    T_camera_world = camera.viewmat(log.ego.transform(t_us))
     found = []
     for track in moving_tracks(log):
         pose = track.transform_near(t_us)

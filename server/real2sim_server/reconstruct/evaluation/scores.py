@@ -226,7 +226,7 @@ def logged_pair(
 def logged_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
     """[H, W] bool, pixels within the boxes of moving objects."""
     t_us = image_time(log, camera.name, frame)
-    pose = log.ego.transform(t_us) @ camera.T_vehicle_camera
+    pose = camera.pose(log.ego.transform(t_us))
     return moving_mask(moving_tracks(log), camera, pose, t_us)
 
 

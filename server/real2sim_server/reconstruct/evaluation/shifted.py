@@ -83,7 +83,7 @@ def true_view(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], Float]:
     """RGB [H, W, 3], depth [H, W] [m], 0 in the sky, and ``T_world_camera`` of the truth."""
     vehicle = shifted_pose(truth.ego.transform(t_us), left)
-    pose = vehicle @ camera.T_vehicle_camera
+    pose = camera.pose(vehicle)
     rgb, depth, _ = truth.render(pose, camera.K, camera.width, camera.height, t_us)
     return rgb, depth, pose
 
@@ -106,7 +106,7 @@ def _compare(
     scene: Scene, truth: SyntheticLog, camera: Camera, *, t_us: int, left: float, backend: str
 ) -> _Compared | None:
     vehicle = shifted_pose(truth.ego.transform(t_us), left)
-    if _within_an_object(truth, (vehicle @ camera.T_vehicle_camera)[:3, 3], t_us):
+    if _within_an_object(truth, camera.pose(vehicle)[:3, 3], t_us):
         return None
     image, depth, pose = true_view(truth, camera, t_us, left)
     frame = render_view(scene, camera, t_us, left=left, backend=backend)

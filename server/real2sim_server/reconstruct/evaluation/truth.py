@@ -45,7 +45,7 @@ def find_truth(log: DrivingLog) -> Truth:
     except (TypeError, ValueError, KeyError) as error:
         return Truth(None, f"the config of log {log.name!r} is of no known street ({error})")
     camera, t_us = log.rig.cameras[0], log.image_time_us(log.rig.names[0], 0)
-    pose = street.ego.transform(t_us) @ camera.T_vehicle_camera
+    pose = camera.pose(street.ego.transform(t_us))
     image, _, _ = street.render(pose, camera.K, camera.width, camera.height, t_us)
     if psnr(image, log.image(camera.name, 0)) < SAME_DB:
         return Truth(None, f"log {log.name!r} shows another street than its config gives today")

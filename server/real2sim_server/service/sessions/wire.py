@@ -24,13 +24,12 @@ from ..websocket import Part
 
 FIXMAP = 16
 FRAMES, DATA = (msgpack.packb(name) for name in ("frames", "data"))
-RAW_DTYPES: dict[Modality, np.dtype[Any]] = {
-    "rgb": np.dtype(np.uint8),
-    "depth": np.dtype("<f4"),
-    "instance": np.dtype("<u2"),
+RAW_PIXELS: dict[Modality, tuple[np.dtype[Any], tuple[int, ...]]] = {
+    "rgb": (np.dtype(np.uint8), (3,)),
+    "depth": (np.dtype("<f4"), ()),
+    "instance": (np.dtype("<u2"), ()),
 }
-RAW_CHANNELS: dict[Modality, tuple[int, ...]] = {"rgb": (3,), "depth": (), "instance": ()}
-"""Shape of one pixel."""
+"""dtype and shape of one pixel."""
 
 
 @dataclass(eq=False)
@@ -181,7 +180,7 @@ def with_pixels(head: FrameHead, pixels: NDArray[Any]) -> EncodedFrame:
         TypeError: the image was drawn in another dtype or shape than its head says.
     """
     fields = head.fields
-    if list(pixels.shape) != fields["shape"] or pixels.dtype != RAW_DTYPES[fields["modality"]]:
+    if list(pixels.shape) != fields["shape"] or pixels.dtype != RAW_PIXELS[fields["modality"]][0]:
         raise TypeError(
             f"an image of {pixels.dtype} {pixels.shape} instead of {fields['dtype']} "
             f"{fields['shape']}"
@@ -191,8 +190,8 @@ def with_pixels(head: FrameHead, pixels: NDArray[Any]) -> EncodedFrame:
 
 def raw_bytes(modality: Modality, width: int, height: int) -> int:
     """Of an image of that size."""
-    channels = math.prod(RAW_CHANNELS[modality])
-    return width * height * channels * RAW_DTYPES[modality].itemsize
+    dtype, shape = RAW_PIXELS[modality]
+    return width * height * math.prod(shape) * dtype.itemsize
 
 
 def _placed(
@@ -215,11 +214,8 @@ def _placed(
 def _raw_head(placed: dict[str, Any], size: tuple[int, ...]) -> FrameHead:
     """Of a raw image of ``size`` (height, width)."""
     modality = placed["modality"]
-    form = {
-        "codec": "raw",
-        "dtype": RAW_DTYPES[modality].name,
-        "shape": [*size, *RAW_CHANNELS[modality]],
-    }
+    dtype, shape = RAW_PIXELS[modality]
+    form = {"codec": "raw", "dtype": dtype.name, "shape": [*size, *shape]}
     return _frame_head(placed | form, raw_bytes(modality, size[1], size[0]))
 
 
