@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,6 +73,11 @@ class Trajectory:
         object.__setattr__(
             self, "quaternions", np.where(unit[:, None], quaternions, quaternions / norms[:, None])
         )
+
+    @cached_property
+    def extent(self) -> float:
+        """Longer side of the rectangle around its places, seen from above [m]."""
+        return float(np.ptp(self.positions[:, :2], axis=0).max())
 
     @classmethod
     def from_transforms(cls, times_us: ArrayLike, transforms: ArrayLike) -> Trajectory:

@@ -56,8 +56,7 @@ def scoring_context(
     lanes = tuple(
         o.trajectory.positions[:, :2]
         for o in scene.objects.values()
-        if o.category in VEHICLES
-        and float(np.ptp(o.trajectory.positions[:, :2], axis=0).max()) > LANE_WAY
+        if o.category in VEHICLES and o.trajectory.extent > LANE_WAY
     )
     return ScoringContext(
         dt=clock.dt_us * 1e-6,

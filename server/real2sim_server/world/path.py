@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..scene import Trajectory
 from ..scene.rotation import quaternion_to_matrix, quaternion_yaw
-from .path_kernels import KNOT, nearest_point
+from .path_kernels import KNOT, nearest_point, point_at, sharpest_turn
 
 Float = NDArray[np.float64]
 
@@ -76,6 +76,16 @@ class LoggedPath:
     def length(self) -> float:
         """Distance from start to end [m]."""
         return float(self.s[-1])
+
+    def at(self, s: float) -> tuple[float, float, float, float]:
+        """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; before the start and after
+        the end straight on."""
+        x, y, z, yaw = point_at(self.knots, float(s))
+        return x, y, z, yaw
+
+    def sharpest_turn(self, s: float, reach: float) -> float:
+        """Largest curvature [1/m] over the ``reach`` metres from ``s`` on, in pieces of 4 m."""
+        return float(sharpest_turn(self.knots, float(s), float(reach)))
 
     def nearest(self, x: float, y: float, *, near_s: float | None = None) -> PathPoint:
         """The nearest point of the path to (x, y).

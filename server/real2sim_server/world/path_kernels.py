@@ -23,6 +23,15 @@ NEAR_BEHIND, NEAR_AHEAD = 20.0, 60.0
 LOST = 10.0
 """Farther from the path than this, the whole of it is searched [m]."""
 
+PIECE = 4.0
+"""Curvature is taken over pieces of this length [m]."""
+
+REACH = 80
+"""Whoever is ahead is looked for in as many metres, at points one metre apart."""
+
+SIDE = 0.3
+"""Room beside a box that counts as in the way [m]."""
+
 
 @compiled
 def nearest_point(knots, x, y, near_s):
@@ -92,6 +101,83 @@ def waypoints(knots, s, pose, count, spacing):
 def turn_between(knots, here, there):
     """Change of heading [rad] between two distances along the path [m]."""
     return _along(knots, there, 4) - _along(knots, here, 4)
+
+
+@compiled
+def point_at(knots, s):
+    """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; before the start and after the
+    end of the path straight on."""
+    yaw = _along(knots, s, 4)
+    beyond = s - min(max(s, 0.0), knots[len(knots) - 1, 0])
+    return (
+        _along(knots, s, 1) + beyond * math.cos(yaw),
+        _along(knots, s, 2) + beyond * math.sin(yaw),
+        _along(knots, s, 3),
+        yaw,
+    )
+
+
+@compiled
+def sharpest_turn(knots, s, reach):
+    """Largest curvature [1/m] of the path over the next ``reach`` metres, in pieces of 4 m."""
+    most, before = 0.0, _along(knots, s, 4)
+    for k in range(1, math.ceil(max(reach, 8.0) / PIECE) + 1):
+        now = _along(knots, s + PIECE * k, 4)
+        most, before = max(most, abs(now - before)), now
+    return most / PIECE
+
+
+@compiled
+def next_in_strip(knots, s, box, bodies, own):
+    """The body that is next in the strip a box sweeps along the path.
+
+    Bodies whose middle is beside or behind that of the box are not looked at.
+
+    Args:
+        knots: see above.
+        s: where the middle of the box is along the path [m].
+        box: its offset from the path, length and width [m].
+        bodies: [B, 7] float64: middle x, y [m], yaw [rad], length, width [m], velocity x, y [m/s].
+        own: row of the box itself.
+
+    Returns:
+        Gap from bumper to bumper [m], infinite where nobody is ahead, and speed along the path
+        [m/s].
+    """
+    offset, length, width = box
+    strip = np.empty((REACH, 3))
+    for i in range(REACH):
+        x, y, _, yaw = point_at(knots, s + i)
+        strip[i, 0], strip[i, 1] = x - offset * math.sin(yaw), y + offset * math.cos(yaw)
+        strip[i, 2] = yaw
+    gap, speed = math.inf, 0.0
+    for k in range(len(bodies)):
+        if k == own:
+            continue
+        body = bodies[k]
+        i = _nearest_row(strip, body[0], body[1])
+        dx, dy, heading = body[0] - strip[i, 0], body[1] - strip[i, 1], strip[i, 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        along, aside = i + dx * cos + dy * sin, dy * cos - dx * sin
+        if along <= 0.5 or i == REACH - 1:
+            continue
+        c, n = abs(math.cos(body[2] - heading)), abs(math.sin(body[2] - heading))
+        if abs(aside) >= width / 2 + (body[3] * n + body[4] * c) / 2 + SIDE:
+            continue
+        free = along - length / 2 - (body[3] * c + body[4] * n) / 2
+        if free < gap:
+            gap, speed = free, body[5] * cos + body[6] * sin
+    return gap, speed
+
+
+@compiled
+def _nearest_row(strip, x, y):
+    nearest, least = 0, math.inf
+    for i in range(len(strip)):
+        dx, dy = x - strip[i, 0], y - strip[i, 1]
+        if dx * dx + dy * dy < least:
+            nearest, least = i, dx * dx + dy * dy
+    return nearest
 
 
 @compiled

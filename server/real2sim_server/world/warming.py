@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from real2sim_proto.episode import ContactSpec, EgoSpec, ResetSpec
+from real2sim_proto.episode import AgentsSpec, ContactSpec, EgoSpec, ResetSpec
 from real2sim_proto.operations import Translate
 from real2sim_proto.plans import TrajectoryPlan
 
@@ -27,7 +27,10 @@ def warm_up() -> None:
     """
     scene = _street()
     spec = ResetSpec(
-        dt_us=PERIOD_US, on_collision="continue", contact=ContactSpec(background=False)
+        dt_us=PERIOD_US,
+        on_collision="continue",
+        contact=ContactSpec(background=False),
+        agents=AgentsSpec(default="idm"),
     )
     world = World(scene, ScenarioState.of(scene), spec)
     for _ in range(STEPS):

@@ -78,6 +78,55 @@ def test_the_nearest_point_is_nearer_than_all_points_of_a_fine_sampling(seed, x,
 
 
 @compiling
+@given(seed=seeds, s=st.floats(-5, 120), reach=st.floats(0, 60))
+def test_the_sharpest_turn_is_that_of_the_headings_every_four_metres(seed, s, reach):
+    knots = some_path(np.random.default_rng(seed))
+    at = s + np.arange(0.0, max(reach, 8.0) + 4.0, 4.0)
+    expected = np.abs(np.diff(np.interp(at, knots[:, 0], knots[:, 4]))).max() / 4
+
+    assert path_kernels.sharpest_turn(knots, s, reach) == pytest.approx(expected, abs=1e-12)
+
+
+def leader_by_numpy(knots, s, box, bodies, own) -> tuple[float, float]:
+    offset, length, width = box
+    at = s + np.arange(80.0)
+    x, y, yaw = (np.interp(at, knots[:, 0], knots[:, c]) for c in (1, 2, 4))
+    beyond = at - np.clip(at, 0, knots[-1, 0])
+    points = np.stack([x + beyond * np.cos(yaw), y + beyond * np.sin(yaw)], axis=1)
+    points += offset * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    _, rows = cKDTree(points).query(bodies[:, :2])
+    ways = bodies[:, :2] - points[rows]
+    ahead = np.stack([np.cos(yaw[rows]), np.sin(yaw[rows])], axis=1)
+    along = rows + (ways * ahead).sum(axis=1)
+    aside = ahead[:, 0] * ways[:, 1] - ahead[:, 1] * ways[:, 0]
+    c, n = np.abs(np.cos(bodies[:, 2] - yaw[rows])), np.abs(np.sin(bodies[:, 2] - yaw[rows]))
+    gaps = along - length / 2 - (bodies[:, 3] * c + bodies[:, 4] * n) / 2
+    blocks = np.abs(aside) < width / 2 + (bodies[:, 3] * n + bodies[:, 4] * c) / 2 + 0.3
+    blocks &= (along > 0.5) & (rows < 79) & (np.arange(len(bodies)) != own)
+    if not blocks.any():
+        return math.inf, 0.0
+    k = np.flatnonzero(blocks)[gaps[blocks].argmin()]
+    return gaps[k], bodies[k, 5:] @ ahead[k]
+
+
+@compiling
+@given(seed=seeds, count=st.integers(1, 12), s=st.floats(0, 80), offset=st.floats(-2, 2))
+def test_the_next_in_a_strip_is_the_nearest_of_those_that_block_it(seed, count, s, offset):
+    rng = np.random.default_rng(seed)
+    knots = some_path(rng)
+    on_it = rng.integers(0, len(knots), count)
+    bodies = np.empty((count, 7))
+    bodies[:, :2] = knots[on_it, 1:3] + rng.normal(scale=3.0, size=(count, 2))
+    bodies[:, 2] = rng.uniform(-7, 7, count)
+    bodies[:, 3:5] = rng.uniform(0.5, 6.0, (count, 2))
+    bodies[:, 5:] = rng.normal(scale=5.0, size=(count, 2))
+    box = (offset, 4.5, 1.8)
+
+    found = path_kernels.next_in_strip(knots, s, box, bodies, 0)
+    assert found == pytest.approx(leader_by_numpy(knots, s, box, bodies, 0), abs=1e-9)
+
+
+@compiling
 @given(seed=seeds, s=st.floats(-5, 120))
 def test_waypoints_are_places_of_the_path_in_the_vehicle_frame(seed, s):
     rng = np.random.default_rng(seed)
@@ -311,9 +360,9 @@ PLANS = {
     ("action", "ego"),
     [*(("trajectory", ego) for ego in EGOS), ("control", {}), ("control", DELAYED), ("pose", {})],
 )
-@pytest.mark.parametrize("on_collision", ["continue", "terminate"])
+@pytest.mark.parametrize(("on_collision", "default"), [("continue", "log"), ("terminate", "idm")])
 def test_steps_and_edits_after_the_warm_up_compile_nothing(
-    make_world, moving, action, ego, on_collision
+    make_world, moving, action, ego, on_collision, default
 ):
     warm_up()
     modules = (
@@ -331,7 +380,13 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
     world = make_world(
         car=moving(25, 0, z=0.8),
         aside=moving(12, 3, z=0.8, speed=3.0),
-        spec={"privileged": True, "action": action, "ego": ego, "on_collision": on_collision},
+        spec={
+            "privileged": True,
+            "action": action,
+            "ego": ego,
+            "on_collision": on_collision,
+            "agents": {"default": default},
+        },
     )
     assert world.apply([Translate(object_id="car", x=-11.0, y=2.0)]).warnings
     while not world.over:

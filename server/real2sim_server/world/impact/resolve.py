@@ -6,8 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-
-import numpy as np
+from typing import NamedTuple
 
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
@@ -102,13 +101,33 @@ class _Account:
     masses: tuple[float, float] = (math.inf, math.inf)
 
 
+class _Way(NamedTuple):
+    """How its driver moves an object through the step: places at the start and the end [m], yaw at
+    the start and its change [rad], velocity [m/s] and turn rate [rad/s]."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    yaw: float
+    turn: float
+    velocity: tuple[float, float]
+    rate: float
+
+    def after(self, share: float) -> Body:
+        """The object after a share of the step."""
+        (ax, ay), (bx, by), rest = self.start, self.end, 1 - share
+        x, y = rest * ax + share * bx, rest * ay + share * by
+        return Body(x, y, self.yaw + share * self.turn, *self.velocity, self.rate)
+
+
 @dataclass(eq=False)
 class _Run:
     bout: Bout
     solids: dict[str, Solid]
     bodies: dict[str, Body]
+    ways: dict[str, _Way]
     free: set[str]
     boxes: dict[str, tuple[float, float]]
+    reaches: dict[str, float]
     accounts: dict[tuple[str, str], _Account] = field(default_factory=dict)
     exempt: set[frozenset[str]] = field(default_factory=set)
     now_us: int = 0
@@ -144,6 +163,7 @@ def _begin(bout: Bout) -> _Run:
     boxes[EGO] = (bottom, bottom + bout.ego_size[2])
     friction = bout.spec.vehicle.friction
     start = {o.object_id: k for k, o in enumerate(bout.before.objects)}
+    ways: dict[str, _Way] = {}
     for k, subject in enumerate(bout.after.objects):
         i, size = subject.object_id, tuple(bout.after.sizes[k].tolist())
         z = float(bout.after.positions[k, 2])
@@ -152,15 +172,24 @@ def _begin(bout: Bout) -> _Run:
             solids[i], bodies[i] = bout.wrecks[i].solid, bout.wrecks[i].body
             continue
         solids[i] = solid_of(subject, bout.contact, friction=friction, size=size)
-        source, row = (bout.before, start[i]) if i in start else (bout.after, k)
-        bodies[i] = _body(source, row, bout.after.velocities[k])
-    return _Run(bout, solids, bodies, {EGO, *bout.wrecks}, boxes, exempt=set(bout.exempt))
+        way = _way(bout, start.get(i), k)
+        bodies[i] = way.after(0.0)._replace(turn=0.0)
+        if i in start:
+            ways[i] = way
+    reaches = {i: math.hypot(s.length, s.width) / 2 + 1 for i, s in solids.items()}
+    free = {EGO, *bout.wrecks}
+    return _Run(bout, solids, bodies, ways, free, boxes, reaches, exempt=set(bout.exempt))
 
 
-def _body(agents: Agents, row: int, velocity: np.ndarray) -> Body:
-    x, y, _ = agents.positions[row].tolist()
-    yaw = float(quaternion_yaw(agents.quaternions[row]))
-    return Body(x, y, yaw, float(velocity[0]), float(velocity[1]), 0.0)
+def _way(bout: Bout, row: int | None, k: int) -> _Way:
+    """Of the object that is in row ``k`` at the end and was in another at the start; an object
+    that has just appeared stands where it is."""
+    source, j = (bout.after, k) if row is None else (bout.before, row)
+    yaw = float(quaternion_yaw(source.quaternions[j]))
+    turn = math.remainder(float(quaternion_yaw(bout.after.quaternions[k])) - yaw, math.tau)
+    (ax, ay, _), (bx, by, _) = source.positions[j].tolist(), bout.after.positions[k].tolist()
+    vx, vy, _ = bout.after.velocities[k].tolist()
+    return _Way((ax, ay), (bx, by), yaw, turn, (vx, vy), turn / (bout.dt_us * 1e-6))
 
 
 def _move_ego(run: _Run, motion: Motion, sliding: bool, begin: int, end: int) -> Motion:
@@ -183,25 +212,14 @@ def _move_ego(run: _Run, motion: Motion, sliding: bool, begin: int, end: int) ->
 
 
 def _move_objects(run: _Run, begin: int, end: int) -> None:
-    bout = run.bout
-    share = end / bout.dt_us
-    start = {o.object_id: k for k, o in enumerate(bout.before.objects)}
-    for k, subject in enumerate(bout.after.objects):
-        i = subject.object_id
+    share = end / run.bout.dt_us
+    for i in run.bodies:
+        if i == EGO:
+            continue
         if i in run.free:
             run.bodies[i] = slid(run.bodies[i], run.solids[i], (end - begin) * 1e-6)
-        elif i in start:
-            a, b = bout.before.positions[start[i]], bout.after.positions[k]
-            turn = _turn(bout, start[i], k)
-            yaw = float(quaternion_yaw(bout.before.quaternions[start[i]])) + share * turn
-            x, y, _ = ((1 - share) * a + share * b).tolist()
-            vx, vy, _ = bout.after.velocities[k].tolist()
-            run.bodies[i] = Body(x, y, yaw, vx, vy, turn / (bout.dt_us * 1e-6))
-
-
-def _turn(bout: Bout, row: int, k: int) -> float:
-    before = float(quaternion_yaw(bout.before.quaternions[row]))
-    return math.remainder(float(quaternion_yaw(bout.after.quaternions[k])) - before, math.tau)
+        elif i in run.ways:
+            run.bodies[i] = run.ways[i].after(share)
 
 
 def _collide(run: _Run) -> bool:
@@ -226,17 +244,18 @@ def _collide(run: _Run) -> bool:
 
 def _near_pairs(run: _Run) -> list[tuple[str, str]]:
     """Pairs of a body that physics moves and another within reach; in the order of ids."""
-    ids = sorted(run.bodies)
-    places = np.array([run.bodies[i][:2] for i in ids])
-    reach = np.array([math.hypot(run.solids[i].length, run.solids[i].width) / 2 + 1 for i in ids])
-    apart = np.linalg.norm(places[:, None] - places, axis=2) - reach[:, None] - reach
-    pairs = []
-    for a, b in itertools.combinations(range(len(ids)), 2):
-        if apart[a, b] < 0 and (ids[a] in run.free or ids[b] in run.free):
-            (low_a, high_a), (low_b, high_b) = run.boxes[ids[a]], run.boxes[ids[b]]
-            if low_a < high_b and low_b < high_a:
-                pairs.append((ids[a], ids[b]))
-    return pairs
+    return [
+        (a, b)
+        for a, b in itertools.combinations(sorted(run.bodies), 2)
+        if (a in run.free or b in run.free) and _may_touch(run, a, b)
+    ]
+
+
+def _may_touch(run: _Run, a: str, b: str) -> bool:
+    (low_a, high_a), (low_b, high_b) = run.boxes[a], run.boxes[b]
+    (ax, ay, *_), (bx, by, *_) = run.bodies[a], run.bodies[b]
+    apart = math.hypot(ax - bx, ay - by)
+    return apart < run.reaches[a] + run.reaches[b] and low_a < high_b and low_b < high_a
 
 
 def _push(run: _Run, a: str, b: str, where: Touch) -> bool:

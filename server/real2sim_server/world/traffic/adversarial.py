@@ -18,7 +18,6 @@ from .driver import (
     AgentPose,
     Surroundings,
     level_quaternion,
-    on_path,
     pose_on_path,
 )
 from .idm import ahead
@@ -163,7 +162,7 @@ class JunctionCrossing:
     ) -> JunctionCrossing:
         """As far from the crossing as it goes at its speed in the time the ego needs."""
         meeting = seen.ego.s + spec.ahead
-        x, y, z, yaw = on_path(seen.route, meeting)
+        x, y, z, yaw = seen.route.at(meeting)
         eta = (spec.ahead - seen.ego.front) / max(seen.ego.speed, 1.0)
         made = cls(
             subject=subject,

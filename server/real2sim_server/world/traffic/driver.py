@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from ...edit import ObjectState
 from ..agents import Agents
 from ..contact import REAR_OVERHANG
+from ..contact_kernels import headings
 from ..ego import Motion
 from ..path import Float, LoggedPath, PathPoint
 
@@ -98,6 +100,23 @@ class Surroundings:
         """The step to be made [s]."""
         return self.dt_us * 1e-6
 
+    @cached_property
+    def bodies(self) -> Float:
+        """[B, 7] float64: middle x, y [m], yaw [rad], length, width [m], velocity x, y [m/s] of all
+        objects in their order, then of the ego."""
+        others, ego = self.others, self.ego
+        bodies = np.empty((len(others.objects) + 1, 7))
+        bodies[:-1, :2], bodies[:-1, 3:5] = others.positions[:, :2], others.sizes[:, :2]
+        bodies[:-1, 2], bodies[:-1, 5:] = headings(others.quaternions), others.velocities[:, :2]
+        vx, vy = ego.speed * math.cos(ego.yaw), ego.speed * math.sin(ego.yaw)
+        bodies[-1] = ego.x, ego.y, ego.yaw, ego.length, ego.width, vx, vy
+        return bodies
+
+    @cached_property
+    def rows(self) -> dict[str, int]:
+        """Row of each object in ``bodies``, by id."""
+        return {o.object_id: k for k, o in enumerate(self.others.objects)}
+
     @property
     def elapsed(self) -> float:
         """Time since the episode began [s]."""
@@ -132,26 +151,6 @@ def level_quaternion(yaw: float) -> tuple[float, float, float, float]:
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
-class PlaceOnPath(NamedTuple):
-    """A point of a path: position [m], heading [rad]."""
-
-    x: float
-    y: float
-    z: float
-    yaw: float
-
-
-def on_path(path: LoggedPath, s: float) -> PlaceOnPath:
-    """The point at distance ``s`` [m]; before its start and after its end straight on."""
-    inside = min(max(s, 0.0), path.length)
-    k = min(max(int(np.searchsorted(path.s, inside, side="right")) - 1, 0), len(path.s) - 2)
-    share = (inside - path.s[k]) / (path.s[k + 1] - path.s[k])
-    x, y, z = ((1 - share) * path.positions[k] + share * path.positions[k + 1]).tolist()
-    yaw = float((1 - share) * path.yaws[k] + share * path.yaws[k + 1])
-    beyond = s - inside
-    return PlaceOnPath(x + beyond * math.cos(yaw), y + beyond * math.sin(yaw), z, yaw)
-
-
 def pose_on_path(
     path: LoggedPath, s: float, speed: float, *, offset: float = 0.0, drift: float = 0.0
 ) -> AgentPose:
@@ -164,7 +163,7 @@ def pose_on_path(
         offset: from it, positive on the left [m].
         drift: rate at which the offset grows [m/s].
     """
-    x, y, z, yaw = on_path(path, s)
+    x, y, z, yaw = path.at(s)
     cos, sin = math.cos(yaw), math.sin(yaw)
     heading = yaw + (math.atan2(drift, speed) if speed > 0.5 else 0.0)
     return AgentPose(
@@ -173,10 +172,3 @@ def pose_on_path(
         heading,
         (speed * cos - drift * sin, speed * sin + drift * cos, 0.0),
     )
-
-
-def curvature_ahead(path: LoggedPath, s: float, reach: float) -> float:
-    """Largest curvature [1/m] of the path over the next ``reach`` metres, in pieces of 4 m."""
-    at = s + np.arange(0.0, max(reach, 8.0) + 4.0, 4.0)
-    yaws: Float = np.interp(at, path.s, path.yaws)
-    return float(np.abs(np.diff(yaws)).max()) / 4.0

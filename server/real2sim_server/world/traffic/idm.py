@@ -12,7 +12,7 @@ from real2sim_proto.episode import IdmDriver
 
 from ...edit import ObjectState
 from ..path import LoggedPath
-from .driver import AgentPose, Surroundings, curvature_ahead, pose_on_path
+from .driver import AgentPose, Surroundings, pose_on_path
 from .leader import Leader, leader_on
 from .replay import recorded_pose
 
@@ -85,7 +85,7 @@ class Idm:
             object_id=self.subject.object_id,
             seen=seen,
         )
-        bend = curvature_ahead(self.path, self.s, 2.0 * self.speed)
+        bend = self.path.sharpest_turn(self.s, 2.0 * self.speed)
         desired = min(self.desired, math.sqrt(self.spec.lateral / max(bend, 1e-4)))
         s, speed = ahead(
             self.s, self.speed, acceleration(self.spec, self.speed, desired, leader), seen.dt

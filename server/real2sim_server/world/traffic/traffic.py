@@ -204,8 +204,7 @@ def begin_driver(subject: ObjectState, spec: DriverSpec, seen: Surroundings) -> 
 
 
 def _moves(subject: ObjectState) -> bool:
-    positions = subject.trajectory.positions
-    return float(np.ptp(positions[:, :2], axis=0).max()) >= MOVING
+    return subject.trajectory.extent >= MOVING
 
 
 def _placed(base: Agents, drivers: Mapping[str, AgentDriver]) -> Agents:
