@@ -173,7 +173,7 @@ def _open(url: str, scenario_id: str, *, revision: int) -> list[float]:
 
 
 def _print(console: Console, figures: Figures) -> None:
-    table = Table("[ms]", "p50", "p95", "p99", "max", "n", title="edits", title_justify="left")
+    table = Table(r"\[ms]", "p50", "p95", "p99", "max", "n", title="edits", title_justify="left")
     for name in ("append_ms", "append_last_hundred_ms", "open_ms", "describe_ms", "preview_ms"):
         row = figures[name]
         numbers = [f"{row[column]:.2f}" for column in ("p50", "p95", "p99", "max")]

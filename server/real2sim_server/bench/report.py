@@ -41,7 +41,7 @@ def print_report(console: Console, figures: Mapping[str, Any]) -> None:
 
 
 def _latencies(figures: Mapping[str, Any]) -> Table:
-    table = Table("[ms]", "p50", "p95", "p99", "max", "n", title="latency", title_justify="left")
+    table = Table(r"\[ms]", "p50", "p95", "p99", "max", "n", title="latency", title_justify="left")
     rows = {title: figures[name] for name, title in TITLES.items()}
     lag = figures["event_loop"]
     rows["ping, worker idle"] = lag["ping_idle_ms"]
@@ -53,7 +53,7 @@ def _latencies(figures: Mapping[str, Any]) -> Table:
 
 
 def _stages(title: str, case: Mapping[str, Any]) -> Table:
-    table = Table("stage [ms]", "p50", "p95", "p99", title=title, title_justify="left")
+    table = Table(r"stage \[ms]", "p50", "p95", "p99", title=title, title_justify="left")
     rows = {**case["by_stage_ms"], "all but render and physics": case["overhead_ms"]}
     for stage, row in rows.items():
         table.add_row(stage, *(f"{row[name]:.2f}" for name in ("p50", "p95", "p99")))

@@ -50,6 +50,14 @@ def bench_serve(json: JsonFile = None) -> None:
     run_command(command.run, json_path=json)
 
 
+@bench.command("world")
+def bench_world(json: JsonFile = None) -> None:
+    """Time of a step of the world alone: vehicle, traffic, contact, scores; also uncompiled."""
+    from ..commands import bench_world as command
+
+    run_command(command.run, json_path=json)
+
+
 @bench.command("soak")
 def bench_soak(
     sessions: Annotated[int, typer.Option(min=1, max=32)] = 16,

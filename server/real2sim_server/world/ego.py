@@ -11,7 +11,7 @@ from real2sim_proto.episode import EgoSpec
 
 from ..scene import Trajectory
 from ..scene.rotation import quaternion_yaw
-from .driving import HOLD, Command, asked_of, driven, vehicle_of
+from .driving import HOLD, Command, PlanarState, asked_of, driven, vehicle_of
 from .path import Float
 
 SLOW = 0.1
@@ -22,17 +22,9 @@ NOTHING_PENDING = np.empty((0, 2))
 
 
 class Motion(NamedTuple):
-    """Planar state of the vehicle.
+    """Planar state of the vehicle: a :class:`.driving.PlanarState`, and what is on its way.
 
     Attributes:
-        x, y: rear axle centre, world [m].
-        yaw: heading [rad], not wrapped.
-        speed: along the heading [m/s].
-        acceleration: along the heading, mean over the last step [m/s^2].
-        steering: road-wheel angle, positive to the left [rad].
-        yaw_rate: [rad/s].
-        lateral_speed: of the rear axle, positive to the left; 0 while its wheels roll [m/s].
-        drive: acceleration that engine or brakes bring about now [m/s^2].
         pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
     """
 
@@ -59,7 +51,7 @@ class Motion(NamedTuple):
     @property
     def numbers(self) -> tuple[float, ...]:
         """All but the pending commands, as :mod:`.driving` takes a state."""
-        return tuple(map(float, self[:9]))
+        return tuple(map(float, self[: len(PlanarState._fields)]))
 
 
 class Driver(NamedTuple):

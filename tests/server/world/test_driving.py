@@ -24,6 +24,7 @@ from real2sim_server.world.driving import (
     LQR,
     PURSUIT,
     Command,
+    PlanarState,
     asked_of,
     curve_at,
     driven,
@@ -33,7 +34,6 @@ from real2sim_server.world.driving import (
 from real2sim_server.world.driving.curve import Curve
 from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS, scheduled
 from real2sim_server.world.driving.lqr import HEADWAY, TIME
-from real2sim_server.world.driving.state import PlanarState
 from real2sim_server.world.driving.tyres import integrate
 from real2sim_server.world.ego import Motion
 

@@ -6,7 +6,7 @@ other files hold what that is made of.
 
 from .curve import MOVING
 from .entries import HOLD, ILQR, LQR, PURSUIT, asked_of, curve_at, driven, plan_curve, world_poses
-from .state import Command
+from .state import Command, PlanarState
 from .vehicle import GRAVITY, Vehicle, vehicle_of
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "MOVING",
     "PURSUIT",
     "Command",
+    "PlanarState",
     "Vehicle",
     "asked_of",
     "curve_at",
