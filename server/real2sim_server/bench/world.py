@@ -27,6 +27,7 @@ from ..scene import Scene
 from ..scene.io import read_packed
 from ..world import World, warm_up
 from .drive_probe import straight_on
+from .serve import percentiles
 
 Figures = dict[str, Any]
 
@@ -73,12 +74,7 @@ def _case(scene: Scene, spec: Mapping[str, Any], episodes: int) -> Figures:
     steps = [times for _ in range(episodes) for times in _episode(scene, ResetSpec(**spec))]
     spent = np.array(steps) * 1e6
     columns = dict(zip((*HALVES, "step"), (*spent.T, spent.sum(axis=1)), strict=True))
-    return {"steps": len(steps), **{name: _spread(column) for name, column in columns.items()}}
-
-
-def _spread(microseconds: np.ndarray) -> dict[str, float]:
-    p50, p95 = np.percentile(microseconds, [50, 95]).tolist()
-    return {"p50": p50, "p95": p95, "max": float(microseconds.max())}
+    return {"steps": len(steps), **{n: percentiles(c.tolist()) for n, c in columns.items()}}
 
 
 def _episode(scene: Scene, spec: ResetSpec) -> Iterator[tuple[float, float, float]]:

@@ -28,9 +28,10 @@ def compiled_from(folder: Path) -> Callable[[Callable[..., Any]], Any]:
     that changes one of those it would go on with the old machine code. So the name of each
     carries a fingerprint of all sources in the folder.
     """
+    mark = fingerprint(sorted(folder.glob("*.py")))
 
     def decorate(function: Callable[..., Any]) -> Any:
-        function.__qualname__ += f"_{fingerprint(sorted(folder.glob('*.py')))}"
+        function.__qualname__ += f"_{mark}"
         return compiled(function)
 
     return decorate

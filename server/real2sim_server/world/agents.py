@@ -10,6 +10,11 @@ Agents = Placed[ObjectState]
 """Where all objects are at one instant."""
 
 
+def rows_of(agents: Agents) -> dict[str, int]:
+    """The row of each object, by id."""
+    return {o.object_id: k for k, o in enumerate(agents.objects)}
+
+
 def agent_fields(agents: Agents) -> list[dict[str, Any]]:
     """The wire's AgentState of each object, as plain maps."""
     poses = zip(

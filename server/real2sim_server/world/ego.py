@@ -93,7 +93,7 @@ def drive(
     pending = np.array(motion.pending) if motion.pending else NOTHING_PENDING
     vehicle = tuple(vehicle_of(spec))
     state, waiting = driven(motion.numbers, pending, driver.after(since), vehicle, dt_us)
-    return Motion(*state, tuple(Command(*row) for row in waiting.tolist()))
+    return Motion(*state, pending=tuple(Command(*row) for row in waiting.tolist()))
 
 
 def asked(motion: Motion, driver: Driver, spec: EgoSpec, *, since: float = 0.0) -> Command:

@@ -18,9 +18,8 @@ from .ego import Motion, logged_motion
 from .episode import Clock
 from .events import Event
 from .path import LoggedPath, PathPoint
-from .pilot import Plan
 from .reference import Course
-from .scoring import EgoSample, Others, PlanNote, ScoringContext
+from .scoring import EgoSample, Others, ScoringContext
 from .scoring.comfort import window_of
 from .scoring.instant import VEHICLES
 
@@ -29,12 +28,12 @@ class Unjudged(NamedTuple):
     """A step that has been made and not judged yet.
 
     Attributes:
-        plan: given to the ego, in the world; None for none.
+        course: given to the ego; None where there was no new trajectory.
         events: that led to it.
         left: by its impacts; None where bodies pass through each other.
     """
 
-    plan: Plan | None
+    course: Course | None
     events: tuple[Event, ...]
     left: Aftermath | None
 
@@ -113,8 +112,3 @@ def others_of(agents: Agents) -> Others:
         sizes=agents.sizes,
         velocities=np.ascontiguousarray(agents.velocities[:, :2]),
     )
-
-
-def plan_note(plan: object) -> PlanNote | None:
-    """A trajectory for the scores; None for other plans."""
-    return PlanNote(plan.times_us, plan.poses) if isinstance(plan, Course) else None

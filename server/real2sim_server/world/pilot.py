@@ -83,6 +83,11 @@ class Coming:
     from_us: int
     plan: Planned
 
+    @property
+    def course(self) -> Course | None:
+        """The plan where it is a trajectory."""
+        return self.plan if isinstance(self.plan, Course) else None
+
 
 @dataclass(frozen=True, eq=False)
 class Pilot:

@@ -34,12 +34,12 @@ from ..edit import AssetLookup, ScenarioState, pack_state, unpack_state
 from ..scene import Scene
 from . import scoring
 from .history import Entry, Retold
+from .reference import Course
 from .scoring import (
     ContactNote,
     EgoSample,
     Instant,
     Others,
-    PlanNote,
     Score,
     ScoringContext,
     Tally,
@@ -310,7 +310,7 @@ def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
     plan = None
     if "plan" in row:
         times, poses = row["plan"]
-        plan = PlanNote(np.array(times, np.int64), np.array(poses, np.float64))
+        plan = Course(np.array(times, np.int64), np.array(poses, np.float64))
     instant = Instant(
         step=row["step"],
         t_us=row["t_us"],

@@ -24,13 +24,14 @@ from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
 from .impact import Deformation, Dents, Impact
-from .judging import Unjudged, ego_sample, others_of, plan_note, scoring_context
+from .judging import Unjudged, ego_sample, others_of, scoring_context
 from .observation import Observation
 from .obstacles import obstacles_of
 from .path import Float, LoggedPath, PathPoint
 from .pilot import Pilot, Plan, braking
+from .reference import Course
 from .route import command_ahead, route_ahead
-from .scoring import Instant, PlanNote, Score, Tally
+from .scoring import Instant, Score, Tally
 from .traffic import EgoSeen, Surroundings, Traffic
 
 LEFT_LOG = 10.0
@@ -167,7 +168,7 @@ class World:
         """
         self._check_running()
         pilot = self._told(plan, latency_us)
-        given = pilot.coming[-1].plan if plan is not None else None
+        given = pilot.coming[-1].course if plan is not None else None
         late = [Event("deadline_missed", self.t_us)] if missed else []
         if missed and self.spec.on_timeout == "brake":
             fallback = braking(pilot, self.motion, self.spec.ego)
@@ -190,7 +191,7 @@ class World:
             self._moved = None
             left = self._overlapped() if left is None else left
             self._contacts = replace(self._contacts, touching=left.touching)
-            self.instant = self._instant(left, plan_note(given))
+            self.instant = self._instant(left, given)
             self.tally = scoring.after(self.tally, self.instant, self._context)
             self._events = (*events, *left.events, *self._strayed(), *self._ended())
         return list(self._events)
@@ -387,12 +388,11 @@ class World:
         clock = self._clock
         return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
 
-    def _instant(self, left: Aftermath, plan: PlanNote | None = None) -> Instant:
-        z = float(self.T_world_vehicle[2, 3])
+    def _instant(self, left: Aftermath, plan: Course | None = None) -> Instant:
         return Instant(
             step=self.steps,
             t_us=self.t_us,
-            ego=ego_sample(self.motion, self._near, z),
+            ego=ego_sample(self.motion, self._near, float(self.T_world_vehicle[2, 3])),
             others=others_of(self.agents),
             contacts=left.notes,
             secondary=left.secondary,

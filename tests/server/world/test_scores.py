@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from real2sim_server.world import scoring
+from real2sim_server.world.reference import Course
 from real2sim_server.world.scoring import (
     ContactNote,
     EgoSample,
     Instant,
     Others,
-    PlanNote,
     ScoringContext,
 )
 from real2sim_server.world.scoring.boxes import side_of_contact
@@ -324,7 +324,7 @@ def with_plans(instants: list[Instant], speed_of) -> list[Instant]:
         times = i.t_us + 100_000 * ahead
         poses = np.zeros((20, 3))
         poses[:, 0] = i.ego.x + speed_of(i.step) * DT * ahead
-        planned.append(replace(i, plan=PlanNote(times, poses)))
+        planned.append(replace(i, plan=Course(times, poses)))
     return planned
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ...scene.rotation import multiply_quaternions, quaternion_yaw, yaw_quaternion
-from ..agents import Agents
+from ..agents import Agents, rows_of
 from ..driving import Command
 from ..ego import Motion
 from ..scoring.boxes import side_of_contact
@@ -162,7 +162,7 @@ def _begin(bout: Bout) -> _Run:
     bottom = bout.height(bout.motion.x, bout.motion.y)
     boxes[EGO] = (bottom, bottom + bout.ego_size[2])
     friction = bout.spec.vehicle.friction
-    start = {o.object_id: k for k, o in enumerate(bout.before.objects)}
+    start = rows_of(bout.before)
     ways: dict[str, _Way] = {}
     for k, subject in enumerate(bout.after.objects):
         i, size = subject.object_id, tuple(bout.after.sizes[k].tolist())

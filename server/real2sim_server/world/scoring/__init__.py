@@ -6,7 +6,6 @@ from .instant import (
     EgoSample,
     Instant,
     Others,
-    PlanNote,
     ScoringContext,
 )
 from .tally import Tally, after, begin
@@ -17,7 +16,6 @@ __all__ = [
     "EgoSample",
     "Instant",
     "Others",
-    "PlanNote",
     "Score",
     "ScoringContext",
     "Tally",

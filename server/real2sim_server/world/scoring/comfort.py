@@ -11,8 +11,8 @@ import numpy as np
 from scipy.signal import savgol_coeffs
 
 from ..path import Float
+from ..reference import Course
 from .comfort_kernels import derivatives, plans_alike, slid
-from .instant import PlanNote
 
 WINDOW_S = 1.5
 ORDER = 3
@@ -103,11 +103,11 @@ def felt_in(samples: Float, dt: float) -> Felt:
     return Felt(acceleration, lateral, jerk, lon_jerk, rate, yaw_acceleration)
 
 
-def plans_agree(before: PlanNote, now: PlanNote) -> bool | None:
+def plans_agree(before: Course, now: Course) -> bool | None:
     """Whether two successive plans feel alike where both say something.
 
     RMS differences of acceleration, jerk, yaw rate and yaw acceleration over the overlap, by
     finite differences of the plans in steps of 0.1 s. None where they overlap for less than 0.5 s.
     """
-    alike: int = plans_alike(before.times_us, before.continuous, now.times_us, now.continuous)
+    alike: int = plans_alike(before.times_us, before.poses, now.times_us, now.poses)
     return None if alike < 0 else bool(alike)

@@ -84,7 +84,7 @@ def plans_alike(times_a, poses_a, times_b, poses_b):
 
     Args:
         times_a, times_b: [N] int64, increasing [us].
-        poses_a, poses_b: [N, 3] float64, x, y [m], continuous yaw [rad].
+        poses_a, poses_b: [N, 3] float64, x, y [m], yaw [rad].
 
     Returns:
         1 for alike, 0 for not, -1 where they overlap for less than 0.5 s.
@@ -93,6 +93,9 @@ def plans_alike(times_a, poses_a, times_b, poses_b):
     count = int((last - first) * 1e-6 / PLAN_STEP + 1e-6) + 1
     if count < SHORTEST_OVERLAP:
         return -1
+    poses_a, poses_b = poses_a.copy(), poses_b.copy()
+    make_continuous(poses_a)
+    make_continuous(poses_b)
     speeds, rates = np.empty((2, count - 1)), np.empty((2, count - 1))
     _differentiate(times_a, poses_a, first, speeds[0], rates[0])
     _differentiate(times_b, poses_b, first, speeds[1], rates[1])

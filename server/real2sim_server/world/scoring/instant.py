@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..path import Float
-from .comfort_kernels import make_continuous
+from ..reference import Course
 from .road_kernels import DENSITY, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
@@ -86,26 +86,6 @@ class ContactNote:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanNote:
-    """A trajectory that the planner sent.
-
-    Attributes:
-        times_us: [N] int64, absolute [us].
-        poses: [N, 3] float64, x, y [m], yaw [rad], world.
-    """
-
-    times_us: NDArray[np.int64]
-    poses: Float
-
-    @cached_property
-    def continuous(self) -> Float:
-        """Its poses with yaws continuous."""
-        poses = self.poses.copy()
-        make_continuous(poses)
-        return poses
-
-
-@dataclass(frozen=True, eq=False)
 class Instant:
     """One committed instant.
 
@@ -124,7 +104,7 @@ class Instant:
     others: Others
     contacts: tuple[ContactNote, ...] = ()
     secondary: int = 0
-    plan: PlanNote | None = None
+    plan: Course | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..path import Float
+from ..reference import Course
 from .comfort import Ride, plans_agree
 from .comfort_kernels import summed
 from .hazard import NEVER, time_to_collision
-from .instant import VEHICLES, VRU, ContactNote, EgoSample, Instant, PlanNote, ScoringContext
+from .instant import VEHICLES, VRU, ContactNote, EgoSample, Instant, ScoringContext
 
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
 ONCOMING_WINDOW_S = 1.0
@@ -78,7 +79,7 @@ class Tally:
     oncoming: float = 0.0
     lane_run: float = 0.0
     left_lane: bool = False
-    plan: PlanNote | None = None
+    plan: Course | None = None
     plans_compared: int = 0
     plans_disagree: bool = False
     overspeed: float = 0.0
@@ -207,7 +208,7 @@ def kind_of(category: str) -> str:
     return "vehicle" if category in VEHICLES else "object"
 
 
-def _of_plans(tally: Tally, plan: PlanNote | None) -> dict[str, Any]:
+def _of_plans(tally: Tally, plan: Course | None) -> dict[str, Any]:
     """The newest plan, and how successive ones compare so far."""
     compared, disagree = tally.plans_compared, tally.plans_disagree
     if plan is not None and tally.plan is not None:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 
 from ...edit import ObjectState
-from ..agents import Agents
+from ..agents import Agents, rows_of
 from ..contact import REAR_OVERHANG
 from ..contact_kernels import headings
 from ..ego import Motion
@@ -115,7 +115,7 @@ class Surroundings:
     @cached_property
     def rows(self) -> dict[str, int]:
         """Row of each object in ``bodies``, by id."""
-        return {o.object_id: k for k, o in enumerate(self.others.objects)}
+        return rows_of(self.others)
 
     @property
     def elapsed(self) -> float:

@@ -26,7 +26,7 @@ from real2sim_proto.episode import (
 
 from ...edit import ObjectState, ScenarioState
 from ...scene.rotation import transform_from
-from ..agents import Agents
+from ..agents import Agents, rows_of
 from ..errors import WorldError
 from ..path import Float
 from .adversarial import CutIn, HardBrake, JunctionCrossing
@@ -211,7 +211,7 @@ def _placed(base: Agents, drivers: Mapping[str, AgentDriver]) -> Agents:
     """``base`` with the objects that have drivers where those have brought them."""
     if not drivers:
         return base
-    rows = {o.object_id: k for k, o in enumerate(base.objects)}
+    rows = rows_of(base)
     keep = [k for i, k in rows.items() if i not in drivers or drivers[i].present]
     late = [d for i, d in drivers.items() if i not in rows and d.present]
     poses = {rows[i]: d.pose for i, d in drivers.items() if i in rows and d.present}
