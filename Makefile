@@ -23,7 +23,7 @@ format: $(STAMP)
 
 schema: $(STAMP)
 	$(BIN)/python -m real2sim_proto.schema proto/schema
-	$(BIN)/python -m real2sim_server.service.openapi docs/openapi.json
+	$(BIN)/python -m real2sim_server.service.http.openapi docs/openapi.json
 
 bench: $(STAMP)
 	$(BIN)/real2sim bench render --json out/bench_render.json

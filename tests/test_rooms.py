@@ -11,14 +11,16 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SERVER = REPOSITORY / "server" / "real2sim_server"
 
 FLOORS = (
+    "geometry",
     "scene",
     "render",
     "physics",
+    "simulation",
     "logs",
+    "synthetic",
     "reconstruct",
     "edit",
     "world",
-    "datasets",
     "service",
 )
 """Rooms of the server, lowest first."""
@@ -62,7 +64,7 @@ def test_a_room_imports_no_room_above_it(room):
 )
 def test_packages_meet_only_in_the_contract(package, forbidden):
     root = REPOSITORY / package
-    allowed_bridges = {"cli", "demo", "bench", "policies"}
+    allowed_bridges = {"cli", "demo", "benchmarks", "policies"}
     for file in python_files(root):
         if root.name == "real2sim_server" and allowed_bridges & set(file.relative_to(root).parts):
             continue

@@ -1,6 +1,6 @@
 """The client's side of the drive socket, without the socket.
 
-Both twins of the drive session talk through a :class:`Conversation`: it numbers messages, says
+Both twins of the drive session talk through a :class:`ProtocolState`: it numbers messages, says
 which answer is awaited, and turns bytes into answers or exceptions.
 """
 
@@ -73,7 +73,7 @@ _STATUS = {code.value: status for code, status in HTTP_STATUS.items()}
 
 
 @dataclass(frozen=True)
-class Question(Generic[A]):
+class PendingRequest(Generic[A]):
     """A message that goes out, and the answer that it waits for.
 
     Attributes:
@@ -92,7 +92,7 @@ class Question(Generic[A]):
     only_at: int | None = None
 
 
-class Conversation:
+class ProtocolState:
     """Numbers messages and follows the session's step and revision."""
 
     def __init__(self) -> None:
@@ -108,7 +108,7 @@ class Conversation:
 
     def hello(
         self, *, sdk: str, role: str, token: str | None, resume_token: str | None = None
-    ) -> Question[Welcome]:
+    ) -> PendingRequest[Welcome]:
         """The first message; with a resume token it goes on where the connection was lost."""
         resume = None
         if resume_token is not None:
@@ -126,12 +126,12 @@ class Conversation:
             message, Welcome, "welcome (scene loading, first render)", patient=True
         )
 
-    def reset(self, spec: ResetSpec) -> Question[Obs]:
+    def reset(self, spec: ResetSpec) -> PendingRequest[Obs]:
         """Starts an episode."""
         message = Reset(id=self._next_id(), spec=spec)
         return self._question(message, Obs, "observation 0 after reset", patient=True)
 
-    def action(self, plan: Plan | Mapping[str, Any]) -> Question[Obs]:
+    def action(self, plan: Plan | Mapping[str, Any]) -> PendingRequest[Obs]:
         """Answers the newest observation.
 
         Raises:
@@ -145,14 +145,14 @@ class Conversation:
         message = Action(id=self._next_id(), step=self._step, plan=valid_plan(plan))
         return self._question(message, Obs, f"observation {self._step + 1}")
 
-    def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> Question[Edited]:
+    def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> PendingRequest[Edited]:
         """Changes the session's world, on the revision seen last."""
         message = checked(
             Edit, id=self._next_id(), base_rev=self._revision, operations=list(operations)
         )
         return self._question(message, Edited, "confirmation of the edit", only_at=self._revision)
 
-    def render(self, sensors: Sequence[SensorSpec]) -> Question[View]:
+    def render(self, sensors: Sequence[SensorSpec]) -> PendingRequest[View]:
         """Asks for images of the current instant."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors))
         return self._question(message, View, "images")
@@ -162,7 +162,7 @@ class Conversation:
         object_id: str,
         times_us: Sequence[int],
         poses: Sequence[tuple[float, float, float]],
-    ) -> Question[Driven]:
+    ) -> PendingRequest[Driven]:
         """Says where an externally driven object goes."""
         message = checked(
             Agent,
@@ -173,27 +173,27 @@ class Conversation:
         )
         return self._question(message, Driven, "confirmation of the object's plan")
 
-    def snapshot(self, name: str) -> Question[Kept]:
+    def snapshot(self, name: str) -> PendingRequest[Kept]:
         """Keeps the present instant."""
         message = checked(Snapshot, id=self._next_id(), name=name)
         return self._question(message, Kept, "confirmation of the snapshot")
 
-    def restore(self, name: str) -> Question[Obs]:
+    def restore(self, name: str) -> PendingRequest[Obs]:
         """Goes back to a snapshot."""
         message = checked(Restore, id=self._next_id(), name=name)
         return self._question(message, Obs, f"observation of snapshot {name!r}", patient=True)
 
-    def fork(self) -> Question[Forked]:
+    def fork(self) -> PendingRequest[Forked]:
         """Makes another session at the same instant."""
         return self._question(Fork(id=self._next_id()), Forked, "a fork", repeatable=False)
 
-    def bye(self) -> Question[Result]:
+    def bye(self) -> PendingRequest[Result]:
         """Ends the session."""
         return self._question(
             Bye(id=self._next_id()), Result, "result of the session", repeatable=False
         )
 
-    def read(self, data: bytes | str, question: Question[A]) -> A | None:
+    def read(self, data: bytes | str, question: PendingRequest[A]) -> A | None:
         """The answer in ``data``; None where it is progress, or late for an older question.
 
         Raises:
@@ -258,9 +258,11 @@ class Conversation:
         return self._ids
 
     @staticmethod
-    def _question(message: Envelope, answer: type[A], awaited: str, **how: Any) -> Question[A]:
+    def _question(
+        message: Envelope, answer: type[A], awaited: str, **how: Any
+    ) -> PendingRequest[A]:
         fields = message.model_dump(mode="python", exclude_none=True)
-        return Question(message.id, encode(fields), answer, awaited, **how)
+        return PendingRequest(message.id, encode(fields), answer, awaited, **how)
 
 
 def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:

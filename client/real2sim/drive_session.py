@@ -23,7 +23,7 @@ from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import SessionInfo
 
 from . import _requests
-from ._conversation import Conversation, Question
+from ._conversation import PendingRequest, ProtocolState
 from ._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from ._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
 from ._transport import Target, Transport
@@ -82,7 +82,7 @@ class SessionBase:
         self._target = target
         self._plan = plan
         self._codec = target.codec(plan.codec)
-        self._conversation = Conversation()
+        self._conversation = ProtocolState()
         self._welcome: Welcome | None = None
         self._result: Result | None = None
         self._token = plan.token
@@ -128,17 +128,17 @@ class SessionBase:
         """Final scores; known after ``close``."""
         return self._result
 
-    def _hello(self) -> Question[Welcome]:
+    def _hello(self) -> PendingRequest[Welcome]:
         resume_token = self._welcome.resume_token if self._welcome else None
         return self._conversation.hello(
             sdk=SDK, role=self._plan.role, token=self._token, resume_token=resume_token
         )
 
-    def _comes_back(self, question: Question[Any]) -> bool:
+    def _comes_back(self, question: PendingRequest[Any]) -> bool:
         """Whether it is worth connecting again for the sake of a question."""
         return self._welcome is not None and self._plan.reconnect > 0 and question.repeatable
 
-    def _check_repeatable(self, question: Question[Any]) -> None:
+    def _check_repeatable(self, question: PendingRequest[Any]) -> None:
         """Raises ConnectionLostError when the question may have taken effect already."""
         if question.only_at is not None and self.welcome.revision != question.only_at:
             raise ConnectionLostError(
@@ -147,10 +147,10 @@ class SessionBase:
                 hint="the session goes on; look at the next observation",
             )
 
-    def _seconds(self, question: Question[Any]) -> float:
+    def _seconds(self, question: PendingRequest[Any]) -> float:
         return self._target.patience if question.patient else self._target.timeout
 
-    def _late(self, question: Question[Any]) -> ReplyTimeoutError:
+    def _late(self, question: PendingRequest[Any]) -> ReplyTimeoutError:
         return ReplyTimeoutError(
             f"{question.awaited} from {self._target.url}",
             self._seconds(question),
@@ -320,7 +320,7 @@ class DriveSession(SessionBase):
                 time.sleep(wait)
         return None
 
-    def _ask(self, question: Question[A]) -> A:
+    def _ask(self, question: PendingRequest[A]) -> A:
         try:
             return self._exchange(question)
         except ConnectionLostError:
@@ -330,7 +330,7 @@ class DriveSession(SessionBase):
             self._check_repeatable(question)
             return self._exchange(question)
 
-    def _exchange(self, question: Question[A]) -> A:
+    def _exchange(self, question: PendingRequest[A]) -> A:
         socket = self._open_socket()
         seconds = self._seconds(question)
         with lost_connection(self._target, question.awaited):

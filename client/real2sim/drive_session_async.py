@@ -19,7 +19,7 @@ from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import SessionInfo
 
 from . import _requests
-from ._conversation import Question
+from ._conversation import PendingRequest
 from ._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from ._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
 from ._transport import AsyncTransport
@@ -162,7 +162,7 @@ class AsyncDriveSession(SessionBase):
                 await asyncio.sleep(wait)
         return None
 
-    async def _ask(self, question: Question[A]) -> A:
+    async def _ask(self, question: PendingRequest[A]) -> A:
         try:
             return await self._exchange(question)
         except ConnectionLostError:
@@ -172,7 +172,7 @@ class AsyncDriveSession(SessionBase):
             self._check_repeatable(question)
             return await self._exchange(question)
 
-    async def _exchange(self, question: Question[A]) -> A:
+    async def _exchange(self, question: PendingRequest[A]) -> A:
         socket = self._open_socket()
         seconds = self._seconds(question)
         with lost_connection(self._target, question.awaited):

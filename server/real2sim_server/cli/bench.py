@@ -16,7 +16,7 @@ def bench_render(
     json: JsonFile = None,
 ) -> None:
     """Milliseconds by stage and Gaussians per second, as ratio to the plain reference."""
-    from ..commands import bench_render as command
+    from . import bench_render as command
 
     run_command(command.run, splat=splat, json_path=json)
 
@@ -24,7 +24,7 @@ def bench_render(
 @bench.command("reconstruct")
 def bench_reconstruct(json: JsonFile = None) -> None:
     """Training iterations per second by stage, at 76,000 Gaussians and 621x188."""
-    from ..commands import bench_reconstruct as command
+    from . import bench_reconstruct as command
 
     run_command(command.run, json_path=json)
 
@@ -37,7 +37,7 @@ def bench_physics(
     json: JsonFile = None,
 ) -> None:
     """Particle-substeps per second, and what they depend on."""
-    from ..commands import bench_physics as command
+    from . import bench_physics as command
 
     run_command(command.run, peers=peers, json_path=json)
 
@@ -45,7 +45,7 @@ def bench_physics(
 @bench.command("serve")
 def bench_serve(json: JsonFile = None) -> None:
     """Latency of a drive step, share of rendering, lag of the event loop, memory per session."""
-    from ..commands import bench_serve as command
+    from . import bench_serve as command
 
     run_command(command.run, json_path=json)
 
@@ -53,7 +53,7 @@ def bench_serve(json: JsonFile = None) -> None:
 @bench.command("world")
 def bench_world(json: JsonFile = None) -> None:
     """Time of a step of the world alone: vehicle, traffic, contact, scores; also uncompiled."""
-    from ..commands import bench_world as command
+    from . import bench_world as command
 
     run_command(command.run, json_path=json)
 
@@ -66,7 +66,7 @@ def bench_soak(
     json: JsonFile = None,
 ) -> None:
     """Many sessions side by side, misbehaving planners among them; every answer, and memory."""
-    from ..commands import bench_soak as command
+    from . import bench_soak as command
 
     run_command(command.run, sessions=sessions, minutes=minutes, rate=rate, json_path=json)
 
@@ -76,6 +76,6 @@ def bench_edit(
     operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000, json: JsonFile = None
 ) -> None:
     """Time of an edit, and of opening a scenario that has had many."""
-    from ..commands import bench_edit as command
+    from . import bench_edit as command
 
     run_command(command.run, operations=operations, json_path=json)

@@ -107,7 +107,7 @@ def replay(
     json: JsonFile = None,
 ) -> None:
     """Score a recorded episode; with its scene, check that it comes out the same, and film it."""
-    from ..commands import replay as command
+    from . import replay as command
 
     run_command(
         command.run,

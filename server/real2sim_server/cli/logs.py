@@ -22,7 +22,7 @@ def synth(
     json: JsonFile = None,
 ) -> None:
     """Generate a driving log of a procedural street: cameras, LiDAR, exact poses and boxes."""
-    from ..commands import synth as command
+    from . import synth as command
 
     run_command(
         command.run,
@@ -47,7 +47,7 @@ def log_info(
     json: JsonFile = None,
 ) -> None:
     """Say what a log holds, and draw its boxes and LiDAR on its images."""
-    from ..commands import log_info as command
+    from . import log_info as command
 
     run_command(
         command.run,
@@ -80,7 +80,7 @@ def track(
     json: JsonFile = None,
 ) -> None:
     """Find what moves in the LiDAR of a log without boxes, and write the log with them."""
-    from ..commands import track as command
+    from . import track as command
 
     run_command(
         command.run,

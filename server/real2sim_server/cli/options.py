@@ -21,6 +21,6 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is th
 
 def run_command(command: Any, **arguments: Any) -> None:
     """Run a command's function; what it raises for the user is printed as a sentence."""
-    from ..commands import console
+    from .. import console
 
     console.run_command(command, **arguments)

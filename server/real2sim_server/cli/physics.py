@@ -22,7 +22,7 @@ def validate(
     json: JsonFile = None,
 ) -> None:
     """Hold the physics to cases with known answers; exit code 1 when a line fails."""
-    from ..commands import validate as command
+    from . import validate as command
 
     run_command(command.run, backend=backend, cases=cases, page=page, json_path=json)
 
@@ -53,7 +53,7 @@ def simulate(
     json: JsonFile = None,
 ) -> None:
     """Let objects of a scene collide, deform and come to rest; leave film and curves."""
-    from ..commands import simulate as command
+    from . import simulate as command
 
     run_command(
         command.run,
@@ -83,6 +83,6 @@ def ground(
     json: JsonFile = None,
 ) -> None:
     """Find the road surface under a scene's objects, from LiDAR and from Gaussians."""
-    from ..commands import ground as command
+    from . import ground as command
 
     run_command(command.run, scene=scene, log=log, frame=frame, picture=picture, json_path=json)

@@ -35,7 +35,7 @@ def reconstruct(
     json: JsonFile = None,
 ) -> None:
     """Turn a driving log into a scene of Gaussians."""
-    from ..commands import reconstruct as command
+    from . import reconstruct as command
 
     run_command(
         command.run,
@@ -78,7 +78,7 @@ def import_(
 ) -> None:
     """Turn a splat file or a checkpoint of another system into a scene, or splats into an asset."""
     if file.suffix == ".pth":
-        from ..commands import import_checkpoint
+        from . import import_checkpoint
 
         run_command(
             import_checkpoint.run,
@@ -90,7 +90,7 @@ def import_(
             json_path=json,
         )
         return
-    from ..commands import import_splats
+    from . import import_splats
 
     run_command(
         import_splats.run,
@@ -120,7 +120,7 @@ def export(
     json: JsonFile = None,
 ) -> None:
     """Write a scene for other programs: per object, baked at a time, or animated as glTF."""
-    from ..commands import export as command
+    from . import export as command
 
     run_command(
         command.run,
@@ -149,7 +149,7 @@ def render(
     json: JsonFile = None,
 ) -> None:
     """Draw one logged camera of a scene; with --log print PSNR against the recorded image."""
-    from ..commands import render as command
+    from . import render as command
 
     run_command(
         command.run,
@@ -184,7 +184,7 @@ def evaluate(
     json: JsonFile = None,
 ) -> None:
     """Compare a scene with its log: images, moving objects, LiDAR depth, speed of rendering."""
-    from ..commands import evaluate as command
+    from . import evaluate as command
 
     run_command(
         command.run,

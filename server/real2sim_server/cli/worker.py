@@ -22,7 +22,7 @@ def serve(
     backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda or reference")] = None,
 ) -> None:
     """Start a worker. Settings not given here come from REAL2SIM_* variables."""
-    from ..commands import serve as command
+    from . import serve as command
 
     run_command(
         command.run,
@@ -60,6 +60,6 @@ def doctor(
     json: JsonFile = None,
 ) -> None:
     """Say what this machine can do, what is missing, and how to mend it."""
-    from ..commands import doctor as command
+    from . import doctor as command
 
     command.run(warm=warm, json_path=json)

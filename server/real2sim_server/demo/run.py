@@ -11,7 +11,7 @@ from pathlib import Path
 from real2sim import connect
 from real2sim.planners import FollowRoute
 
-from ..commands.console import console, print_figures, write_json
+from ..console import console, print_figures, write_json
 from .drive import Drive, drive_through
 from .edits import Edits, make_room
 from .pictures import draw_map, write_png

@@ -11,11 +11,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ..commands.console import staged_progress
-from ..logs.synthetic import SyntheticConfig, synthesize
+from ..console import staged_progress
 from ..reconstruct import InitialiseOptions, reconstruct
 from ..reconstruct.training.schedule import preset
 from ..scene.io import load_scene, read_packed, save_scene, write_packed
+from ..synthetic import SyntheticConfig, synthesize
 
 SHIPPED = Path(__file__).with_name("street.r2s.zip")
 DURATION_S = 10.4

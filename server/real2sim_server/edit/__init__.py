@@ -3,12 +3,12 @@
 from .apply import EditOutcome, advance, apply_operations
 from .compose import cloud_of, compose, instances_at
 from .errors import EditError
-from .review import GroundHeight
+from .ground_inpainting import vacated
 from .scenario import LogEntry, Planned, Scenario
 from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
 from .tracks import PackedTracks, Placed
-from .uncovered import vacated
+from .validation import GroundHeight
 
 __all__ = [
     "AssetLookup",

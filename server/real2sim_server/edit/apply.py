@@ -30,11 +30,12 @@ from real2sim_proto.operations import (
 from real2sim_proto.scenarios import EditWarning
 
 from ..scene import SceneError
-from . import motion, presence, properties
+from . import lifecycle as presence
+from . import motion, properties
 from .change import Change, existing
 from .errors import EditError
-from .review import GroundHeight, review
 from .state import ScenarioState
+from .validation import GroundHeight, review
 
 
 @dataclass(frozen=True, eq=False)

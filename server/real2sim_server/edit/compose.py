@@ -13,14 +13,14 @@ import torch
 
 from real2sim_proto.operations import EraseRegion
 
+from ..geometry.rotation import Float, invert_transform, transform_from
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene
-from ..scene.rotation import Float, invert_transform, transform_from
 from .ground import RecordedGround
+from .ground_inpainting import uncovered, vacated
 from .shadow import shadow_under
 from .state import ObjectState, ScenarioState
 from .tracks import Placed
-from .uncovered import uncovered, vacated
 
 T = TypeVar("T")
 

@@ -8,9 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from ..geometry.box import box_corners
+from ..geometry.rotation import Float, quaternion_to_matrix, transform_from
 from ..scene import Trajectory
-from ..scene.box import box_corners
-from ..scene.rotation import Float, quaternion_to_matrix, transform_from
 
 SPACING = 1.0
 """Of the samples of a path [m]."""

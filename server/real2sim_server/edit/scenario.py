@@ -13,8 +13,8 @@ from real2sim_proto.operations import Operation
 
 from .apply import EditOutcome, advance, apply_operations
 from .errors import EditError
-from .review import GroundHeight
 from .state import ScenarioState
+from .validation import GroundHeight
 
 KEPT_STATES = 32
 """States kept in memory; older ones are rebuilt from the log when an undo needs them."""

@@ -11,10 +11,10 @@ from functools import cache
 import numpy as np
 import torch
 
+from ..geometry.rotation import Float, transform_from, yaw_quaternion
 from ..render.types import Instance
 from ..scene import GaussianCloud
 from ..scene.harmonics import SH_C0
-from ..scene.rotation import Float, transform_from, yaw_quaternion
 from .ground import RecordedGround, bottoms_of
 
 MARGIN = 0.35

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..scene.compiled import compiled
+from .._numba import compiled
 
 KNOT = 11
 """Numbers of a knot: position [3], quaternion wxyz [4], velocity [3], and whether the quaternion

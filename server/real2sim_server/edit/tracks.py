@@ -9,8 +9,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import slerp, transform_from
 from ..scene import Trajectory
-from ..scene.rotation import slerp, transform_from
 from .track_kernels import KNOT, poses_at
 
 Float = NDArray[np.float64]

@@ -8,7 +8,6 @@ from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTr
 from .inspect import CameraReport, LogReport, inspect_log
 from .native_writer import write_native_log
 from .open import open_log
-from .waymo_writer import RangeGrid, write_waymo_v2
 
 __all__ = [
     "CameraReport",
@@ -18,10 +17,8 @@ __all__ = [
     "LogError",
     "LogReport",
     "ObjectTrack",
-    "RangeGrid",
     "check_log",
     "inspect_log",
     "open_log",
     "write_native_log",
-    "write_waymo_v2",
 ]

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import Float
 from ..scene import CameraRig, Trajectory
-from ..scene.rotation import Float
 
 
 class LogError(ValueError):

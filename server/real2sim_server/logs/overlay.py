@@ -7,8 +7,8 @@ import colorsys
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import Float, apply_transform, invert_transform
 from ..scene import Camera
-from ..scene.rotation import Float, apply_transform, invert_transform
 from .driving_log import DrivingLog
 
 NEAR = 0.3

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.rotation import Float, apply_transform
+from ..geometry.rotation import Float, apply_transform
 from .driving_log import DrivingLog, LidarSweep, ObjectTrack
 from .overlay import colour_of
 

@@ -11,20 +11,12 @@ from .errors import (
     SolverError,
     UnstableError,
 )
-from .fill import Filling, fill_object
-from .masses import CLASS_MASSES, default_mass
-from .materials import Foam, Jelly, Material, Metal, NearRigid, NeoHookean, Sand, Snow
+from .materials import FixedCorotated, Foam, Material, Metal, NearRigid, NeoHookean, Sand, Snow
 from .particles import Particles, ball_particles, box_particles
-from .playback import Playback
-from .presets import PRESETS, ObjectPhysics
 from .restitution import RestitutionFit, fit_restitution
-from .result import ContactRecord, ObjectResult, SimulationResult
-from .simulation import SimulateOptions, simulate
 from .solver import BodyState, Contact, Energies, Solver, SolverOptions, StepReport
 
 __all__ = [
-    "CLASS_MASSES",
-    "PRESETS",
     "Body",
     "BodyState",
     "Box",
@@ -32,28 +24,21 @@ __all__ = [
     "Collider",
     "ColliderError",
     "Contact",
-    "ContactRecord",
     "Energies",
-    "Filling",
+    "FixedCorotated",
     "Foam",
     "HeightField",
-    "Jelly",
     "Material",
     "MaterialError",
     "Metal",
     "NearRigid",
     "NeoHookean",
-    "ObjectPhysics",
-    "ObjectResult",
     "ParticleError",
     "Particles",
     "PhysicsError",
     "Plane",
-    "Playback",
     "RestitutionFit",
     "Sand",
-    "SimulateOptions",
-    "SimulationResult",
     "Snow",
     "Solver",
     "SolverError",
@@ -63,8 +48,5 @@ __all__ = [
     "ball_particles",
     "box_particles",
     "calibrate",
-    "default_mass",
-    "fill_object",
     "fit_restitution",
-    "simulate",
 ]

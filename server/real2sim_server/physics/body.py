@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..scene.rotation import Float
+from ..geometry.rotation import Float
 from .errors import MaterialError, ParticleError
 from .materials import Material
 from .particles import Particles

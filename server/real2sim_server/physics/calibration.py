@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..scene.rotation import Float
-from .backends.reference import torch_model
-from .backends.reference_step import TorchRules, TorchState, settle, substep
+from ..geometry.rotation import Float
+from .backends.reference.backend import torch_model
+from .backends.reference.step import TorchRules, TorchState, settle, substep
 from .colliders import Collider
+from .constitutive import stress as laws
 from .errors import SolverError
-from .laws import stress as laws
 from .solver import Solver
 
 PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")

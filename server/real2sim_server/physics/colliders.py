@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..scene.rotation import Float, is_rigid
+from ..geometry.rotation import Float, is_rigid
 from .errors import ColliderError
 
 PLANE, BOX, HEIGHT_FIELD = range(3)

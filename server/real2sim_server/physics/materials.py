@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from .constitutive import stress as laws
 from .errors import MaterialError
-from .laws import stress as laws
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ class Material:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Jelly(Material):
+class FixedCorotated(Material):
     """Fixed corotated elasticity (Stomakhin et al. 2012): soft bodies, and the paper's cars.
 
     Psi = mu |F - R|^2 + lambda/2 (J - 1)^2.

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from .backends.base import Model, ParticleArrays
 from .body import Body
+from .constitutive.contact import STICKS
 from .errors import ParticleError, SolverError
-from .laws.contact import STICKS
 from .materials import Material
 
 PRECISIONS: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}

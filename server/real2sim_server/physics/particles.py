@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..scene.rotation import Float, apply_transform, is_rigid
+from ..geometry.rotation import Float, apply_transform, is_rigid
 from .errors import ParticleError
 
 

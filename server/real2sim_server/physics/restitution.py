@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..scene.rotation import Float
+from ..geometry.rotation import Float
 from .body import Body
 from .colliders import Plane
 from .errors import SolverError

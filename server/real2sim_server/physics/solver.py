@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ..scene.rotation import Float
+from ..geometry.rotation import Float
 from .backends import Measure, Model, ParticleArrays, Simulation, select_backend
-from .backends.base import Blowup
+from .backends.base import SolverDiverged
 from .body import Body
 from .colliders import Collider
+from .constitutive import stress as laws
 from .errors import PhysicsError, SolverError, UnstableError
-from .laws import stress as laws
 from .model import build_model
 
 CHECK_EVERY = 16
@@ -349,7 +349,7 @@ class Solver:
         try:
             self.simulation.advance(count, dt, self._colliders)
             self._measure = self.simulation.measure()
-        except Blowup:
+        except SolverDiverged:
             return "particles left the grid"
         return ""
 

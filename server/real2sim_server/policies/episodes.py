@@ -14,7 +14,7 @@ import real2sim
 from real2sim.planners import load_planner, needs_of, run_episode
 from real2sim.planners.planner import forward_camera
 
-from ..world.recording import Recording, load_recording
+from ..world.recording.recording import Recording, load_recording
 from .suite import Asked, Case
 
 if TYPE_CHECKING:

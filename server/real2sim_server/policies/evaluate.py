@@ -13,10 +13,10 @@ from rich.table import Table
 
 import real2sim
 
-from ..commands.console import CommandError, console, staged_progress, write_json
+from .._files import atomic_file
+from ..console import CommandError, console, staged_progress, write_json
 from ..demo.street import unpack_street
 from ..demo.worker import own_worker
-from ..scene.io.atomic import atomic_file
 from .episodes import Driven, Place, drive_all
 from .page import page
 from .suite import Asked, Case, cases_of, demo_cases, load_suite

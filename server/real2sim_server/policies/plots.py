@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..world.recording import Recording
+from ..world.recording.recording import Recording
 from .episodes import Driven
 
 COLOURS = ("#1f6feb", "#d1495b", "#2a9d5c", "#e08a00", "#7b4fc9", "#0e8f9e", "#8a5a2b", "#555e68")

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation
 
-from ..commands.console import CommandError
+from ..console import CommandError
 
 OWN = frozenset({"seed", "sensors", "action", "privileged"})
 """Fields of reset that the evaluation sets: the seed, and what the planner needs."""

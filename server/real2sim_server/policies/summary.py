@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..world.recording import load_recording
+from ..world.recording.recording import load_recording
 from ..world.scoring import VERSIONS
 from .episodes import Driven
 

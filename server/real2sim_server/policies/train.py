@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from real2sim.planners.learned import REACH, PolicyShape, network, shrink, state_of
 
-from ..commands.console import CommandError, print_figures, staged_progress, write_json
+from .._files import atomic_file
+from ..console import CommandError, print_figures, staged_progress, write_json
+from ..geometry.rotation import quaternion_yaw, transform_from
 from ..logs import open_log
 from ..scene import CameraRig, Trajectory
 from ..scene.io import load_scene
-from ..scene.io.atomic import atomic_file
-from ..scene.rotation import quaternion_yaw, transform_from
+from ..world.ego.route import command_ahead
 from ..world.path import LoggedPath
-from ..world.route import command_ahead
 from .views import Seen, logged_views, scene_views
 
 BATCH, RATE, DECAY = 32, 2e-3, 1e-4

@@ -13,10 +13,10 @@ from real2sim.planners.learned import PolicyShape
 
 from ..edit import ScenarioState
 from ..edit.compose import instances_at
+from ..geometry.rotation import transform_from
 from ..logs import DrivingLog
 from ..render import render_cameras, select_backend
 from ..scene import Scene
-from ..scene.rotation import transform_from
 
 STEP_US = 100_000
 """Between views of a scene."""

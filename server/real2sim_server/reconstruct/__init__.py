@@ -1,7 +1,7 @@
 """From driving logs to scenes of Gaussians."""
 
 from .evaluation import EvaluationReport, ViewScore, evaluate_views
-from .initialise import initialise_scene
+from .initialise.stage0 import initialise_scene
 from .options import InitialiseOptions, ReconstructError
 from .run import ReconstructReport, TrainingFigures, reconstruct
 

@@ -12,18 +12,11 @@ from ..logs import DrivingLog, open_log
 from ..scene import Scene
 from ..scene.io import save_scene
 from .evaluation import evaluate_views, render_logged_view
-from .initialise import initialise_scene
+from .initialise.stage0 import initialise_scene
+from .initialise.views import chosen_frames
 from .options import InitialiseOptions, ReconstructError
 from .stages import OnProgress, Stages
-from .training import (
-    OnTraining,
-    TrainOptions,
-    held_out_frames,
-    preset,
-    train,
-    with_box_noise,
-)
-from .views import chosen_frames
+from .training import OnTraining, TrainOptions, held_out_frames, preset, train, with_box_noise
 
 EVALUATED_FRAMES = 4
 

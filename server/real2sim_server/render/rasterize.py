@@ -10,8 +10,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ..geometry.rotation import are_rigid, is_rotation
 from ..scene import GaussianCloud, TimeColour
-from ..scene.rotation import are_rigid, is_rotation
 from .backends.base import Backend, RasterRequest
 from .backends.select import select_backend
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import Float, invert_transform, is_rigid
 from .errors import SceneError
-from .rotation import Float, invert_transform, is_rigid
 
 T_VEHICLE_OPTICAL = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ..geometry.rotation import is_rigid, matrix_to_quaternion
 from .errors import SceneError
 from .harmonics import rotate_sh
-from .rotation import is_rigid, matrix_to_quaternion
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 

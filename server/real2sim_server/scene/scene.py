@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .box import box_corners
+from ..geometry.box import box_corners
+from ..geometry.rotation import Float
 from .camera import CameraRig
 from .cloud import GaussianCloud
 from .colour import TimeColour
 from .errors import SceneError, UnknownObjectError
-from .rotation import Float
 from .sky import Sky
 from .trajectory import Trajectory
 

@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import SceneError, TimeOutOfRangeError
-from .rotation import (
+from ..geometry.rotation import (
     Float,
     apply_transform,
     are_rigid,
@@ -18,6 +17,7 @@ from .rotation import (
     slerp,
     transform_from,
 )
+from .errors import SceneError, TimeOutOfRangeError
 
 MOVING_DISTANCE, MOVING_SPREAD = 2.0, 0.5
 

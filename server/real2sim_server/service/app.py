@@ -13,11 +13,11 @@ from fastapi.routing import APIRoute
 from real2sim_proto import Problem
 
 from ..settings import Settings
-from .auth import require_token
-from .hosts import LoopbackOnly
-from .openapi import published
-from .problems import install_problem_handlers
-from .requests import BodyLimit, RequestContext
+from .http.auth import require_token
+from .http.hosts import LoopbackOnly
+from .http.openapi import published
+from .http.problems import install_problem_handlers
+from .http.requests import BodyLimit, RequestContext
 from .routes import (
     assets,
     drive,

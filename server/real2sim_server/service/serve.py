@@ -21,9 +21,9 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 
 from ..settings import Settings
 from .app import create_app
-from .auth import check_bind
+from .http.auth import check_bind
+from .http.websocket import PartedProtocol
 from .logging_setup import configure_logging
-from .websocket import PartedProtocol
 from .worker import Worker
 
 PING_INTERVAL_S = 10.0

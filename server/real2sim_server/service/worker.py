@@ -20,20 +20,20 @@ from real2sim_proto.scenes import DeviceInfo, Readiness
 from ..render import Backend, describe_backends, select_backend
 from ..settings import Settings
 from ..world import warm_up
-from .assets import AssetLibrary
-from .engine import Engine
-from .idempotency import Idempotency
-from .job_log import JobLog
-from .jobs import Jobs
-from .library import Library
-from .metrics import Metrics
-from .pictures import Pictures
-from .residency import Residency
-from .scenarios import Scenarios
+from .http.idempotency import Idempotency
+from .http.metrics import Metrics
+from .jobs.jobs import Jobs
+from .jobs.simulations import Simulations
+from .library.assets import AssetLibrary
+from .library.scene_cache import SceneCache
+from .library.scene_catalog import SceneCatalog
+from .rendering.engine import Engine
+from .rendering.renderer import Renderer
+from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
-from .sessions.show import Show
-from .simulations import Simulations
-from .store import Store
+from .sessions.observation_renderer import ObservationRenderer
+from .storage.job_log import JobLog
+from .storage.store import Store
 
 LAG_PERIOD_S = 0.1
 
@@ -54,13 +54,13 @@ class Worker:
     engine: Engine
     metrics: Metrics
     store: Store
-    residency: Residency
+    residency: SceneCache
     scenarios: Scenarios
     assets: AssetLibrary
     jobs: Jobs
     simulations: Simulations
     idempotency: Idempotency
-    pictures: Pictures
+    pictures: Renderer
     sessions: Sessions
     backend: Backend
     device: DeviceInfo
@@ -81,8 +81,8 @@ class Worker:
             threads=settings.threads,
             on_job=metrics.observe_job,
         )
-        residency = Residency(
-            Library(settings.scenes_path),
+        residency = SceneCache(
+            SceneCatalog(settings.scenes_path),
             engine,
             budget_bytes=settings.scene_memory_bytes,
             device=_device_of(backend),
@@ -92,7 +92,7 @@ class Worker:
         assets = AssetLibrary(settings.assets_path)
         scenarios = Scenarios(store, residency, metrics, assets=assets.find)
         jobs = Jobs(JobLog(store, settings.worker_id), settings.jobs_path)
-        pictures = Pictures(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
+        pictures = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(
             settings=settings,
             engine=engine,
@@ -109,7 +109,9 @@ class Worker:
                 SessionLimits(
                     settings.worker_id, settings.max_sessions, settings.session_idle_seconds
                 ),
-                show=Show(engine, pictures, metrics, max_pixels=settings.max_pixels_per_step),
+                show=ObservationRenderer(
+                    engine, pictures, metrics, max_pixels=settings.max_pixels_per_step
+                ),
                 store=store,
                 residency=residency,
                 scenarios=scenarios,

@@ -1,15 +1,15 @@
 """The closed loop: the only room in which time passes."""
 
 from .agents import Agents, agent_fields
-from .ego import Motion
+from .ego.controller import Plan
+from .ego.vehicle import Motion
 from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround
 from .observation import Observation
 from .path import LoggedPath
-from .pilot import Plan
 from .scoring import Score, metrics_version
-from .warming import warm_up
+from .warm_up import warm_up
 from .world import World
 
 __all__ = [

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from .agents import Agents, agent_fields
-from .ego import Motion
+from .ego.route import Command
+from .ego.vehicle import Motion
 from .events import Event
 from .path import Float
-from .route import Command
 
 
 @dataclass(frozen=True, eq=False)

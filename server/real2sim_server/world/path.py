@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import quaternion_to_matrix, quaternion_yaw
 from ..scene import Trajectory
-from ..scene.rotation import quaternion_to_matrix, quaternion_yaw
 from .path_kernels import KNOT, nearest_point, point_at, sharpest_turn
 
 Float = NDArray[np.float64]

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ..scene.compiled import compiled
+from .._numba import compiled
 
 KNOT = 11
 

@@ -15,23 +15,24 @@ from ..edit import EditError, EditOutcome, ScenarioState, apply_operations, comp
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
-from .aftermath import Aftermath, after_impacts, after_overlaps
 from .agents import Agents
-from .contacts import Contacts, Moved
-from .ego import logged_motion
+from .collision.contacts import Contacts, Moved
+from .collision.deformation import DeformationTracker
+from .collision.model import Deformation, Impact
+from .collision.obstacles import obstacles_of
+from .collision.step_contacts import StepContacts, after_impacts, after_overlaps
+from .ego.controller import EgoController, Plan, braking
+from .ego.reference import PlannedTrajectory
+from .ego.route import command_ahead, route_ahead
+from .ego.vehicle import logged_motion
 from .episode import plan_episode, takes_effect_us
 from .errors import WorldError
+from .evaluation import PendingStep, ego_sample, others_of, scoring_context
 from .events import Event
 from .ground import LoggedGround
-from .impact import Deformation, Dents, Impact
-from .judging import Unjudged, ego_sample, others_of, scoring_context
 from .observation import Observation
-from .obstacles import obstacles_of
 from .path import Float, LoggedPath, PathPoint
-from .pilot import Pilot, Plan, braking
-from .reference import Course
-from .route import command_ahead, route_ahead
-from .scoring import Instant, Score, Tally
+from .scoring import Instant, MetricAccumulator, Score
 from .traffic import EgoSeen, Surroundings, Traffic
 
 LEFT_LOG = 10.0
@@ -91,7 +92,7 @@ class World:
         self.motion = logged_motion(scene.ego, self.t_us, spec.ego)
         self._near: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._standing()
-        self._pilot = Pilot(spec, scene.ego)
+        self._pilot = EgoController(spec, scene.ego)
         obstacles = obstacles_of(scene, self._path) if spec.contact.background else None
         seen = self._seen(state.tracks.at(self.t_us))
         self.traffic = Traffic.begin(state, spec.agents, seen)
@@ -105,14 +106,14 @@ class World:
             agents=self.agents,
         )
         if deformation is None and self._contacts.physical and spec.contact.dents:
-            self.deformation = Dents(scene)
+            self.deformation = DeformationTracker(scene)
         self.impacts: tuple[Impact, ...] = ()
         self._events: tuple[Event, ...] = ()
         self._edits: tuple[Event, ...] = ()
-        self._moved: Unjudged | None = None
+        self._moved: PendingStep | None = None
         self._context = scoring_context(scene, spec, self._clock, self._path, self._near.s)
-        self.instant = self._instant(Aftermath())
-        self.tally: Tally = scoring.begin(self.instant, self._context)
+        self.instant = self._instant(StepContacts())
+        self.tally: MetricAccumulator = scoring.begin(self.instant, self._context)
 
     @property
     def t_us(self) -> int:
@@ -180,7 +181,7 @@ class World:
         self.T_world_vehicle = self._standing()
         left = None if impacts is None else self._struck(impacts, before)
         self.impacts = impacts or ()
-        self._moved = Unjudged(given, (*self._edits, *late, *reacted), left)
+        self._moved = PendingStep(given, (*self._edits, *late, *reacted), left)
         self._edits = ()
 
     def judge(self) -> list[Event]:
@@ -305,13 +306,13 @@ class World:
                 hint="reset the session to start another",
             )
 
-    def _told(self, plan: Plan | None, latency_us: int) -> Pilot:
+    def _told(self, plan: Plan | None, latency_us: int) -> EgoController:
         if plan is None:
             return self._pilot
         from_us = takes_effect_us(self.spec, self._clock, self.t_us, latency_us)
         return self._pilot.told(plan, self.motion, self.t_us, from_us)
 
-    def _move(self, pilot: Pilot) -> tuple[Impact, ...] | None:
+    def _move(self, pilot: EgoController) -> tuple[Impact, ...] | None:
         """Ego and objects one step on; impacts, or None where bodies pass through each other."""
         motion, t_us, before = self.motion, self.t_us, self.agents
         end_us = t_us + self._clock.dt_us
@@ -329,7 +330,7 @@ class World:
         self.motion = after._replace(acceleration=acceleration)
         return impacts
 
-    def _struck(self, impacts: tuple[Impact, ...], before: Agents) -> Aftermath:
+    def _struck(self, impacts: tuple[Impact, ...], before: Agents) -> StepContacts:
         """What the impacts of the step leave, dents among it."""
         if self.deformation is not None:
             subjects = {o.object_id: o for o in self.agents.objects}
@@ -337,7 +338,7 @@ class World:
                 self.deformation = self.deformation.struck(impact, subjects)
         return after_impacts(impacts, self.t_us, touched=self._contacts.touching, before=before)
 
-    def _overlapped(self) -> Aftermath:
+    def _overlapped(self) -> StepContacts:
         """What overlaps leave where bodies pass through each other."""
         met = self._contacts.met(self.T_world_vehicle, self.motion, self.agents)
         left = after_overlaps(met, self.t_us)
@@ -388,7 +389,7 @@ class World:
         clock = self._clock
         return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
 
-    def _instant(self, left: Aftermath, plan: Course | None = None) -> Instant:
+    def _instant(self, left: StepContacts, plan: PlannedTrajectory | None = None) -> Instant:
         return Instant(
             step=self.steps,
             t_us=self.t_us,

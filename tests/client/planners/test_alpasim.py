@@ -15,7 +15,7 @@ from real2sim.planners import load_planner, needs_of
 from real2sim.planners._alpasim_messages import METHODS, SERVICE, messages
 from real2sim.planners.alpasim import AlpasimDriver, _quaternion
 from real2sim.planners.peer import PeerError
-from real2sim_server.scene.rotation import quaternion_to_matrix
+from real2sim_server.geometry.rotation import quaternion_to_matrix
 
 from . import rig
 

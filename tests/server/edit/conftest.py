@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from real2sim_server.edit import ScenarioState
+from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.scene import Trajectory
-from real2sim_server.scene.rotation import yaw_quaternion
 
 STEP_US = 100_000
 FRAMES = 50

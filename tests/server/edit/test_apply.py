@@ -17,7 +17,7 @@ from real2sim_proto.operations import (
     Translate,
 )
 from real2sim_server.edit import EditError, ObjectState, ScenarioState, apply_operations
-from real2sim_server.scene.box import box_corners
+from real2sim_server.geometry.box import box_corners
 
 
 def after(state: ScenarioState, *operations: Operation, of: str = "turning") -> ObjectState:

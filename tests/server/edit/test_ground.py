@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from real2sim_server.edit.ground import RecordedGround
+from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.scene import Trajectory
-from real2sim_server.scene.rotation import yaw_quaternion
 
 LEVEL = np.tile([1.0, 0, 0, 0], (50, 1))
 

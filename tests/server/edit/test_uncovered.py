@@ -8,7 +8,7 @@ import torch
 
 from real2sim_proto.operations import Delete, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, vacated
-from real2sim_server.edit.uncovered import uncovered
+from real2sim_server.edit.ground_inpainting import uncovered
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.scene.harmonics import SH_C0
 

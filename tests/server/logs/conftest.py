@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from real2sim_server.logs import DrivingLog, write_native_log, write_waymo_v2
-from real2sim_server.logs.synthetic import SyntheticConfig, SyntheticLog, generate_log
-from real2sim_server.scene.rotation import apply_transform, invert_transform
+from real2sim_server.geometry.rotation import apply_transform, invert_transform
+from real2sim_server.logs import DrivingLog, write_native_log
+from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
+
+from .waymo_v2_writer import write_waymo_v2
 
 TINY = SyntheticConfig(
     seed=5,

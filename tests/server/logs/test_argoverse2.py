@@ -9,9 +9,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import feather
 
+from real2sim_server.geometry.rotation import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, open_log
-from real2sim_server.logs.synthetic import SyntheticLog
-from real2sim_server.scene.rotation import apply_transform, invert_transform
+from real2sim_server.synthetic import SyntheticLog
 
 
 @pytest.fixture(scope="module")

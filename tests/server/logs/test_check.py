@@ -11,8 +11,8 @@ import pytest
 
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
 from real2sim_server.logs.images import encode_image
-from real2sim_server.logs.synthetic import SyntheticLog
 from real2sim_server.scene import CameraRig
+from real2sim_server.synthetic import SyntheticLog
 
 LAYOUTS = ("native", "kitti", "kitti_raw", "waymo_v2", "waymo_v1", "argoverse2", "nuscenes",
            "street_gaussians", "drivestudio")  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
-from real2sim_server.logs.synthetic import SyntheticLog
+from real2sim_server.synthetic import SyntheticLog
 
 CAMERAS = {
     "kitti_raw": {"image_00": "front"},

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
-from real2sim_server.logs.images import write_image
-from real2sim_server.logs.readers.kitti_files import EARTH_RADIUS
-from real2sim_server.logs.synthetic import SyntheticLog
-from real2sim_server.scene.rotation import (
+from real2sim_server.geometry.rotation import (
     apply_transform,
     invert_transform,
     matrix_to_quaternion,
     quaternion_yaw,
 )
+from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
+from real2sim_server.logs.images import write_image
+from real2sim_server.logs.readers.kitti.files import EARTH_RADIUS
+from real2sim_server.synthetic import SyntheticLog
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 
 from real2sim_server.logs import LogError, open_log, write_native_log
 from real2sim_server.logs.images import write_image
-from real2sim_server.logs.synthetic import SyntheticLog
+from real2sim_server.synthetic import SyntheticLog
 
 
 def test_round_trip_keeps_every_bit(tiny_log: SyntheticLog, written_native: Path) -> None:

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from real2sim_server.geometry.rotation import Float, apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, ObjectTrack, open_log
-from real2sim_server.logs.synthetic import (
+from real2sim_server.scene import Camera
+from real2sim_server.synthetic import (
     CameraSpec,
     SyntheticConfig,
     SyntheticLog,
     generate_log,
     synthesize,
 )
-from real2sim_server.logs.synthetic.traffic import Drive, plan_drive
-from real2sim_server.logs.synthetic.vehicles import SHAPES
-from real2sim_server.scene import Camera
-from real2sim_server.scene.rotation import Float, apply_transform, invert_transform
+from real2sim_server.synthetic.traffic import Drive, plan_drive
+from real2sim_server.synthetic.vehicles import SHAPES
 
 SEED = 3
 SMALL = SyntheticConfig(seed=SEED, frames=4, width=192, height=128, lidar_columns=720)

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from real2sim_server.geometry.rotation import apply_transform
 from real2sim_server.logs import DrivingLog, LidarSweep, ObjectTrack, open_log
 from real2sim_server.logs.overlay import points_in_box
-from real2sim_server.logs.synthetic import SyntheticConfig, generate_log
 from real2sim_server.logs.tracking import TrackingOptions, track_moving_objects
 from real2sim_server.logs.tracking.free_space import Witness
 from real2sim_server.logs.tracking.ground import find_ground
 from real2sim_server.logs.tracking.motion import smooth
-from real2sim_server.scene.rotation import apply_transform
+from real2sim_server.synthetic import SyntheticConfig, generate_log
 
 NEAR = 30.0
 SEEN = 20

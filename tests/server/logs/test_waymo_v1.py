@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from real2sim_server.geometry.rotation import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
-from real2sim_server.logs.readers.wire_format import (
+from real2sim_server.logs.readers.formats.wire_format import (
     Message,
     list_records,
     masked_crc32c,
     read_record,
 )
-from real2sim_server.logs.synthetic import SyntheticLog
-from real2sim_server.scene.rotation import apply_transform, invert_transform
+from real2sim_server.synthetic import SyntheticLog
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.logs import DrivingLog, LogError, RangeGrid, open_log, write_waymo_v2
-from real2sim_server.logs.synthetic import SyntheticLog
+from real2sim_server.logs import DrivingLog, LogError, open_log
+from real2sim_server.synthetic import SyntheticLog
+
+from .waymo_v2_writer import RangeGrid, write_waymo_v2
 
 POINT_TOLERANCE = 1e-4
 

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from real2sim_server.physics import Body, Jelly, Plane, Solver, SolverOptions, box_particles
+from real2sim_server.physics import (
+    Body,
+    FixedCorotated,
+    Plane,
+    Solver,
+    SolverOptions,
+    box_particles,
+)
 
-SOFT = Jelly(young=2e5, poisson=0.4)
+SOFT = FixedCorotated(young=2e5, poisson=0.4)
 
 
 def at(*position: float) -> np.ndarray:

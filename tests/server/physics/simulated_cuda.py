@@ -26,9 +26,9 @@ from numba.np.numpy_support import as_dtype
 from real2sim_server.physics import (
     Body,
     Box,
+    FixedCorotated,
     Foam,
     HeightField,
-    Jelly,
     Metal,
     NeoHookean,
     Plane,
@@ -38,7 +38,7 @@ from real2sim_server.physics import (
     SolverOptions,
     box_particles,
 )
-from real2sim_server.physics.laws import contact, matrices, obstacle, stress
+from real2sim_server.physics.constitutive import contact, matrices, obstacle, stress
 from real2sim_server.physics.validation import motion
 
 from .scenes import at
@@ -68,7 +68,7 @@ FakeCUDAShared.array = shared_array
 STATE = ("positions", "velocities", "gradients", "F_elastic", "F_total", "history")
 DT = 5e-4
 MATERIALS = (
-    Jelly(young=2e5, poisson=0.4, viscosity=100),
+    FixedCorotated(young=2e5, poisson=0.4, viscosity=100),
     NeoHookean(young=2e5),
     Metal(young=2e5, yield_stress=5e3, hardening=1e4),
     Foam(young=2e5, yield_stress=3e3, plastic_viscosity=100),
@@ -140,13 +140,13 @@ def strained(material: Any) -> tuple[list[Body], list[Any]]:
 
 def on(collider: Any) -> tuple[list[Body], list[Any]]:
     """A cube thrown at a collider."""
-    soft = Jelly(young=2e5, poisson=0.4)
+    soft = FixedCorotated(young=2e5, poisson=0.4)
     return [cube("cube", (0.21, 0.2, 0.2), soft, velocity=(0.5, 0.2, -3))], [collider]
 
 
 def meeting() -> tuple[list[Body], list[Any]]:
     """Two cubes that collide and rub."""
-    soft = Jelly(young=2e5, poisson=0.4)
+    soft = FixedCorotated(young=2e5, poisson=0.4)
     return [
         cube("left", (0.15, 0.2, 0.2), soft, velocity=(3, 0.5, 0), friction=0.3),
         cube("right", (0.253, 0.21, 0.2), soft, velocity=(-3, 0, 0), friction=0.3),
@@ -155,7 +155,7 @@ def meeting() -> tuple[list[Body], list[Any]]:
 
 def leaving() -> tuple[list[Body], list[Any]]:
     """A cube so fast that it must be sorted into other blocks on its way."""
-    return [cube("cube", (0.3, 0.2, 0.2), Jelly(young=2e5), velocity=(120, 0, 30))], []
+    return [cube("cube", (0.3, 0.2, 0.2), FixedCorotated(young=2e5), velocity=(120, 0, 30))], []
 
 
 SCENES: dict[str, Callable[[], tuple[list[Body], list[Any]]]] = {
@@ -225,7 +225,7 @@ if __name__ == "__main__":
     report = {
         "reference": {name: difference(name, "reference") for name in SCENES},
         "cpu": {name: difference(name, "cpu") for name in MATERIAL_NAMES},
-        "single": difference("Jelly", "reference", "single"),
+        "single": difference("FixedCorotated", "reference", "single"),
         "restored": restored(),
         "lines": list(lines()),
     }

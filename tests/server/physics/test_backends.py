@@ -12,9 +12,9 @@ import pytest
 
 from real2sim_server.physics import (
     Box,
+    FixedCorotated,
     Foam,
     HeightField,
-    Jelly,
     Metal,
     NeoHookean,
     Plane,
@@ -27,7 +27,7 @@ from real2sim_server.physics.backends import select_backend
 from .scenes import SOFT, at, cube, ground, solve
 
 MATERIALS = [
-    Jelly(young=2e5, poisson=0.4, viscosity=100),
+    FixedCorotated(young=2e5, poisson=0.4, viscosity=100),
     NeoHookean(young=2e5),
     Metal(young=2e5, yield_stress=5e3, hardening=1e4),
     Foam(young=2e5, yield_stress=3e3, plastic_viscosity=100),

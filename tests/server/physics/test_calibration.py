@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.physics import Jelly, Metal, SolverError
+from real2sim_server.physics import FixedCorotated, Metal, SolverError
 from real2sim_server.physics.calibration import calibrate, jacobian, rollout
 
 from .scenes import cube, ground, solve
 
 DT, EVERY, TIMES = 1e-3, 4, 6
 TRUE = {"stiffness": 1.3, "yield_stress": 0.8, "viscosity": 1.5, "friction": 1.2, "speed": 1.1}
-SOFT = Jelly(young=2e5, poisson=0.3, viscosity=100)
+SOFT = FixedCorotated(young=2e5, poisson=0.3, viscosity=100)
 
 
 def pressed(material):
@@ -61,7 +61,7 @@ def test_yield_stress_is_recovered_too():
 def test_residuals_never_rise_and_blown_up_steps_are_taken_back():
     start = observed(pressed(SOFT), ["speed"])
     # A hundred times too stiff is far beyond what this substep can take.
-    hard = pressed(Jelly(young=8e5, poisson=0.3, viscosity=100))
+    hard = pressed(FixedCorotated(young=8e5, poisson=0.3, viscosity=100))
     found = calibrate(hard, start, parameters=["stiffness", "speed"], dt=DT, every=EVERY, steps=6)
     assert np.isfinite(found.residual).all()
     assert (np.diff(found.residual) < 0).all()

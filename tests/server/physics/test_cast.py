@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from real2sim_server.edit.state import ScenarioState
-from real2sim_server.physics import ObjectPhysics, PhysicsError, Plane, SimulateOptions, simulate
+from real2sim_server.physics import PhysicsError, Plane
+from real2sim_server.simulation.presets import ObjectPhysics
+from real2sim_server.simulation.rollout import SimulateOptions, simulate
 
 from .scenes import at
 

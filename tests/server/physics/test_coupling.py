@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.physics import Body, Jelly, Plane, Solver, SolverOptions, box_particles
-from real2sim_server.physics.coupling import Embedding, RigidMotion, Tyres, deform_cloud
-from real2sim_server.physics.coupling.actor import RESTING, RIGID, Actor
-from real2sim_server.physics.coupling.rigid import inertia_about, rotation_of
+from real2sim_server.geometry.rotation import quaternion_to_matrix
+from real2sim_server.physics import (
+    Body,
+    FixedCorotated,
+    Plane,
+    Solver,
+    SolverOptions,
+    box_particles,
+)
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.scene.rotation import quaternion_to_matrix
+from real2sim_server.simulation.body import RIGID, SLEEPING, DeformableBody
+from real2sim_server.simulation.embedding import Embedding, deform_cloud
+from real2sim_server.simulation.rigid import RigidMotion, inertia_about, rotation_of
+from real2sim_server.simulation.tyres import Tyres
 
 from .scenes import at
 
@@ -72,7 +80,7 @@ def test_gaussians_follow_the_total_deformation_that_the_solver_has():
     body = Body(
         name="block",
         particles=particles,
-        material=Jelly(young=1.0, poisson=0.2),
+        material=FixedCorotated(young=1.0, poisson=0.2),
         particle_velocities=velocities,
         particle_gradients=np.tile(
             [[-0.8, 0, 0], [0.3, 0.2, 0], [0, 0, 0.1]], (len(particles), 1, 1)
@@ -96,7 +104,7 @@ def test_a_gaussian_across_a_tear_does_not_become_a_sheet():
     assert moved.scales.max() <= 2.0 * cloud.scales.max() + 1e-6
 
 
-def thrown(**options) -> Actor:
+def thrown(**options) -> DeformableBody:
     pose = at(0.2, 0.1, 2.0)
     pose[:3, :3] = rotation_of(np.array([0.2, 0.5, -0.4]))
     settings = {
@@ -108,10 +116,12 @@ def thrown(**options) -> Actor:
     }
     particles = lattice()
     regions = np.zeros(len(particles), dtype=np.int64)
-    return Actor("box", particles, [Jelly(young=2e6)], regions, **{**settings, **options})
+    return DeformableBody(
+        "box", particles, [FixedCorotated(young=2e6)], regions, **{**settings, **options}
+    )
 
 
-def loose(actor: Actor) -> Solver:
+def loose(actor: DeformableBody) -> Solver:
     actor.loosen()
     options = SolverOptions(dx=actor.cell, gravity=(0, 0, 0), precision="double")
     return Solver([actor.body()], (), options)
@@ -147,7 +157,7 @@ def test_laid_to_rest_it_stands_still():
     actor = thrown()
     solver = loose(actor)
     actor.take(solver.state("box"))
-    actor.stiffen(RESTING)
+    actor.stiffen(SLEEPING)
     assert actor.motion.kinetic == 0
 
 

@@ -12,7 +12,7 @@ import pytest
 from numba import cuda
 
 from real2sim_server.physics import SolverError
-from real2sim_server.physics.backends.cuda import CudaBackend
+from real2sim_server.physics.backends.cuda.backend import CudaBackend
 
 ROOT = Path(__file__).parents[3]
 MATERIALS = ("Jelly", "NeoHookean", "Metal", "Foam", "Sand", "Snow")

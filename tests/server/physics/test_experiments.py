@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from real2sim_server.edit.state import ScenarioState
-from real2sim_server.physics import PhysicsError, Playback, simulate
-from real2sim_server.physics.experiments import set_up, views, walls
-from real2sim_server.physics.experiments.film import View, draw, look_at
-from real2sim_server.physics.experiments.viewing import seen
+from real2sim_server.physics import PhysicsError
+from real2sim_server.simulation.experiments import set_up, views, walls
+from real2sim_server.simulation.experiments.film import View, draw, look_at
+from real2sim_server.simulation.experiments.viewing import seen
+from real2sim_server.simulation.playback import Playback
+from real2sim_server.simulation.rollout import simulate
 
 
 @pytest.fixture

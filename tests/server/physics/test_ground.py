@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from real2sim_server.physics import PhysicsError
-from real2sim_server.physics.coupling.surroundings import clearance
-from real2sim_server.physics.ground import find_road
+from real2sim_server.simulation.ground import find_road
+from real2sim_server.simulation.surroundings import clearance
 
 from .scenes import at
 

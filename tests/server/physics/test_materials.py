@@ -9,8 +9,8 @@ import pytest
 
 from real2sim_server.physics import (
     Body,
+    FixedCorotated,
     Foam,
-    Jelly,
     MaterialError,
     Metal,
     NearRigid,
@@ -26,14 +26,14 @@ from .scenes import cube, solve
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Jelly(young=-1), "young of Jelly must be positive"),
-        (lambda: Jelly(young=0), "young of Jelly must be positive"),
-        (lambda: Jelly(young=float("nan")), "finite"),
-        (lambda: Jelly(young="soft"), "finite"),
-        (lambda: Jelly(young=1e5, poisson=0.5), "0.5 is incompressible"),
-        (lambda: Jelly(young=1e5, poisson=-1), r"\(-1, 0.5\)"),
-        (lambda: Jelly(young=1e5, density=0), "density"),
-        (lambda: Jelly(young=1e5, viscosity=-1), "viscosity"),
+        (lambda: FixedCorotated(young=-1), "young of Jelly must be positive"),
+        (lambda: FixedCorotated(young=0), "young of Jelly must be positive"),
+        (lambda: FixedCorotated(young=float("nan")), "finite"),
+        (lambda: FixedCorotated(young="soft"), "finite"),
+        (lambda: FixedCorotated(young=1e5, poisson=0.5), "0.5 is incompressible"),
+        (lambda: FixedCorotated(young=1e5, poisson=-1), r"\(-1, 0.5\)"),
+        (lambda: FixedCorotated(young=1e5, density=0), "density"),
+        (lambda: FixedCorotated(young=1e5, viscosity=-1), "viscosity"),
         (lambda: Metal(young=1e5, yield_stress=0), "yield_stress"),
         (lambda: Metal(young=1e5, yield_stress=1, hardening=-1), "hardening"),
         (lambda: Foam(young=1e5, yield_stress=1, plastic_viscosity=-1), "plastic_viscosity"),
@@ -48,7 +48,7 @@ def test_impossible_parameters_are_refused_by_name(make, words):
 
 
 def test_moduli_follow_from_young_and_poisson():
-    jelly = Jelly(young=2e6, poisson=0.4, density=200)
+    jelly = FixedCorotated(young=2e6, poisson=0.4, density=200)
     assert jelly.shear_modulus == pytest.approx(2e6 / 2.8)
     assert jelly.lame_lambda == pytest.approx(2e6 * 0.4 / (1.4 * 0.2))
     assert jelly.wave_speed == pytest.approx(146.4, abs=0.1)
@@ -114,7 +114,7 @@ def test_snow_carries_stress_and_packs_harder():
 
 @pytest.mark.parametrize(
     "material",
-    [Jelly(young=1e5), NeoHookean(young=1e5), NearRigid()],
+    [FixedCorotated(young=1e5), NeoHookean(young=1e5), NearRigid()],
     ids=lambda m: type(m).__name__,
 )
 def test_elastic_bodies_have_one_deformation(material):

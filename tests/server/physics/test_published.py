@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_server.physics.experiments.published import PUBLISHED
+from real2sim_server.simulation.experiments.published import PUBLISHED
 
 
 @pytest.mark.slow

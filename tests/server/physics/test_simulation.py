@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.physics import Jelly, PhysicsError, Plane, box_particles
-from real2sim_server.physics.coupling.actor import DEFORMING, RESTING, RIGID, Actor
-from real2sim_server.physics.presets import ObjectPhysics
-from real2sim_server.physics.result import SimulationResult
-from real2sim_server.physics.simulation import SimulateOptions, roll
+from real2sim_server.physics import FixedCorotated, PhysicsError, Plane, box_particles
+from real2sim_server.simulation.body import DEFORMING, RIGID, SLEEPING, DeformableBody
+from real2sim_server.simulation.presets import ObjectPhysics
+from real2sim_server.simulation.result import SimulationResult
+from real2sim_server.simulation.rollout import SimulateOptions, roll
 
 from .scenes import at
 
-SOFT = Jelly(young=2e5, poisson=0.3, viscosity=150.0)
+SOFT = FixedCorotated(young=2e5, poisson=0.3, viscosity=150.0)
 
 
-def box(name="box", position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 0.0)) -> Actor:
+def box(name="box", position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 0.0)) -> DeformableBody:
     particles = box_particles((0.6, 0.6, 0.6), spacing=0.1, density=200.0)
-    return Actor(
+    return DeformableBody(
         name,
         particles,
         [SOFT],
@@ -47,7 +47,7 @@ def test_it_falls_freely_then_deforms_then_rests(fall):
     modes = fall.objects["box"].modes
     assert modes[1] == RIGID
     assert DEFORMING in modes
-    assert modes[-1] == RESTING
+    assert modes[-1] == SLEEPING
     assert fall.objects["box"].positions[-1, 2] == pytest.approx(0.3, abs=0.06)
 
 
@@ -61,7 +61,7 @@ def test_the_ground_gives_back_the_momentum_of_the_whole_fall(fall):
     own = fall.objects["box"]
     wanted = own.mass * 9.81 * fall.times_s[-1]
     # Once laid to rest no more is booked: the ground then carries the weight without an impulse.
-    lying = fall.times_s[np.argmax(own.modes == RESTING)]
+    lying = fall.times_s[np.argmax(own.modes == SLEEPING)]
     given = fall.impulses[-1, 0, 2] + own.mass * 9.81 * (fall.times_s[-1] - lying)
     assert given == pytest.approx(wanted, rel=0.03)
 
@@ -91,7 +91,7 @@ def test_a_moving_body_hits_a_standing_one_and_both_part():
     after = {k: o.velocities[-1, 0] for k, o in result.objects.items()}
     assert after["striker"] + after["struck"] == pytest.approx(2.0, abs=1e-3)
     assert after["struck"] > 1.0 > after["striker"]
-    assert result.objects["struck"].modes[0] == RESTING
+    assert result.objects["struck"].modes[0] == SLEEPING
     assert result.objects["struck"].modes[-1] == RIGID
     delta = {c.object_id: c.delta_v for c in result.contacts}
     assert delta["struck"] == pytest.approx(after["struck"], abs=1e-3)

@@ -9,8 +9,8 @@ from real2sim_server.physics import (
     Body,
     Box,
     ColliderError,
+    FixedCorotated,
     HeightField,
-    Jelly,
     MaterialError,
     ParticleError,
     Particles,
@@ -234,7 +234,7 @@ def test_regions_of_one_body_may_differ_in_stiffness():
     body = Body(
         name="car",
         particles=particles,
-        material=[Jelly(young=2e6), Jelly(young=2e4)],
+        material=[FixedCorotated(young=2e6), FixedCorotated(young=2e4)],
         regions=front,
         velocity=(3, 0, 0),
     )

@@ -8,7 +8,7 @@ import pytest
 from real2sim_server.policies.evaluate import Options, run
 from real2sim_server.policies.page import page
 from real2sim_server.policies.summary import figures_of, groups_of, recompute
-from real2sim_server.world.recording import load_recording
+from real2sim_server.world.recording.recording import load_recording
 from real2sim_server.world.scoring import VERSIONS
 
 pytestmark = pytest.mark.network

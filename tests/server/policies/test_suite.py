@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from real2sim_proto.episode import ResetSpec
-from real2sim_server.commands.console import CommandError
+from real2sim_server.console import CommandError
 from real2sim_server.policies.suite import Asked, Case, cases_of, demo_cases, load_suite
 
 BRAKES = {"agents": {"drivers": {"car": {"kind": "hard_brake", "gap": 20.0}}}}

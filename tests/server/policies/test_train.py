@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from real2sim.cli import build_app
 from real2sim.planners import LearnedPolicy, load_planner
 from real2sim.planners.learned import PolicyShape, network, shrink
-from real2sim_server.commands.console import CommandError
+from real2sim_server.console import CommandError
 from real2sim_server.policies.train import Asked, Lessons, driven_from, learn, lessons_of
 from real2sim_server.policies.views import Seen, scene_views
 from real2sim_server.scene.io import save_scene

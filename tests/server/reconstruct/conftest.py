@@ -118,7 +118,7 @@ def painted_log(*, boxes: bool = True, lidar: bool = True, frames: int = 9) -> D
 
 @pytest.fixture(scope="session")
 def synthetic_log() -> DrivingLog:
-    from real2sim_server.logs.synthetic import CameraSpec, SyntheticConfig, generate_log
+    from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
     cameras = (CameraSpec("front"), CameraSpec("front_left", yaw=0.87, position=(1.6, 0.25, 1.6)))
     config = SyntheticConfig(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderOutput, rasterize
 from real2sim_server.scene import GaussianCloud, Sky
-from real2sim_server.scene.rotation import transform_from
 
 WIDTH, HEIGHT = 150, 110
 K = np.array([[[140.0, 0, 70], [0, 150, 60], [0, 0, 1]]])

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.render import Instance, RasterOptions, describe_backends, rasterize
 from real2sim_server.scene import GaussianCloud, Sky
-from real2sim_server.scene.rotation import transform_from
 
 CUDA = next(status for status in describe_backends() if status.name == "cuda")
 needs_gpu = pytest.mark.skipif(not CUDA.usable, reason=f"no CUDA backend: {CUDA.reason}")

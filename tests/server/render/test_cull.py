@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.render import Instance, rasterize
-from real2sim_server.render.backends import cpu
 from real2sim_server.render.backends.base import RasterRequest, place_instances
-from real2sim_server.render.backends.cpu_cull import all_chunks, bounds_of, seen_chunks
-from real2sim_server.render.backends.cpu_inputs import view_of
-from real2sim_server.render.backends.cpu_records import CHUNK
+from real2sim_server.render.backends.cpu import backend as cpu
+from real2sim_server.render.backends.cpu.cull import all_chunks, bounds_of, seen_chunks
+from real2sim_server.render.backends.cpu.inputs import view_of
+from real2sim_server.render.backends.cpu.records import CHUNK
 from real2sim_server.render.types import RasterOptions
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.scene.rotation import transform_from
 
 WIDTH, HEIGHT = 160, 96
 K = np.array([[120.0, 0, 70], [0, 130, 50], [0, 0, 1]])

@@ -12,7 +12,7 @@ import torch
 
 from real2sim_server.render import Instance, RenderOutput, rasterize
 from real2sim_server.render.backends.base import place_instances
-from real2sim_server.render.backends.cpu_inputs import cluster_of, places_of
+from real2sim_server.render.backends.cpu.inputs import cluster_of, places_of
 from real2sim_server.scene import GaussianCloud, Sky
 
 K = np.array([[[200.0, 0, 100], [0, 200, 75], [0, 0, 1]]])
@@ -85,7 +85,7 @@ def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
 def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     instances = scene()
     whole = digest(draw(instances))
-    monkeypatch.setattr("real2sim_server.render.backends.cpu.LIST_BUDGET", 2000)
+    monkeypatch.setattr("real2sim_server.render.backends.cpu.backend.LIST_BUDGET", 2000)
     assert digest(draw(instances)) == whole
 
 

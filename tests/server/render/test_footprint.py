@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from real2sim_server.render.backends.cpu_footprint import (
+from real2sim_server.render.backends.cpu.footprint import (
     FIELD,
     FIELD_MASK,
     ellipse_columns,
@@ -14,9 +14,9 @@ from real2sim_server.render.backends.cpu_footprint import (
     tile_columns,
     tile_rows,
 )
-from real2sim_server.render.backends.cpu_lanes import LANES
-from real2sim_server.render.backends.cpu_project_lanes import PROJECTION
-from real2sim_server.render.backends.cpu_records import (
+from real2sim_server.render.backends.cpu.lanes import LANES
+from real2sim_server.render.backends.cpu.project_lanes import PROJECTION
+from real2sim_server.render.backends.cpu.records import (
     EXPONENT_LIMIT,
     EXTENT_X,
     EXTENT_Y,

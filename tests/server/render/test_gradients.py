@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderOutput, rasterize
 from real2sim_server.scene import GaussianCloud, Sky
-from real2sim_server.scene.rotation import transform_from
 
 WIDTH, HEIGHT = 75, 50
 K = np.array([[70.0, 0, 37], [0, 66, 24], [0, 0, 1]])

@@ -14,10 +14,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.render import Instance, RasterOptions, rasterize
 from real2sim_server.render.backends.reference import ReferenceBackend
 from real2sim_server.scene import GaussianCloud, Sky
-from real2sim_server.scene.rotation import transform_from
 
 WIDTH, HEIGHT = 9, 7
 K = np.array([[[30.0, 0, 4.2], [0, 28, 3.4], [0, 0, 1]]])

@@ -9,21 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.render import (
-    Instance,
-    RasterOptions,
-    RenderError,
-    RenderOutput,
-    rasterize,
-)
-from real2sim_server.scene import GaussianCloud, Sky, TimeColour
-from real2sim_server.scene.rotation import (
+from real2sim_server.geometry.rotation import (
     invert_transform,
     matrix_to_quaternion,
     multiply_quaternions,
     quaternion_to_matrix,
     transform_from,
 )
+from real2sim_server.render import Instance, RasterOptions, RenderError, RenderOutput, rasterize
+from real2sim_server.scene import GaussianCloud, Sky, TimeColour
 
 SIZE, FOCAL = 33, 60.0
 K = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])

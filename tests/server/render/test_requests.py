@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderError, rasterize
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.scene.rotation import transform_from
 
 K = np.array([[[10.0, 0, 5], [0, 10, 5], [0, 0, 1]]])
 EYE = np.eye(4)[None]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.scene import (
     Camera,
     CameraRig,
@@ -18,7 +19,6 @@ from real2sim_server.scene import (
     Trajectory,
 )
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
-from real2sim_server.scene.rotation import yaw_quaternion
 
 MakeCloud = Callable[..., GaussianCloud]
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from real2sim_server.geometry.rotation import apply_transform, transform_from, yaw_quaternion
 from real2sim_server.scene import Camera, CameraRig, SceneError
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
-from real2sim_server.scene.rotation import apply_transform, transform_from, yaw_quaternion
 
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 

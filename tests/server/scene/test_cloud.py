@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import apply_transform, quaternion_to_matrix, transform_from
 from real2sim_server.scene import GaussianCloud, SceneError
 from real2sim_server.scene.harmonics import sh_basis
-from real2sim_server.scene.rotation import apply_transform, quaternion_to_matrix, transform_from
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from real2sim_server.geometry.rotation import quaternion_yaw, transform_from, yaw_quaternion
 from real2sim_server.scene import SceneError, TimeOutOfRangeError, Trajectory
-from real2sim_server.scene.rotation import quaternion_yaw, transform_from, yaw_quaternion
 from real2sim_server.scene.trajectory import relative_transform
 
 TIMES = np.array([1_000_000, 2_000_000, 4_000_000])

@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from real2sim_proto.scenes import Readiness
 from real2sim_server.service.app import create_app
-from real2sim_server.service.store import StoreError
+from real2sim_server.service.storage.store import StoreError
 
 
 def wait_until_ready(client) -> None:
@@ -36,7 +36,9 @@ def test_a_started_worker_lives_and_becomes_ready(client):
 
 def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypatch):
     warm = threading.Event()
-    monkeypatch.setattr("real2sim_server.service.pictures.warm_up", lambda _: warm.wait(30))
+    monkeypatch.setattr(
+        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(30)
+    )
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         assert client.get("/livez").status_code == 200
         response = client.get("/readyz")
@@ -51,7 +53,7 @@ def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
     def fail(_backend):
         raise RuntimeError("no compiler")
 
-    monkeypatch.setattr("real2sim_server.service.pictures.warm_up", fail)
+    monkeypatch.setattr("real2sim_server.service.rendering.renderer.warm_up", fail)
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         deadline = time.monotonic() + 10
         while "no compiler" not in client.get("/readyz").text:

@@ -14,9 +14,9 @@ import httpx2
 import pytest
 
 import real2sim
-from real2sim_server.service.auth import OpenBindError
+from real2sim_server.service.http.auth import OpenBindError
+from real2sim_server.service.http.websocket import PartedProtocol
 from real2sim_server.service.serve import run, running_worker, server_config
-from real2sim_server.service.websocket import PartedProtocol
 
 pytestmark = pytest.mark.network
 
@@ -55,7 +55,9 @@ def test_the_token_is_handed_on(make_settings):
 
 def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
     warm = threading.Event()
-    monkeypatch.setattr("real2sim_server.service.pictures.warm_up", lambda _: warm.wait(1))
+    monkeypatch.setattr(
+        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(1)
+    )
     with (
         pytest.raises(RuntimeError, match="warming up kernels"),
         running_worker(make_settings(), timeout_s=0.5),

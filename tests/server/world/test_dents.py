@@ -12,11 +12,11 @@ import torch
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
-from real2sim_server.physics import crash
+from real2sim_server.geometry.rotation import transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, SceneObject
-from real2sim_server.scene.rotation import transform_from, yaw_quaternion
+from real2sim_server.simulation import impact as crash
 from real2sim_server.world import World
-from real2sim_server.world.history import Entry, Retold, action_payload, reset_payload
+from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
 
 SIZE = (4.2, 1.8, 1.5)
 MASS = 1500.0
@@ -118,11 +118,11 @@ def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_sce
     scene, spec = crash_scene(car=moving(20, 0.4, z=0.75)), ResetSpec(**GO_ON)
     entries = [Entry("reset", 0, reset_payload(spec))]
     entries += [Entry("action", k, action_payload(COAST)) for k in range(25)]
-    told = Retold.on(scene, ScenarioState.of(scene))
+    told = Replayer.on(scene, ScenarioState.of(scene))
     for entry in entries:
         world = told.tell(entry)
     fork = world.light_copy()
-    again = Retold.on(scene, ScenarioState.of(scene))
+    again = Replayer.on(scene, ScenarioState.of(scene))
     for entry in entries:
         other = again.tell(entry)
         other.instances()
@@ -168,7 +168,7 @@ def test_a_car_pushed_into_the_next_is_dented_at_both_ends(crash_scene, moving):
 def crasher(x: float, y: float, vx: float, *, yaw: float = 0.0, mass: float = MASS):
     body = crash.vehicle_body(SIZE, mass=mass, friction=0.4)
     pose = transform_from(np.array([x, y, SIZE[2] / 2]), yaw_quaternion(yaw))
-    return crash.Crasher(body, pose, np.array([vx, 0.0, 0.0]))
+    return crash.ImpactBody(body, pose, np.array([vx, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize(("mass", "y"), [(1500.0, 0.0), (3000.0, 0.0), (1500.0, 0.7)])

@@ -35,7 +35,7 @@ from real2sim_server.world.driving.curve import Curve
 from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS, scheduled
 from real2sim_server.world.driving.lqr import HEADWAY, TIME
 from real2sim_server.world.driving.tyres import integrate
-from real2sim_server.world.ego import Motion
+from real2sim_server.world.ego.vehicle import Motion
 
 VEHICLE = vehicle_of(EgoSpec())
 SLIPPING = vehicle_of(EgoSpec(dynamics="dynamic_bicycle"))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_server.world.driving import Command
-from real2sim_server.world.ego import Motion, drive, holding, logged_motion, placed
+from real2sim_server.world.ego.vehicle import Motion, drive, holding, logged_motion, placed
 
 SPEC = EgoSpec()
 

@@ -11,7 +11,9 @@ import torch
 from real2sim_proto.operations import SetPhysics
 from real2sim_proto.plans import Control
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.world.impact import Body, Solid, corners, exchange, slid, touch
+from real2sim_server.world.collision import manifold as touch
+from real2sim_server.world.collision.body import Body, Solid, integrate_sliding
+from real2sim_server.world.collision.manifold import corners, exchange
 
 COAST = Control(acceleration=0.0, steering=0.0)
 GO_ON = {"action": "control", "on_collision": "continue", "privileged": True}
@@ -106,7 +108,7 @@ def test_boxes_that_are_apart_do_not_touch():
 def test_a_body_without_wheels_slides_as_far_as_friction_says():
     body, solid = Body(0, 0, 0, 10, 0, 0), Solid(80.0, 5.0, 0.5, 0.5, friction=0.7)
     for _ in range(400):
-        body = slid(body, solid, 0.01)
+        body = integrate_sliding(body, solid, 0.01)
     assert (body.vx, body.vy, body.turn) == (0.0, 0.0, 0.0)
     assert body.x == pytest.approx(10**2 / (2 * 0.7 * 9.81), rel=0.03)
 
@@ -115,7 +117,7 @@ def test_a_car_slides_sideways_as_far_as_its_tyres_say():
     solid = Solid(1500.0, 2500.0, 4.5, 1.8, axles=(1.35, 1.35), friction=0.8)
     body = Body(0, 0, math.pi / 2, 8, 0, 0)
     for _ in range(400):
-        body = slid(body, solid, 0.01)
+        body = integrate_sliding(body, solid, 0.01)
     assert body.vx == 0.0
     assert body.x == pytest.approx(8**2 / (2 * 0.8 * 9.81), rel=0.05)
     assert abs(body.y) < 0.1
@@ -126,7 +128,7 @@ def test_a_spinning_car_comes_to_rest():
     body = Body(0, 0, 0, 8, 2, 3.0)
     energies = []
     for _ in range(2000):
-        body = slid(body, solid, 0.01)
+        body = integrate_sliding(body, solid, 0.01)
         energies.append(body.energy(solid))
     assert energies[-1] == 0.0
     assert max(np.diff(energies)) <= 1e-6

@@ -14,12 +14,13 @@ from scipy.spatial import cKDTree
 from real2sim_proto.operations import Translate
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import track_kernels
-from real2sim_server.scene import box_kernels
-from real2sim_server.scene.box import box_penetration
-from real2sim_server.scene.rotation import quaternion_yaw, transform_from, yaw_quaternion
-from real2sim_server.world import contact_kernels, path_kernels, warm_up
+from real2sim_server.geometry import box_kernels
+from real2sim_server.geometry.box import box_penetration
+from real2sim_server.geometry.rotation import quaternion_yaw, transform_from, yaw_quaternion
+from real2sim_server.world import path_kernels, warm_up
+from real2sim_server.world.collision import contact_kernels
 from real2sim_server.world.driving import entries
-from real2sim_server.world.reference import Course
+from real2sim_server.world.ego.reference import PlannedTrajectory
 from real2sim_server.world.scoring import comfort_kernels, hazard_kernels, road_kernels
 from real2sim_server.world.scoring.comfort import plans_agree
 
@@ -311,7 +312,7 @@ def test_yaws_become_continuous_as_by_unwrapping(yaws):
     np.testing.assert_allclose(poses[:, 2], np.unwrap(yaws), atol=1e-9)
 
 
-def plans_alike_by_numpy(before: Course, now: Course) -> bool | None:
+def plans_alike_by_numpy(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | None:
     times = [p.times_us * 1e-6 for p in (before, now)]
     first, last = max(t[0] for t in times), min(t[-1] for t in times)
     count = int((last - first) / 0.1 + 1e-6) + 1
@@ -340,7 +341,7 @@ def test_plans_are_alike_when_their_derivatives_are(seed, scale):
         poses = np.stack([8 * t, 0.1 * t, 3.0 + 0.1 * t], axis=1)
         poses += scale * rng.normal(size=poses.shape)
         poses[:, 2] = np.remainder(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
-        notes.append(Course(times, poses))
+        notes.append(PlannedTrajectory(times, poses))
 
     assert plans_agree(*notes) == plans_alike_by_numpy(*notes)
 

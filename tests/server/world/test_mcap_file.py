@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
-from real2sim_server.world.history import Entry, Retold, action_payload, reset_payload
-from real2sim_server.world.mcap_file import mcap_bytes, recording_in, save_mcap
-from real2sim_server.world.recording import RecordingError, record, to_bytes
+from real2sim_server.world.recording.mcap_file import mcap_bytes, recording_in, save_mcap
+from real2sim_server.world.recording.recording import RecordingError, record, to_bytes
+from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
 
 PICTURE = b"\xff\xd8 a picture"
 
@@ -29,7 +29,7 @@ def recording(make_scene, moving):
         times = [5_000_000 + 100_000 * (step + k + 1) for k in range(10)]
         plan = TrajectoryPlan(times_us=times, poses=[(k + 1.0, 0.0, 0.0) for k in range(10)])
         log.append(Entry("action", step, action_payload(plan)))
-    made = record(Retold.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
+    made = record(Replayer.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
     return replace(made, frames={"frames/front/rgb/000002.jpg": PICTURE})
 
 
@@ -96,7 +96,7 @@ def test_episodes_without_plans_have_no_topic_for_them(make_scene):
     scene = make_scene()
     log = [Entry("reset", 0, reset_payload(ResetSpec(action="control")))]
     log.append(Entry("action", 0, action_payload(Control(acceleration=0.0, steering=0.0))))
-    made = record(Retold.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
+    made = record(Replayer.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
     assert b"/plan" not in mcap_bytes(made)
     assert b"/tf" in mcap_bytes(made)
 

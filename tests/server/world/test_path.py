@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from real2sim_server.geometry.rotation import multiply_quaternions, yaw_quaternion
 from real2sim_server.scene import Trajectory
-from real2sim_server.scene.rotation import multiply_quaternions, yaw_quaternion
 from real2sim_server.world import LoggedGround, LoggedPath
-from real2sim_server.world.route import command_ahead, route_ahead
+from real2sim_server.world.ego.route import command_ahead, route_ahead
 
 
 def along(xyz: list[tuple[float, float, float]], quaternions: np.ndarray) -> Trajectory:

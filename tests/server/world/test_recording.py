@@ -11,9 +11,17 @@ from real2sim_proto.operations import Delete, Translate
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.edit.apply import advance
-from real2sim_server.world.history import (
+from real2sim_server.world.recording.recording import (
+    RecordingError,
+    first_difference,
+    load_recording,
+    record,
+    save_recording,
+    to_bytes,
+)
+from real2sim_server.world.recording.replay import (
     Entry,
-    Retold,
+    Replayer,
     action_payload,
     agent_payload,
     edit_payload,
@@ -22,14 +30,6 @@ from real2sim_server.world.history import (
     no_action_impact,
     reset_payload,
     stop_payload,
-)
-from real2sim_server.world.recording import (
-    RecordingError,
-    first_difference,
-    load_recording,
-    record,
-    save_recording,
-    to_bytes,
 )
 
 DRIVERS = {"car": {"kind": "external"}, "other": {"kind": "idm"}}
@@ -75,8 +75,8 @@ def entries(steps: int = 40, **spec) -> list[Entry]:
     return log
 
 
-def fresh(scene) -> Retold:
-    return Retold.on(scene, ScenarioState.of(scene))
+def fresh(scene) -> Replayer:
+    return Replayer.on(scene, ScenarioState.of(scene))
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,9 @@ def test_an_episode_of_a_scenario_is_lived_through_from_the_file_alone(scene, tm
     for operation in (Translate(object_id="other", x=3.0), Delete(object_id="parked")):
         moved = advance(moved, [operation])
     log = [e for e in entries(8) if e.kind in {"reset", "action"}][:9]
-    made = record(Retold.on(scene, moved), log, scene_hash="abc", scenario=("sc_1", 3), state=moved)
+    made = record(
+        Replayer.on(scene, moved), log, scene_hash="abc", scenario=("sc_1", 3), state=moved
+    )
     loaded = load_recording(save_recording(made, tmp_path / "episode.r2e"))
     assert first_difference(loaded, loaded.fresh(scene)) is None
     assert first_difference(loaded, fresh(scene)) == 0

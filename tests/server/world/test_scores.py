@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 
 from real2sim_server.world import scoring
-from real2sim_server.world.reference import Course
-from real2sim_server.world.scoring import (
-    ContactNote,
-    EgoSample,
-    Instant,
-    Others,
-    ScoringContext,
-)
+from real2sim_server.world.ego.reference import PlannedTrajectory
+from real2sim_server.world.scoring import ContactNote, EgoSample, Instant, Others, ScoringContext
 from real2sim_server.world.scoring.boxes import side_of_contact
 from real2sim_server.world.scoring.comfort import felt_in, window_of
 
@@ -324,7 +318,7 @@ def with_plans(instants: list[Instant], speed_of) -> list[Instant]:
         times = i.t_us + 100_000 * ahead
         poses = np.zeros((20, 3))
         poses[:, 0] = i.ego.x + speed_of(i.step) * DT * ahead
-        planned.append(replace(i, plan=Course(times, poses)))
+        planned.append(replace(i, plan=PlannedTrajectory(times, poses)))
     return planned
 
 

@@ -11,9 +11,9 @@ from real2sim_proto.episode import EgoSpec
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.world.driving import GRAVITY, Command, vehicle_of
 from real2sim_server.world.driving.tyres import axle_forces, fiala
-from real2sim_server.world.ego import Motion, drive, holding
-from real2sim_server.world.reference import Course, Reference
-from real2sim_server.world.trackers import make_tracker
+from real2sim_server.world.ego.reference import PlannedTrajectory, Reference
+from real2sim_server.world.ego.trackers import make_tracker
+from real2sim_server.world.ego.vehicle import Motion, drive, holding
 
 DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
 
@@ -171,7 +171,10 @@ def worst_offset(spec: EgoSpec, speed: float) -> float:
     errors = []
     for k in range(70):
         reference = Reference(
-            motion, start_us=k * 100_000, course=Course.of(times[k:], poses[k:]), spec=spec
+            motion,
+            start_us=k * 100_000,
+            course=PlannedTrajectory.of(times[k:], poses[k:]),
+            spec=spec,
         )
         motion = make_tracker(reference, spec).advance(motion, 0.0, 100_000)
         x, y, yaw = poses[k]
@@ -209,7 +212,9 @@ def test_trackers_obey_the_limits_of_the_vehicle(tracker):
     reference = Reference(
         motion,
         start_us=0,
-        course=Course.of([500_000, 1_000_000], [(-20.0, 30.0, 2.0), (60.0, -50.0, -2.0)]),
+        course=PlannedTrajectory.of(
+            [500_000, 1_000_000], [(-20.0, 30.0, 2.0), (60.0, -50.0, -2.0)]
+        ),
         spec=spec,
     )
     tracker_ = make_tracker(reference, spec)

@@ -2,14 +2,14 @@
 
 from .argoverse2 import Argoverse2Reader
 from .drivestudio import DrivestudioReader
-from .kitti import KittiReader
-from .kitti_raw import KittiRawReader
+from .kitti.raw import KittiRawReader
+from .kitti.tracking import KittiReader
 from .native import NativeReader
 from .nuscenes import NuScenesReader
 from .reader import LogReader
 from .street_gaussians import StreetGaussiansReader
-from .waymo_v1 import WaymoV1Reader
-from .waymo_v2 import WaymoV2Reader
+from .waymo.v1 import WaymoV1Reader
+from .waymo.v2 import WaymoV2Reader
 
 READERS: tuple[LogReader, ...] = (
     NativeReader(),

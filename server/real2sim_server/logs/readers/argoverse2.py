@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, invert_transform, transform_from
 from ...scene import Camera, CameraRig, SceneError, Trajectory
-from ...scene.rotation import Float, invert_transform, transform_from
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from .box_tracks import Box, build_tracks
 from .choice import choose_sequence
-from .image_files import ImageFiles
+from .formats.image_files import ImageFiles
+from .formats.parquet_files import read_feather
+from .formats.tables import check_ego_covers, check_frame_times
 from .image_matching import TimedImages, match_images
 from .lens import Lens
-from .parquet_files import read_feather
-from .tables import check_ego_covers, check_frame_times
 
 AXLE_HEIGHT = 0.33
 """Height of the ego frame above the road [m], from the user guide."""

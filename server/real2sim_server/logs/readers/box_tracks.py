@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from ...geometry.rotation import Float
 from ...scene import SceneError, Trajectory
-from ...scene.rotation import Float
 from ..driving_log import LogError, ObjectTrack
 
 

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, invert_transform
 from ...scene import Camera, CameraRig, SceneError, Trajectory
-from ...scene.rotation import Float, invert_transform
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import image_size
 from .box_tracks import Box, build_tracks
-from .image_files import ImageFiles
-from .json_tables import read_json
-from .tables import check_rigid, parse_numbers, read_lines
-from .waymo import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
+from .formats.image_files import ImageFiles
+from .formats.json_tables import read_json
+from .formats.tables import check_rigid, parse_numbers, read_lines
+from .waymo.segment import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
 
 PERIOD_US = 100_000
 COLUMNS = 14

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 
 MOST_ZOOM = 4.0
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image
-from .tables import check_ego_covers, check_frame_times, check_images
+from .formats.tables import check_ego_covers, check_frame_times, check_images
 
 FORMAT = "real2sim-log"
 VERSION = 1

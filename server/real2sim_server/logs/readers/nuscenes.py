@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, apply_transform, invert_transform, transform_from
 from ...scene import Camera, CameraRig, SceneError, Trajectory
-from ...scene.rotation import Float, apply_transform, invert_transform, transform_from
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from .box_tracks import Box, build_tracks
 from .choice import choose_sequence
-from .image_files import ImageFiles
+from .formats.image_files import ImageFiles
+from .formats.json_tables import Tables
+from .formats.tables import check_ego_covers, check_frame_times
 from .image_matching import MatchedImages, TimedImages, match_images
-from .json_tables import Tables
 from .lens import Lens
-from .tables import check_ego_covers, check_frame_times
 
 LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
 TOLERANCE_US = 60_000

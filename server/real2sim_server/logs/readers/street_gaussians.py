@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float
 from ...scene.camera import T_VEHICLE_OPTICAL
-from ...scene.rotation import Float
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import image_size
-from .array_pickles import read_pickled_arrays
-from .image_files import ImageFiles
-from .json_tables import read_json
-from .tables import check_rigid, parse_numbers, read_lines
-from .waymo import (
+from .formats.array_pickles import read_pickled_arrays
+from .formats.image_files import ImageFiles
+from .formats.json_tables import read_json
+from .formats.tables import check_rigid, parse_numbers, read_lines
+from .waymo.segment import (
     CAMERA_NAMES,
     WaymoBox,
     WaymoCamera,

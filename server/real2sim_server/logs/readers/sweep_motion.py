@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.rotation import Float, invert_transform
+from ...geometry.rotation import Float, invert_transform
 
 
 def compensate_sweep(

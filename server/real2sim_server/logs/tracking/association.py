@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 from .clusters import Cluster
 from .motion import State
 
@@ -25,7 +25,7 @@ REFUSED = 1e6
 
 
 @dataclass(eq=False)
-class Trail:
+class Track:
     """Clusters that are one thing, by frame."""
 
     state: State
@@ -42,10 +42,10 @@ class Trail:
         return max(self.clusters)
 
 
-def follow(scans: Sequence[Sequence[Cluster]], times: Float, *, patience: int) -> list[Trail]:
+def follow(scans: Sequence[Sequence[Cluster]], times: Float, *, patience: int) -> list[Track]:
     """Trails through all frames; one ends after ``patience`` frames without a cluster."""
-    alive: list[Trail] = []
-    ended: list[Trail] = []
+    alive: list[Track] = []
+    ended: list[Track] = []
     for frame, scan in enumerate(scans):
         if frame:
             for trail in alive:
@@ -56,11 +56,11 @@ def follow(scans: Sequence[Sequence[Cluster]], times: Float, *, patience: int) -
         for index in free:
             cluster = scan[index]
             state = State.first(cluster.centre, DEVIATION)
-            alive.append(Trail(state, {frame: cluster}))
+            alive.append(Track(state, {frame: cluster}))
     return ended + alive
 
 
-def _match(trails: Sequence[Trail], clusters: Sequence[Cluster], frame: int) -> list[int]:
+def _match(trails: Sequence[Track], clusters: Sequence[Cluster], frame: int) -> list[int]:
     """Give trails their clusters; returns the clusters that nobody gets (Hungarian method)."""
     if not trails or not clusters:
         return list(range(len(clusters)))
@@ -82,7 +82,7 @@ def _match(trails: Sequence[Trail], clusters: Sequence[Cluster], frame: int) -> 
     return [i for i in range(len(clusters)) if i not in taken]
 
 
-def _change(trail: Trail, cluster: Cluster) -> float:
+def _change(trail: Track, cluster: Cluster) -> float:
     """How much the extent changes [m]: two things near each other are told apart by it."""
     latest = trail.clusters[trail.last]
     one = np.ptp(latest.points[:, :2], axis=0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 from .clusters import Cluster
 from .motion import smooth
 

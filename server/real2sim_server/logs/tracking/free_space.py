@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 
 BEAM = 0.013
 """A beam tells about directions this near to its own [rad]."""

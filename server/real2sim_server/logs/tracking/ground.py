@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 
 CELL = 1.0
 WINDOW = 7

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 
 ACCELERATION = 2.5
 """Standard deviation of accelerations [m/s^2]."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, apply_transform, invert_transform, yaw_quaternion
 from ...scene import Trajectory
-from ...scene.rotation import Float, apply_transform, invert_transform, yaw_quaternion
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
-from .association import Trail, follow
+from .association import Track, follow
 from .boxes import FittedBox, fit_box
 from .clusters import Cluster, find_clusters
 from .free_space import Witness
@@ -110,7 +110,7 @@ def _witness(sweep: LidarSweep, pose: Float) -> Witness:
     return Witness(world.astype(np.float32), sensor)
 
 
-def _goes_somewhere(trail: Trail, times: Float, options: TrackingOptions) -> bool:
+def _goes_somewhere(trail: Track, times: Float, options: TrackingOptions) -> bool:
     """A first, cheap sieve: half of what is asked for in the end."""
     if len(trail.clusters) < max(3, options.least_frames // 2):
         return False
@@ -122,7 +122,7 @@ def _goes_somewhere(trail: Trail, times: Float, options: TrackingOptions) -> boo
     return bool(gone > options.least_distance / 2 and gone > options.least_speed / 2 * seconds)
 
 
-def _join(trails: Sequence[Trail], times: Float) -> list[dict[int, Cluster]]:
+def _join(trails: Sequence[Track], times: Float) -> list[dict[int, Cluster]]:
     """Put together what is one thing: parts side by side, and trails that were cut in two."""
     parts = [dict(t.clusters) for t in trails]
     boxes = [fit_box(p, times) for p in parts]

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 from ..colliders import Box, Collider, HeightField, Plane
-from ..laws import obstacle
-from ..laws.contact import STICKS
+from ..constitutive import obstacle
+from ..constitutive.contact import STICKS
 
 TOTALS = 8
 """Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
@@ -188,5 +188,5 @@ def _pack_box(row: Float, box: Box) -> None:
     row[obstacle.SPEED : obstacle.SPEED + 3] = box.velocity
 
 
-class Blowup(Exception):
+class SolverDiverged(Exception):
     """Particles left the numbers or the grid within a step; the state is lost, go back."""

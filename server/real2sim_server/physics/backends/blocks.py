@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 from ..colliders import Box, Collider
-from ..laws.stress import KIND, VON_MISES
+from ..constitutive.stress import KIND, VON_MISES
 from . import particle as columns
-from .base import TOTALS, Blowup, Measure, Model, ParticleArrays, pack_colliders
+from .base import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from .layout import BLOCK, COLLIDER_MARGIN, Int, Layout, arrange
 from .particle import NODES, TILE, Rules, State, Work
 
@@ -222,13 +222,13 @@ class BlockSimulation:
         s = self._state
         at = self._fetch(s.xi)
         if not (np.isfinite(at).all() and np.isfinite(self._fetch(s.v)).all()):
-            raise Blowup
+            raise SolverDiverged
         if hasattr(self, "_work"):
             self._flush()
         shift = _block_of(at)
         # More than a few blocks in one go is no motion but an explosion.
         if np.abs(shift).max() > 1 << 10:
-            raise Blowup
+            raise SolverDiverged
         xi = (at - (shift * BLOCK).astype(self._dtype)).astype(self._dtype)
         blocks = self._blocks + shift
         bodies = self._model.body[self._order]

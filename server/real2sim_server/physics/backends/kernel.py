@@ -14,10 +14,10 @@ from typing import Any
 
 import numba
 
-from ...scene.compiled import fingerprint
-from ..laws.shared import FASTMATH
+from ..._numba import fingerprint
+from ..constitutive.shared import FASTMATH
 
-FOLDERS = (Path(__file__).parent, Path(__file__).parents[1] / "laws")
+FOLDERS = (Path(__file__).parent, Path(__file__).parents[1] / "constitutive")
 inner: Any = functools.partial(numba.njit, error_model="numpy", fastmath=FASTMATH)
 """Compiles functions that only entry points call; they are cached as part of those."""
 
@@ -38,4 +38,4 @@ def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 @functools.cache
 def source_fingerprint() -> str:
     """Eight hexadecimal digits that change with any source a kernel is made of."""
-    return fingerprint(path for folder in FOLDERS for path in sorted(folder.glob("*.py")))
+    return fingerprint(path for folder in FOLDERS for path in sorted(folder.rglob("*.py")))

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 from ..colliders import Collider, HeightField
+from ..constitutive.obstacle import obstacle_distance
 from ..errors import ParticleError
-from ..laws.obstacle import obstacle_distance
 from .base import pack_colliders
 
 Int = NDArray[np.int64]

@@ -12,15 +12,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..laws.contact import OPPOSED, coulomb, face_score, surface_offset
-from ..laws.obstacle import (
-    FRICTION,
-    SEPARABLE,
-    obstacle_distance,
-    obstacle_velocity,
-    unit,
-)
-from ..laws.shared import ZERO, law
+from ..constitutive.contact import OPPOSED, coulomb, face_score, surface_offset
+from ..constitutive.obstacle import FRICTION, SEPARABLE, obstacle_distance, obstacle_velocity, unit
+from ..constitutive.shared import ZERO, law
 from .layout import BLOCK
 
 

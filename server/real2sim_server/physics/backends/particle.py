@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..laws.matrices import det
-from ..laws.shared import F32, FOUR, HALF, ZERO, law
-from ..laws.stress import (
+from ..constitutive.matrices import det
+from ..constitutive.shared import F32, FOUR, HALF, ZERO, law
+from ..constitutive.stress import (
     KIND,
     LAMBDA,
     MU,
@@ -23,7 +23,7 @@ from ..laws.stress import (
     C,
     add_viscosity,
     advance_gradient,
-    respond,
+    stress_update,
 )
 from .layout import BLOCK
 
@@ -202,7 +202,7 @@ def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
     """Advance one particle's deformation by its velocity gradient and find its stress."""
     L = nine(state.L, p)
     trial = advance_gradient(nine(state.F, p), L, dt)
-    F, tau, energy, history = respond(trial, state.history[p], row, dt)
+    F, tau, energy, history = stress_update(trial, state.history[p], row, dt)
     if row[VISCOSITY] > ZERO:
         tau = add_viscosity(tau, L, det(F), row[VISCOSITY])
     for c in range(9):

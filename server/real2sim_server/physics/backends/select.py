@@ -22,15 +22,15 @@ def select_backend(name: str = "auto") -> Backend:
         SolverError: for an unknown name, or for ``cuda`` where no device is usable.
     """
     if name in ("auto", "cpu"):
-        from .cpu import CpuBackend
+        from .cpu.backend import CpuBackend
 
         return CpuBackend()
     if name == "cuda":
-        from .cuda import CudaBackend
+        from .cuda.backend import CudaBackend
 
         return CudaBackend()
     if name == "reference":
-        from .reference import ReferenceBackend
+        from .reference.backend import ReferenceBackend
 
         return ReferenceBackend()
     raise SolverError(f"unknown backend {name!r}; allowed are 'auto' and {list(BACKENDS)}")

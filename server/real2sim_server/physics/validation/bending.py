@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...scene.rotation import Float
+from ...geometry.rotation import Float
 from ..body import Body
 from ..colliders import Box
-from ..materials import Jelly
+from ..materials import FixedCorotated
 from ..solver import Solver
 from .check import Check, Curve, block, placed, solve
 
 LENGTH, HEIGHT, DX = 2.0, 0.2, 0.05
-MATERIAL = Jelly(young=1e6, poisson=0.0, density=1000)
+MATERIAL = FixedCorotated(young=1e6, poisson=0.0, density=1000)
 BENDING = MATERIAL.young * HEIGHT**4 / 12
 """E I [N m^2]."""
 SHEARING = 5 / 6 * MATERIAL.shear_modulus * HEIGHT**2

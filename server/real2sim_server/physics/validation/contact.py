@@ -8,14 +8,14 @@ import numpy as np
 
 from ..body import Body
 from ..colliders import Plane
-from ..materials import Jelly
+from ..materials import FixedCorotated
 from ..particles import ball_particles
 from ..restitution import fit_restitution
 from ..solver import SolverOptions
 from .check import Check, Curve, block, placed, solve
 
 GRAVITY = 9.81
-RUBBER = Jelly(young=2e5, poisson=0.2, viscosity=200)
+RUBBER = FixedCorotated(young=2e5, poisson=0.2, viscosity=200)
 """Damped, so that a block that is set down comes to rest and stays in touch."""
 
 
@@ -72,7 +72,7 @@ def oblique_impact(backend: str) -> list[Check]:
     checks = []
     for mu in (0.1, 0.3):
         body = block(
-            Jelly(young=2e6, poisson=0.2),
+            FixedCorotated(young=2e6, poisson=0.2),
             size=(0.8, 0.8, 0.2),
             at=(0, 0, 0.11),
             velocity=(6, 0, -2),
@@ -94,7 +94,7 @@ def frictionless_slide(backend: str) -> list[Check]:
 
     Stiff enough that edges do not dig in, which would brake them in earnest.
     """
-    material = Jelly(young=2e6, poisson=0.2)
+    material = FixedCorotated(young=2e6, poisson=0.2)
     upper = block(material, at=(0.1, 0, 0.205), velocity=(-3, 0, -0.5), friction=0, name="upper")
     lower = block(
         material,
@@ -122,7 +122,7 @@ def restitution(backend: str, *, requests: tuple[float, ...] = (0.1, 0.3, 0.5, 0
     dx, speed = 0.08, 2.5
     wall = Plane(name="wall", point=(0, 0, 0.75 * dx))
     options = SolverOptions(dx=dx, backend=backend, gravity=(0.0, 0.0, 0.0))
-    body = block(Jelly(young=2e6, poisson=0.4), size=(0.48,) * 3, spacing=0.04)
+    body = block(FixedCorotated(young=2e6, poisson=0.4), size=(0.48,) * 3, spacing=0.04)
     for e in requests:
         fit = fit_restitution(body, e, speed=speed, wall=wall, options=options)
         thrown = block(
@@ -148,7 +148,7 @@ def restitution(backend: str, *, requests: tuple[float, ...] = (0.1, 0.3, 0.5, 0
 def collinear_cars(backend: str) -> list[Check]:
     """Delta-v of two cars in line: m2 / (m1 + m2) (1 + e) Vc (momentum theory)."""
     front = block(
-        Jelly(young=2e6, poisson=0.2, density=150, viscosity=3000),
+        FixedCorotated(young=2e6, poisson=0.2, density=150, viscosity=3000),
         size=(1.6, 0.8, 0.6),
         spacing=0.1,
         at=(-0.85, 0, 0),
@@ -156,7 +156,7 @@ def collinear_cars(backend: str) -> list[Check]:
         name="bullet",
     )
     target = block(
-        Jelly(young=2e6, poisson=0.2, density=250, viscosity=3000),
+        FixedCorotated(young=2e6, poisson=0.2, density=250, viscosity=3000),
         size=(1.6, 0.8, 0.6),
         spacing=0.1,
         at=(0.85, 0, 0),
@@ -208,7 +208,7 @@ def rolling_ball(backend: str) -> list[Check]:
     ball = Body(
         name="ball",
         particles=matter.moved(placed(0, 0, radius)),
-        material=Jelly(young=1e7, poisson=0.3, density=1000, viscosity=3000),
+        material=FixedCorotated(young=1e7, poisson=0.3, density=1000, viscosity=3000),
         velocity=(speed, 0, 0),
         friction=0.5,
     )

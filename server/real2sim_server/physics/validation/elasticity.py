@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..colliders import Box, Plane
-from ..materials import Jelly, Metal, NeoHookean
+from ..materials import FixedCorotated, Metal, NeoHookean
 from ..solver import Solver
 from .check import Check, Curve, block, placed, solve
 
@@ -16,7 +16,7 @@ def vibrating_bar(backend: str) -> list[Check]:
     L = 25 m, E = 100 Pa, rho = 1 kg/m^3, nu = 0, v = 0.1 sin(pi x / 2L) m/s. The clamp is the
     middle of a bar of twice the length.
     """
-    material = Jelly(young=100, poisson=0, density=1)
+    material = FixedCorotated(young=100, poisson=0, density=1)
     still = block(material, size=(50, 2, 2), spacing=0.5)
     x = still.particles.positions[:, 0]
     velocity = np.zeros((len(x), 3))
@@ -44,7 +44,7 @@ def vibrating_bar(backend: str) -> list[Check]:
 
 def bar_on_wall(backend: str) -> list[Check]:
     """A bar on a rigid wall: stress rho c v there, for 2 L / c, then it comes off whole."""
-    material = Jelly(young=1e6, poisson=0, density=1000)
+    material = FixedCorotated(young=1e6, poisson=0, density=1000)
     length, speed, dx = 2.0, 0.3, 0.05
     c, area = material.wave_speed, 0.1**2
     t, J, rebound = _bar_run(backend, material, (length, 0.1, 0.1), speed, dx)
@@ -71,7 +71,11 @@ def bar_on_wall(backend: str) -> list[Check]:
 
 
 def _bar_run(
-    backend: str, material: Jelly, size: tuple[float, float, float], speed: float, dx: float
+    backend: str,
+    material: FixedCorotated,
+    size: tuple[float, float, float],
+    speed: float,
+    dx: float,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Times, impulses of the wall until then, and the restitution."""
     length, c = size[0], material.wave_speed
@@ -93,7 +97,7 @@ def bulk_modulus(backend: str) -> list[Check]:
     checks = []
     strain = 1e-3
     for material in (
-        Jelly(young=1e6, poisson=0.3),
+        FixedCorotated(young=1e6, poisson=0.3),
         NeoHookean(young=1e6, poisson=0.3),
         Metal(young=1e6, poisson=0.3, yield_stress=1e6),
     ):
@@ -120,7 +124,7 @@ def confined_compression(backend: str) -> list[Check]:
     Mean pressure over loss of volume is the bulk modulus, differences give the shear modulus. The
     squeeze is read in the middle of the block, as surfaces give way by part of a cell.
     """
-    material = Jelly(young=1e6, poisson=0.3, density=1000, viscosity=2000)
+    material = FixedCorotated(young=1e6, poisson=0.3, density=1000, viscosity=2000)
     edge, speed, window = 0.8, 0.1, 0.04
     body = block(material, size=(edge,) * 3, spacing=0.05)
     middle = np.abs(body.particles.positions).max(axis=1) < edge / 8

@@ -8,10 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..backends.reference import torch_model
-from ..backends.reference_step import TorchRules, TorchState, settle, substep
+from ..backends.reference.backend import torch_model
+from ..backends.reference.step import TorchRules, TorchState, settle, substep
 from ..colliders import Plane
-from ..laws import stress as laws
+from ..constitutive import stress as laws
 from ..materials import Metal
 from .check import Check, block, solve
 

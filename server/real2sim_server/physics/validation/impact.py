@@ -9,7 +9,7 @@ import numpy as np
 
 from ..body import Body
 from ..colliders import Plane
-from ..materials import Jelly
+from ..materials import FixedCorotated
 from ..particles import Particles, ball_particles, box_particles
 from .check import Check, Curve, placed, solve
 
@@ -41,7 +41,7 @@ def _disc_run(backend: str, dx: float) -> tuple[tuple[float, float], float, floa
     """((kinetic energy kept, distance at the end), time of touch, initial energy / thickness)."""
     thickness = 0.1
     matter = disc_particles(0.2, thickness, spacing=dx / 2, density=1000)
-    material = Jelly(young=1000, poisson=0.3, density=1000)
+    material = FixedCorotated(young=1000, poisson=0.3, density=1000)
     bodies = [
         Body(
             name=name,
@@ -72,7 +72,7 @@ def stiff_discs(backend: str) -> list[Check]:
     Up to what goes on ringing in them, for they meet at a seventh of the speed of sound.
     """
     diameter, dx = 0.05, 0.0025
-    material = Jelly(young=1e9, poisson=0.33, density=1500)
+    material = FixedCorotated(young=1e9, poisson=0.33, density=1500)
     speed = 0.07 * math.sqrt(material.young / material.density)
     matter = disc_particles(diameter / 2, 2 * dx, spacing=dx / 2, density=1500)
     bodies = [
@@ -96,7 +96,7 @@ def stiff_discs(backend: str) -> list[Check]:
 
 def hertz(backend: str) -> list[Check]:
     """A ball on a rigid wall: t_c = 2.87 (m^2 / (R E*^2 v))^(1/5) (Johnson 1985, 11.24)."""
-    material = Jelly(young=1e6, poisson=0.3, density=1000)
+    material = FixedCorotated(young=1e6, poisson=0.3, density=1000)
     radius, speed, dx = 0.5, 0.5, 0.05
     matter = ball_particles(radius, spacing=dx / 2, density=1000)
     body = Body(

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..body import Body
 from ..colliders import Plane
-from ..materials import Jelly
+from ..materials import FixedCorotated
 from .check import Check, block, solve
 
 GRAVITY = 9.81
@@ -17,7 +17,7 @@ GRAVITY = 9.81
 def free_fall(backend: str, *, edge: float = 0.4, steps: int = 100) -> list[Check]:
     """A falling block: symplectic Euler gives z0 - g t (t + dt) / 2, and F stays I."""
     dt = 1e-4
-    body = block(Jelly(young=2e6), size=(edge,) * 3)
+    body = block(FixedCorotated(young=2e6), size=(edge,) * 3)
     solver = solve([body], gravity=(0, 0, -GRAVITY), backend=backend, dt_max=dt)
     solver.step(steps * dt)
     fallen = float(solver.measure.centre[0, 2])
@@ -37,10 +37,10 @@ def affine_patch(backend: str, *, edge: float = 0.4) -> list[Check]:
     """
     A = np.array([[0.3, -0.2, 0.1], [0.5, -0.4, 0.2], [-0.1, 0.6, 0.2]])
     size = (edge,) * 3
-    still = block(Jelly(young=1e-9), size=size)
+    still = block(FixedCorotated(young=1e-9), size=size)
     x = still.particles.positions
     moving = block(
-        Jelly(young=1e-9),
+        FixedCorotated(young=1e-9),
         size=size,
         particle_velocities=x @ A.T,
         particle_gradients=np.tile(A, (len(x), 1, 1)),
@@ -61,7 +61,7 @@ def affine_patch(backend: str, *, edge: float = 0.4) -> list[Check]:
 
 def spin(backend: str, *, edge: float = 0.48, turns: float = 1.0) -> list[Check]:
     """A free block at 60 rad/s keeps its angular momentum and its energy for a revolution."""
-    material = Jelly(young=2e6, poisson=0.4)
+    material = FixedCorotated(young=2e6, poisson=0.4)
     body = block(material, size=(edge,) * 3, spacing=0.06, angular_velocity=(0, 0, 60.0))
     solver = solve([body], backend=backend, dx=0.12)
     start = solver.measure
@@ -77,7 +77,7 @@ def spin(backend: str, *, edge: float = 0.48, turns: float = 1.0) -> list[Check]
 
 def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Check]:
     """Two blocks that collide in space: mass, momentum, angular momentum, energy, volume."""
-    material = Jelly(young=2e5, poisson=0.3)
+    material = FixedCorotated(young=2e5, poisson=0.3)
     size, away = (edge,) * 3, 0.625 * edge
     bodies = [
         block(material, size=size, at=(-away, 0, 0), velocity=(1.5, 0, 0), name="left"),
@@ -112,7 +112,7 @@ def scale_invariance(backend: str) -> list[Check]:
     ends = []
     for s in (1.0, 2.0):
         body = block(
-            Jelly(young=2e5 * s**2, poisson=0.4),
+            FixedCorotated(young=2e5 * s**2, poisson=0.4),
             size=np.full(3, 0.4) * s,
             spacing=0.05 * s,
             at=np.array([0.01, 0.02, 0.21]) * s,
@@ -134,7 +134,9 @@ def scale_invariance(backend: str) -> list[Check]:
 
 def reproducibility(backend: str) -> list[Check]:
     """The same run twice gives the same bits; particles in another order, the same motion."""
-    body = block(Jelly(young=2e5, poisson=0.4), at=(0.01, 0.02, 0.21), velocity=(0.5, 0, -2))
+    body = block(
+        FixedCorotated(young=2e5, poisson=0.4), at=(0.01, 0.02, 0.21), velocity=(0.5, 0, -2)
+    )
     shuffled = np.random.default_rng(0).permutation(len(body.particles))
     first, again, other = (
         _drop(replace(body, particles=body.particles.take(order)), backend)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, invert_transform
 from ...logs import ObjectTrack
-from ...logs.synthetic import SyntheticLog
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene
-from ...scene.rotation import Float, invert_transform
+from ...synthetic import SyntheticLog
 from .image_metrics import mean_psnr, psnr
 
 AZIMUTHS = 8

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, apply_transform
 from ...logs import DrivingLog
 from ...scene import Camera
-from ...scene.rotation import Float, apply_transform
 
 NEAR, FAR = 0.5, 80.0
 """Points at other depths are not compared [m]."""

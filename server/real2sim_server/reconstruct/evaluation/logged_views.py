@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render import RasterOptions, render_cameras
 from ...scene import Camera, Scene
-from ...scene.rotation import apply_transform, invert_transform
 from ..options import ReconstructError
 from .image_metrics import psnr
 from .rendering import scene_instances

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.box import box_corners
+from ...geometry.rotation import Float, apply_transform, invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import Camera
-from ...scene.box import box_corners
-from ...scene.rotation import Float, apply_transform, invert_transform
 
 NEAR = 0.2
 """Boxes are cut off at this depth before the camera [m]."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.box import box_corners
 from ...logs import DrivingLog
 from ...render import encode_rgb
 from ...scene import Camera
-from ...scene.box import box_corners
 from ..training.data import image_time
 from .object_regions import box_outline, moving_tracks
 

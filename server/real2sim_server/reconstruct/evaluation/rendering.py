@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...geometry.rotation import Float
 from ...render import Frame, Instance, RasterOptions, render_cameras
 from ...scene import Camera, Scene
-from ...scene.rotation import Float
 
 
 def scene_instances(scene: Scene, t_us: int) -> list[Instance]:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..._files import atomic_file
 from ...logs import DrivingLog
 from ...render import Frame
 from ...scene import Camera, Scene
-from ...scene.io.atomic import atomic_file
 from ..training.data import image_time
 from .choice import compared_cameras
 from .pictures import (

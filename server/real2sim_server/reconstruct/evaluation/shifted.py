@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...logs.synthetic import SyntheticLog
+from ...geometry.rotation import Float, apply_transform, invert_transform
 from ...scene import Camera, Scene
-from ...scene.rotation import Float, apply_transform, invert_transform
+from ...synthetic import SyntheticLog
 from .image_metrics import mean_psnr, psnr, ssim
 from .lidar_depth import FAR, NEAR, median_error
 from .object_regions import moving_mask, moving_tracks

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...logs import DrivingLog
-from ...logs.synthetic import CameraSpec, SyntheticConfig, SyntheticLog, generate_log
+from ...synthetic import CameraSpec, SyntheticConfig, SyntheticLog, generate_log
 from .image_metrics import psnr
 
 SAME_DB = 30.0

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...geometry.rotation import Float
 from ...scene import GaussianCloud, Scene
 from ...scene.cloud import SH_DEGREES
 from ...scene.errors import SceneError
 from ...scene.harmonics import rotate_sh
 from ...scene.io.formats.types import build_cloud
-from ...scene.rotation import Float
 from ..options import ReconstructError
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import simplejpeg
 
-from ...scene.rotation import Float, is_rigid
+from ...geometry.rotation import Float, is_rigid
 from .checkpoint import CheckpointError
 
 PNG_MAGIC = b"\x89PNG"

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float
 from ...scene import Sky
-from ...scene.rotation import Float
 from ...scene.sky import face_directions
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float
 from ...scene import Camera, CameraRig
 from ...scene.errors import SceneError
-from ...scene.rotation import Float
 from .checkpoint import CheckpointError
 from .dataset_files import image_size, read_intrinsics, read_json, read_pose
 

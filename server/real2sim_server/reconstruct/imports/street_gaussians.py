@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ...geometry.rotation import Float, transform_from, yaw_quaternion
 from ...scene import GaussianCloud, Scene, SceneObject, Sky, Trajectory
-from ...scene.rotation import Float, transform_from, yaw_quaternion
 from .checkpoint import (
     DIRECTIONS_WARNING,
     CheckpointError,

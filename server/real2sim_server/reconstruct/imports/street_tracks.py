@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.rotation import Float, apply_transform
+from ...geometry.rotation import Float, apply_transform
 from ...scene.trajectory import leads_anywhere
 from .checkpoint import CheckpointError
 from .dataset_files import read_json

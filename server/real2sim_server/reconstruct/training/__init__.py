@@ -5,8 +5,8 @@ from .data import held_out_frames, training_log
 from .held_out import HeldOutScore, score_held_out
 from .losses import LossWeights
 from .model import SceneModel
+from .progress import OnTraining, TrainingProgress
 from .run import TrainResult, train
-from .running import OnTraining, TrainingProgress
 from .schedule import PRESETS, DensifyOptions, LearningRates, TrainOptions, preset
 from .trainer import Trainer
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...logs import DrivingLog, ObjectTrack
-from ...scene import Trajectory
-from ...scene.rotation import (
+from ...geometry.rotation import (
     Float,
     multiply_quaternions,
     quaternion_to_matrix,
     quaternion_yaw,
     yaw_quaternion,
 )
+from ...logs import DrivingLog, ObjectTrack
+from ...scene import Trajectory
 
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 """What vehicles usually do: standard deviations [m/s^2] and [rad/s^2]."""

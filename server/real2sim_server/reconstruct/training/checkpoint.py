@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from ...scene.io.atomic import atomic_folder
+from ..._files import atomic_folder
 from ..options import ReconstructError
 
 FORMAT = "real2sim-training"

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...geometry.rotation import apply_transform
 from ...logs import DrivingLog, LidarSweep
 from ...scene import Camera
-from ...scene.rotation import apply_transform
 from ..options import ReconstructError
 from .schedule import TrainOptions
 

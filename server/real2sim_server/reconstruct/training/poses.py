@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...scene import Scene, Trajectory
-from ...scene.rotation import (
+from ...geometry.rotation import (
     Float,
     multiply_quaternions,
     quaternion_to_matrix,
     transform_from,
     yaw_quaternion,
 )
+from ...scene import Scene, Trajectory
 from .losses import second_differences
 
 

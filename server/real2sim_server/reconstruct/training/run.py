@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
+from ..._files import atomic_file
 from ...logs import DrivingLog, check_log
 from ...render.backends import Backend
 from ...scene import Scene
 from ...scene.io import load_scene, save_scene
-from ...scene.io.atomic import atomic_file
-from ..initialise import initialise_scene
+from ..initialise.stage0 import initialise_scene
 from ..options import ReconstructError
 from ..stages import OnProgress, Stages
 from .boxes import smoothed_boxes
 from .data import Views, held_out_frames, training_log
 from .held_out import HeldOutScore, score_held_out
 from .model import SceneModel
-from .running import OnTraining, TrainingProgress
+from .progress import OnTraining, TrainingProgress
 from .schedule import TrainOptions
 from .threads import one_torch_thread
 from .trainer import CHECKPOINT, Trainer

@@ -24,7 +24,7 @@ from .metrics import MetricsFile
 from .model import Rendered, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
-from .running import Clock, OnTraining, Running, Stopwatch, TrainingProgress
+from .progress import Clock, OnTraining, Running, Stopwatch, TrainingProgress
 from .schedule import HiddenLimits, TrainOptions, from_values, rates_at
 from .visibility import Look, drop_hidden, guesses_behind, hidden_sky, visibility
 

@@ -64,11 +64,11 @@ def describe_backends() -> list[BackendStatus]:
 
 def _make(name: str) -> Backend:
     if name == "cuda":
-        from .cuda import CudaBackend
+        from .cuda.backend import CudaBackend
 
         return CudaBackend()
     if name == "cpu":
-        from .cpu import CpuBackend
+        from .cpu.backend import CpuBackend
 
         return CpuBackend()
     from .reference import ReferenceBackend

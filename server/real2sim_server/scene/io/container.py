@@ -11,8 +11,8 @@ from typing import Any, TypeVar, get_args
 from pydantic import ValidationError
 from torch import Tensor
 
+from ..._files import atomic_folder
 from ..errors import BundleError
-from .atomic import atomic_folder
 from .document import AssetDocument, SceneDocument
 from .tensors import write_tensors
 

@@ -9,11 +9,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from ..._files import atomic_file, atomic_folder
+from ...geometry.rotation import Float, invert_transform
 from ..cloud import GaussianCloud
 from ..errors import SceneError
-from ..rotation import Float, invert_transform
 from ..scene import Scene, SceneObject
-from .atomic import atomic_file, atomic_folder
 from .export_gltf import write_gltf
 from .splats import UpAxis, format_to_write, upright, write_splats
 

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float, invert_transform, matrix_to_quaternion
 from ..camera import Camera
 from ..cloud import GaussianCloud
 from ..harmonics import SH_C0
-from ..rotation import Float, invert_transform, matrix_to_quaternion
 from ..scene import Scene, SceneObject
 from ..trajectory import Trajectory
 from .formats.types import host_array

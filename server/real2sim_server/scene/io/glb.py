@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._files import atomic_file
 from ..errors import SceneError
-from .atomic import atomic_file
 
 FLOAT, UNSIGNED_BYTE = 5126, 5121
 ARRAY_BUFFER = 34962

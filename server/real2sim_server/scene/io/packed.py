@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from ..._files import atomic_file
 from ..camera import CameraRig
 from ..cloud import GaussianCloud
 from ..colour import TimeColour
 from ..errors import BundleError, SceneError
 from ..scene import Scene, SceneObject
 from ..sky import Sky
-from .atomic import atomic_file
 from .document import CameraPart, TrajectoryPart
 
 FORMAT, VERSION = "real2sim-packed", 1

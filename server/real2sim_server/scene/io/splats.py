@@ -9,11 +9,11 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
+from ...geometry.rotation import Float, quaternion_to_matrix, yaw_quaternion
 from ..asset import Asset
 from ..camera import T_VEHICLE_OPTICAL, Camera, CameraRig
 from ..cloud import GaussianCloud
 from ..errors import BundleError, SceneError
-from ..rotation import Float, quaternion_to_matrix, yaw_quaternion
 from ..scene import Scene
 from ..trajectory import Trajectory
 from .formats import FORMATS, SplatFormat, inria_ply

@@ -19,11 +19,11 @@ from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.base import Identifier
 
 from ...render import encode_image
-from ..answers import info_response
-from ..assets import LibraryAsset, cut_out, uploaded
-from ..imports import scene_name
-from ..problems import ServiceError
-from ..thumbnails import draw_thumbnail
+from ..http.problems import ServiceError
+from ..http.responses import info_response
+from ..library.assets import LibraryAsset, cut_out, uploaded
+from ..library.imports import scene_name
+from ..library.thumbnails import draw_thumbnail
 from ..worker import Worker, WorkerOf
 
 UPLOAD_PATH = "/v1/assets"

@@ -6,8 +6,8 @@ from fastapi import APIRouter, WebSocket
 
 from real2sim_proto import SUPPORTED_SUBPROTOCOLS
 
-from ..auth import same_secret, unauthorized
-from ..problems import REQUEST_ID_KEY, ServiceError, problem_response
+from ..http.auth import same_secret, unauthorized
+from ..http.problems import REQUEST_ID_KEY, ServiceError, problem_response
 from ..sessions.connection import Connection
 from ..sessions.messages import unsupported_protocol
 from ..sessions.session import Session

@@ -9,11 +9,11 @@ from fastapi import APIRouter, Request, Response
 from real2sim_proto.jobs import ExportRequest, JobInfo
 
 from ...edit import ScenarioState, instances_at
-from ..answers import info_response
-from ..clients import ClientName
-from ..exports import Film, check_camera, export_video, frame_times
-from ..idempotency import IdempotencyKey
-from ..jobs import JobResult, NewJob, Ticket, accepted_headers
+from ..http.clients import ClientName
+from ..http.idempotency import IdempotencyKey
+from ..http.responses import info_response
+from ..jobs.exports import Film, check_camera, export_video, frame_times
+from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
 from ..worker import Worker, WorkerOf
 
 router = APIRouter(prefix="/v1/exports", tags=["exports"])
@@ -38,7 +38,7 @@ async def create(
         check_camera(film, body, max_pixels=worker.settings.max_pixels_per_step)
         frame_times(film, body)
 
-        async def work(ticket: Ticket) -> JobResult:
+        async def work(ticket: JobContext) -> JobResult:
             return await export_video(film, body, pictures=worker.pictures, ticket=ticket)
 
         subject = body.scenario or body.scene or body.simulation or ""

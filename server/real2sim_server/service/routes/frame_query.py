@@ -14,8 +14,8 @@ from real2sim_proto.drive import SensorSpec
 from ...edit import ScenarioState, instances_at
 from ...render import Instance
 from ...scene import Scene
-from ..answers import CODEC_OF, choose_media_type
-from ..pictures import Shot
+from ..http.responses import CODEC_OF, choose_media_type
+from ..rendering.renderer import RenderRequest
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class FrameQuery:
         """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
         return choose_media_type(self.accept, self.modality)
 
-    def shot(self, scene: Scene, state: ScenarioState, media_type: str) -> Shot:
+    def shot(self, scene: Scene, state: ScenarioState, media_type: str) -> RenderRequest:
         """What to draw, from where the recording vehicle was.
 
         Raises:
@@ -51,7 +51,7 @@ class FrameQuery:
 
     def shot_of(
         self, scene: Scene, instances: Sequence[Instance], t_us: int, media_type: str
-    ) -> Shot:
+    ) -> RenderRequest:
         """The same for instances that are there already."""
         sensor = SensorSpec(
             camera=self.camera or scene.rig.names[0],
@@ -59,7 +59,7 @@ class FrameQuery:
             width=self.width,
             codec=CODEC_OF[media_type],
         )
-        return Shot(
+        return RenderRequest(
             scene=scene,
             instances=instances,
             T_world_vehicle=scene.ego.transform(t_us),

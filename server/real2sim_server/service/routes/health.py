@@ -7,8 +7,8 @@ from fastapi import APIRouter, Depends, Response
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import Readiness
 
-from ..auth import require_token
-from ..problems import ServiceError
+from ..http.auth import require_token
+from ..http.problems import ServiceError
 from ..worker import WorkerOf
 
 router = APIRouter(tags=["health"])

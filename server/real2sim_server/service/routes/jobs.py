@@ -12,11 +12,11 @@ from fastapi.responses import FileResponse, StreamingResponse
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo, JobList
 
-from ..answers import FRAME_RESPONSES, frame_response, info_response
-from ..disconnects import unless_gone
-from ..events import event_stream
-from ..jobs import Jobs
-from ..pictures import Shot
+from ..http.disconnects import unless_gone
+from ..http.events import event_stream
+from ..http.responses import FRAME_RESPONSES, frame_response, info_response
+from ..jobs.jobs import Jobs
+from ..rendering.renderer import RenderRequest
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -97,7 +97,7 @@ async def preview(
     film = await worker.simulations.film(job_id)
     t_us = film.span[0] if asked.t_us is None else asked.t_us
 
-    def shot() -> Shot:
+    def shot() -> RenderRequest:
         return asked.shot_of(film.scene, film.instances(t_us), t_us, media_type)
 
     taken = await asyncio.to_thread(shot)

@@ -24,14 +24,14 @@ from real2sim_proto.scenarios import (
     ScenarioList,
 )
 
-from ..answers import FRAME_RESPONSES, frame_response, info_response, large_response
-from ..clients import ClientName
-from ..disconnects import unless_gone
-from ..idempotency import IdempotencyKey, Once
-from ..jobs import accepted_headers
-from ..problems import ServiceError
-from ..scenarios import created_headers, tag
-from ..views import etag
+from ..http.clients import ClientName
+from ..http.disconnects import unless_gone
+from ..http.idempotency import IdempotencyKey, IdempotentRequest
+from ..http.problems import ServiceError
+from ..http.responses import FRAME_RESPONSES, frame_response, info_response, large_response
+from ..jobs.jobs import accepted_headers
+from ..library.views import etag
+from ..scenarios.scenarios import created_headers, tag
 from ..worker import Worker, WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -62,7 +62,7 @@ class Change:
         """Revision that the change was made for. Raises ServiceError: INVALID_REQUEST."""
         return expected_revision(self.if_match)
 
-    def once(self, worker: Worker) -> AbstractAsyncContextManager[Once]:
+    def once(self, worker: Worker) -> AbstractAsyncContextManager[IdempotentRequest]:
         """See :meth:`Idempotency.once`."""
         return worker.idempotency.once(self.request, self.idempotency_key)
 

@@ -15,8 +15,8 @@ from starlette.datastructures import UploadFile
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import SceneImport, SceneInfo
 
-from ..imports import import_scene, resolve_import, scene_name
-from ..problems import ServiceError
+from ..http.problems import ServiceError
+from ..library.imports import import_scene, resolve_import, scene_name
 from ..worker import Worker, WorkerOf
 from .scenes import scene_response
 

@@ -13,12 +13,12 @@ from real2sim_proto.jobs import JobInfo
 from real2sim_proto.scenes import SceneInfo, SceneList, SceneState
 
 from ...edit import ScenarioState
-from ..answers import FRAME_RESPONSES, frame_response, info_response, large_response
-from ..clients import ClientName
-from ..disconnects import unless_gone
-from ..jobs import JobResult, NewJob, Ticket, accepted_headers
-from ..problems import ServiceError
-from ..views import scene_info
+from ..http.clients import ClientName
+from ..http.disconnects import unless_gone
+from ..http.problems import ServiceError
+from ..http.responses import FRAME_RESPONSES, frame_response, info_response, large_response
+from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
+from ..library.views import scene_info
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -71,7 +71,7 @@ async def load(
         return await scene_response(worker, scene)
     await worker.residency.summary(scene)
 
-    async def work(_ticket: Ticket) -> JobResult:
+    async def work(_ticket: JobContext) -> JobResult:
         await worker.residency.get(scene)
         return JobResult()
 

@@ -19,10 +19,10 @@ from real2sim_proto.sessions import (
     StepRequest,
 )
 
-from ..answers import info_response, large_response
-from ..auth import opens, require_token, unauthorized
-from ..idempotency import IdempotencyKey
-from ..problems import ServiceError
+from ..http.auth import opens, require_token, unauthorized
+from ..http.idempotency import IdempotencyKey
+from ..http.problems import ServiceError
+from ..http.responses import info_response, large_response
 from ..sessions.describe import session_info, session_state
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import created_headers

@@ -9,9 +9,9 @@ from fastapi.responses import RedirectResponse, Response
 
 from real2sim_proto import ErrorCode
 
-from ..problems import ServiceError
+from ..http.problems import ServiceError
 
-FOLDER = Path(__file__).parent.parent / "ui"
+FOLDER = Path(__file__).parents[1] / "ui"
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",

@@ -7,10 +7,10 @@ from urllib.parse import urlsplit
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
-from ..auth import same_secret
-from ..hosts import FOREIGN
-from ..problems import ServiceError
-from ..views_socket import View
+from ..http.auth import same_secret
+from ..http.hosts import FOREIGN
+from ..http.problems import ServiceError
+from ..rendering.views_socket import View
 from ..worker import Worker, WorkerOf
 
 UNAUTHORIZED, REFUSED = 4401, 4404

@@ -24,20 +24,20 @@ from real2sim_proto.drive import (
     Snapshot,
 )
 
-from ..auth import opens, same_secret, unauthorized
-from ..problems import ServiceError, service_error
-from ..websocket import send, written
+from ..http.auth import opens, same_secret, unauthorized
+from ..http.problems import ServiceError, service_error
+from ..http.websocket import send, written
+from .deadline_timer import DeadlineTimer
 from .describe import welcome_fields
 from .messages import BadMessageError, Incoming, bad_message, read_message, unsupported_protocol
 from .observers import Mailbox
-from .patience import Patience
 from .registry import Sessions
 from .session import Session, controller_taken
 from .wire import Message, pack_message
 
-GREETING_S = 10.0
+HANDSHAKE_TIMEOUT_S = 10.0
 PROGRESS_S = 1.0
-FAREWELL_S = 2.0
+CLOSE_TIMEOUT_S = 2.0
 SMALL_BYTES = 16_384
 """Messages up to this size are read on the event loop: that takes less than handing them over."""
 
@@ -91,7 +91,7 @@ class Connection:
         self._worker_token = worker_token
         self._ws_base = ws_base
         self._sending = asyncio.Lock()
-        self._patience = Patience(session, sessions.stepper, self._send)
+        self._patience = DeadlineTimer(session, sessions.stepper, self._send)
 
     async def serve(self) -> None:
         """Talk until one of both leaves. A client that vanishes disturbs nobody."""
@@ -124,10 +124,10 @@ class Connection:
     async def _greeting(self) -> Hello:
         """The client's hello. Raises FatalError when there is no talking to it."""
         try:
-            async with asyncio.timeout(GREETING_S):
+            async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
                 message = (await self._receive()).message
         except TimeoutError as error:
-            refusal = ServiceError(ErrorCode.TIMEOUT, f"no hello within {GREETING_S:g} s")
+            refusal = ServiceError(ErrorCode.TIMEOUT, f"no hello within {HANDSHAKE_TIMEOUT_S:g} s")
             raise FatalError(refusal) from error
         except BadMessageError as error:
             raise FatalError(error.refusal, message_id=error.message_id) from error
@@ -375,7 +375,7 @@ class Connection:
     async def _hang_up(self, refusal: ServiceError, *, message_id: int = 0) -> None:
         """Tell the client why this is over and close; one that does not listen is left alone."""
         with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
-            async with asyncio.timeout(FAREWELL_S):
+            async with asyncio.timeout(CLOSE_TIMEOUT_S):
                 await self._send(self._error(refusal, fatal=True), message_id)
                 await self._socket.close(POLICY_VIOLATION, refusal.code.value)
 

@@ -14,7 +14,7 @@ from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionInfo, SessionState
 
 from ...world import Event, World, agent_fields, metrics_version
-from ..views import camera_infos, edited_objects
+from ..library.views import camera_infos, edited_objects
 from .session import Session
 
 

@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 
 from real2sim_proto import ErrorCode
 
-from ..problems import ServiceError
+from ..http.problems import ServiceError
 
 A = TypeVar("A")
 

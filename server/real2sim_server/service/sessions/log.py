@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ...world.history import Entry
-from ..store import SessionEntry
+from ...world.recording.replay import Entry
+from ..storage.store import SessionEntry
 
 
 def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:

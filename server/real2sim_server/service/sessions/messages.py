@@ -17,8 +17,8 @@ from real2sim_proto import (
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage
 
-from ...world.history import plan_payload
-from ..problems import ServiceError
+from ...world.recording.replay import plan_payload
+from ..http.problems import ServiceError
 
 MAX_PROBLEMS = 4
 TYPES = "hello, reset, action, edit, render, agent, snapshot, restore, fork, bye"

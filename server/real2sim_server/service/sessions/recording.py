@@ -8,12 +8,12 @@ from dataclasses import replace
 from real2sim_proto import ErrorCode
 
 from ...world import World
-from ...world.history import Entry, Retold, last_episode, no_action_impact
-from ...world.recording import Recording, record, to_bytes
-from ..problems import ServiceError
+from ...world.recording.recording import Recording, record, to_bytes
+from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
+from ..http.problems import ServiceError
+from .observation_renderer import ObservationRenderer
 from .registry import Sessions
 from .session import Session, Start
-from .show import Show
 from .wire import EncodedFrame
 
 RECORDING = "application/vnd.real2sim.episode"
@@ -40,14 +40,14 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
         world = session.running_world()
         impact = None
         if world.tally.first_impact is not None:
-            impact = no_action_impact(Retold.on(start.scene, start.state), entries)
+            impact = no_action_impact(Replayer.on(start.scene, start.state), entries)
         scenario = (
             (row.scenario_id, row.scenario_revision)
             if row.scenario_id is not None and row.scenario_revision is not None
             else None
         )
         return record(
-            Retold.on(start.scene, start.state),
+            Replayer.on(start.scene, start.state),
             entries,
             scene_hash=row.scene_hash,
             scenario=scenario,
@@ -61,8 +61,10 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
     return await sessions.show.on_world_thread(to_bytes, recording)
 
 
-async def _frames(show: Show, start: Start, entries: Iterable[Entry]) -> Mapping[str, bytes]:
-    retold, kept, total = Retold.on(start.scene, start.state), dict[str, bytes](), 0
+async def _frames(
+    show: ObservationRenderer, start: Start, entries: Iterable[Entry]
+) -> Mapping[str, bytes]:
+    retold, kept, total = Replayer.on(start.scene, start.state), dict[str, bytes](), 0
     for entry in entries:
         world = await show.on_world_thread(retold.tell, entry)
         if entry.kind not in {"reset", "action"}:
@@ -79,7 +81,7 @@ async def _frames(show: Show, start: Start, entries: Iterable[Entry]) -> Mapping
     return kept
 
 
-async def _drawn(show: Show, world: World) -> list[EncodedFrame]:
+async def _drawn(show: ObservationRenderer, world: World) -> list[EncodedFrame]:
     sensors = [
         s.model_copy(update={"codec": "png"}) if s.codec == "raw" else s
         for s in world.due_sensors()

@@ -9,16 +9,18 @@ from real2sim_proto import ErrorCode, decode, encode
 
 from ...edit import LogEntry, Scenario, ScenarioState
 from ...world import World
-from ...world.history import Entry, Retold
-from ..problems import ServiceError
-from ..scenarios import Scenarios
-from ..store import SessionRow, Store
+from ...world.recording.replay import Entry, Replayer
+from ..http.problems import ServiceError
+from ..scenarios.scenarios import Scenarios
+from ..storage.store import SessionRow, Store
 from .log import entries_of
+from .observation_renderer import ObservationRenderer
 from .session import Session, Start
-from .show import Show
 
 
-async def rebuild(row: SessionRow, start: Start, *, store: Store, show: Show) -> Session:
+async def rebuild(
+    row: SessionRow, start: Start, *, store: Store, show: ObservationRenderer
+) -> Session:
     """The session as it was when its last entry took effect.
 
     Everything is lived through again without rendering but the last step, whose answer its client
@@ -36,7 +38,7 @@ async def rebuild(row: SessionRow, start: Start, *, store: Store, show: Show) ->
     entries = entries_of(rows)
     if not entries:
         return session
-    retold = Retold.on(start.scene, start.state)
+    retold = Replayer.on(start.scene, start.state)
     *before, last = entries
     await show.on_world_thread(_tell_all, retold, before)
     session.snapshots = retold.snapshots
@@ -92,12 +94,12 @@ def check_scene(row: SessionRow, scene_hash: str) -> None:
         )
 
 
-def _tell_all(retold: Retold, entries: Sequence[Entry]) -> None:
+def _tell_all(retold: Replayer, entries: Sequence[Entry]) -> None:
     for entry in entries:
         retold.tell(entry)
 
 
-def _world(retold: Retold) -> World:
+def _world(retold: Replayer) -> World:
     assert retold.world is not None
     return retold.world
 

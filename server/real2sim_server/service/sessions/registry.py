@@ -20,19 +20,19 @@ from real2sim_proto.sessions import SessionInfo
 from ...edit import ScenarioState
 from ...scene import Scene
 from ...world import Score
-from ...world.history import Entry, Retold, last_episode, no_action_impact
+from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ...world.scoring import scores_of
-from ..idempotency import Once
-from ..metrics import Metrics
-from ..problems import ServiceError
-from ..residency import Residency
-from ..scenarios import Scenarios
-from ..store import SessionRow, Store, now_us
+from ..http.idempotency import IdempotentRequest
+from ..http.metrics import Metrics
+from ..http.problems import ServiceError
+from ..library.scene_cache import SceneCache
+from ..scenarios.scenarios import Scenarios
+from ..storage.store import SessionRow, Store, now_us
 from .describe import session_info
 from .log import entries_of
+from .observation_renderer import ObservationRenderer
 from .recovery import check_scene, rebuild, state_at
 from .session import Session, Start
-from .show import Show
 from .step import Stepper
 
 RETRY_AFTER_S = 5
@@ -73,9 +73,9 @@ class Sessions:
         self,
         limits: SessionLimits,
         *,
-        show: Show,
+        show: ObservationRenderer,
         store: Store,
-        residency: Residency,
+        residency: SceneCache,
         scenarios: Scenarios,
         metrics: Metrics,
     ) -> None:
@@ -127,7 +127,7 @@ class Sessions:
         scene: str | None,
         scenario: str | None,
         spec: ResetSpec | None,
-        once: Once,
+        once: IdempotentRequest,
         ws_base: str,
     ) -> SessionInfo:
         """A new session on a scene or a scenario.
@@ -237,7 +237,7 @@ class Sessions:
         def score() -> list[Score]:
             context = world.context
             if world.tally.first_impact is not None:
-                retold = Retold.on(session.start.scene, session.start.state)
+                retold = Replayer.on(session.start.scene, session.start.state)
                 context = replace(context, no_action_impact=no_action_impact(retold, entries))
             return scores_of(world.tally, context)
 

@@ -15,8 +15,8 @@ from ...edit import ScenarioState
 from ...scene import Camera, Scene
 from ...scene.io import SceneSummary
 from ...world import Event, World
-from ..problems import ServiceError
-from ..store import SessionRow
+from ..http.problems import ServiceError
+from ..storage.store import SessionRow
 from .lockstep import LockStep, not_reset
 from .observers import Mailbox
 from .wire import Message

@@ -17,7 +17,7 @@ from real2sim_proto.operations import Operation
 from ...edit import EditOutcome
 from ...scene import Camera
 from ...world import Event, Plan, World
-from ...world.history import (
+from ...world.recording.replay import (
     KEPT_PLAN,
     action_payload,
     agent_payload,
@@ -26,10 +26,10 @@ from ...world.history import (
     reset_payload,
     stop_payload,
 )
-from ..problems import ServiceError
-from ..store import SessionEntry, Store, now_us
+from ..http.problems import ServiceError
+from ..storage.store import SessionEntry, Store, now_us
+from .observation_renderer import EncodedObservation, ObservationRenderer, Tell
 from .session import Session
-from .show import Show, Shown, Tell
 from .wire import Message
 
 Thing = tuple[str, int, bytes]
@@ -49,7 +49,7 @@ class Stepper:
         store: takes the logs of the sessions.
     """
 
-    def __init__(self, show: Show, store: Store) -> None:
+    def __init__(self, show: ObservationRenderer, store: Store) -> None:
         self._show = show
         self._store = store
 
@@ -100,7 +100,8 @@ class Stepper:
             plan: what the ego does.
             payload: canonical bytes of the plan.
             latency_us: wall-clock time from the observation to this action.
-            tell: may get the observation before it is returned, see :meth:`Show.observe`.
+            tell: may get the observation before it is returned, see
+                :meth:`ObservationRenderer.observe`.
 
         Raises:
             WorldError: the plan is refused.
@@ -148,7 +149,7 @@ class Stepper:
         payload: bytes,
         *,
         tell: Tell | None = None,
-    ) -> Shown:
+    ) -> EncodedObservation:
         now = session.running_world()
 
         def moved() -> World:
@@ -254,7 +255,7 @@ class Stepper:
         thing: Thing,
         *,
         tell: Tell | None = None,
-    ) -> Shown:
+    ) -> EncodedObservation:
         entries = _entries(session, [thing])
         recorded = False
 

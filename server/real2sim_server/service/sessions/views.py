@@ -9,15 +9,15 @@ from fastapi import Response
 from real2sim_proto.drive import SensorSpec
 
 from ...world import World
-from ..answers import CODEC_OF, choose_among, choose_media_type
-from ..views import etag
-from .show import Show
+from ..http.responses import CODEC_OF, choose_among, choose_media_type
+from ..library.views import etag
+from .observation_renderer import ObservationRenderer
 
 MSGPACK = "application/msgpack"
 
 
 async def view_response(
-    show: Show, world: World, sensors: Sequence[SensorSpec], accept: str | None
+    show: ObservationRenderer, world: World, sensors: Sequence[SensorSpec], accept: str | None
 ) -> Response:
     """All frames as msgpack; a single one also as an image file, if ``accept`` likes that best.
 

@@ -19,8 +19,8 @@ from real2sim_proto.drive import SensorSpec
 
 from ...render import encode_image
 from ...scene import Camera
-from ..pictures import Image
-from ..websocket import Part
+from ..http.websocket import Part
+from ..rendering.renderer import Image
 
 FIXMAP = 16
 FRAMES, DATA = (msgpack.packb(name) for name in ("frames", "data"))

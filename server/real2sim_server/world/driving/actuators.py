@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...scene.compiled import inner
+from ..._numba import inner
 from .state import Command, clamped
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ...scene.compiled import inner
+from ..._numba import inner
 from .state import PlanarState, clamped
 from .tyres import integrate, tyre_share
 from .vehicle import GRAVITY

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...scene.compiled import inner
+from ..._numba import inner
 from .state import clamped, wrapped
 
 T, X, Y, YAW, VX, VY = range(6)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...scene.compiled import compiled_from, inner
+from ..._numba import compiled_from, inner
 from .actuators import at_wheels, begun, left, sent
 from .bicycle import moved_on
 from .curve import Curve, at, curve_through, end_of, heading

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ...scene.compiled import inner
+from ..._numba import inner
 from .lqr import point_at
 from .state import Command, clamped, wrapped
 

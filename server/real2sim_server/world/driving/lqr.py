@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ...scene.compiled import inner
+from ..._numba import inner
 from .curve import MOVING, YAW, X, Y, end_of, heading, planned
 from .state import GENTLE_BRAKING, Command, wrapped
 

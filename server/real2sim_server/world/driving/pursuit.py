@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ...scene.compiled import inner
+from ..._numba import inner
 from .curve import YAW, X, Y, at, end_of, heading
 from .state import GENTLE_BRAKING, Command, clamped
 

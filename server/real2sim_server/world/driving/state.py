@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ...scene.compiled import inner
+from ..._numba import inner
 
 GENTLE_BRAKING = 2.0
 """Deceleration after a plan's end [m/s^2]."""

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import savgol_coeffs
 
+from ..ego.reference import PlannedTrajectory
 from ..path import Float
-from ..reference import Course
 from .comfort_kernels import derivatives, plans_alike, slid
 
 WINDOW_S = 1.5
@@ -103,7 +103,7 @@ def felt_in(samples: Float, dt: float) -> Felt:
     return Felt(acceleration, lateral, jerk, lon_jerk, rate, yaw_acceleration)
 
 
-def plans_agree(before: Course, now: Course) -> bool | None:
+def plans_agree(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | None:
     """Whether two successive plans feel alike where both say something.
 
     RMS differences of acceleration, jerk, yaw rate and yaw acceleration over the overlap, by

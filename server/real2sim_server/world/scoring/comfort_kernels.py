@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...scene.compiled import compiled
+from ..._numba import compiled
 
 PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
 """Greatest RMS difference of successive plans in acceleration, jerk, yaw rate, yaw acceleration

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from ...scene.compiled import compiled
+from ..._numba import compiled
 
 HORIZON, STEP = 3.0, 0.1
 STEPS = 31

@@ -11,8 +11,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ego.reference import PlannedTrajectory
 from ..path import Float
-from ..reference import Course
 from .road_kernels import DENSITY, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
@@ -104,7 +104,7 @@ class Instant:
     others: Others
     contacts: tuple[ContactNote, ...] = ()
     secondary: int = 0
-    plan: Course | None = None
+    plan: PlannedTrajectory | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...scene.compiled import compiled
+from ..._numba import compiled
 
 DENSITY = 0.25
 """Distance between points of the lines that roads are made of [m]."""

@@ -14,12 +14,7 @@ from real2sim_proto.episode import CutInDriver, HardBrakeDriver, JunctionCrossin
 
 from ...edit import ObjectState
 from ..path import LoggedPath
-from .driver import (
-    AgentPose,
-    Surroundings,
-    level_quaternion,
-    pose_on_path,
-)
+from .driver import AgentPose, Surroundings, level_quaternion, pose_on_path
 from .idm import ahead
 from .replay import recorded_pose
 

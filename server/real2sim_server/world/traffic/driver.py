@@ -11,9 +11,9 @@ import numpy as np
 
 from ...edit import ObjectState
 from ..agents import Agents, rows_of
-from ..contact import REAR_OVERHANG
-from ..contact_kernels import headings
-from ..ego import Motion
+from ..collision.contact import REAR_OVERHANG
+from ..collision.contact_kernels import headings
+from ..ego.vehicle import Motion
 from ..path import Float, LoggedPath, PathPoint
 
 

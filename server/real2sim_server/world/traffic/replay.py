@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 from ...edit import ObjectState
-from ...scene.rotation import quaternion_yaw
+from ...geometry.rotation import quaternion_yaw
 from .driver import AgentPose, Surroundings
 
 

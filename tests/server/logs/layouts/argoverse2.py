@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
+from real2sim_server.geometry.rotation import invert_transform, matrix_to_quaternion
 from real2sim_server.logs import DrivingLog
 from real2sim_server.logs.images import write_image
-from real2sim_server.scene.rotation import invert_transform, matrix_to_quaternion
 
 AXLE = 0.33
 FIRST_NS = 315966253660357000

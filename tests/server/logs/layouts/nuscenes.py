@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from real2sim_server.logs import DrivingLog
-from real2sim_server.logs.images import write_image
-from real2sim_server.scene.rotation import (
+from real2sim_server.geometry.rotation import (
     apply_transform,
     invert_transform,
     matrix_to_quaternion,
 )
+from real2sim_server.logs import DrivingLog
+from real2sim_server.logs.images import write_image
 
 MAP = np.array([411.3, 1180.9, 0.0])
 FIRST_US = 1532402927647951

@@ -7,13 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from real2sim_server.geometry.rotation import invert_transform, matrix_to_quaternion, quaternion_yaw
 from real2sim_server.logs import DrivingLog
 from real2sim_server.logs.images import write_image
-from real2sim_server.scene.rotation import (
-    invert_transform,
-    matrix_to_quaternion,
-    quaternion_yaw,
-)
 
 WORLD = np.array([-25211.0, 42391.0, -160.0])
 SENSORS = ("FRAME", "FRONT", "FRONT_LEFT", "FRONT_RIGHT")

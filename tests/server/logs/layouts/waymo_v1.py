@@ -8,15 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from real2sim_server.geometry.rotation import invert_transform, matrix_to_quaternion, quaternion_yaw
 from real2sim_server.logs import DrivingLog
 from real2sim_server.logs.images import encode_image
-from real2sim_server.logs.readers.wire_format import masked_crc32c
+from real2sim_server.logs.readers.formats.wire_format import masked_crc32c
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
-from real2sim_server.scene.rotation import (
-    invert_transform,
-    matrix_to_quaternion,
-    quaternion_yaw,
-)
 
 BEAMS, COLUMNS = 100, 2048
 LOW, HIGH = np.radians(-45.0), np.radians(5.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.logs.synthetic import CameraSpec, SyntheticConfig, generate_log
+from real2sim_server.geometry.rotation import invert_transform
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
 from real2sim_server.reconstruct.evaluation.around import (
     HEIGHT,
@@ -14,7 +14,7 @@ from real2sim_server.reconstruct.evaluation.around import (
     logged_azimuths,
     view_from,
 )
-from real2sim_server.scene.rotation import invert_transform
+from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from real2sim_server.geometry.box import box_corners
 from real2sim_server.logs import ObjectTrack
 from real2sim_server.reconstruct.evaluation.object_regions import (
     box_outline,
@@ -10,7 +11,6 @@ from real2sim_server.reconstruct.evaluation.object_regions import (
     moving_tracks,
 )
 from real2sim_server.scene import Camera, Trajectory
-from real2sim_server.scene.box import box_corners
 
 from ..conftest import painted_log
 

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 from real2sim_server.cli import app
 from real2sim_server.logs import open_log, write_native_log
-from real2sim_server.logs.synthetic import CameraSpec, SyntheticConfig, generate_log
 from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
 from real2sim_server.reconstruct.evaluation import EvaluateOptions, evaluate_scene
 from real2sim_server.reconstruct.evaluation.box_error import box_error
@@ -21,6 +20,7 @@ from real2sim_server.reconstruct.evaluation.scores import logged_mask
 from real2sim_server.reconstruct.evaluation.shifted import evaluate_shifts, true_view
 from real2sim_server.reconstruct.evaluation.truth import find_truth
 from real2sim_server.scene.io import save_scene
+from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
 from ..conftest import painted_log
 

@@ -7,7 +7,6 @@ import math
 import pytest
 
 from real2sim_server.logs import DrivingLog
-from real2sim_server.logs.synthetic import CameraSpec, SyntheticConfig, generate_log
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
 from real2sim_server.reconstruct.training import (
     DensifyOptions,
@@ -16,6 +15,7 @@ from real2sim_server.reconstruct.training import (
     training_log,
 )
 from real2sim_server.scene import Scene
+from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
 TINY = TrainOptions(
     iterations=60,

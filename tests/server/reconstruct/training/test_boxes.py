@@ -28,7 +28,7 @@ def errors(log, truth) -> list[float]:
 
 @pytest.fixture(scope="module")
 def long_log():
-    from real2sim_server.logs.synthetic import SyntheticConfig, generate_log
+    from real2sim_server.synthetic import SyntheticConfig, generate_log
 
     return generate_log(SyntheticConfig(seed=2, frames=50, parked_cars=0))
 

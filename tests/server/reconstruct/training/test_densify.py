@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.reconstruct.training.densify import (
-    Densifier,
-    ScreenSums,
-    rotations,
-)
+from real2sim_server.reconstruct.training.densify import Densifier, ScreenSums, rotations
 from real2sim_server.reconstruct.training.gaussians import FIELDS, Gaussians, leaf
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.reconstruct.training.relocation import share

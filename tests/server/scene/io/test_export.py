@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import apply_transform
 from real2sim_server.scene import GaussianCloud, SceneError, Trajectory, UnknownObjectError
 from real2sim_server.scene.io import export_scene, import_splats, read_splats
 from real2sim_server.scene.io.export import bake
-from real2sim_server.scene.rotation import apply_transform
 
 SPLATS = ["ply", "compressed.ply", "spz", "splat"]
 

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.scene import (
     CameraRig,
     GaussianCloud,
@@ -12,7 +13,6 @@ from real2sim_server.scene import (
     Trajectory,
 )
 from real2sim_server.scene.io import export_scene
-from real2sim_server.scene.rotation import yaw_quaternion
 
 from .glb_reading import Glb, rotation_matrix
 

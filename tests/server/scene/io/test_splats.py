@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.geometry.rotation import apply_transform
 from real2sim_server.scene import Asset, BundleError, GaussianCloud, Scene, SceneError
 from real2sim_server.scene.io import (
     import_splats,
@@ -15,7 +16,6 @@ from real2sim_server.scene.io import (
     write_ply,
 )
 from real2sim_server.scene.io.formats import FORMATS
-from real2sim_server.scene.rotation import apply_transform
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import pytest
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode
 from real2sim_proto.drive import SERVER_MESSAGE
-from real2sim_server.service.engine import QueueFullError
-from real2sim_server.service.websocket import written
+from real2sim_server.service.http.websocket import written
+from real2sim_server.service.rendering.engine import QueueFullError
 
 pytestmark = pytest.mark.network
 

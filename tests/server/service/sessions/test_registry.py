@@ -143,7 +143,7 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(
         raise RenderError("no memory for this picture")
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"real2sim_server.service.sessions.show.{encoding}", fail)
+        patch.setattr(f"real2sim_server.service.sessions.observation_renderer.{encoding}", fail)
         assert planner.act(0)["type"] == "error"
     assert [e.kind for e in entries(site, info)] == ["reset"]
     assert planner.act(0, acceleration=0.2)["step"] == 1

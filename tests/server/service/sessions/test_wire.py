@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from real2sim_proto import decode
 from real2sim_proto.drive import SERVER_MESSAGE, SensorSpec
+from real2sim_server.geometry.rotation import transform_from
 from real2sim_server.scene import Camera
-from real2sim_server.scene.rotation import transform_from
-from real2sim_server.service.pictures import Image
+from real2sim_server.service.rendering.renderer import Image
 from real2sim_server.service.sessions.wire import (
     Stopwatch,
     encode_frame,

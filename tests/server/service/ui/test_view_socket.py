@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from real2sim_server.service.views_socket import instance_at
+from real2sim_server.service.rendering.views_socket import instance_at
 
 
 @pytest.fixture

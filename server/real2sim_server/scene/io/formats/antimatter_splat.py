@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ...._files import atomic_file
 from ...cloud import GaussianCloud
 from ...errors import BundleError
 from ...harmonics import SH_C0
-from ..atomic import atomic_file
 from .types import build_cloud, host_array
 
 RECORD = np.dtype(

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...._files import atomic_file
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
-from ..atomic import atomic_file
 from ..ply import read_ply_elements
 from .types import build_cloud, column, columns, require_properties
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...rotation import Float
+from ....geometry.rotation import Float
 
 BITS = 21
 _SPREAD = (

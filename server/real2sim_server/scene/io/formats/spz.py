@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...._files import atomic_file
+from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError, SceneError
-from ...rotation import Float
-from ..atomic import atomic_file
 from .spz_container import Header, Streams, is_spz, read_streams, write_streams
 from .types import build_cloud, host_array
 

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError
-from ...rotation import Float
 
 SMALLEST_SCALE = 1e-20
 """Scales whose exponential underflows are lifted to this [m], since a scale is positive."""

@@ -1,1 +1,0 @@
-"""Measurements of a worker as its users meet it. Stands above all rooms, the client included."""

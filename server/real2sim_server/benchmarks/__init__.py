@@ -1,0 +1,1 @@
+"""Measurements, each a ratio to a reference or a peer of the same run."""

@@ -1,0 +1,242 @@
+"""``real2sim bench physics``: particle-substeps per second, and what they depend on."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+
+from ..physics.body import Body
+from ..physics.colliders import Plane
+from ..physics.materials import FixedCorotated, Material, NeoHookean
+from ..physics.particles import box_particles
+from ..physics.solver import Solver, SolverOptions
+from .peers.block import PEERS, PeerBlock, missing_reason, start_peer
+
+SIZES = (10_000, 100_000, 1_000_000)
+MATERIALS: dict[str, Material] = {
+    "fixed_corotated": FixedCorotated(young=2e6, poisson=0.4),
+    "neo_hookean": NeoHookean(young=2e6, poisson=0.4),
+}
+PARTICLES_PER_CELL = 14
+SPACING = 0.05
+REPEATS = 8
+"""The best of this many runs counts: other work on the machine only ever makes them slower."""
+SECONDS_PER_RUN = 0.3
+REFERENCE_PARTICLES = 2_000
+PEER_PARTICLES = 100_000
+PEER_TURNS = 3
+PEER_STEPS = 30
+"""After so many substeps peers must have fallen as far."""
+TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6}
+"""Particle-substeps per second of 100,000 particles on two cores."""
+
+
+def run(
+    *, peers: bool = False, on_progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """Measure the solver and return the figures.
+
+    Args:
+        peers: also measure other frameworks, in the same process on the same block.
+        on_progress: takes (parts done, parts).
+
+    Returns:
+        Figures as JSON takes them. ``rate`` is in particle-substeps per second, elapsed, the best
+        of REPEATS runs; ``cpu_rate`` is per second of processor time and thread, which says what
+        an otherwise idle machine would do.
+    """
+    tell = on_progress or (lambda done, parts: None)
+    cases = [(m, n) for m in MATERIALS for n in SIZES]
+    parts = len(cases) + 2 + peers
+    report: dict[str, Any] = {
+        "threads": numba.get_num_threads(),
+        "cores": os.cpu_count(),
+        "particles_per_cell": PARTICLES_PER_CELL,
+        "repeats": REPEATS,
+        "targets": TARGETS,
+        "speed": [],
+    }
+    for done, (material, particles) in enumerate(cases):
+        tell(done, parts)
+        report["speed"].append(_speed(material, particles))
+    tell(len(cases), parts)
+    report["domain"] = _domain()
+    tell(len(cases) + 1, parts)
+    report["reference"] = _reference()
+    if peers:
+        tell(len(cases) + 2, parts)
+        report["peers"] = _peers()
+    tell(parts, parts)
+    return report
+
+
+def as_rows(figures: dict[str, Any]) -> dict[str, str]:
+    """The figures as lines for a person."""
+    rows = {"threads": str(figures["threads"])}
+    for line in figures["speed"]:
+        name = f"{line['material'].replace('_', ' ')}, {line['particles']:,} particles"
+        rows[name] = f"{line['rate'] / 1e6:.2f} M/s, {line['substep_ms']:.2f} ms a substep"
+    for line in figures["domain"]:
+        rows[f"two blocks {line['distance']:,.0f} m apart"] = f"{line['rate'] / 1e6:.2f} M/s"
+    rows["times as fast as plain torch"] = f"{figures['reference']['ratio']:.0f}"
+    for line in figures.get("peers", ()):
+        name = f"{line['name']}, {line.get('particles', 0):,} particles"
+        if "missing" in line:
+            rows[line["name"]] = line["missing"]
+        elif line["name"] != "this solver":
+            rows[name] = f"{line['rate'] / 1e6:.2f} M/s; here {line['ratio']:.2f} times as fast"
+        else:
+            rows[name] = f"{line['rate'] / 1e6:.2f} M/s"
+    return rows
+
+
+def _speed(material: str, particles: int) -> dict[str, Any]:
+    """Rate of a turning, falling block of about that many particles."""
+    solver = Solver([_block(material, particles)], [Plane(name="ground")], _options())
+    elapsed, processor = _time_substep(solver)
+    count = len(solver.model.masses)
+    return {
+        "material": material,
+        "particles": count,
+        "rate": count / elapsed,
+        "cpu_rate": count / processor,
+        "substep_ms": 1e3 * elapsed,
+    }
+
+
+def _domain() -> list[dict[str, Any]]:
+    """Two blocks of 50,000 particles, ever further apart: the cost stays."""
+    rows = []
+    for distance in (4.0, 100.0, 2_000.0):
+        blocks = [_block("fixed_corotated", 50_000, x, str(x)) for x in (0.0, distance)]
+        solver = Solver(blocks, (), _options())
+        elapsed, processor = _time_substep(solver)
+        rows.append(
+            {
+                "distance": distance,
+                "rate": len(solver.model.masses) / elapsed,
+                "cpu_rate": len(solver.model.masses) / processor,
+            }
+        )
+    return rows
+
+
+def _reference() -> dict[str, Any]:
+    """How many times faster than plain torch."""
+    rates = {}
+    for backend in ("cpu", "reference"):
+        body = _block("fixed_corotated", REFERENCE_PARTICLES)
+        solver = Solver([body], (), _options(backend))
+        elapsed, _ = _time_substep(solver)
+        rates[backend] = len(body.particles) / elapsed
+    return {"particles": REFERENCE_PARTICLES, **rates, "ratio": rates["cpu"] / rates["reference"]}
+
+
+def _peers() -> list[dict[str, Any]]:
+    """The same falling block here and elsewhere; all must fall as far."""
+    edge = SPACING * round(PEER_PARTICLES ** (1 / 3))
+    body = _block("fixed_corotated", PEER_PARTICLES)
+    dx, n = _options().dx, len(body.particles)
+    assert dx is not None
+    positions = body.particles.positions - body.particles.positions.min(axis=0) + 3 * dx
+    body = replace(
+        body,
+        particles=replace(body.particles, positions=positions + np.array([0, 0, edge / 2])),
+        angular_velocity=(0, 0, 0),
+    )
+    solver = Solver([body], (), _options())
+    dt = solver.time_step()
+    start = body.particles.positions[:, 2].mean()
+
+    def own(steps: int) -> None:
+        solver.simulation.advance(steps, dt, ())
+
+    own(PEER_STEPS)
+    fallen = start - solver.simulation.particles().positions[:, 2].mean()
+    runs: dict[str, Callable[[int], None]] = {"this solver": own}
+    rows: list[dict[str, Any]] = [{"name": "this solver", "particles": n}]
+    for peer in PEERS:
+        reason = missing_reason(peer)
+        if reason:
+            rows.append({"name": peer, "missing": reason})
+            continue
+        other = start_peer(peer, _as_peer_block(body, dx, dt))
+        other.advance(PEER_STEPS)
+        runs[peer] = other.advance
+        error = start - other.positions().astype(np.float64)[:, 2].mean() - fallen
+        rows.append({"name": peer, "particles": n, "fall_differs_by_m": abs(float(error))})
+    rates = _rates_by_turns(runs, n)
+    for row in rows:
+        if row["name"] in rates:
+            row["rate"] = rates[row["name"]]
+            row["ratio"] = rates["this solver"] / row["rate"]
+    return rows
+
+
+def _rates_by_turns(runs: dict[str, Callable[[int], None]], particles: int) -> dict[str, float]:
+    """Best rate of each; they take turns, so that a slow minute of the machine meets all."""
+    best = dict.fromkeys(runs, math.inf)
+    for _ in range(PEER_TURNS):
+        for name, advance in runs.items():
+            best[name] = min(best[name], _best(advance)[0])
+    return {name: particles / elapsed for name, elapsed in best.items()}
+
+
+def _as_peer_block(body: Body, dx: float, dt: float) -> PeerBlock:
+    material = body.materials[0]
+    return PeerBlock(
+        positions=body.particles.positions.astype(np.float32),
+        velocities=body.velocities.astype(np.float32),
+        mass=float(body.particles.masses[0]),
+        volume=float(body.particles.volumes[0]),
+        mu=material.shear_modulus,
+        lam=material.lame_lambda,
+        dx=dx,
+        dt=dt,
+        gravity=SolverOptions.gravity[2],
+        threads=numba.get_num_threads(),
+    )
+
+
+def _block(material: str, particles: int, x: float = 0.0, name: str = "block") -> Body:
+    edge = SPACING * round(particles ** (1 / 3))
+    kind = MATERIALS[material]
+    pose = np.eye(4)
+    pose[:3, 3] = x, 0.0, edge / 2 + 5.0
+    matter = box_particles([edge] * 3, spacing=SPACING, density=kind.density).moved(pose)
+    return Body(
+        name=name, particles=matter, material=kind, velocity=(0, 0, -2), angular_velocity=(1, 0, 0)
+    )
+
+
+def _options(backend: str = "cpu") -> SolverOptions:
+    return SolverOptions(dx=SPACING * PARTICLES_PER_CELL ** (1 / 3), backend=backend)
+
+
+def _time_substep(solver: Solver) -> tuple[float, float]:
+    """Shortest elapsed time of a substep [s], and processor time per thread [s]; guard left out."""
+    simulation, dt = solver.simulation, solver.time_step()
+    simulation.advance(2, dt, solver.colliders)
+    return _best(lambda steps: simulation.advance(steps, dt, solver.colliders))
+
+
+def _best(advance: Callable[[int], None]) -> tuple[float, float]:
+    """Shortest elapsed time of a substep [s], and processor time per thread [s]."""
+    begin = time.perf_counter()
+    advance(1)
+    steps = max(int(SECONDS_PER_RUN / (time.perf_counter() - begin)), 1)
+    best = [float("inf"), float("inf")]
+    for _ in range(REPEATS):
+        begin, used = time.perf_counter(), time.process_time()
+        advance(steps)
+        taken = time.perf_counter() - begin, time.process_time() - used
+        best[0] = min(best[0], taken[0] / steps)
+        best[1] = min(best[1], taken[1] / steps / numba.get_num_threads())
+    return best[0], best[1]

@@ -1,0 +1,83 @@
+"""``real2sim doctor``: what this machine can do, what is missing, how to mend it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import time
+from pathlib import Path
+
+import typer
+from rich.table import Table
+
+from ..console import SERVER_MODULES, console, write_json
+
+DISTRIBUTIONS = (
+    "real2sim",
+    "torch",
+    "numba",
+    "numpy",
+    "fastapi",
+    "uvicorn",
+    "gsplat",
+    "numba-cuda",
+)
+
+
+def run(*, warm: bool, json_path: Path | None) -> None:
+    """Print a table of findings; exit code 1 when a worker cannot run here."""
+    findings = {"python": platform.python_version(), "cores": str(os.cpu_count())}
+    findings |= {name: _version(name) for name in DISTRIBUTIONS}
+    missing = [name for name in SERVER_MODULES if importlib.util.find_spec(name) is None]
+    advice = [f"pip install 'real2sim[server]'  # for {', '.join(missing)}"] if missing else []
+    backends: list[dict[str, object]] = []
+    if not missing:
+        backends, more = _inspect_backends()
+        advice += more
+    if warm and not missing:
+        findings["kernels compiled in"] = f"{_warm_seconds():.1f} s"
+    _print(findings, backends, advice)
+    write_json(json_path, {"findings": findings, "backends": backends, "advice": advice})
+    if missing:
+        raise typer.Exit(1)
+
+
+def _version(distribution: str) -> str:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _inspect_backends() -> tuple[list[dict[str, object]], list[str]]:
+    from ..render import describe_backends
+
+    described = describe_backends()
+    rows: list[dict[str, object]] = [
+        {"name": b.name, "usable": b.usable, "reason": b.reason} for b in described
+    ]
+    return rows, [f"{b.name}: {b.remedy}" for b in described if b.remedy]
+
+
+def _warm_seconds() -> float:
+    from ..render import warm_up
+
+    start = time.perf_counter()
+    warm_up()
+    return time.perf_counter() - start
+
+
+def _print(findings: dict[str, str], backends: list[dict[str, object]], advice: list[str]) -> None:
+    table = Table(title="this machine", title_justify="left", show_header=False)
+    for name, value in findings.items():
+        table.add_row(name, value)
+    console.print(table)
+    if backends:
+        table = Table("backend", "usable", "reason", title="rendering", title_justify="left")
+        for row in backends:
+            table.add_row(str(row["name"]), "yes" if row["usable"] else "no", str(row["reason"]))
+        console.print(table)
+    for line in advice:
+        console.print(f"to mend: {line}", highlight=False)

@@ -1,0 +1,54 @@
+"""``real2sim validate``: the solver against theory; exit code 1 when a line fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+from .._files import atomic_file
+from ..console import console, progress, write_json
+from ..physics.validation.page import render_page
+from ..physics.validation.table import CaseResult, as_figures, run_table
+
+
+def run(*, backend: str, cases: str | None, page: Path | None, json_path: Path | None) -> None:
+    """Run the table; leave figures and a page, which lies beside the figures by default.
+
+    Raises:
+        typer.Exit: with code 1 when a line fails.
+    """
+    names = None if cases is None else [name.strip() for name in cases.split(",")]
+    with progress("validating") as report:
+        results = run_table(backend=backend, cases=names, on_progress=report)
+    figures = as_figures(results, backend)
+    write_json(json_path, figures)
+    if page is None and json_path is not None:
+        page = json_path.with_suffix(".html")
+    if page is not None:
+        with atomic_file(page) as file:
+            file.write(render_page(results, backend=backend).encode())
+    _tell(results)
+    if page is not None:
+        console.print(f"page: {page}", highlight=False, soft_wrap=True)
+    if not figures["passed"]:
+        raise typer.Exit(1)
+
+
+def _tell(results: Sequence[CaseResult]) -> None:
+    lines = 0
+    for result in results:
+        for check in result.checks:
+            lines += 1
+            mark = "[green]holds[/]" if check.passed else "[bold red]FAILS[/]"
+            console.print(
+                f"{mark}  {check.name}: {check.measured:.5g}, expected {check.expected:.5g} "
+                f"± {check.tolerance:.2g} {check.unit}".rstrip(),
+                highlight=False,
+                soft_wrap=True,
+            )
+        if result.error:
+            console.print(f"[bold red]FAILS[/]  {result.name}: {result.error}", highlight=False)
+    failed = sum(not r.passed for r in results)
+    console.print(f"{lines} lines of {len(results)} cases; {failed} cases fail", highlight=False)

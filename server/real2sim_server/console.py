@@ -1,0 +1,126 @@
+"""How commands talk to a person: progress, tables, errors as sentences, figures as JSON."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+SERVER_MODULES = ("torch", "numba", "fastapi", "uvicorn", "cv2", "sqlalchemy", "safetensors")
+
+console = Console()
+errors = Console(stderr=True)
+
+
+class CommandError(Exception):
+    """A command cannot go on; the message says what was given, what is allowed, what to do."""
+
+
+def run_command(command: Callable[..., None], **arguments: Any) -> None:
+    """Run a command; turn the errors a person can mend into one sentence and exit code 1."""
+    require_server_extra()
+    try:
+        command(**arguments)
+    except typer.Exit:
+        raise
+    except KeyboardInterrupt:
+        errors.print("stopped")
+        raise typer.Exit(130) from None
+    except Exception as error:
+        if os.environ.get("REAL2SIM_DEBUG") or not is_expected(error):
+            raise
+        errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        raise typer.Exit(1) from None
+
+
+def is_expected(error: Exception) -> bool:
+    """Whether an error is one of ours or the system's, rather than a bug."""
+    if isinstance(error, CommandError | OSError):
+        return True
+    module = type(error).__module__.split(".")[0]
+    return module in ("real2sim", "real2sim_proto", "real2sim_server")
+
+
+def require_server_extra() -> None:
+    """Leave with a sentence when the base install meets a command of the worker."""
+    missing = [name for name in SERVER_MODULES if importlib.util.find_spec(name) is None]
+    if missing:
+        errors.print(
+            f"[bold red]error:[/] this command runs a worker and needs {', '.join(missing)}; "
+            "install them with: pip install 'real2sim\\[server]'",
+            highlight=False,
+        )
+        raise typer.Exit(1)
+
+
+@contextmanager
+def progress(description: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar; the yielded function takes (done, total)."""
+    with staged_progress() as report:
+        yield lambda done, total: report(description, done, total)
+
+
+@contextmanager
+def staged_progress() -> Iterator[Callable[..., None]]:
+    """Progress bars by stage; the yielded function takes (stage, done, total[, text])."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=errors, transient=not sys.stderr.isatty()) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int, text: str | None = None) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total, description=text or stage)
+
+        yield report
+
+
+def print_figures(title: str, figures: Mapping[str, Any]) -> None:
+    """A two-column table of figures; those within mappings get rows of their own."""
+    table = Table(title=title, show_header=False, title_justify="left")
+    for name, figure in _flat(figures):
+        text = f"{figure:.4g}" if isinstance(figure, float) else str(figure)
+        table.add_row(escape(name), escape(text))
+    console.print(table)
+
+
+def _flat(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in figures.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name} {part}", figure) for part, figure in _flat(value))
+        else:
+            yield name, value
+
+
+def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
+    """Write figures to ``path``, whole or not at all; nothing where it is None."""
+    if path is None:
+        return
+    from ._files import atomic_file
+
+    with atomic_file(path) as file:
+        file.write((json.dumps(figures, indent=2) + "\n").encode())
+
+
+def refuse_existing(path: Path, *, overwrite: bool) -> None:
+    """Raise when ``path`` exists and may not be replaced."""
+    if path.exists() and not overwrite:
+        raise CommandError(
+            f"{path} exists already; give another --out, or --overwrite to replace it"
+        )

@@ -1,0 +1,105 @@
+"""Ground under parked objects that an edit took away.
+
+No picture shows it while they stand there, so that training leaves a smear of their own colours.
+The ground beside them is what is known best about it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from ..geometry.rotation import invert_transform
+from ..scene import GaussianCloud, Scene
+from .state import ObjectState, ScenarioState
+from .tracks import Float
+
+PARKED = 0.5
+"""An object whose recorded places are all within this of each other is parked; tracks of things
+that stand still waver by some decimetres [m]."""
+
+AWAY = 0.5
+"""An object this far from its parking place leaves it to be seen [m]."""
+
+MARGIN = 0.25
+"""Colours reach this far beyond a box [m]."""
+
+RIM = 1.2
+"""Ground up to this far beyond the box is taken for what is under it [m]."""
+
+LOW = 0.25
+"""The ground's Gaussians are less than this above or below the box's bottom [m]."""
+
+NEIGHBOURS = 6
+
+
+def vacated(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
+    """Ids of recorded objects that were parked and are not at their places.
+
+    Args:
+        state: knows what was recorded.
+        poses: ``T_world_object`` [4, 4] of all objects that exist, by id; where an edit or a blow
+            has brought them.
+    """
+    return tuple(
+        recorded.object_id
+        for recorded in state.recorded.values()
+        if _parked(recorded)
+        and (
+            _away(poses[recorded.object_id], recorded)
+            if recorded.object_id in poses
+            # What is unedited and not there was not recorded at that time.
+            else state.objects[recorded.object_id] is not recorded
+        )
+    )
+
+
+def uncovered(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
+    """The background with the ground coloured like that around it where objects ``left`` stood.
+
+    Gaussians inside a box and above its ground become invisible: they belonged to the object.
+
+    Raises:
+        UnknownObjectError: ``scene`` has no such object.
+    """
+    opacities, sh = background.opacities.clone(), background.sh.clone()
+    for object_id in left:
+        parked = scene.object(object_id)
+        track = parked.trajectory
+        T_world_box = track.transform((track.start_us + track.end_us) // 2)
+        to_box = torch.from_numpy(invert_transform(T_world_box)).to(background.means)
+        local = background.means @ to_box[:3, :3].T + to_box[:3, 3]
+        half = torch.tensor(parked.size).to(local) / 2
+        beyond = (local[:, :2].abs() - half[:2]).amax(dim=1)
+        height = local[:, 2] + half[2]
+        level = height.abs() <= LOW
+        opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
+        known = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
+        _recolour(sh, local[:, :2], level & (beyond <= MARGIN), known)
+    return replace(background, opacities=opacities, sh=sh)
+
+
+@lru_cache(maxsize=4096)
+def _parked(recorded: ObjectState) -> bool:
+    low, high = recorded.bounds[:, :2]
+    return bool((high - low - 2 * recorded.radius).max() <= PARKED)
+
+
+def _away(pose: Float, parked: ObjectState) -> bool:
+    (low_x, low_y), (high_x, high_y) = parked.bounds[:, :2].tolist()
+    x, y = float(pose[0, 3]), float(pose[1, 3])
+    return math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
+
+
+def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
+    """Give those of ``unknown`` [N] bool the mean ``sh`` of the nearest of ``known``, in place."""
+    if int(known.sum()) < NEIGHBOURS or not bool(unknown.any()):
+        return
+    distances = torch.cdist(places[unknown], places[known])
+    nearest = distances.topk(NEIGHBOURS, largest=False).indices
+    sh[unknown] = sh[known][nearest].mean(dim=1)

@@ -1,0 +1,161 @@
+"""What a person should look at after an edit: overlaps, floating objects, objects far outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.scenarios import EditWarning
+
+from ..geometry.box import box_corners
+from ..geometry.box_kernels import first_overlap
+from ..scene import Trajectory
+from .state import ObjectState, ScenarioState
+from .tracks import Float, sample
+
+GroundHeight = Callable[[Float], Float]
+"""Ground height [S] [m] below points [S, 2] of the world."""
+
+SAMPLE_PERIOD_US = 100_000
+MAX_SAMPLES = 201
+MAX_GROUND_SAMPLES = 21
+OFF_GROUND = 0.3
+"""A box bottom this much higher or lower above ground than in the recording is reported [m]."""
+
+OUTSIDE_MAP = 100.0
+"""An object this far outside the rectangle that the recording reached is reported [m]."""
+
+NAMED_OVERLAPS = 5
+
+REMEMBERED = 512
+"""Objects whose sampled trajectories are kept, 26 kB each at most."""
+
+
+def review(
+    state: ScenarioState, touched: Sequence[str], *, ground: GroundHeight | None = None
+) -> Iterator[EditWarning]:
+    """Warnings about the objects ``touched``, looked at every 0.1 s of their trajectories.
+
+    Very long trajectories are looked at 201 times at most, evenly spread.
+
+    Args:
+        state: after the edit.
+        touched: ids that the edit named or created; deleted ones are passed over.
+        ground: height of the ground; without it the ground counts as flat.
+    """
+    subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
+    for subject in subjects:
+        times = _sample_times(subject.trajectory.start_us, subject.trajectory.end_us)
+        transforms, _ = _sampled(subject.trajectory, int(times[0]), int(times[-1]))
+        yield from _overlaps(subject, state, times, transforms)
+        recorded = None if subject.asset else state.recorded[subject.source_id]
+        yield from _off_ground(subject, recorded, transforms, ground)
+        yield from _outside_map(subject, state.extent, transforms)
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> tuple[Float, NDArray[np.bool_]]:
+    """The trajectory at the sample times of that range; remembered, for few objects move."""
+    return sample(trajectory, _sample_times(start_us, end_us))
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _sample_times(start: int, end: int) -> NDArray[np.int64]:
+    count = min(2 + (end - start) // SAMPLE_PERIOD_US, MAX_SAMPLES)
+    steps = np.arange(count, dtype=object) * (end - start) // (count - 1)
+    times = np.unique((start + steps).astype(np.int64))
+    times.flags.writeable = False
+    return times
+
+
+def _overlaps(
+    subject: ObjectState, state: ScenarioState, times: NDArray[np.int64], own: Float
+) -> Iterator[EditWarning]:
+    hit = {}
+    for other in _within_reach(subject, state, own):
+        first = _first_overlap(subject, other, times, own)
+        if first < len(times):
+            hit[other.object_id] = times[first] * 1e-6
+    if hit:
+        named = [f"{i!r} from t={t:.2f} s" for i, t in list(hit.items())[:NAMED_OVERLAPS]]
+        more = f" and {len(hit) - len(named)} more" if len(hit) > len(named) else ""
+        yield EditWarning(
+            code="overlap",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} overlaps {', '.join(named)}{more}",
+        )
+
+
+def _first_overlap(
+    subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
+) -> int:
+    """Index of the first of ``times`` at which the boxes overlap; their number where none."""
+    theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
+    found: int = first_overlap(
+        (own, theirs),
+        (subject.scaled_size, other.scaled_size),
+        covered,
+        subject.radius + other.radius,
+        subject.standing and other.standing,
+    )
+    return found
+
+
+def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
+    """Visible objects whose path, as a box around it, comes near that of ``subject``."""
+    others = [o for o in state.objects.values() if not o.deleted and o is not subject]
+    if not others:
+        return
+    bounds = np.array([o.bounds for o in others])
+    at, radius = own[:, :3, 3], subject.radius
+    low, high = at.min(axis=0) - radius, at.max(axis=0) + radius
+    apart = (bounds[:, 0] > high) | (bounds[:, 1] < low)
+    for i in np.flatnonzero(~apart.any(axis=1)):
+        yield others[i]
+
+
+def _off_ground(
+    subject: ObjectState, recorded: ObjectState | None, own: Float, ground: GroundHeight | None
+) -> Iterator[EditWarning]:
+    usual = 0.0
+    if recorded is not None:
+        usual = _usual_clearance(recorded, ground)
+    off = _clearance(own, subject, ground) - usual
+    worst = float(off[np.argmax(np.abs(off))])
+    if abs(worst) > OFF_GROUND:
+        side = "above" if worst > 0 else "below"
+        yield EditWarning(
+            code="off_ground",
+            object_id=subject.object_id,
+            message=f"the bottom of {subject.object_id!r} is {abs(worst):.2f} m {side} "
+            + ("where it stood in the recording" if recorded else "the ground"),
+        )
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _usual_clearance(recorded: ObjectState, ground: GroundHeight | None) -> float:
+    track = recorded.trajectory
+    theirs, _ = _sampled(track, track.start_us, track.end_us)
+    return float(np.median(_clearance(theirs, recorded, ground)))
+
+
+def _clearance(transforms: Float, subject: ObjectState, ground: GroundHeight | None) -> Float:
+    count = 1 if subject.standing else MAX_GROUND_SAMPLES
+    sparse = transforms[:: -(-len(transforms) // count)]
+    lowest: Float = box_corners(sparse, subject.scaled_size)[..., 2].min(axis=-1)
+    return lowest - ground(sparse[:, :2, 3]) if ground else lowest
+
+
+def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iterator[EditWarning]:
+    at = transforms[:, :2, 3]
+    beyond = np.maximum(np.maximum(extent[0] - at, at - extent[1]), 0.0)
+    farthest = float(np.linalg.norm(beyond, axis=1).max())
+    if farthest > OUTSIDE_MAP:
+        yield EditWarning(
+            code="outside_map",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} gets {farthest:.0f} m away from everything recorded",
+        )

@@ -1,0 +1,1 @@
+"""File formats of data sets, read strictly; every failure is a LogError."""

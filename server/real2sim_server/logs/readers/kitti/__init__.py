@@ -1,0 +1,1 @@
+"""KITTI: tracking layout and raw drives."""

@@ -1,0 +1,1 @@
+"""Waymo Open Dataset (perception), editions 1 and 2."""

@@ -1,0 +1,249 @@
+"""What both editions of the Waymo Open Dataset have in common, and the log they become.
+
+A frame's time stamp in the files is the start of a turn of the TOP laser. Its pose, its boxes and
+its points hold for the middle of the turn, which is when the FRONT camera is triggered: the pose
+of the frame is that of the FRONT image (github.com/waymo-research/waymo-open-dataset, issue 464).
+That instant is the frame's time in the log. Pixel centres lie at +0.5, as in a Camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ....geometry.rotation import Float, invert_transform
+from ....scene import Camera, CameraRig, Trajectory
+from ....scene.camera import T_VEHICLE_OPTICAL
+from ...driving_log import DrivingLog, FrameSource, LogError
+from ..box_tracks import Box, build_tracks, upright_pose
+from ..formats.tables import check_frame_times, check_rigid
+from ..lens import Lens
+from .lidar import Turn
+
+CAMERA_NAMES = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
+FRONT = 1
+SHUTTERS = {
+    1: "top_to_bottom",
+    2: "left_to_right",
+    3: "bottom_to_top",
+    4: "right_to_left",
+    5: "global",
+}
+CATEGORIES = {0: "other", 1: "car", 2: "pedestrian", 3: "sign", 4: "cyclist"}
+TRUCK_LENGTH = 7.0
+"""Waymo has one type for all vehicles; longer ones than this [m] are called trucks."""
+
+EGO_SIZE = (5.18, 2.05, 1.78)
+"""Chrysler Pacifica without its roof sensors [m]."""
+
+TURN_US = 100_000
+LICENCE = "Waymo Open Dataset terms, non-commercial"
+
+
+@dataclass(frozen=True, eq=False)
+class WaymoCamera:
+    """A camera: lens, pose on the vehicle in OpenCV's axes [4, 4], read-out direction."""
+
+    number: int
+    lens: Lens
+    T_vehicle_camera: Float
+    shutter: str
+
+    @property
+    def name(self) -> str:
+        """As the log calls it."""
+        return CAMERA_NAMES[self.number]
+
+
+def waymo_camera(
+    number: int,
+    *,
+    size: tuple[int, int],
+    intrinsic: Sequence[float],
+    extrinsic: Float,
+    shutter: int,
+    where: str,
+) -> WaymoCamera:
+    """A camera of its calibration: (width, height), [f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3].
+
+    Raises:
+        LogError: an unknown camera, or values that make no camera.
+    """
+    where = f"{where}: camera {number}"
+    if number not in CAMERA_NAMES:
+        raise LogError(f"{where} is unknown; known are {CAMERA_NAMES}")
+    if len(intrinsic) != 9 or not np.isfinite(intrinsic).all() or min(intrinsic[:2]) <= 0:
+        raise LogError(f"{where}: needs nine finite intrinsics, not {list(intrinsic)}")
+    if min(size) < 1:
+        raise LogError(f"{where}: size {size[0]}x{size[1]} is not positive")
+    f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = (float(v) for v in intrinsic)
+    k = np.array([[f_u, 0, c_u], [0, f_v, c_v], [0, 0, 1]])
+    pose = check_rigid(extrinsic, f"{where}, extrinsic") @ T_VEHICLE_OPTICAL
+    lens = Lens(size[0], size[1], k, (k1, k2, p1, p2, k3))
+    return WaymoCamera(number, lens, pose, SHUTTERS.get(shutter, "unknown"))
+
+
+@dataclass(frozen=True, eq=False)
+class WaymoImage:
+    """When and where an image was taken.
+
+    Attributes:
+        time_us: time of ``pose`` [us].
+        pose: ``T_world_vehicle`` [4, 4].
+        readout_us: from the first to the last row or column [us].
+    """
+
+    time_us: int
+    pose: Float
+    readout_us: float
+
+
+@dataclass(frozen=True)
+class WaymoBox:
+    """A box in the vehicle frame of its frame."""
+
+    key: str
+    type: int
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+    heading: float
+    where: str
+
+
+@dataclass(frozen=True, eq=False)
+class WaymoFrame:
+    """One frame.
+
+    Attributes:
+        start_us: the frame's time stamp in the files [us].
+        pose: ``T_world_vehicle`` [4, 4], in Waymo's world.
+        images: by camera number.
+        boxes: of the lasers.
+    """
+
+    start_us: int
+    pose: Float
+    images: Mapping[int, WaymoImage] = field(default_factory=dict)
+    boxes: Sequence[WaymoBox] = ()
+
+    @property
+    def time_us(self) -> int:
+        """When ``pose`` holds [us]."""
+        front = self.images.get(FRONT)
+        return front.time_us if front is not None else self.start_us + TURN_US // 2
+
+
+def turns(frames: Sequence[WaymoFrame]) -> list[Turn]:
+    """When the TOP laser turned, frame by frame."""
+    starts = np.array([f.start_us for f in frames])
+    duration = float(np.median(np.diff(starts))) if len(starts) > 1 else float(TURN_US)
+    return [Turn(f.start_us - f.time_us, duration) for f in frames]
+
+
+def build_waymo_log(
+    *,
+    name: str,
+    cameras: Sequence[WaymoCamera],
+    frames: Sequence[WaymoFrame],
+    source: FrameSource,
+    where: str,
+    provenance: Mapping[str, Any],
+) -> DrivingLog:
+    """The log; its world is the vehicle frame of the first frame.
+
+    The ego's path goes through the poses of all frames and of all images. Cameras without any
+    image are left out and named in the provenance.
+
+    Raises:
+        LogError: times out of order, poses that are not rigid, images or boxes that are missing
+            or wrong.
+    """
+    times_us = check_frame_times(np.array([f.time_us for f in frames], dtype=np.int64), where)
+    for frame in frames:
+        check_rigid(frame.pose, f"{where}: vehicle pose at {frame.start_us} us")
+    to_first = invert_transform(frames[0].pose)
+    used = [c for c in cameras if any(c.number in f.images for f in frames)]
+    _check_complete(used, frames, where)
+    tracks, keys = build_tracks(_boxes(frames, to_first))
+    return DrivingLog(
+        name=name,
+        rig=CameraRig(tuple(_pinhole(c) for c in used)),
+        frame_times_us=times_us,
+        ego=_ego(frames, to_first, where),
+        tracks=tracks,
+        source=source,
+        ego_size=EGO_SIZE,
+        provenance={
+            **provenance,
+            "licence": LICENCE,
+            "track_ids": keys,
+            "rolling_shutter": {c.name: _shutter(c, frames) for c in used},
+            "cameras_without_images": [c.name for c in cameras if c not in used],
+        },
+        image_times_us={
+            c.name: np.array([f.images[c.number].time_us for f in frames], dtype=np.int64)
+            for c in used
+        },
+    )
+
+
+def _check_complete(
+    cameras: Sequence[WaymoCamera], frames: Sequence[WaymoFrame], where: str
+) -> None:
+    for camera in cameras:
+        for frame in frames:
+            if camera.number not in frame.images:
+                raise LogError(
+                    f"{where}: camera {camera.name!r} has no image in the frame of "
+                    f"{frame.start_us} us; every frame needs one"
+                )
+
+
+def _pinhole(camera: WaymoCamera) -> Camera:
+    lens = camera.lens
+    return Camera(camera.name, lens.width, lens.height, lens.pinhole_K, camera.T_vehicle_camera)
+
+
+def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[Box]:
+    boxes = []
+    for frame in frames:
+        to_world = to_first @ frame.pose
+        for box in frame.boxes:
+            if not np.isfinite([*box.centre, box.heading]).all():
+                raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
+            boxes.append(
+                Box(
+                    key=box.key,
+                    category=_category(box),
+                    size=box.size,
+                    time_us=frame.time_us,
+                    T_world_object=to_world @ upright_pose(box.centre, box.heading),
+                    where=box.where,
+                )
+            )
+    return boxes
+
+
+def _category(box: WaymoBox) -> str:
+    if box.type not in CATEGORIES:
+        raise LogError(f"{box.where}: unknown type {box.type!r}; known are {CATEGORIES}")
+    category = CATEGORIES[box.type]
+    return "truck" if category == "car" and box.size[0] > TRUCK_LENGTH else category
+
+
+def _ego(frames: Sequence[WaymoFrame], to_first: Float, where: str) -> Trajectory:
+    poses = {frame.time_us: frame.pose for frame in frames}
+    for frame in frames:
+        for number, image in sorted(frame.images.items()):
+            place = f"{where}: pose of image {number} at {frame.start_us} us"
+            poses.setdefault(image.time_us, check_rigid(image.pose, place))
+    times = sorted(poses)
+    return Trajectory.from_transforms(times, to_first @ np.array([poses[t] for t in times]))
+
+
+def _shutter(camera: WaymoCamera, frames: Sequence[WaymoFrame]) -> dict[str, Any]:
+    readouts = [f.images[camera.number].readout_us for f in frames]
+    return {"direction": camera.shutter, "readout_us": float(np.median(readouts))}

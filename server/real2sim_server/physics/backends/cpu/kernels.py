@@ -1,0 +1,219 @@
+"""The substep on the CPU: homes scatter to tiles, fields collect and meet, homes gather."""
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import prange
+
+from ...constitutive.shared import ONE, ZERO
+from ...constitutive.weights import spline_weights
+from ..kernel import entry, inner
+from ..layout import BLOCK, CHUNKS
+from ..particle import NODES, SIDE, momentum, move, place, velocity_gradient
+from .contact import resolve_body_contact, resolve_collider_contact
+from .deform import deform_all
+from .simd import LANES, gather, scatter
+
+
+@entry()
+def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> Any:
+    """Make up to ``steps`` substeps; returns how many, fewer when particles must be sorted.
+
+    No steps at all find the stress and energy of the particles as they stand.
+    """
+    if steps == 0:
+        gather_homes(dt, state, layout, work, rules, False, False)
+    else:
+        scatter_homes(dt, state, layout, work, rules)
+    for done in range(steps):
+        collect_fields(dt, layout, work, rules)
+        gather_homes(dt, state, layout, work, rules, True, done + 1 < steps)
+        if work.strayed.any():
+            return done + 1
+    return steps
+
+
+@inner(parallel=True)
+def scatter_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> None:
+    """Particles to tiles: momentum with APIC and stress (MLS-MPM, Hu et al. 2018), mass."""
+    for chunk in prange(CHUNKS):
+        for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
+            scatter_home(home, dt, state, layout, work, rules)
+
+
+@inner()
+def scatter_home(home: Any, dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> None:
+    """Add the particles of one home to its tile, and their moments where they are asked for."""
+    tile = work.tiles[home]
+    tile[:] = ZERO
+    begin, end = layout.home_start[home], layout.home_start[home + 1]
+    scatter_particles(begin, end, dt, rules.dx, state, tile.reshape(-1))
+    slot = layout.home_moment[home]
+    if slot >= 0:
+        moments = work.moments[slot]
+        moments[:] = ZERO
+        scatter_moments(begin, end, state, moments.reshape(-1))
+
+
+@inner()
+def scatter_particles(begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any) -> None:
+    """Add the particles of one home to its tile."""
+    for p in range(begin, end):
+        first, f = place(p, state.xi)
+        start, qx, qy, qz = momentum(p, dt, dx, f, state)
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        scatter(tile, first, wx, wy, wz, (*start, state.mass[p]), qx, qy, qz)
+
+
+@inner()
+def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
+    """Add w V (x_p - x_i) and w V of one home's particles to its moments; V at rest."""
+    for p in range(begin, end):
+        first, f = place(p, state.xi)
+        V = state.volume[p]
+        zero = ZERO * V
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        start = (V * f[0], V * f[1], V * f[2], V)
+        scatter(
+            moments, first, wx, wy, wz, start, (-V, zero, zero), (zero, -V, zero), (zero, zero, -V)
+        )
+
+
+@inner(parallel=True)
+def collect_fields(dt: Any, layout: Any, work: Any, rules: Any) -> None:
+    """Tiles to fields: sums, gravity, contact. One group of fields is one task."""
+    groups = len(layout.group_start) - 1
+    for group in prange(groups):
+        begin, end = layout.group_start[group], layout.group_start[group + 1]
+        for field in range(begin, end):
+            collect(field, layout.field_homes, work.tiles, work.velocity[field])
+            to_velocity(work.velocity[field], dt, rules.gravity)
+            if layout.near[field]:
+                collect_moments(field, layout, work)
+        if end - begin > 1:
+            resolve_body_contact(begin, end, layout, work, rules)
+        for field in range(begin, end):
+            if layout.touch_start[field] < layout.touch_start[field + 1]:
+                resolve_collider_contact(field, layout, work, rules)
+
+
+@inner()
+def overlap(offset: Any) -> Any:
+    """(first, end, shift): nodes of a block that lie on a tile ``offset`` blocks below; tile index
+    is node + shift."""
+    if offset < 0:
+        return BLOCK - 1, BLOCK, 1 - BLOCK
+    if offset > 0:
+        return 0, SIDE - 1 - BLOCK, 1 + BLOCK
+    return 0, BLOCK, 1
+
+
+@inner()
+def collect(field: Any, field_homes: Any, tiles: Any, out: Any) -> None:
+    """Sum a field from the tiles of the homes around it, always in the same order."""
+    out[:] = ZERO
+    for o in range(27):
+        home = field_homes[field, o]
+        if home >= 0:
+            add_tile(tiles[home], o, out)
+
+
+@inner()
+def add_tile(tile: Any, o: Any, out: Any) -> None:
+    """Add what a tile says of a field; the tile's home lies at offset number ``o``."""
+    i0, i1, si = overlap(1 - o // 9)
+    j0, j1, sj = overlap(1 - o // 3 % 3)
+    k0, k1, sk = overlap(1 - o % 3)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            row = (i * BLOCK + j) * BLOCK
+            source = ((i + si) * SIDE + j + sj) * SIDE + sk
+            for k in range(k0, k1):
+                for lane in range(LANES):
+                    out[row + k, lane] += tile[source + k, lane]
+
+
+@inner()
+def collect_moments(field: Any, layout: Any, work: Any) -> None:
+    """Sum the first moments of a field; every home around a near field has some."""
+    out = work.offset[field]
+    out[:] = ZERO
+    for o in range(27):
+        home = layout.field_homes[field, o]
+        if home >= 0:
+            add_tile(work.moments[layout.home_moment[home]], o, out)
+
+
+@inner()
+def to_velocity(field: Any, dt: Any, gravity: Any) -> None:
+    """Momentum to velocity, with gravity."""
+    gx, gy, gz = dt * gravity[0], dt * gravity[1], dt * gravity[2]
+    for node in range(NODES):
+        m = field[node, 3]
+        if m > ZERO:
+            inverse = ONE / m
+            field[node, 0] = field[node, 0] * inverse + gx
+            field[node, 1] = field[node, 1] * inverse + gy
+            field[node, 2] = field[node, 2] * inverse + gz
+
+
+@inner(parallel=True)
+def gather_homes(
+    dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving: Any, going_on: Any
+) -> None:
+    """Fields to particles when ``moving``, then stress; when ``going_on``, already the scattering
+    of the next substep, while a home's particles are in the cache."""
+    for chunk in prange(CHUNKS):
+        for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
+            tile = work.tiles[home]
+            for o in range(27):
+                copy_field(work.velocity[layout.home_fields[home, o]], o, tile)
+            begin, end = layout.home_start[home], layout.home_start[home + 1]
+            gone = gather_particles(begin, end, dt, rules.dx, state, tile.reshape(-1), moving)
+            deform_all(begin, end, dt, state, rules.table, work.scratch[chunk])
+            note(work.strayed, home, gone)
+            # What has strayed does not fit the tile; all is sorted and scattered anew then.
+            if going_on and not gone:
+                scatter_home(home, dt, state, layout, work, rules)
+
+
+@inner()
+def note(flags: Any, index: Any, flag: Any) -> None:
+    """Store a flag. As a plain assignment in the parallel loop Numba takes it for dead code."""
+    flags[index] = flag
+
+
+@inner()
+def copy_field(field: Any, o: Any, tile: Any) -> None:
+    """Copy to a tile the nodes of the field at offset number ``o`` from the home."""
+    i0, i1, si = overlap(o // 9 - 1)
+    j0, j1, sj = overlap(o // 3 % 3 - 1)
+    k0, k1, sk = overlap(o % 3 - 1)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            row = (i * BLOCK + j) * BLOCK
+            target = ((i + si) * SIDE + j + sj) * SIDE + sk
+            for k in range(k0, k1):
+                for lane in range(LANES):
+                    tile[target + k, lane] = field[row + k, lane]
+
+
+@inner()
+def gather_particles(
+    begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any, moving: Any
+) -> Any:
+    """Move the particles of one home; returns whether one strayed off its tile."""
+    strayed = False
+    if moving:
+        for p in range(begin, end):
+            first, f = place(p, state.xi)
+            wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+            g = gather(tile, first, wx, wy, wz)
+            L = velocity_gradient(g, dx, f)
+            if move(p, dt, dx, (g[0], g[1], g[2]), L, state):
+                strayed = True
+    return strayed

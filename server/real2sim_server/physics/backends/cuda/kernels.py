@@ -1,0 +1,341 @@
+"""The substep on a CUDA device: the CPU's blocks, one group of threads for each.
+
+Homes add up in shared memory with atomics, fields collect from homes without any. Threads of a
+group share out particles or nodes, however many they are, so the simulator may use few.
+"""
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import config, cuda, float64
+from numba.np.numpy_support import from_dtype
+
+from ...constitutive.shared import F32, ONE, ZERO, law
+from ...constitutive.weights import spline_weights
+from ..base import TOTALS
+from ..layout import BLOCK
+from ..node_contact import meet_node, meet_obstacle, node_position, pair_friction
+from ..particle import (
+    COLUMNS,
+    NODES,
+    SIDE,
+    TILE,
+    VOLUME_RATIO,
+    add_matter,
+    add_motion,
+    deform,
+    momentum,
+    move,
+    place,
+    tile_node,
+    velocity_gradient,
+)
+
+SIMULATED = bool(config.ENABLE_CUDASIM)
+THREADS = 2 if SIMULATED else 128
+"""Of a group. The simulator starts a Python thread for each."""
+NODE_THREADS = 2 if SIMULATED else NODES
+MEASURE_THREADS = 1 if SIMULATED else 32
+STRAYED, HALTED, DONE = range(3)
+"""Entries of ``progress``: a particle strayed in this substep; no more steps until particles are
+sorted; substeps made."""
+
+
+class Kernels(NamedTuple):
+    """Entry points for one precision; see ``kernels_of``."""
+
+    scatter: Any
+    collect: Any
+    gather: Any
+    finish: Any
+    measure: Any
+    reorder: Any
+
+
+@law
+def tile_index(node: Any, o: Any) -> Any:
+    """Index on the tile of a home of a field's node, or -1; the home is at offset number ``o``."""
+    i = node // (BLOCK * BLOCK) + BLOCK * (1 - o // 9)
+    j = node // BLOCK % BLOCK + BLOCK * (1 - o // 3 % 3)
+    k = node % BLOCK + BLOCK * (1 - o % 3)
+    inside = -1 <= i < SIDE - 1 and -1 <= j < SIDE - 1 and -1 <= k < SIDE - 1
+    return tile_node(i, j, k) if inside else -1
+
+
+@law
+def field_of(index: Any) -> Any:
+    """Where a node of a tile is stored: offset number of its field, and node on that field."""
+    i, j, k = index // (SIDE * SIDE) - 1, index // SIDE % SIDE - 1, index % SIDE - 1
+    o = (i // BLOCK + 1) * 9 + (j // BLOCK + 1) * 3 + k // BLOCK + 1
+    return o, (i % BLOCK * BLOCK + j % BLOCK) * BLOCK + k % BLOCK
+
+
+@law
+def collect_node(field: Any, node: Any, dt: Any, layout: Any, work: Any, rules: Any) -> None:
+    """Sum one node of a field from the tiles around it, always in the same order; to velocity."""
+    zero = ZERO * rules.dx
+    px, py, pz, m = zero, zero, zero, zero
+    for o in range(27):
+        home = layout.field_homes[field, o]
+        index = tile_index(node, o) if home >= 0 else -1
+        if index >= 0:
+            px += work.tiles[home, index, 0]
+            py += work.tiles[home, index, 1]
+            pz += work.tiles[home, index, 2]
+            m += work.tiles[home, index, 3]
+    inverse = ONE / m if m > ZERO else zero
+    work.velocity[field, node, 0] = px * inverse + dt * rules.gravity[0]
+    work.velocity[field, node, 1] = py * inverse + dt * rules.gravity[1]
+    work.velocity[field, node, 2] = pz * inverse + dt * rules.gravity[2]
+    work.velocity[field, node, 3] = m
+
+
+@law
+def collect_moment(field: Any, node: Any, layout: Any, work: Any) -> None:
+    """Sum the first moment of one node; every home around a near field has some."""
+    for c in range(4):
+        work.offset[field, node, c] = ZERO
+    for o in range(27):
+        home = layout.field_homes[field, o]
+        index = tile_index(node, o) if home >= 0 else -1
+        if index >= 0:
+            slot = layout.home_moment[home]
+            for c in range(4):
+                work.offset[field, node, c] += work.moments[slot, index, c]
+
+
+@cuda.jit(device=True)
+def add_particles(home, thread, dt, state, layout, rules, tile):  # type: ignore[no-untyped-def]
+    """Add momentum and mass of one home's particles to its tile."""
+    for p in range(layout.home_start[home] + thread, layout.home_start[home + 1], THREADS):
+        first, f = place(p, state.xi)
+        start, qx, qy, qz = momentum(p, dt, rules.dx, f, state)
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        for a in range(3):
+            for b in range(3):
+                for c in range(3):
+                    w = wx[a] * wy[b] * wz[c]
+                    node = first + (a * SIDE + b) * SIDE + c
+                    i, j, k = F32(a), F32(b), F32(c)
+                    for axis in range(3):
+                        at = start[axis] + i * qx[axis] + j * qy[axis] + k * qz[axis]
+                        cuda.atomic.add(tile, (node, axis), w * at)
+                    cuda.atomic.add(tile, (node, 3), w * state.mass[p])
+
+
+@cuda.jit(device=True)
+def add_volumes(home, thread, state, layout, tile):  # type: ignore[no-untyped-def]
+    """Add w V (x_p - x_i) and w V of one home's particles to its tile; V at rest."""
+    for p in range(layout.home_start[home] + thread, layout.home_start[home + 1], THREADS):
+        first, f = place(p, state.xi)
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        for a in range(3):
+            for b in range(3):
+                for c in range(3):
+                    share = wx[a] * wy[b] * wz[c] * state.volume[p]
+                    node = first + (a * SIDE + b) * SIDE + c
+                    cuda.atomic.add(tile, (node, 0), share * (f[0] - F32(a)))
+                    cuda.atomic.add(tile, (node, 1), share * (f[1] - F32(b)))
+                    cuda.atomic.add(tile, (node, 2), share * (f[2] - F32(c)))
+                    cuda.atomic.add(tile, (node, 3), share)
+
+
+@law
+def pick_up(first: Any, f: Any, tile: Any) -> Any:
+    """Twelve sums over a particle's nodes, see ``particle.velocity_gradient``."""
+    wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+    zero = ZERO * f[0]
+    vx, vy, vz = zero, zero, zero
+    xi, xj, xk = zero, zero, zero
+    yi, yj, yk = zero, zero, zero
+    zi, zj, zk = zero, zero, zero
+    for a in range(3):
+        for b in range(3):
+            for c in range(3):
+                w = wx[a] * wy[b] * wz[c]
+                node = first + (a * SIDE + b) * SIDE + c
+                i, j, k = F32(a), F32(b), F32(c)
+                x, y, z = w * tile[node, 0], w * tile[node, 1], w * tile[node, 2]
+                vx, vy, vz = vx + x, vy + y, vz + z
+                xi, xj, xk = xi + i * x, xj + j * x, xk + k * x
+                yi, yj, yk = yi + i * y, yj + j * y, yk + k * y
+                zi, zj, zk = zi + i * z, zj + j * z, zk + k * z
+    return vx, vy, vz, xi, yi, zi, xj, yj, zj, xk, yk, zk
+
+
+@cuda.jit(device=True)
+def clear(thread, tile):  # type: ignore[no-untyped-def]
+    """Zero a tile."""
+    for index in range(thread, TILE, THREADS):
+        for c in range(4):
+            tile[index, c] = ZERO
+
+
+@cuda.jit(device=True)
+def store(thread, tile, out):  # type: ignore[no-untyped-def]
+    """Copy a tile out of shared memory."""
+    for index in range(thread, TILE, THREADS):
+        for c in range(4):
+            out[index, c] = tile[index, c]
+
+
+@cuda.jit(device=True)
+def look_around(home, thread, layout, work, tile):  # type: ignore[no-untyped-def]
+    """Copy the velocities around a home to its tile."""
+    for index in range(thread, TILE, THREADS):
+        o, node = field_of(index)
+        field = layout.home_fields[home, o]
+        for c in range(3):
+            tile[index, c] = work.velocity[field, node, c]
+
+
+@functools.cache
+def kernels_of(dtype: type[np.floating[Any]]) -> Kernels:
+    """The kernels for one precision; compiled when first launched.
+
+    Shared memory needs its type when it is compiled, hence the functions in a function.
+    """
+    number = from_dtype(np.dtype(dtype))
+
+    @cuda.jit
+    def scatter(dt, state, layout, work, rules, progress):  # type: ignore[no-untyped-def]
+        """Particles of one home to its tile, then volumes where contact asks for them."""
+        if progress[HALTED] != 0:
+            return
+        home, thread = cuda.blockIdx.x, cuda.threadIdx.x
+        tile = cuda.shared.array((TILE, 4), number)
+        clear(thread, tile)
+        cuda.syncthreads()
+        add_particles(home, thread, dt, state, layout, rules, tile)
+        cuda.syncthreads()
+        store(thread, tile, work.tiles[home])
+        slot = layout.home_moment[home]
+        if slot < 0:
+            return
+        cuda.syncthreads()
+        clear(thread, tile)
+        cuda.syncthreads()
+        add_volumes(home, thread, state, layout, tile)
+        cuda.syncthreads()
+        store(thread, tile, work.moments[slot])
+
+    @cuda.jit
+    def gather(dt, state, layout, work, rules, progress, moving):  # type: ignore[no-untyped-def]
+        """Fields to the particles of one home when ``moving``, then stress."""
+        if progress[HALTED] != 0:
+            return
+        home, thread = cuda.blockIdx.x, cuda.threadIdx.x
+        tile = cuda.shared.array((TILE, 4), number)
+        if moving:
+            look_around(home, thread, layout, work, tile)
+        cuda.syncthreads()
+        for p in range(layout.home_start[home] + thread, layout.home_start[home + 1], THREADS):
+            if moving:
+                first, f = place(p, state.xi)
+                g = pick_up(first, f, tile)
+                L = velocity_gradient(g, rules.dx, f)
+                if move(p, dt, rules.dx, (g[0], g[1], g[2]), L, state):
+                    progress[STRAYED] = 1
+            deform(p, dt, state, rules.table[state.material[p]])
+
+    return Kernels(scatter, collect, gather, finish, measure, reorder)
+
+
+@cuda.jit
+def collect(dt, layout, work, rules, progress):  # type: ignore[no-untyped-def]
+    """Tiles to the fields of one group: sums, gravity, contact. Nodes do not know each other."""
+    if progress[HALTED] != 0:
+        return
+    group = cuda.blockIdx.x
+    begin, end = layout.group_start[group], layout.group_start[group + 1]
+    for node in range(cuda.threadIdx.x, NODES, NODE_THREADS):
+        for field in range(begin, end):
+            collect_node(field, node, dt, layout, work, rules)
+            if layout.near[field]:
+                collect_moment(field, node, layout, work)
+        at = node_position(layout.field_block[begin], node, rules.dx)
+        for a in range(begin, end):
+            for b in range(a + 1, end):
+                if work.velocity[a, node, 3] > ZERO and work.velocity[b, node, 3] > ZERO:
+                    collide(a, b, node, at, layout, work, rules)
+        for field in range(begin, end):
+            if work.velocity[field, node, 3] > ZERO:
+                obstruct(field, node, at, layout, work, rules)
+
+
+@cuda.jit(device=True)
+def collide(a, b, node, at, layout, work, rules):  # type: ignore[no-untyped-def]
+    """Contact of two bodies at one node; what it did goes to the totals of both."""
+    on_a = cuda.local.array(TOTALS, float64)
+    on_b = cuda.local.array(TOTALS, float64)
+    for c in range(TOTALS):
+        on_a[c] = 0.0
+        on_b[c] = 0.0
+    body_a, body_b = layout.field_body[a], layout.field_body[b]
+    friction = pair_friction(rules.friction[body_a], rules.friction[body_b])
+    meet_node(
+        work.velocity[a, node], work.velocity[b, node],
+        work.offset[a, node], work.offset[b, node],
+        friction, rules.dx, at, on_a, on_b,
+    )  # fmt: skip
+    for c in range(TOTALS):
+        if on_a[c] != 0.0:
+            cuda.atomic.add(work.by_body, (a, body_b, c), on_a[c])
+        if on_b[c] != 0.0:
+            cuda.atomic.add(work.by_body, (b, body_a, c), on_b[c])
+
+
+@cuda.jit(device=True)
+def obstruct(field, node, at, layout, work, rules):  # type: ignore[no-untyped-def]
+    """Contact of one body's node with every collider near its field."""
+    friction = rules.friction[layout.field_body[field]]
+    for touch in range(layout.touch_start[field], layout.touch_start[field + 1]):
+        total = cuda.local.array(TOTALS, float64)
+        for c in range(TOTALS):
+            total[c] = 0.0
+        row = rules.obstacles[layout.touch_collider[touch]]
+        meet_obstacle(
+            row, rules.heights, rules.dx, friction, at,
+            work.velocity[field, node], work.offset[field, node], total,
+        )  # fmt: skip
+        for c in range(TOTALS):
+            if total[c] != 0.0:
+                cuda.atomic.add(work.by_collider, (touch, c), total[c])
+
+
+@cuda.jit
+def finish(progress):  # type: ignore[no-untyped-def]
+    """End of a substep, by one thread: count it, and halt when particles must be sorted."""
+    if progress[HALTED] == 0:
+        progress[DONE] += 1
+        progress[HALTED] = progress[STRAYED]
+
+
+@cuda.jit
+def measure(state, layout, rules, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` [P MEASURE_THREADS, COLUMNS] float64, one row for each thread of each home."""
+    home, thread = cuda.blockIdx.x, cuda.threadIdx.x
+    row = out[home * MEASURE_THREADS + thread]
+    for c in range(COLUMNS):
+        row[c] = 0.0
+    row[VOLUME_RATIO] = math.inf
+    begin, end = layout.home_start[home], layout.home_start[home + 1]
+    for p in range(begin + thread, end, MEASURE_THREADS):
+        add_motion(p, layout.home_block[home], state, rules.dx, row)
+        add_matter(p, state, rules.table[state.material[p]], row)
+
+
+@cuda.jit
+def reorder(source, order, out):  # type: ignore[no-untyped-def]
+    """Rows of ``source`` [N, C] in another order."""
+    p = cuda.grid(1)
+    if p < order.shape[0]:
+        for c in range(source.shape[1]):
+            out[p, c] = source[order[p], c]

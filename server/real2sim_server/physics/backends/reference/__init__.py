@@ -1,0 +1,1 @@
+"""The reference backend: plain torch, float64, differentiable; the oracle of the others."""

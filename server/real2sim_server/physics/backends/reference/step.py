@@ -1,0 +1,340 @@
+"""One substep in plain torch, as a pure function: slow, obvious, differentiable."""
+
+# The substep passes its pieces on by position, as kernels do.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...colliders import Box, Collider, HeightField, Plane
+from ...constitutive import stress as laws
+from ...constitutive.contact import FLAT_MOMENT, OPPOSED, STICKS, SURFACE
+from ...errors import ColliderError
+from .stress import stress_update
+
+OFFSETS = torch.cartesian_prod(*[torch.arange(3)] * 3)
+"""[27, 3] offsets of a particle's nodes from the first."""
+SURFACE_TABLE = torch.from_numpy(SURFACE.astype(np.float64))
+FLAT_TABLE = torch.from_numpy(FLAT_MOMENT.astype(np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class TorchState:
+    """Particles; gradients flow through all of it.
+
+    Attributes:
+        x, v: [N, 3] float64 [m], [m/s].
+        L: [N, 3, 3] velocity gradient [1/s].
+        F, F_total: [N, 3, 3].
+        tau: [N, 3, 3] Kirchhoff stress, viscosity included [Pa].
+        energy: [N] stored energy per rest volume [J/m^3].
+        history: [N].
+    """
+
+    x: Tensor
+    v: Tensor
+    L: Tensor
+    F: Tensor
+    F_total: Tensor
+    tau: Tensor
+    energy: Tensor
+    history: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class TorchRules:
+    """What holds for a run; gradients flow to masses, rows, friction and gravity.
+
+    Attributes:
+        mass, volume: [N].
+        rows: [N, ROW] material row of each particle.
+        body: [N] int64.
+        friction: [B].
+        dx: [m].
+        gravity: [3].
+    """
+
+    mass: Tensor
+    volume: Tensor
+    rows: Tensor
+    body: Tensor
+    friction: Tensor
+    dx: float
+    gravity: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """What contact did to a body's nodes in one substep.
+
+    Attributes:
+        body: who was touched.
+        other: collider index, or body index when ``by_body``.
+        at: [U, 3] nodes [m].
+        impulse: [U, 3] [N s].
+        slip: [U, 3] velocity relative to the other, after the touch [m/s].
+        velocity: [U, 3] of the other [m/s].
+    """
+
+    body: int
+    other: int
+    by_body: bool
+    at: Tensor
+    impulse: Tensor
+    slip: Tensor
+    velocity: Tensor
+
+
+def settle(state: TorchState, rules: TorchRules) -> TorchState:
+    """The state with stress and energy of its deformation."""
+    return _respond(state, rules, state.x, state.v, state.L, state.F, state.F_total, 0.0)
+
+
+def substep(
+    state: TorchState, rules: TorchRules, colliders: Sequence[Collider], dt: float
+) -> tuple[TorchState, list[Touch]]:
+    """MLS-MPM with APIC (Hu et al. 2018), contact on separate velocity fields."""
+    index, weights, arm, nodes = _stencil(state.x, rules.dx)
+    velocity, mass, moment = _to_grid(state, rules, dt, index, weights, arm, len(nodes))
+    velocity = velocity + dt * rules.gravity
+    touches: list[Touch] = []
+    velocity = _meet_bodies(velocity, mass, moment, nodes, rules, touches)
+    velocity = _meet_colliders(velocity, mass, moment, nodes, rules, colliders, touches)
+
+    seen = velocity[rules.body[:, None], index]
+    v = (weights[:, :, None] * seen).sum(1)
+    L = 4 / rules.dx**2 * torch.einsum("nk,nki,nkj->nij", weights, seen, arm)
+    step = torch.eye(3, dtype=state.x.dtype) + dt * L
+    moved = state.x + dt * v
+    return (
+        _respond(state, rules, moved, v, L, step @ state.F, step @ state.F_total, dt),
+        touches,
+    )
+
+
+def _respond(
+    state: TorchState,
+    rules: TorchRules,
+    x: Tensor,
+    v: Tensor,
+    L: Tensor,
+    F: Tensor,
+    F_total: Tensor,
+    dt: float,
+) -> TorchState:
+    F, tau, energy, history = stress_update(F, state.history, rules.rows, dt)
+    eta = rules.rows[:, laws.VISCOSITY] * torch.linalg.det(F)
+    tau = tau + eta[:, None, None] * (L + L.mT)
+    return TorchState(x, v, L, F, F_total, tau, energy, history)
+
+
+def _stencil(x: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Node number [N, 27], weight [N, 27], arm x_i - x_p [N, 27, 3] and node positions [U, 3]."""
+    base = torch.floor(x.detach() / dx - 0.5)
+    f = x / dx - base
+    w = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
+    weights = torch.stack(
+        [w[:, i, 0] * w[:, j, 1] * w[:, k, 2] for i, j, k in OFFSETS.tolist()], dim=1
+    )
+    cells = base.long()[:, None] + OFFSETS
+    low = cells.amin((0, 1))
+    span = cells.amax((0, 1)) - low + 1
+    local = cells - low
+    key = (local[..., 0] * span[1] + local[..., 1]) * span[2] + local[..., 2]
+    keys, index = torch.unique(key, return_inverse=True)
+    nodes = torch.stack(
+        [keys // (span[1] * span[2]), keys // span[2] % span[1], keys % span[2]], dim=1
+    )
+    # Whole numbers times a Python float would come out in single precision.
+    arm = cells.to(x.dtype) * dx - x[:, None]
+    return index, weights, arm, (nodes + low).to(x.dtype) * dx
+
+
+def _to_grid(
+    state: TorchState,
+    rules: TorchRules,
+    dt: float,
+    index: Tensor,
+    weights: Tensor,
+    arm: Tensor,
+    nodes: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Velocity [B, U, 3], mass [B, U], volume and its first moment [B, U, 4] of each body."""
+    scale = (-dt * 4 / rules.dx**2 * rules.volume)[:, None, None]
+    Q = scale * state.tau + rules.mass[:, None, None] * state.L
+    momentum = (rules.mass[:, None] * state.v)[:, None] + torch.einsum("nij,nkj->nki", Q, arm)
+    m = weights * rules.mass[:, None]
+    V = (weights * rules.volume[:, None])[..., None]
+    values = torch.cat([weights[..., None] * momentum, m[..., None], -V * arm / rules.dx, V], -1)
+    bodies = len(rules.friction)
+    flat = (rules.body[:, None] * nodes + index).reshape(-1)
+    grid = torch.zeros(bodies * nodes, 8, dtype=state.x.dtype)
+    grid = grid.index_add(0, flat, values.reshape(-1, 8)).reshape(bodies, nodes, 8)
+    mass = grid[..., 3]
+    safe = torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
+    return grid[..., :3] / safe, mass, grid[..., 4:]
+
+
+def surface_offset(centroid: Tensor) -> Tensor:
+    """Where surfaces lie, from centroid offsets [cells]; see ``laws.contact``."""
+    return _look_up(SURFACE_TABLE, centroid / 1.5)
+
+
+def _look_up(table: Tensor, at: Tensor) -> Tensor:
+    """Linear interpolation in a table over [0, 1]."""
+    last = len(table) - 1
+    scaled = at.clamp(0, 1) * last
+    index = scaled.detach().floor().clamp(max=last - 1).long()
+    low, high = table[index], table[index + 1]
+    return low + (scaled - index) * (high - low)
+
+
+def _depth(moment: Tensor, n: Tensor) -> Tensor:
+    """Offset [U] [cells] along ``n`` of the centroid of the volume [U, 4] near each node."""
+    volume = moment[:, 3]
+    safe = torch.where(volume > 0, volume, torch.ones_like(volume))
+    return (moment[:, :3] * n).sum(-1) / safe
+
+
+def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
+    """Relative velocities [U, 3] after a touch; see ``laws.contact``."""
+    approach = (v * n).sum(-1, keepdim=True)
+    t = v - approach * n
+    square = t.square().sum(-1, keepdim=True)
+    speed = torch.where(square > 0, square, torch.ones_like(square)).sqrt()
+    keep = (1 - friction * approach.abs() / speed).clamp(min=0)
+    slides = (square > 0) & (friction < STICKS)
+    slid = torch.where(slides, keep, torch.zeros_like(keep)) * t
+    return torch.where((approach >= 0) & separable, v, slid)
+
+
+def _meet_bodies(
+    velocity: Tensor,
+    mass: Tensor,
+    moment: Tensor,
+    nodes: Tensor,
+    rules: TorchRules,
+    touches: list[Touch],
+) -> Tensor:
+    """Contact of every two bodies, pair after pair."""
+    fields = list(velocity)
+    for a in range(len(fields)):
+        for b in range(a + 1, len(fields)):
+            ma, mb = mass[a], mass[b]
+            n, opposed = _normal(moment[a] / rules.dx**3, moment[b] / rules.dx**3)
+            gap = surface_offset(_depth(moment[a], -n)) + surface_offset(_depth(moment[b], n))
+            meet = (ma > 0) & (mb > 0) & opposed & (gap <= 0)
+            relative = fields[b] - fields[a]
+            friction = (rules.friction[a] * rules.friction[b]).sqrt()
+            change = coulomb(relative, n, friction, separable=True) - relative
+            change = torch.where(meet[:, None], change, torch.zeros_like(change))
+            total = torch.where(meet, ma + mb, torch.ones_like(ma))
+            new_a = fields[a] - (mb / total)[:, None] * change
+            new_b = fields[b] + (ma / total)[:, None] * change
+            slip = new_b - new_a
+            on_a, on_b = ma[:, None] * (new_a - fields[a]), mb[:, None] * (new_b - fields[b])
+            touches.append(Touch(a, b, True, nodes, on_a, -slip, new_b))
+            touches.append(Touch(b, a, True, nodes, on_b, slip, new_a))
+            fields[a], fields[b] = new_a, new_b
+    return torch.stack(fields)
+
+
+def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
+    """Contact normals [U, 3] from a to b, and where [U] the surfaces look at each other."""
+    size_a, size_b = moment_a[:, :3].norm(dim=-1), moment_b[:, :3].norm(dim=-1)
+    out_of_a = -moment_a[:, :3] / size_a.clamp(min=1e-30)[:, None]
+    into_b = moment_b[:, :3] / size_b.clamp(min=1e-30)[:, None]
+    from_a = _face_score(size_a, moment_a[:, 3]) > _face_score(size_b, moment_b[:, 3])
+    n = torch.where(from_a[:, None], out_of_a, into_b)
+    return n, (out_of_a * into_b).sum(-1) >= float(OPPOSED)
+
+
+def _face_score(size: Tensor, share: Tensor) -> Tensor:
+    """How well first moments tell normals; see ``laws.contact``."""
+    flat = _look_up(FLAT_TABLE, share).clamp(min=1e-3)
+    return (size / flat) ** 2 * size
+
+
+def _meet_colliders(
+    velocity: Tensor,
+    mass: Tensor,
+    moment: Tensor,
+    nodes: Tensor,
+    rules: TorchRules,
+    colliders: Sequence[Collider],
+    touches: list[Touch],
+) -> Tensor:
+    fields = list(velocity)
+    for b in range(len(fields)):
+        for k, collider in enumerate(colliders):
+            distance, n = _distance(collider, nodes)
+            gap = distance / rules.dx + surface_offset(_depth(moment[b], n))
+            meet = (mass[b] > 0) & (distance <= 0) & (gap <= 0)
+            own = collider.friction is None
+            friction = (
+                rules.friction[b]
+                if own
+                else rules.friction.new_tensor(min(collider.friction, float(STICKS)))
+            )
+            u = _material_velocity(collider, nodes)
+            after = u + coulomb(fields[b] - u, n, friction, collider.separable)
+            new = torch.where(meet[:, None], after, fields[b])
+            impulse = mass[b][:, None] * (new - fields[b])
+            touches.append(Touch(b, k, False, nodes, impulse, new - u, u))
+            fields[b] = new
+    return torch.stack(fields)
+
+
+def _distance(collider: Collider, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance [U] [m] and outward normal [U, 3]."""
+    if isinstance(collider, Plane):
+        n = torch.as_tensor(collider.normal)
+        return (points - torch.as_tensor(collider.point)) @ n, n.expand_as(points)
+    if isinstance(collider, Box):
+        return _box_distance(collider, points)
+    if isinstance(collider, HeightField):
+        return _height_distance(collider, points)
+    raise ColliderError(f"no distance to a {type(collider).__name__}")
+
+
+def _box_distance(box: Box, points: Tensor) -> tuple[Tensor, Tensor]:
+    pose = torch.as_tensor(box.T_world_box)
+    q = (points - pose[:3, 3]) @ pose[:3, :3]
+    d = q.abs() - torch.as_tensor(box.size) / 2
+    outer = d.clamp(min=0)
+    far = outer.norm(dim=-1)
+    nearest = torch.nn.functional.one_hot(d.argmax(-1), 3).to(q.dtype)
+    outside = (far > 0)[:, None]
+    n = torch.where(outside, outer / far.clamp(min=1e-300)[:, None], nearest)
+    n = torch.copysign(n, q) @ pose[:3, :3].T
+    return torch.where(far > 0, far, d.max(-1).values), n
+
+
+def _height_distance(field: HeightField, points: Tensor) -> tuple[Tensor, Tensor]:
+    heights = torch.as_tensor(field.heights)
+    at = (points[:, :2] - torch.as_tensor(field.origin)) / field.spacing
+    last = torch.tensor(heights.shape) - 1
+    at = torch.minimum(at.clamp(min=0), last.to(at.dtype))
+    i, j = torch.minimum(at.floor().long(), last - 1).unbind(-1)
+    a, b = at[:, 0] - i, at[:, 1] - j
+    h00, h01, h10, h11 = heights[i, j], heights[i, j + 1], heights[i + 1, j], heights[i + 1, j + 1]
+    slope_x = ((h10 - h00) * (1 - b) + (h11 - h01) * b) / field.spacing
+    slope_y = ((h01 - h00) * (1 - a) + (h11 - h10) * a) / field.spacing
+    height = (h00 * (1 - a) + h10 * a) * (1 - b) + (h01 * (1 - a) + h11 * a) * b
+    n = torch.stack([-slope_x, -slope_y, torch.ones_like(a)], dim=-1)
+    n = n / n.norm(dim=-1, keepdim=True)
+    return (points[:, 2] - height) * n[:, 2], n
+
+
+def _material_velocity(collider: Collider, points: Tensor) -> Tensor:
+    if not isinstance(collider, Box):
+        return torch.zeros_like(points)
+    arm = points - torch.as_tensor(collider.T_world_box)[:3, 3]
+    spin = torch.as_tensor(collider.angular_velocity).expand_as(arm)
+    return torch.as_tensor(collider.velocity) + torch.linalg.cross(spin, arm)

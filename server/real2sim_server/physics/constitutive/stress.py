@@ -1,0 +1,270 @@
+"""Stress and return mapping of one particle.
+
+``stress_update`` is the one entry: it takes the trial elastic deformation gradient and gives the
+elastic part that is left after plastic flow, the Kirchhoff stress tau, the stored energy per rest
+volume and the history variable. Formulas: reference in :mod:`..materials` at each class.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from .matrices import (
+    det,
+    eigen_symmetric,
+    gram,
+    multiply,
+    polar_rotation,
+    recompose,
+    symmetric_times,
+)
+from .shared import F32, HALF, ONE, THREE, TWO, ZERO, law
+
+COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW = range(6)
+"""Kinds of material, as kernels know them."""
+KIND, MU, LAMBDA, VISCOSITY, A, B, C = range(7)
+"""Columns of a material's row; A, B, C are read by kind, see ``Material.row``."""
+ROW = 7
+
+SQRT_TWO_THIRDS = F32(math.sqrt(2 / 3))
+STRETCH_MIN = F32(0.05)
+"""Principal stretches are taken as no smaller than this, so that logarithms stay finite."""
+VOLUME_MIN = F32(1e-3)
+"""A particle squeezed below this share of its volume has turned inside out or is about to."""
+
+
+@law
+def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
+    """(elastic F, tau, energy density, history) of a trial elastic deformation gradient.
+
+    Args:
+        F: trial deformation gradient, nine numbers.
+        history: plastic memory; hardening [Pa], volume correction, or plastic volume ratio.
+        row: material parameters, see the column constants.
+        dt: time since the last call [s]; 0 leaves rate-dependent flow out.
+    """
+    kind = row[KIND]
+    if kind == COROTATED:
+        tau, energy = corotated(F, row[MU], row[LAMBDA])
+        return F, tau, energy, history
+    if kind == NEO_HOOKEAN:
+        tau, energy = neo_hookean(F, row[MU], row[LAMBDA])
+        return F, tau, energy, history
+    squares, vectors = eigen_symmetric(gram(F))
+    stretch = (stretch_of(squares[0]), stretch_of(squares[1]), stretch_of(squares[2]))
+    if kind == SNOW:
+        left, tau, energy, history = snow(stretch, history, row)
+    else:
+        left, tau, energy, history = hencky(stretch, history, row, dt)
+    if left[0] != stretch[0] or left[1] != stretch[1] or left[2] != stretch[2]:
+        ratio = (left[0] / stretch[0], left[1] / stretch[1], left[2] / stretch[2])
+        F = symmetric_times(recompose(ratio, vectors), F)
+    return F, recompose(tau, vectors), energy, history
+
+
+@law
+def stretch_of(square: Any) -> Any:
+    """Principal stretch of an eigenvalue of F F^T."""
+    return max(math.sqrt(max(square, ZERO)), STRETCH_MIN)
+
+
+@law
+def corotated(F: Any, mu: Any, lam: Any) -> Any:
+    """Fixed corotated: tau = 2 mu (F - R) F^T + lambda J (J - 1) I (Stomakhin et al. 2012)."""
+    volume = max(det(F), VOLUME_MIN)
+    return corotated_about(F, polar_rotation(F, volume), volume, mu, lam)
+
+
+@law
+def corotated_about(F: Any, R: Any, volume: Any, mu: Any, lam: Any) -> Any:
+    """The same where rotation R and volume ratio are known."""
+    d = (
+        F[0] - R[0], F[1] - R[1], F[2] - R[2],
+        F[3] - R[3], F[4] - R[4], F[5] - R[5],
+        F[6] - R[6], F[7] - R[7], F[8] - R[8],
+    )  # fmt: skip
+    two_mu = TWO * mu
+    pressure = lam * volume * (volume - ONE)
+    tau = (
+        two_mu * (d[0] * F[0] + d[1] * F[1] + d[2] * F[2]) + pressure,
+        two_mu * (d[3] * F[3] + d[4] * F[4] + d[5] * F[5]) + pressure,
+        two_mu * (d[6] * F[6] + d[7] * F[7] + d[8] * F[8]) + pressure,
+        two_mu * (d[0] * F[3] + d[1] * F[4] + d[2] * F[5]),
+        two_mu * (d[0] * F[6] + d[1] * F[7] + d[2] * F[8]),
+        two_mu * (d[3] * F[6] + d[4] * F[7] + d[5] * F[8]),
+    )
+    shear = (
+        d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
+        + d[6] * d[6] + d[7] * d[7] + d[8] * d[8]
+    )  # fmt: skip
+    return tau, mu * shear + HALF * lam * (volume - ONE) * (volume - ONE)
+
+
+@law
+def neo_hookean(F: Any, mu: Any, lam: Any) -> Any:
+    """Compressible neo-Hookean: tau = mu (F F^T - I) + lambda ln J I (Bonet and Wood, 6.4)."""
+    return neo_hookean_at(F, math.log(max(det(F), VOLUME_MIN)), mu, lam)
+
+
+@law
+def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
+    """The same where ln J is known."""
+    b = gram(F)
+    pressure = lam * log_volume - mu
+    tau = (
+        mu * b[0] + pressure, mu * b[1] + pressure, mu * b[2] + pressure,
+        mu * b[3], mu * b[4], mu * b[5],
+    )  # fmt: skip
+    trace = b[0] + b[1] + b[2] - THREE
+    return tau, HALF * mu * trace - mu * log_volume + HALF * lam * log_volume * log_volume
+
+
+@law
+def hencky(stretch: Any, history: Any, row: Any, dt: Any) -> Any:
+    """Hencky's law with the flow rule of the row's kind, in principal stretches.
+
+    tau = 2 mu e + lambda tr(e), e = ln(stretch).
+    """
+    mu, lam = row[MU], row[LAMBDA]
+    e = (math.log(stretch[0]), math.log(stretch[1]), math.log(stretch[2]))
+    if row[KIND] == VON_MISES:
+        flowed, history = von_mises(e, history, row)
+    elif row[KIND] == VISCOPLASTIC:
+        flowed = viscoplastic(e, stretch, row, dt)
+    else:
+        flowed, history = drucker_prager(e, history, row)
+    if flowed[0] != e[0] or flowed[1] != e[1] or flowed[2] != e[2]:
+        stretch = (math.exp(flowed[0]), math.exp(flowed[1]), math.exp(flowed[2]))
+    trace = flowed[0] + flowed[1] + flowed[2]
+    tau = (
+        TWO * mu * flowed[0] + lam * trace,
+        TWO * mu * flowed[1] + lam * trace,
+        TWO * mu * flowed[2] + lam * trace,
+    )
+    square = flowed[0] * flowed[0] + flowed[1] * flowed[1] + flowed[2] * flowed[2]
+    return stretch, tau, mu * square + HALF * lam * trace * trace, history
+
+
+@law
+def deviator(e: Any) -> Any:
+    """Deviatoric part of principal values, and its norm."""
+    mean = (e[0] + e[1] + e[2]) / THREE
+    d = (e[0] - mean, e[1] - mean, e[2] - mean)
+    return d, math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+
+
+@law
+def shrink(e: Any, d: Any, factor: Any) -> Any:
+    """e with ``factor`` of its deviator ``d`` taken away."""
+    return e[0] - factor * d[0], e[1] - factor * d[1], e[2] - factor * d[2]
+
+
+@law
+def von_mises(e: Any, history: Any, row: Any) -> Any:
+    """Radial return with linear hardening (Simo and Hughes 1998, box 3.2), in log strain.
+
+    Columns: A yield stress [Pa], B hardening modulus [Pa]; history: increase of yield [Pa].
+    """
+    d, norm = deviator(e)
+    two_mu = TWO * row[MU]
+    excess = two_mu * norm - SQRT_TWO_THIRDS * (row[A] + history)
+    if excess <= ZERO:
+        return e, history
+    flow = excess / (two_mu + TWO * row[B] / THREE)
+    return shrink(e, d, flow / norm), history + SQRT_TWO_THIRDS * row[B] * flow
+
+
+@law
+def viscoplastic(e: Any, stretch: Any, row: Any, dt: Any) -> Any:
+    """Von Mises flow that needs time (Yue et al. 2015; as in PhysGaussian's foam).
+
+    Columns: A yield stress [Pa], B plastic viscosity [Pa s]; B = 0 flows at once.
+    """
+    d, norm = deviator(e)
+    mu = row[MU]
+    excess = TWO * mu * norm - SQRT_TWO_THIRDS * row[A]
+    if excess <= ZERO or dt <= ZERO:
+        return e
+    mean_square = (
+        stretch[0] * stretch[0] + stretch[1] * stretch[1] + stretch[2] * stretch[2]
+    ) / THREE
+    share = dt / (dt + row[B] / (TWO * mu * mean_square))
+    return shrink(e, d, share * excess / (TWO * mu * norm))
+
+
+@law
+def drucker_prager(e: Any, history: Any, row: Any) -> Any:
+    """Frictional flow without cohesion (Klar et al. 2016), with volume correction (2017).
+
+    Column A: alpha of the cone; history: volume gained in tension, to be given back.
+    """
+    mu, lam = row[MU], row[LAMBDA]
+    share = history / THREE
+    e = (e[0] + share, e[1] + share, e[2] + share)
+    trace = e[0] + e[1] + e[2]
+    d, norm = deviator(e)
+    if trace >= ZERO:
+        return (ZERO * trace, ZERO * trace, ZERO * trace), trace
+    excess = norm + (THREE * lam + TWO * mu) / (TWO * mu) * trace * row[A]
+    if excess <= ZERO:
+        return e, ZERO * history
+    return shrink(e, d, excess / norm), ZERO * history
+
+
+@law
+def snow(stretch: Any, history: Any, row: Any) -> Any:
+    """Clamped stretches and hardening, fixed corotated stress (Stomakhin et al. 2013).
+
+    Columns: A critical compression, B critical stretch, C hardening exponent; history: ln of the
+    plastic volume ratio. Hardening is held within exp(+-3), as loose and as hard as snow gets.
+    """
+    low, high = ONE - row[A], ONE + row[B]
+    s = (
+        min(max(stretch[0], low), high),
+        min(max(stretch[1], low), high),
+        min(max(stretch[2], low), high),
+    )
+    volume = s[0] * s[1] * s[2]
+    before = stretch[0] * stretch[1] * stretch[2]
+    if before != volume:
+        history = history + math.log(before / volume)
+    hard = math.exp(min(max(row[C] * (ONE - math.exp(history)), -THREE), THREE))
+    mu, lam = row[MU] * hard, row[LAMBDA] * hard
+    pressure = lam * volume * (volume - ONE)
+    d = (s[0] - ONE, s[1] - ONE, s[2] - ONE)
+    tau = (
+        TWO * mu * d[0] * s[0] + pressure,
+        TWO * mu * d[1] * s[1] + pressure,
+        TWO * mu * d[2] * s[2] + pressure,
+    )
+    square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    energy = mu * square + HALF * lam * (volume - ONE) * (volume - ONE)
+    return s, tau, energy, history
+
+
+@law
+def advance_gradient(F: Any, L: Any, dt: Any) -> Any:
+    """(I + dt L) F."""
+    one = ONE
+    step = (
+        one + dt * L[0], dt * L[1], dt * L[2],
+        dt * L[3], one + dt * L[4], dt * L[5],
+        dt * L[6], dt * L[7], one + dt * L[8],
+    )  # fmt: skip
+    return multiply(step, F)
+
+
+@law
+def add_viscosity(tau: Any, L: Any, volume: Any, viscosity: Any) -> Any:
+    """Kelvin-Voigt: tau + J eta (L + L^T); ``volume`` is J."""
+    k = volume * viscosity
+    return (
+        tau[0] + TWO * k * L[0],
+        tau[1] + TWO * k * L[4],
+        tau[2] + TWO * k * L[8],
+        tau[3] + k * (L[1] + L[3]),
+        tau[4] + k * (L[2] + L[6]),
+        tau[5] + k * (L[5] + L[7]),
+    )

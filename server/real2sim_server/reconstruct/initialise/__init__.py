@@ -1,0 +1,1 @@
+"""Stage 0: from a log to a scene of Gaussians without training."""

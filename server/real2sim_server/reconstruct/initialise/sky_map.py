@@ -1,0 +1,164 @@
+"""The sky, and whatever is out of the LiDAR's reach, as a cube map around the drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...scene import Sky
+from ...scene.sky import face_directions
+from .views import SHRINK, View
+
+SLOTS = 15
+"""Samples of which the median is taken for a direction."""
+PANORAMA = (256, 512)
+ZENITH = np.array([0.75, 0.82, 0.9])
+"""Colour of a sky that was never seen."""
+FADE = 1 / 24
+"""Share of a turn over which a seen colour loses its say."""
+GROUND_ELEVATION = -0.03
+"""Below this elevation [rad] directions are given the colour of the ground."""
+
+
+class SkySamples:
+    """Collects, for each direction, the pixels that no Gaussian covers."""
+
+    def __init__(self, resolution: int) -> None:
+        self._resolution = resolution
+        self._directions = face_directions(resolution).reshape(-1, 3)
+        n = len(self._directions)
+        self._slots: list[NDArray[np.uint8]] = []
+        self._counts = np.zeros(n, dtype=np.uint8)
+
+    def add(self, view: View) -> None:
+        """Take the pixels of ``view`` that show neither a Gaussian nor a tracked object."""
+        texels, u, v = self._texels_in(view)
+        row, column = (v / SHRINK).astype(np.int64), (u / SHRINK).astype(np.int64)
+        free = uncovered(view)[row, column] & (self._counts[texels] < SLOTS)
+        texels, u, v = texels[free], u[free], v[free]
+        colours = _bilinear(view.image, u, v)
+        slot = self._counts[texels]
+        while len(self._slots) <= int(slot.max(initial=0)):
+            self._slots.append(np.full((len(self._directions), 3), 255, dtype=np.uint8))
+        for s in range(int(slot.max(initial=0)) + 1):
+            mine = slot == s
+            self._slots[s][texels[mine]] = colours[mine]
+        self._counts[texels] += 1
+
+    def _texels_in(self, view: View) -> tuple[NDArray[np.int64], ...]:
+        """Texels inside the image and their pixel coordinates u, v."""
+        camera = view.camera
+        rotation = view.T_camera_world[:3, :3].astype(np.float32)
+        ahead = np.flatnonzero(self._directions @ rotation[2] > 0.05)
+        x, y, z = (self._directions[ahead] @ rotation.T).T
+        u = camera.K[0, 0] * x / z + camera.K[0, 2]
+        v = camera.K[1, 1] * y / z + camera.K[1, 2]
+        inside = (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
+        return ahead[inside], u[inside], v[inside]
+
+    def finish(self, ground_colour: NDArray[np.float32]) -> Sky:
+        """The cube map: medians where anything was seen, smoothly filled elsewhere."""
+        known = self._counts > 0
+        texels = np.zeros((len(self._directions), 3), dtype=np.float32)
+        texels[known] = self._median(known)
+        fill = _panorama(self._directions, texels, known, ground_colour)
+        texels[~known] = _look_up(fill, self._directions[~known])
+        r = self._resolution
+        return Sky(torch.from_numpy(texels.reshape(6, r, r, 3).clip(0, 1)))
+
+    def _median(self, known: NDArray[np.bool_]) -> NDArray[np.float32]:
+        stack = np.stack([slot[known] for slot in self._slots])
+        # Unused slots hold 255 and so stay behind the used ones.
+        stack.sort(axis=0)
+        middle = (self._counts[known].astype(np.int64) - 1) // 2
+        chosen = np.take_along_axis(stack, middle[None, :, None], axis=0)[0]
+        return chosen.astype(np.float32) / 255
+
+
+def uncovered(view: View) -> NDArray[np.bool_]:
+    """[H / 2, W / 2] bool: no Gaussian and no object there; pinholes closed."""
+    import cv2
+
+    covered = (np.isfinite(view.depth) | view.on_object).astype(np.uint8)
+    closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return np.asarray(closed == 0)
+
+
+def _bilinear(image: NDArray[np.uint8], u: NDArray, v: NDArray) -> NDArray[np.uint8]:
+    import cv2
+
+    if len(u) == 0:
+        return np.zeros((0, 3), dtype=np.uint8)
+    side = 1 << 14
+    rows = -(-len(u) // side)
+    maps = [np.zeros(rows * side, dtype=np.float32) for _ in range(2)]
+    maps[0][: len(u)], maps[1][: len(v)] = u - 0.5, v - 0.5
+    flat = cv2.remap(image, *(m.reshape(rows, side) for m in maps), cv2.INTER_LINEAR)
+    return flat.reshape(-1, 3)[: len(u)]
+
+
+def _panorama(
+    directions: NDArray[np.float32],
+    texels: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    ground_colour: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Elevation x azimuth image [H, W, 3] that extends the known texels all around."""
+    height, width = PANORAMA
+    row, column = _panorama_place(directions[known])
+    flat = row.astype(np.int64) * width + column.astype(np.int64)
+    counts = np.bincount(flat, minlength=height * width).reshape(height, width)
+    sums = np.stack([np.bincount(flat, texels[known, c], height * width) for c in range(3)], -1)
+    values = sums.reshape(height, width, 3) / np.maximum(counts, 1)[..., None]
+    elevation = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    seen = np.flatnonzero((counts > 0).any(axis=1) & (elevation > 0))
+    panorama = np.empty((height, width, 3))
+    for r in range(height):
+        if elevation[r] < GROUND_ELEVATION or len(seen) == 0:
+            panorama[r] = ground_colour if elevation[r] < 0 else ZENITH
+        else:
+            # What was never seen looks like what was seen at the same elevation.
+            nearest = int(seen[np.abs(seen - r).argmin()])
+            panorama[r] = _around(values[nearest], counts[nearest] > 0)
+    return _softened(panorama)
+
+
+def _around(row: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """A closed ring of colours [W, 3]: from the nearest known ones, fading to their mean."""
+    width = len(row)
+    place = np.flatnonzero(known)
+    gap = np.abs(np.arange(width)[:, None] - place)
+    gap = np.minimum(gap, width - gap)
+    trust = np.exp(-gap.min(axis=1) / (FADE * width))[:, None]
+    return trust * row[place[gap.argmin(axis=1)]] + (1 - trust) * row[place].mean(axis=0)
+
+
+def _softened(panorama: NDArray[np.float64]) -> NDArray[np.float32]:
+    import cv2
+
+    width = panorama.shape[1]
+    # Three turns side by side, so that there is no seam at the back.
+    blurred = cv2.GaussianBlur(np.tile(panorama, (1, 3, 1)).astype(np.float32), (0, 0), 2)
+    return blurred[:, width : 2 * width]
+
+
+def _panorama_place(directions: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
+    height, width = PANORAMA
+    elevation = np.arcsin(np.clip(directions[:, 2], -1, 1))
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    row = np.clip((np.pi / 2 - elevation) / np.pi * height, 0, height - 1e-3)
+    return row, np.clip((azimuth + np.pi) / (2 * np.pi) * width, 0, width - 1e-3)
+
+
+def _look_up(panorama: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
+    import cv2
+
+    row, column = _panorama_place(directions)
+    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    side = 1 << 14
+    rows = -(-len(row) // side)
+    maps = [np.zeros(rows * side, dtype=np.float32) for _ in range(2)]
+    maps[0][: len(row)], maps[1][: len(row)] = column + 0.5, np.maximum(row - 0.5, 0)
+    flat = cv2.remap(wrapped, *(m.reshape(rows, side) for m in maps), cv2.INTER_LINEAR)
+    return flat.reshape(-1, 3)[: len(row)]

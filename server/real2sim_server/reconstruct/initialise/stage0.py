@@ -1,0 +1,329 @@
+"""Stage 0: from a log to a scene of Gaussians without training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...logs import DrivingLog, ObjectTrack
+from ...scene import GaussianCloud, Scene, SceneObject, Sky
+from ...scene.harmonics import SH_C0
+from ..options import InitialiseOptions, ReconstructError
+from ..stages import OnProgress, Stages
+from .accumulate import Accumulation, accumulate, drive_path
+from .ground import GroundSurface, box_bottoms, fit_ground, spread_ground
+from .inpainting import ColourPrior, fill_from_mirror, fill_from_neighbours, fill_ground, own_paint
+from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
+from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
+from .sky_map import SkySamples
+from .surfels import Surfels, fit_surfels
+from .views import Placed, View, chosen_frames, gather_views
+from .walls import continue_walls, real_walls
+
+OPACITY = 0.95
+ABOVE_GROUND = 0.1
+"""Points this close to the ground surface are replaced by it [m]."""
+UNDERSIDE_COLOUR = 0.06
+SKY_FRAMES = 15
+WALL_FRAMES = 16
+BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
+OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
+PAINT_REACH = 0.2
+"""How far the colours of a vehicle's seen parts reach beyond them [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """All Gaussians in the making.
+
+    In this order: ground, structure, continued walls, then object by object.
+    """
+
+    surfels: Surfels
+    intensity: NDArray[np.float32]
+    instance: NDArray[np.uint16]
+    is_underside: NDArray[np.bool_]
+    ground_count: int
+    walls: slice
+
+    def without(self, dropped: NDArray[np.int64]) -> _Parts:
+        """Without the walls at these indices."""
+        kept = np.ones(len(self.surfels), dtype=np.bool_)
+        kept[dropped] = False
+        return _Parts(
+            self.surfels.select(kept),
+            self.intensity[kept],
+            self.instance[kept],
+            self.is_underside[kept],
+            self.ground_count,
+            slice(self.walls.start, self.walls.stop - len(dropped)),
+        )
+
+
+def initialise_scene(
+    log: DrivingLog,
+    *,
+    options: InitialiseOptions | None = None,
+    on_progress: OnProgress | None = None,
+    timing_s: dict[str, float] | None = None,
+) -> Scene:
+    """Build a scene from a log in seconds, without training.
+
+    LiDAR is accumulated in the world and in each tracked box, thinned, turned into flat Gaussians
+    and coloured from the cameras; the road becomes a closed surface, also where cars hide it;
+    pixels that nothing covers become the sky. The same log gives the same bits.
+
+    Args:
+        log: a drive with LiDAR and at least one camera; boxes may be missing.
+        options: see InitialiseOptions.
+        on_progress: told the stage and how far it is.
+        timing_s: filled with the seconds of each stage.
+
+    Returns:
+        The scene in the log's world frame, objects under their track's id, SH of degree 0.
+
+    Raises:
+        ReconstructError: the log has no camera, no frame or no usable LiDAR point.
+        LogError: a file of the log cannot be read.
+    """
+    options = options or InitialiseOptions()
+    stages = Stages(on_progress, timing_s)
+    if len(log.rig) == 0 or log.frame_count == 0:
+        raise ReconstructError(f"log {log.name!r} has no camera images; colours come from them")
+    with stages("accumulate") as tell:
+        measured = accumulate(log, options, lambda f: tell(f + 1, log.frame_count))
+    if len(measured.background) == 0:
+        raise ReconstructError(
+            f"log {log.name!r} has no usable LiDAR points; stage 0 builds everything from LiDAR"
+        )
+    with stages("shape"):
+        surface = _fit_ground(log, measured.background)
+        parts = _shape(log, measured, surface, options)
+    with stages("walls") as tell:
+        parts = _keep_real_walls(log, parts, options, tell)
+    with stages("colour") as tell:
+        colours, known, sky_samples = _look(log, parts, options, tell)
+    with stages("fill"):
+        colours = _fill_unseen(log, parts, surface, colours, known)
+        sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
+    return _assemble(log, parts, colours, sky, options)
+
+
+def _fit_ground(log: DrivingLog, background: PointSet) -> GroundSurface:
+    poses = np.array([log.ego.transform(int(t)) for t in log.frame_times_us])
+    boxes = box_bottoms(log.tracks, log.frame_times_us)
+    return fit_ground(background.points.astype(np.float64), poses, boxes)
+
+
+def _shape(
+    log: DrivingLog, measured: Accumulation, surface: GroundSurface, options: InitialiseOptions
+) -> _Parts:
+    """Gaussians without colour: the ground, what stands on it, and the objects."""
+    path = drive_path(log)
+    ground = _ground_surfels(surface, options)
+    above = _above_ground(measured.background, surface)
+    distance = path_distance(above.points, path)
+    supported = well_supported(above.points, 0.1 + 0.015 * distance)
+    above, distance = above.select(supported), distance[supported]
+    levels = voxel_levels(distance, options.voxel, options.voxel_per_metre)
+    limit = max(1, options.max_background - len(ground) - options.max_background // 5)
+    above = thin_to(above, options.voxel, limit, levels)
+    largest = 0.03 + 0.006 * path_distance(above.points, path)
+    structure = fit_surfels(above.points, largest=largest)
+    walls = continue_walls(structure, measured.limit, max_count=options.max_background // 5)
+    surfels = [ground, structure, walls]
+    standing = len(ground) + len(structure)
+    intensity = [np.zeros(len(ground), np.float32), above.intensity]
+    intensity.append(np.zeros(len(walls), np.float32))
+    instance = [np.zeros(standing + len(walls), np.uint16)]
+    is_underside = [np.zeros(standing + len(walls), np.bool_)]
+    for index, track in enumerate(log.tracks):
+        points = _object_points(measured.objects[track.object_id], track, options)
+        body = fit_surfels(points.points, largest=0.1, smallest=0.004)
+        plate = underside(track.size)
+        surfels += [body, plate]
+        intensity += [points.intensity, np.zeros(len(plate), np.float32)]
+        instance.append(np.full(len(body) + len(plate), index + 1, np.uint16))
+        is_underside.append(np.repeat([False, True], [len(body), len(plate)]))
+    return _Parts(
+        Surfels.join(surfels),
+        np.concatenate(intensity),
+        np.concatenate(instance),
+        np.concatenate(is_underside),
+        len(ground),
+        slice(standing, standing + len(walls)),
+    )
+
+
+def _ground_surfels(surface: GroundSurface, options: InitialiseOptions) -> Surfels:
+    ground = spread_ground(surface, options.ground_spacing, options.max_background // 2)
+    normal = ground.normals
+    forward = np.cross([0.0, 1.0, 0.0], normal)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    axes = np.stack([forward, np.cross(normal, forward), normal], axis=2)
+    scales = ground.spacing[:, None] * np.array([0.6, 0.6, 0.1], dtype=np.float32)
+    return Surfels(ground.points, axes.astype(np.float32), scales.astype(np.float32))
+
+
+def _above_ground(background: PointSet, surface: GroundSurface) -> PointSet:
+    xy = background.points[:, :2].astype(np.float64)
+    height = background.points[:, 2] - surface.height_at(xy)
+    return background.select(~surface.covers(xy) | (height > ABOVE_GROUND))
+
+
+def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOptions) -> PointSet:
+    """Thinned points of an object, its unseen parts completed."""
+    thinned = thin_to(points, options.object_voxel, options.max_object // 2)
+    if track.size[0] >= VEHICLE_LENGTH:
+        thinned = mirrored(thinned, voxel=options.object_voxel)
+    completed = complete_body(thinned, track.size, track.category)
+    return thin_to(completed, options.object_voxel, options.max_object)
+
+
+def _keep_real_walls(
+    log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
+) -> _Parts:
+    """Drop continued walls that look like sky, or different from every view."""
+    if parts.walls.start == parts.walls.stop:
+        return parts
+    frames = chosen_frames(log, WALL_FRAMES)
+    done = 0
+
+    def on_view(view: View) -> None:
+        nonlocal done
+        done += 1
+        tell(done, len(frames) * len(log.rig))
+
+    placed = Placed(parts.surfels, parts.instance)
+    samples = gather_views(log, placed, frames=frames, slots=options.samples, on_view=on_view)
+    colours, known = (values[parts.walls] for values in samples.mean())
+    real = real_walls(colours, known, samples.spread()[parts.walls])
+    return parts.without(parts.walls.start + np.flatnonzero(~real))
+
+
+def _look(
+    log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], SkySamples]:
+    frames = chosen_frames(log, options.max_colour_frames)
+    sky_frames = set(frames[:: -(-len(frames) // SKY_FRAMES)])
+    sky = SkySamples(options.sky_resolution)
+    done = 0
+
+    def on_view(view: View) -> None:
+        nonlocal done
+        done += 1
+        if view.frame in sky_frames:
+            sky.add(view)
+        tell(done, len(frames) * len(log.rig))
+
+    samples = gather_views(
+        log,
+        Placed(parts.surfels, parts.instance),
+        frames=frames,
+        slots=options.samples,
+        on_view=on_view,
+    )
+    return *samples.mean(), sky
+
+
+def _fill_unseen(
+    log: DrivingLog,
+    parts: _Parts,
+    surface: GroundSurface,
+    colours: NDArray[np.float32],
+    known: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    points, filled = parts.surfels.points, colours.copy()
+    ground = slice(0, parts.ground_count)
+    filled[ground] = fill_ground(surface, points[ground], colours[ground], known[ground])
+    structure = np.flatnonzero(parts.instance == 0)[parts.ground_count :]
+    xy = points[structure, :2].astype(np.float64)
+    height = points[structure, 2] - surface.height_at(xy)
+    intensity = parts.intensity[structure]
+    prior = ColourPrior(height, intensity, colours[structure], known[structure], BACKGROUND_HEIGHTS)
+    filled[structure] = fill_from_neighbours(
+        points[structure], colours[structure], known[structure], prior.colour(height, intensity)
+    )
+    return _fill_objects(log, parts, filled, known)
+
+
+def _fill_objects(
+    log: DrivingLog, parts: _Parts, colours: NDArray[np.float32], known: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Fill each object's body from itself, then its underside, in place."""
+    bodies = ~parts.is_underside
+    members = [np.flatnonzero((parts.instance == i + 1) & bodies) for i in range(len(log.tracks))]
+    if not members:
+        return colours
+    relative = np.zeros(len(colours), dtype=np.float32)
+    for track, mine in zip(log.tracks, members, strict=True):
+        relative[mine] = parts.surfels.points[mine, 2] / track.size[2]
+    every = np.concatenate(members)
+    prior = ColourPrior(
+        relative[every], parts.intensity[every], colours[every], known[every], OBJECT_HEIGHTS
+    )
+    for mine in members:
+        points = parts.surfels.points[mine]
+        mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
+        likely = prior.colour(relative[mine], parts.intensity[mine])
+        paint = own_paint(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
+        colours[mine] = fill_from_neighbours(
+            points, mirrored, now_known, paint, trust_reach=PAINT_REACH
+        )
+    colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
+    return colours
+
+
+def _median_colour(colours: NDArray[np.float32]) -> NDArray[np.float32]:
+    if len(colours) == 0:
+        return np.full(3, 0.4, dtype=np.float32)
+    return np.median(colours, axis=0).astype(np.float32)
+
+
+def _assemble(
+    log: DrivingLog,
+    parts: _Parts,
+    colours: NDArray[np.float32],
+    sky: Sky,
+    options: InitialiseOptions,
+) -> Scene:
+    clouds = [
+        _cloud(parts, colours, np.flatnonzero(parts.instance == i))
+        for i in range(len(log.tracks) + 1)
+    ]
+    objects = {
+        t.object_id: SceneObject(t.object_id, t.category, t.size, cloud, t.trajectory)
+        for t, cloud in zip(log.tracks, clouds[1:], strict=True)
+    }
+    return Scene(
+        name=log.name,
+        background=clouds[0],
+        objects=objects,
+        sky=sky,
+        rig=log.rig,
+        ego=log.ego,
+        frame_times_us=log.frame_times_us,
+        ego_size=log.ego_size,
+        provenance={
+            **log.provenance,
+            "reconstruction": {"stage": 0, "iterations": 0, "options": asdict(options)},
+        },
+    )
+
+
+def _cloud(
+    parts: _Parts, colours: NDArray[np.float32], members: NDArray[np.int64]
+) -> GaussianCloud:
+    surfels = parts.surfels.select(members)
+    dc = (colours[members] - 0.5) / SH_C0
+    return GaussianCloud(
+        means=torch.from_numpy(surfels.points.copy()),
+        quats=torch.from_numpy(surfels.quats),
+        scales=torch.from_numpy(surfels.scales.copy()),
+        opacities=torch.full((len(members),), OPACITY),
+        sh=torch.from_numpy(dc[:, None].astype(np.float32)),
+    )

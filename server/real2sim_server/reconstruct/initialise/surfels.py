@@ -1,0 +1,127 @@
+"""Shape of Gaussians from the layout of points: flat along the local surface, closing its gaps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float, matrix_to_quaternion
+
+NEIGHBOURS = 20
+CHUNK = 50_000
+"""Points whose neighbourhoods are looked at together; bounds the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Flat Gaussians.
+
+    Attributes:
+        points: [N, 3] float32 [m].
+        axes: [N, 3, 3] float32 rotations; columns are the two tangents and the normal.
+        scales: [N, 3] float32, standard deviations along these axes [m].
+    """
+
+    points: NDArray[np.float32]
+    axes: NDArray[np.float32]
+    scales: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def normals(self) -> NDArray[np.float32]:
+        """[N, 3] float32, unit, of either sign."""
+        return self.axes[:, :, 2]
+
+    @property
+    def quats(self) -> NDArray[np.float32]:
+        """[N, 4] float32, wxyz."""
+        return matrix_to_quaternion(self.axes).astype(np.float32)
+
+    def select(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Surfels:
+        """The surfels picked by a mask or by indices."""
+        return Surfels(self.points[index], self.axes[index], self.scales[index])
+
+    @classmethod
+    def join(cls, parts: list[Surfels]) -> Surfels:
+        """All surfels of ``parts``, in order."""
+        return cls(
+            np.concatenate([p.points for p in parts]),
+            np.concatenate([p.axes for p in parts]),
+            np.concatenate([p.scales for p in parts]),
+        )
+
+
+def fit_surfels(
+    points: NDArray[np.float32],
+    *,
+    largest: NDArray[np.float32] | float,
+    smallest: float = 0.008,
+) -> Surfels:
+    """Orient and size a Gaussian on each point by its nearest neighbours.
+
+    Normals are the least principal axes. Along each tangent the scale follows the distance to the
+    neighbours on either side, so that gaps between scan lines close without blurring along them.
+    Where neighbours spread in all directions (leaves) the Gaussian becomes round.
+
+    Args:
+        points: [N, 3] float32 [m].
+        largest: upper bound of the tangent scales [m], one or [N].
+        smallest: lower bound of the normal scale [m]; tangent scales are at least twice that.
+    """
+    n = len(points)
+    bound = np.broadcast_to(np.asarray(largest, dtype=np.float32), (n,))
+    if n < 4:
+        return _round_surfels(points, bound)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    axes = np.empty((n, 3, 3), dtype=np.float32)
+    scales = np.empty((n, 3), dtype=np.float32)
+    count = min(NEIGHBOURS + 1, n)
+    for start in range(0, n, CHUNK):
+        part = slice(start, min(start + CHUNK, n))
+        _, index = tree.query(points[part], k=count, workers=-1)
+        offsets = points[index[:, 1:]].astype(np.float64) - points[part, None]
+        axes[part], scales[part] = _fit_chunk(offsets, bound[part], smallest)
+    return Surfels(points, axes, scales)
+
+
+def _round_surfels(points: NDArray[np.float32], bound: NDArray[np.float32]) -> Surfels:
+    axes = np.broadcast_to(np.eye(3, dtype=np.float32), (len(points), 3, 3)).copy()
+    return Surfels(points, axes, np.repeat(bound[:, None], 3, axis=1).astype(np.float32))
+
+
+def _fit_chunk(
+    offsets: Float, bound: NDArray[np.float32], smallest: float
+) -> tuple[Float, NDArray[np.float32]]:
+    """Axes [N, 3, 3] and scales [N, 3] from neighbour ``offsets`` [N, K, 3]."""
+    centred = offsets - offsets.mean(axis=1, keepdims=True)
+    covariance = np.einsum("nki,nkj->nij", centred, centred) / offsets.shape[1]
+    spread, vectors = np.linalg.eigh(covariance)
+    axes = vectors[:, :, ::-1].copy()
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
+    local = np.einsum("nki,nij->nkj", offsets, axes)
+    tangent = np.stack([_gap(local, 0), _gap(local, 1)], axis=1)
+    # Three neighbouring Gaussians then cover the middle of a gap by more than 90 %.
+    tangent = np.clip(0.6 * tangent, 2 * smallest, bound[:, None])
+    thickness = np.sqrt(np.maximum(spread[:, 0], 0) / np.maximum(spread[:, 2], 1e-12))
+    normal = tangent.mean(axis=1) * np.clip(thickness, 0.12, 0.8)
+    scales = np.concatenate([tangent, np.maximum(normal, smallest)[:, None]], axis=1)
+    return axes, scales.astype(np.float32)
+
+
+def _gap(local: Float, axis: int) -> Float:
+    """Mean distance [N] to the next neighbours ahead and behind along a tangent axis."""
+    along, across = local[:, :, axis], local[:, :, 1 - axis]
+    length = np.linalg.norm(local, axis=2)
+    in_sector = np.abs(along) >= np.abs(across)
+    ahead = np.where(in_sector & (along > 0), length, np.inf).min(axis=1)
+    behind = np.where(in_sector & (along < 0), length, np.inf).min(axis=1)
+    # At the rim of a surface one side is empty; there the other side alone counts.
+    ahead, behind = np.minimum(ahead, 1.5 * behind), np.minimum(behind, 1.5 * ahead)
+    mean = (ahead + behind) / 2
+    return np.where(np.isfinite(mean), mean, length[:, : min(4, length.shape[1])].mean(axis=1))

@@ -1,0 +1,208 @@
+"""The CUDA backend: gsplat behind the same call.
+
+Objects are brought into the world on the device as means and covariances; their colours are
+evaluated in their own frames before gsplat blends them. Imported only where CUDA is asked for.
+"""
+
+from __future__ import annotations
+
+import time
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gsplat
+import torch
+from torch import Tensor
+
+from ....scene import GaussianCloud
+from ...types import Instance, RenderOutput
+from ..base import Placement, RasterRequest, needs_gradients, pixel_directions, place_instances
+from ..warm_up import warm_up_requests
+from .instance import instance_image
+from .screen import track_screen
+
+
+class CudaBackend:
+    """Rasterizer for an NVIDIA GPU; images stay on it. Gradients flow as through gsplat.
+
+    Clouds that lie elsewhere are copied to the device once and kept while they live.
+    """
+
+    name = "cuda"
+
+    def __init__(self, device: torch.device | str = "cuda") -> None:
+        self.device = torch.device(device)
+        self._resident: weakref.WeakKeyDictionary[GaussianCloud, GaussianCloud] = (
+            weakref.WeakKeyDictionary()
+        )
+
+    def rasterize(self, request: RasterRequest) -> RenderOutput:
+        """Draw all cameras in one call of gsplat.rasterization."""
+        timing: dict[str, float] = {}
+        options = request.options
+        on_device = _moved(request, self.device)
+        with self._timed(timing, "project"):
+            world = self._world(on_device)
+        with self._timed(timing, "blend"):
+            rgb, alpha, depth, meta = _blend(on_device, world)
+        screen = None
+        if options.track_screen and needs_gradients(request):
+            screen = track_screen(on_device, meta, self.device)
+        instance = None
+        if options.instance:
+            with self._timed(timing, "instance"):
+                shape = (request.cameras, request.height, request.width)
+                instance = instance_image(meta, world.instance_ids, shape)
+        with self._timed(timing, "sky"):
+            behind = _behind(on_device)
+            rgb = rgb + (1 - alpha)[..., None] * behind
+        return RenderOutput(
+            rgb=rgb,
+            alpha=alpha,
+            depth=depth if options.depth else None,
+            instance=instance,
+            timing_ms=timing,
+            screen=screen,
+        )
+
+    def warm_up(self) -> None:
+        """Load or build gsplat's extension and compile the instance kernel."""
+        for request in warm_up_requests():
+            self.rasterize(request)
+
+    def _world(self, request: RasterRequest) -> _World:
+        placement = place_instances(request.instances, request.viewmats)
+        parts = [
+            self._place(instance, placement, index)
+            for index, instance in enumerate(request.instances)
+            if len(instance.cloud)
+        ]
+        if not parts:
+            return _World.empty(request.cameras, self.device)
+        return _World(
+            means=torch.cat([part.means for part in parts]),
+            covars=torch.cat([part.covars for part in parts]),
+            opacities=torch.cat([part.opacities for part in parts]),
+            colors=torch.cat([part.colors for part in parts], dim=1),
+            instance_ids=torch.cat([part.instance_ids for part in parts]),
+        )
+
+    def _place(self, instance: Instance, placement: Placement, index: int) -> _World:
+        cloud = self._on_device(instance.cloud)
+        if instance.colour is not None:
+            cloud = instance.colour.to(self.device).at(cloud, instance.t_us)
+        scale = placement.scale[index]
+        T = torch.eye(4, dtype=torch.float64, device=self.device)
+        if instance.T_world_object is not None:
+            T = torch.as_tensor(instance.T_world_object, dtype=torch.float64, device=self.device)
+        linear = T[:3, :3] * scale
+        seen = cloud.means * scale.float()
+        colors = [
+            gsplat.spherical_harmonics(cloud.sh_degree, seen - position.float(), cloud.sh)
+            for position in placement.camera_position[:, index]
+        ]
+        covars = self._covariances(instance, cloud)
+        return _World(
+            means=cloud.means @ linear.float().mT + T[:3, 3].float(),
+            covars=linear.float() @ covars @ linear.float().mT,
+            opacities=cloud.opacities,
+            colors=torch.clamp_min(torch.stack(colors) + 0.5, 0.0),
+            instance_ids=torch.full(
+                (len(cloud),), instance.instance_id, dtype=torch.int32, device=self.device
+            ),
+        )
+
+    def _on_device(self, cloud: GaussianCloud) -> GaussianCloud:
+        if cloud.device.type == self.device.type:
+            return cloud
+        if any(tensor.requires_grad for tensor in vars(cloud).values()):
+            return cloud.to(self.device)
+        if cloud not in self._resident:
+            self._resident[cloud] = cloud.to(self.device)
+        return self._resident[cloud]
+
+    def _covariances(self, instance: Instance, cloud: GaussianCloud) -> Tensor:
+        if instance.covars is not None:
+            return instance.covars.to(self.device)
+        covars, _ = gsplat.quat_scale_to_covar_preci(
+            cloud.quats, cloud.scales, compute_covar=True, compute_preci=False, triu=False
+        )
+        return covars
+
+    @contextmanager
+    def _timed(self, timing: dict[str, float], stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        torch.cuda.synchronize(self.device)
+        timing[stage] = (time.perf_counter() - start) * 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class _World:
+    """Gaussians in the world frame: means [N, 3], covars [N, 3, 3], opacities [N], RGB colors
+    [C, N, 3] as each camera sees them, instance_ids [N] int32.
+    """
+
+    means: Tensor
+    covars: Tensor
+    opacities: Tensor
+    colors: Tensor
+    instance_ids: Tensor
+
+    @classmethod
+    def empty(cls, cameras: int, device: torch.device) -> _World:
+        shapes = ((0, 3), (0, 3, 3), (0,), (cameras, 0, 3))
+        floats = (torch.zeros(shape, device=device) for shape in shapes)
+        return cls(*floats, torch.zeros(0, dtype=torch.int32, device=device))
+
+
+def _moved(request: RasterRequest, device: torch.device) -> RasterRequest:
+    return replace(
+        request,
+        viewmats=request.viewmats.to(device),
+        Ks=request.Ks.to(device),
+        sky=None if request.sky is None else request.sky.to(device),
+    )
+
+
+def _blend(
+    request: RasterRequest, world: _World
+) -> tuple[Tensor, Tensor, Tensor | None, dict[str, Any] | None]:
+    """RGB without background, alpha, depth, and what gsplat says about its tiles."""
+    options, shape = request.options, (request.cameras, request.height, request.width)
+    if len(world.means) == 0:
+        empty = torch.zeros(shape, device=world.means.device)
+        return empty[..., None].repeat(1, 1, 1, 3), empty, empty if options.depth else None, None
+    images, alphas, meta = gsplat.rasterization(
+        means=world.means,
+        quats=None,
+        scales=None,
+        covars=world.covars,
+        opacities=world.opacities,
+        colors=world.colors,
+        viewmats=request.viewmats.float(),
+        Ks=request.Ks.float(),
+        width=request.width,
+        height=request.height,
+        near_plane=options.near_plane,
+        far_plane=options.far_plane,
+        radius_clip=options.radius_clip,
+        eps2d=options.eps2d,
+        render_mode="RGB+ED" if options.depth else "RGB",
+        rasterize_mode=options.rasterize_mode,
+        packed=True,
+        absgrad=options.track_screen,
+    )
+    depth = images[..., 3] if options.depth else None
+    return images[..., :3], alphas[..., 0], depth, meta
+
+
+def _behind(request: RasterRequest) -> Tensor:
+    """Colour behind everything, [3] or [C, H, W, 3]."""
+    if request.sky is None:
+        return torch.tensor(request.options.background, device=request.viewmats.device)
+    cameras = range(request.cameras)
+    return torch.stack([request.sky.sample(pixel_directions(request, c)) for c in cameras])

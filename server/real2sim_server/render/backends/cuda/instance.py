@@ -1,0 +1,93 @@
+"""Instance images on the GPU, which gsplat has no mode for: a walk over its tile lists.
+
+Needs numba-cuda. The kernel also runs in Numba's CUDA simulator, where it is tested.
+"""
+
+# Kernels take arrays by position.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import cuda
+from torch import Tensor
+
+from ..base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+F32 = np.float32
+THREADS = (16, 16)
+
+
+def instance_image(
+    meta: dict[str, Any] | None, instance_ids: Tensor, shape: tuple[int, int, int]
+) -> Tensor:
+    """Instance images [C, H, W] uint16 on the device.
+
+    Args:
+        meta: what ``gsplat.rasterization(packed=True)`` returned last; None where there was nothing
+            to draw.
+        instance_ids: [N] int32, of each Gaussian given to gsplat.
+        shape: C, H, W.
+    """
+    image = torch.zeros(shape, dtype=torch.int32, device=instance_ids.device)
+    if meta is None:
+        return image.to(torch.uint16)
+    ids = instance_ids[meta["gaussian_ids"].long()]
+    arrays = (meta["means2d"], meta["conics"], meta["opacities"], ids)
+    lists = (meta["isect_offsets"].reshape(shape[0], -1).int(), meta["flatten_ids"].int())
+    cameras, height, width = shape
+    blocks = (-(-width // THREADS[0]), -(-height // THREADS[1]), cameras)
+    stream = cuda.external_stream(torch.cuda.current_stream(image.device).cuda_stream)
+    given = [
+        cuda.as_cuda_array(tensor.detach().contiguous()) for tensor in (*arrays, *lists, image)
+    ]
+    find_instances[blocks, (*THREADS, 1), stream](*given, meta["tile_size"], meta["tile_width"])
+    return image.to(torch.uint16)
+
+
+@cuda.jit
+def find_instances(
+    means2d, conics, opacities, ids, offsets, members, image, tile_size, tiles_x
+):  # pragma: no cover - runs on a GPU or in the simulator of another process
+    """For each pixel, the id of the Gaussian at which transmittance falls to 0.5 or below.
+
+    Args:
+        means2d, conics, opacities, ids: [V, 2], [V, 3], [V] float32 and [V] int32.
+        offsets: [C, tiles] int32, where each tile's list starts.
+        members: [M] int32 records by tile, near to far.
+        image: [C, H, W] int32, written where there is such a Gaussian.
+        tile_size: edge length of a tile [px].
+        tiles_x: tiles in a row.
+    """
+    x, y, camera = cuda.grid(3)
+    cameras, height, width = image.shape
+    if x >= width or y >= height or camera >= cameras:
+        return
+    tile = (y // tile_size) * tiles_x + x // tile_size
+    position = offsets[camera, tile]
+    if tile + 1 < offsets.shape[1]:
+        end = offsets[camera, tile + 1]
+    elif camera + 1 < cameras:
+        end = offsets[camera + 1, 0]
+    else:
+        end = members.shape[0]
+    left = F32(1)
+    while position < end:
+        k = members[position]
+        dx, dy = means2d[k, 0] - F32(x) - F32(0.5), means2d[k, 1] - F32(y) - F32(0.5)
+        sigma = F32(0.5) * (conics[k, 0] * dx * dx + conics[k, 2] * dy * dy)
+        sigma += conics[k, 1] * dx * dy
+        alpha = min(F32(ALPHA_MAX), opacities[k] * math.exp(-sigma))
+        if sigma >= F32(0) and alpha >= F32(ALPHA_MIN):
+            after = left * (F32(1) - alpha)
+            if after <= F32(TRANSMITTANCE_MIN):
+                return
+            left = after
+            if left <= F32(0.5):
+                image[camera, y, x] = ids[k]
+                return
+        position += 1

@@ -1,0 +1,162 @@
+"""The OpenAPI document: what FastAPI makes of the routes, with examples and true error types.
+
+``python -m real2sim_server.service.http.openapi FILE`` writes it; the committed copy is
+``docs/openapi.json``, and a test holds it against the routes.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+
+from real2sim_proto import PROBLEM_MEDIA_TYPE
+
+METHODS = ("get", "put", "post", "delete", "patch")
+
+PARAMETERS: dict[str, Any] = {
+    "scene": "demo_street",
+    "scenario": "sc_0123456789abcdef",
+    "scenario_id": "sc_0123456789abcdef",
+    "session_id": "w0.0123456789abcdef",
+    "job_id": "job_0123456789abcdef",
+    "asset_id": "red_car",
+    "name": "video.webm",
+    "camera": "front",
+    "t_us": 2_000_000,
+    "width": 640,
+    "after": 0,
+}
+"""An example of each parameter, by name."""
+
+BODIES: dict[str, Any] = {
+    "ScenarioCreate": {"scene": "demo_street", "name": "cut-in"},
+    "ScenarioFork": {"name": "cut-in, later"},
+    "ScenarioDocument": {
+        "format": "real2sim.scenario",
+        "version": 1,
+        "name": "cut-in",
+        "scene": "demo_street",
+        "scene_hash": "0" * 64,
+        "entries": [
+            {
+                "revision": 1,
+                "kind": "edit",
+                "operations": [{"op": "translate", "object_id": "car_0", "y": 3.5}],
+                "created_at": "2026-01-01T12:00:00.000+00:00",
+            }
+        ],
+    },
+    "OperationBatch": {
+        "operations": [
+            {"op": "translate", "object_id": "van_0", "y": 3.5, "frame": "object", "snap": True},
+            {"op": "rotate", "object_id": "car_6", "angle": 0.2618},
+        ]
+    },
+    "SimulateRequest": {"start_us": 0, "end_us": 2_000_000, "objects": ["car_0", "van_0"]},
+    "ExportRequest": {"scenario": "sc_0123456789abcdef", "camera": "front", "fps": 10},
+    "SessionCreate": {"reset": {"seed": 0, "dt_us": 100_000}},
+    "ResetSpec": {"seed": 0, "dt_us": 100_000},
+    "StepRequest": {"n": 10},
+    "SessionRender": {"sensors": [{"camera": "front", "width": 640, "codec": "jpeg"}]},
+}
+"""An example of each JSON body, by the name of its schema."""
+
+_published: dict[str, Any] = {}
+
+
+def published(app: FastAPI) -> dict[str, Any]:
+    """The document, made once a process: it is the same for all settings.
+
+    Made on demand it would keep the event loop busy for tenths of a second.
+    """
+    if not _published:
+        _published.update(document(app))
+    return _published
+
+
+def document(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document of ``app``."""
+    made = app.openapi()
+    for path, method, operation in operations(made):
+        _tell_errors(operation)
+        _give_examples(operation)
+        operation["x-codeSamples"] = [{"lang": "Shell", "source": curl(path, method, operation)}]
+    schemas = made["components"]["schemas"]
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    return made
+
+
+def operations(made: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """(path, method, operation) of everything in a document."""
+    for path, item in made["paths"].items():
+        for method in METHODS:
+            if method in item:
+                yield path, method, item[method]
+
+
+def curl(path: str, method: str, operation: dict[str, Any]) -> str:
+    """A call of the operation for a shell, with ``$WORKER`` as its address."""
+    query = []
+    for parameter in operation.get("parameters", ()):
+        given = parameter.get("example")
+        if parameter["in"] == "path":
+            path = path.replace(f"{{{parameter['name']}}}", str(given))
+        elif parameter["in"] == "query" and parameter.get("required"):
+            query.append(f"{parameter['name']}={given}")
+    address = f'"$WORKER{path}{"?" + "&".join(query) if query else ""}"'
+    words = ["curl", *([] if method == "get" else ["-X", method.upper()]), address]
+    content = operation.get("requestBody", {}).get("content", {})
+    example = content.get("application/json", {}).get("example")
+    if example is not None:
+        words += ["-H", "'Content-Type: application/json'", "-d", shlex.quote(json.dumps(example))]
+    return " ".join(words)
+
+
+def _tell_errors(operation: dict[str, Any]) -> None:
+    """Errors are problem documents, also those of validation."""
+    responses = operation["responses"]
+    responses.pop("422", None)
+    problem = responses.get("default", {}).get("content", {})
+    if "application/json" in problem:
+        problem[PROBLEM_MEDIA_TYPE] = problem.pop("application/json")
+
+
+def _give_examples(operation: dict[str, Any]) -> None:
+    for parameter in operation.get("parameters", ()):
+        if "example" not in parameter and parameter["name"] in PARAMETERS:
+            parameter["example"] = PARAMETERS[parameter["name"]]
+    body = operation.get("requestBody", {}).get("content", {}).get("application/json")
+    if body is not None and "example" not in body:
+        name = _schema_name(body["schema"])
+        if name in BODIES:
+            body["example"] = BODIES[name]
+
+
+def _schema_name(schema: dict[str, Any]) -> str:
+    references = [schema, *schema.get("anyOf", ())]
+    return next((r["$ref"].rsplit("/", 1)[1] for r in references if "$ref" in r), "")
+
+
+def text_of(made: dict[str, Any]) -> str:
+    """The committed form of a document."""
+    return json.dumps(made, indent=1, sort_keys=True) + "\n"
+
+
+def _write(path: Path) -> None:
+    from ...settings import Settings
+    from ..app import create_app
+
+    with tempfile.TemporaryDirectory() as folder:
+        path.write_text(text_of(document(create_app(Settings(data_dir=Path(folder))))))
+
+
+if __name__ == "__main__":
+    _write(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/openapi.json"))

@@ -1,0 +1,242 @@
+"""Every error as an RFC 9457 problem document.
+
+Routes and the classes below them raise :class:`ServiceError`; errors of the lower rooms are
+translated here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from starlette.exceptions import HTTPException
+
+from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem
+from real2sim_proto.errors import ProblemDetail, title_of
+
+from ...edit import EditError
+from ...physics.errors import PhysicsError
+from ...render import RenderError
+from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
+from ...world import WorldError
+from ..rendering.engine import DeviceLostError, EngineStoppedError, QueueFullError
+from .disconnects import ClientGoneError
+
+MAX_DETAILS = 50
+REQUEST_ID_KEY = "real2sim.request_id"
+
+log = structlog.get_logger(__name__)
+
+
+class ServiceError(Exception):
+    """A request that is refused or failed, with its stable code.
+
+    Args:
+        code: decides the HTTP status.
+        detail: what was given and what is allowed; sent to the client.
+        hint: what to do next.
+        errors: invalid values by JSON pointer.
+        extra: further members of the problem document.
+        headers: of the answer.
+    """
+
+    def __init__(
+        self,
+        code: ErrorCode,
+        detail: str,
+        *,
+        hint: str | None = None,
+        errors: Sequence[ProblemDetail] = (),
+        extra: Mapping[str, Any] | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.code = code
+        self.detail = detail
+        self.hint = hint
+        self.errors = list(errors)
+        self.extra = dict(extra or {})
+        self.headers = dict(headers or {})
+        if code in RETRYABLE:
+            self.headers.setdefault("Retry-After", "1")
+
+    @property
+    def status(self) -> int:
+        """HTTP status."""
+        return HTTP_STATUS[self.code]
+
+
+_KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
+    (QueueFullError, ErrorCode.QUEUE_FULL, "send it again after Retry-After seconds"),
+    (EngineStoppedError, ErrorCode.DRAINING, None),
+    (TimeOutOfRangeError, ErrorCode.TIME_OUT_OF_RANGE, None),
+    (UnknownObjectError, ErrorCode.UNKNOWN_OBJECT, None),
+    (BundleError, ErrorCode.SCENE_BROKEN, None),
+    (RenderError, ErrorCode.INVALID_REQUEST, None),
+    (SceneError, ErrorCode.INVALID_OPERATION, None),
+    (PhysicsError, ErrorCode.INVALID_REQUEST, None),
+)
+"""Errors of other rooms that a client is told in their own words; the first that fits counts."""
+
+
+def service_error(error: Exception) -> ServiceError:
+    """What a client is told about ``error``. Unexpected ones become INTERNAL and say nothing."""
+    if isinstance(error, ServiceError):
+        return error
+    if isinstance(error, EditError):
+        return _of_edit(error)
+    if isinstance(error, WorldError):
+        return ServiceError(error.code, str(error), hint=error.hint)
+    for kind, code, hint in _KINDS:
+        if isinstance(error, kind):
+            return ServiceError(code, str(error), hint=hint)
+    # torch's class is known by its name, so that this module needs no torch.
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return ServiceError(
+            ErrorCode.OUT_OF_MEMORY,
+            "the device has no memory left for this",
+            hint="ask for smaller or fewer images, or unload a scene",
+        )
+    detail = "an unexpected error; it is in the worker's log under this request_id"
+    if isinstance(error, DeviceLostError):
+        detail = "the device was lost; the worker restarts"
+    return ServiceError(ErrorCode.INTERNAL, detail)
+
+
+def _of_edit(error: EditError) -> ServiceError:
+    errors = []
+    if error.index is not None:
+        errors = [ProblemDetail(pointer=f"/operations/{error.index}", message=str(error))]
+    return ServiceError(error.code, str(error), hint=error.hint, errors=errors)
+
+
+def problem_of(error: ServiceError, *, path: str, request_id: str | None) -> Problem:
+    """The problem document of ``error``."""
+    return Problem(
+        type=f"urn:real2sim:problem:{error.code.value.lower().replace('_', '-')}",
+        title=title_of(error.code),
+        status=error.status,
+        code=error.code,
+        detail=error.detail,
+        hint=error.hint,
+        instance=path,
+        request_id=request_id,
+        retryable=error.code in RETRYABLE,
+        errors=error.errors,
+        **error.extra,
+    )
+
+
+def problem_response(error: ServiceError, *, path: str, request_id: str | None) -> Response:
+    """The answer that carries ``error``."""
+    problem = problem_of(error, path=path, request_id=request_id)
+    return Response(
+        json.dumps(problem.model_dump(mode="json", exclude_none=True)),
+        status_code=error.status,
+        media_type=PROBLEM_MEDIA_TYPE,
+        headers=error.headers,
+    )
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Answer every error of ``app`` with a problem document."""
+
+    async def leave(_request: Request, _error: Exception) -> Response:
+        # Never sent; the number is what proxies log for it.
+        return Response(status_code=499)
+
+    app.add_exception_handler(ClientGoneError, leave)
+
+    async def refuse(request: Request, error: Exception) -> Response:
+        return problem_response(
+            _of_framework(request, error),
+            path=request.url.path,
+            request_id=request.scope.get(REQUEST_ID_KEY),
+        )
+
+    for kind in (ServiceError, RequestValidationError, HTTPException):
+        app.add_exception_handler(kind, refuse)
+
+
+def _of_framework(request: Request, error: Exception) -> ServiceError:
+    if isinstance(error, RequestValidationError):
+        return _of_validation(error)
+    if isinstance(error, HTTPException):
+        return _of_http(request, error)
+    return service_error(error)
+
+
+def _of_validation(error: RequestValidationError) -> ServiceError:
+    found = error.errors()
+    details = [
+        ProblemDetail(pointer=_pointer(e, error.body), message=_message(e))
+        for e in found[:MAX_DETAILS]
+    ]
+    first = ": ".join(filter(None, (details[0].pointer, details[0].message)))
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return ServiceError(
+        ErrorCode.INVALID_REQUEST,
+        first + more,
+        hint="see /docs for the request this call takes",
+        errors=details,
+    )
+
+
+def _message(error: Mapping[str, Any]) -> str:
+    if error["type"] == "json_invalid":
+        return f"not valid JSON: {error.get('ctx', {}).get('error', error['msg'])}"
+    return str(error["msg"]).removeprefix("Value error, ")
+
+
+def _pointer(error: Mapping[str, Any], body: Any) -> str:
+    """JSON pointer (RFC 6901) into the body; parts of the request beside it keep their name."""
+    parts = list(error["loc"])
+    if error["type"] == "json_invalid":
+        return ""
+    if parts and parts[0] == "body":
+        parts = list(_places(parts[1:], body))
+    return "".join("/" + str(p).replace("~", "~0").replace("/", "~1") for p in parts)
+
+
+def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
+    """Only the parts that are members of ``body``: pydantic names union tags among them."""
+    for index, part in enumerate(parts):
+        is_last = index == len(parts) - 1
+        if isinstance(body, dict) and (part in body or is_last):
+            body = body.get(part)
+            yield part
+        elif isinstance(body, list) and isinstance(part, int) and (part < len(body) or is_last):
+            body = body[part] if part < len(body) else None
+            yield part
+
+
+_CODES = {
+    HTTPStatus.UNAUTHORIZED: ErrorCode.UNAUTHORIZED,
+    HTTPStatus.FORBIDDEN: ErrorCode.UNAUTHORIZED,
+    HTTPStatus.NOT_FOUND: ErrorCode.NOT_FOUND,
+    HTTPStatus.METHOD_NOT_ALLOWED: ErrorCode.METHOD_NOT_ALLOWED,
+    HTTPStatus.NOT_ACCEPTABLE: ErrorCode.NOT_ACCEPTABLE,
+    HTTPStatus.REQUEST_ENTITY_TOO_LARGE: ErrorCode.PAYLOAD_TOO_LARGE,
+}
+
+
+def _of_http(request: Request, error: HTTPException) -> ServiceError:
+    headers = dict(error.headers or {})
+    match error.status_code:
+        case HTTPStatus.NOT_FOUND:
+            detail = f"there is nothing at {request.url.path!r}; see /docs for the calls"
+            return ServiceError(ErrorCode.NOT_FOUND, detail, headers=headers)
+        case HTTPStatus.METHOD_NOT_ALLOWED:
+            allowed = headers.get("Allow", headers.get("allow", "other methods"))
+            detail = f"{request.method} is not allowed at {request.url.path!r}; allowed: {allowed}"
+            return ServiceError(ErrorCode.METHOD_NOT_ALLOWED, detail, headers=headers)
+    code = _CODES.get(HTTPStatus(error.status_code))
+    if code is None:
+        code = ErrorCode.INVALID_REQUEST if error.status_code < 500 else ErrorCode.INTERNAL
+    return ServiceError(code, str(error.detail), headers=headers)

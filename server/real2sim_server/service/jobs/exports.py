@@ -1,0 +1,148 @@
+"""Videos of scenes, scenarios and simulations."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.drive import Frame, SensorSpec
+from real2sim_proto.jobs import ExportRequest
+
+from ...render import Instance
+from ...scene import Scene
+from ..http.problems import ServiceError
+from ..rendering.engine import QueueFullError
+from ..rendering.renderer import Renderer, RenderRequest, check_sensors
+from .jobs import JobContext, JobResult
+
+VIDEO = "video.webm"
+VIDEO_TYPE = "video/webm"
+MAX_FRAMES = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """What a video shows.
+
+    Attributes:
+        scene: gives cameras, sky and the way of the vehicle.
+        instances: what is drawn at an instant [us]; called off the event loop.
+        span: first and last instant that can be shown [us].
+    """
+
+    scene: Scene
+    instances: Callable[[int], Sequence[Instance]]
+    span: tuple[int, int]
+
+
+async def export_video(
+    film: Film, asked: ExportRequest, *, pictures: Renderer, ticket: JobContext
+) -> JobResult:
+    """Draw a video frame by frame, other users of the engine in between.
+
+    Raises:
+        ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST; TIME_OUT_OF_RANGE.
+        JobCancelled: nobody wants it any more.
+    """
+    times = frame_times(film, asked)
+    sensor = SensorSpec(camera=asked.camera, width=asked.width, codec="raw")
+    await asyncio.to_thread(ticket.folder.mkdir, parents=True, exist_ok=True)
+    loop = asyncio.get_running_loop()
+    with ThreadPoolExecutor(1, thread_name_prefix="video") as encoder:
+        writer = _Writer(ticket.folder / VIDEO, asked.fps)
+        try:
+            for index, t_us in enumerate(times):
+                ticket.progress(index / len(times), "drawing")
+                shot = await asyncio.to_thread(_shot, film, sensor, t_us)
+                frame = await _drawn(pictures, shot, ticket)
+                pixels = np.frombuffer(frame.data, np.uint8).reshape(frame.shape)
+                await loop.run_in_executor(encoder, writer.add, pixels)
+        finally:
+            await loop.run_in_executor(encoder, writer.close)
+    values = {"frames": len(times), "fps": asked.fps, "start_us": times[0], "end_us": times[-1]}
+    return JobResult(values, {VIDEO: VIDEO_TYPE})
+
+
+async def _drawn(pictures: Renderer, shot: RenderRequest, ticket: JobContext) -> Frame:
+    """The frame, drawn when those who wait for an answer leave room."""
+    while True:
+        try:
+            return (await pictures.take(shot, stream="export")).frames[0]
+        except QueueFullError:
+            ticket.check()
+            await asyncio.sleep(0.2)
+
+
+def frame_times(film: Film, asked: ExportRequest) -> list[int]:
+    """Instants of the frames [us].
+
+    Raises:
+        ServiceError: TIME_OUT_OF_RANGE or INVALID_REQUEST.
+    """
+    first, last = film.span
+    start = first if asked.start_us is None else asked.start_us
+    end = last if asked.end_us is None else asked.end_us
+    if not first <= start <= end <= last:
+        raise ServiceError(
+            ErrorCode.TIME_OUT_OF_RANGE,
+            f"the video would show {start} to {end} us; there is {first} to {last} us",
+            hint="leave start_us and end_us out for all of it",
+        )
+    count = int((end - start) * 1e-6 * asked.fps) + 1
+    if count > MAX_FRAMES:
+        raise ServiceError(
+            ErrorCode.INVALID_REQUEST, f"{count} frames; {MAX_FRAMES} is the most in one video"
+        )
+    return [start + round(i * 1e6 / asked.fps) for i in range(count)]
+
+
+def check_camera(film: Film, asked: ExportRequest, *, max_pixels: int) -> None:
+    """Refuse a camera or size before the job begins. Raises ServiceError."""
+    sensor = SensorSpec(camera=asked.camera, width=asked.width, codec="raw")
+    check_sensors(film.scene.rig, [sensor], max_pixels=max_pixels)
+
+
+def _shot(film: Film, sensor: SensorSpec, t_us: int) -> RenderRequest:
+    return RenderRequest(
+        scene=film.scene,
+        instances=film.instances(t_us),
+        T_world_vehicle=film.scene.ego.transform(t_us),
+        t_us=t_us,
+        sensors=(sensor,),
+    )
+
+
+class _Writer:
+    """A WebM file; VP8 plays in every browser, and the encoder comes with OpenCV."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._path = path
+        self._fps = fps
+        self._writer: Any = None
+
+    def add(self, pixels: NDArray[np.uint8]) -> None:
+        """Append an RGB frame [H, W, 3]; odd sizes lose their last row or column."""
+        import cv2
+
+        height, width = (side // 2 * 2 for side in pixels.shape[:2])
+        if self._writer is None:
+            fourcc = cv2.VideoWriter.fourcc(*"VP80")
+            self._writer = cv2.VideoWriter(str(self._path), fourcc, self._fps, (width, height))
+            if not self._writer.isOpened():
+                raise ServiceError(
+                    ErrorCode.UNSUPPORTED, "this worker's OpenCV has no VP8 encoder for videos"
+                )
+        self._writer.write(np.ascontiguousarray(pixels[:height, :width, ::-1]))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.release()

@@ -1,0 +1,319 @@
+"""From a scenario to a physics rollout, and from its result to pictures and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, assert_never
+
+import numpy as np
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.jobs import SimulateRequest
+from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, MaterialName, PlaneShape
+
+from ...edit import ObjectState, ScenarioState
+from ...edit.compose import background_of, shadows_of
+from ...edit.ground import RecordedGround
+from ...geometry.rotation import Float, quaternion_to_matrix, transform_from
+from ...physics.colliders import Box, Collider, HeightField, Plane
+from ...physics.materials import (
+    FixedCorotated,
+    Foam,
+    Material,
+    Metal,
+    NearRigid,
+    NeoHookean,
+    Sand,
+    Snow,
+)
+from ...render import Instance
+from ...scene import Scene, SceneObject
+from ...simulation.playback import Playback
+from ...simulation.presets import ObjectPhysics
+from ...simulation.result import ENERGIES, SimulationResult
+from ...simulation.rollout import SimulateOptions, simulate
+from ..http.problems import ServiceError
+
+GROUND = "ground"
+GROUND_MARGIN = 40.0
+GROUND_SPACING = 1.0
+"""The ground reaches this far around all objects, and is sampled so far apart [m]."""
+
+REACH = 25.0
+"""What stands this near to something that moves takes part [m]; further, at most ``MOST``."""
+
+MOST = 12
+PLAYBACK = "playback.json"
+
+MATERIALS: dict[MaterialName, Callable[[], Material]] = {
+    "rigid": NearRigid,
+    "metal": lambda: Metal(young=2e8, density=300.0, yield_stress=4e6, hardening=2e7),
+    "foam": lambda: Foam(young=4e5, density=60.0, yield_stress=3e4, viscosity=400.0),
+    "rubber": lambda: NeoHookean(young=3e6, poisson=0.45, density=1100.0),
+    "jelly": lambda: FixedCorotated(young=2e6, poisson=0.4, density=200.0),
+    "sand": Sand,
+    "snow": Snow,
+}
+"""What the names of operations stand for. Metal is that of a car body smeared over its volume."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A rollout that can begin.
+
+    Attributes:
+        scene: with what is erased hidden, and inserted assets among its objects.
+        state: of the scenario; ``stand_ins`` are its objects as ``scene`` has them.
+        options: of the physics.
+    """
+
+    scene: Scene
+    state: ScenarioState
+    stand_ins: StandIns
+    options: SimulateOptions
+
+
+@dataclass(frozen=True, eq=False)
+class StandIns:
+    """A scenario's objects, each with the id of the object in the scene that it shows."""
+
+    visible: tuple[ObjectState, ...]
+
+
+def plan_rollout(scene: Scene, state: ScenarioState, asked: SimulateRequest) -> Plan:
+    """What a request asks for.
+
+    Raises:
+        ServiceError: INVALID_REQUEST, UNKNOWN_OBJECT or TIME_OUT_OF_RANGE.
+        PhysicsError: a value that the physics cannot have.
+    """
+    start, end = _span(state, asked)
+    there = {o.object_id: o for o in state.visible if o.trajectory.covers(start)}
+    chosen = _chosen(there, asked, start)
+    complete, stand_ins = with_everything(scene, state)
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects={object_id: _physics(there[object_id], start) for object_id in chosen},
+        colliders=_colliders(state),
+        start_us=start,
+        duration=(end - start) * 1e-6,
+        frame_rate=1e6 / asked.frame_us,
+        backend=asked.backend,
+    )
+    return Plan(complete, state, stand_ins, options)
+
+
+def run_rollout(
+    plan: Plan, folder: Path, *, progress: Callable[[float], None], cancelled: Callable[[], bool]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Simulate and keep the result in ``folder``; figures, and names of files by media type."""
+    result = simulate(
+        plan.scene,
+        plan.stand_ins,
+        plan.options,
+        on_progress=lambda done, frames: progress(done / frames),
+        cancelled=cancelled,
+    )
+    result.save(folder)
+    playback = json.dumps(describe(result), separators=(",", ":"))
+    (folder / PLAYBACK).write_text(playback, encoding="utf-8")
+    files = {
+        PLAYBACK: "application/json",
+        "simulation.json": "application/json",
+        "frames.safetensors": "application/octet-stream",
+    }
+    return summary_of(result), files
+
+
+def summary_of(result: SimulationResult) -> dict[str, Any]:
+    """What is said of a rollout in its job."""
+    return {
+        "frames": result.frames,
+        "start_us": result.start_us,
+        "end_us": result.start_us + round(float(result.times_s[-1]) * 1e6),
+        "objects": list(result.objects),
+        "contacts": [vars(contact) for contact in result.contacts],
+        "figures": dict(result.figures),
+        "stopped": result.stopped,
+    }
+
+
+def describe(result: SimulationResult) -> dict[str, Any]:
+    """Everything but deformed shapes, for plots and maps: times, poses, contacts, energies."""
+    return summary_of(result) | {
+        "times_us": [result.start_us + round(t * 1e6) for t in result.times_s.tolist()],
+        "energy_names": list(ENERGIES),
+        "energies": _rounded(result.energies),
+        "impulses": _rounded(result.impulses),
+        "tracks": {
+            object_id: {
+                "mass": own.mass,
+                "positions": _rounded(own.positions),
+                "quaternions": _rounded(own.quaternions),
+                "velocities": _rounded(own.velocities),
+                "angular_velocities": _rounded(own.angular_velocities),
+                "modes": own.modes.tolist(),
+            }
+            for object_id, own in result.objects.items()
+        },
+    }
+
+
+class Show:
+    """A finished rollout as pictures; for one thread at a time."""
+
+    def __init__(self, scene: Scene, state: ScenarioState, result: SimulationResult) -> None:
+        self._scene = scene
+        self._state = state
+        self._result = result
+        complete, stand_ins = with_everything(scene, state)
+        self._playback = Playback(complete, stand_ins, result)
+        self.span = (result.start_us, self._playback.time_us(result.frames - 1))
+
+    def instances(self, t_us: int) -> Sequence[Instance]:
+        """What is drawn at the kept frame nearest to ``t_us`` [us], with contact shadows."""
+        since = (t_us - self._result.start_us) * 1e-6
+        frame = int(np.abs(self._result.times_s - since).argmin())
+        standing = [
+            (subject, self._pose(subject, frame, t_us))
+            for subject in self._state.visible
+            if subject.object_id in self._result.objects or subject.trajectory.covers(t_us)
+        ]
+        poses = {subject.object_id: pose for subject, pose in standing}
+        background = Instance(background_of(self._scene, self._state, poses))
+        _, *objects = self._playback.instances(frame)
+        placed = [
+            (subject, pose)
+            for subject, pose in standing
+            if subject.placed or subject.object_id in self._result.objects
+        ]
+        return [background, *objects, *shadows_of(self._scene, placed, t_us)]
+
+    def _pose(self, subject: ObjectState, frame: int, t_us: int) -> Float:
+        simulated = self._result.objects.get(subject.object_id)
+        if simulated is not None:
+            return simulated.transform(frame)
+        return subject.trajectory.transform(t_us)
+
+
+def with_everything(scene: Scene, state: ScenarioState) -> tuple[Scene, StandIns]:
+    """The scene with the scenario's assets as objects of it."""
+    objects = dict(scene.objects)
+    visible = []
+    for subject in state.visible:
+        if subject.asset is None:
+            visible.append(subject)
+            continue
+        stand_in = f"asset.{subject.asset.asset_id}"
+        cloud = subject.asset.cloud_in(scene)
+        objects[stand_in] = SceneObject(
+            stand_in, subject.category, subject.size, cloud, subject.trajectory
+        )
+        visible.append(replace(subject, source_id=stand_in))
+    return replace(scene, objects=objects), StandIns(tuple(visible))
+
+
+def _span(state: ScenarioState, asked: SimulateRequest) -> tuple[int, int]:
+    first, last = state.clock
+    start = first if asked.start_us is None else asked.start_us
+    end = last if asked.end_us is None else asked.end_us
+    if not first <= start < end <= last:
+        raise ServiceError(
+            ErrorCode.TIME_OUT_OF_RANGE,
+            f"the rollout would go from {start} to {end} us; the scenario plays from {first} to "
+            f"{last} us",
+            hint="choose start_us before end_us, both within the scenario's span",
+        )
+    return start, end
+
+
+def _chosen(there: dict[str, ObjectState], asked: SimulateRequest, start: int) -> list[str]:
+    if asked.objects is not None:
+        missing = [name for name in asked.objects if name not in there]
+        if missing or not asked.objects:
+            raise ServiceError(
+                ErrorCode.UNKNOWN_OBJECT if missing else ErrorCode.INVALID_REQUEST,
+                f"no object {missing[0]!r} at {start} us" if missing else "objects is empty",
+                hint=f"there are: {', '.join(there) or 'none'}",
+            )
+        return list(dict.fromkeys(asked.objects))
+    moved = [o for o in there.values() if o.velocity is not None or o.physics is not None]
+    if not moved:
+        raise ServiceError(
+            ErrorCode.INVALID_REQUEST,
+            "no object has a velocity or physics of its own, so nothing would be simulated",
+            hint="name objects, or edit one with set_velocity or set_physics first",
+        )
+    centres = np.array([o.trajectory.pose(start)[0] for o in moved])
+    rest = [o for o in there.values() if o not in moved]
+    apart = [
+        float(np.linalg.norm(centres - o.trajectory.pose(start)[0], axis=1).min()) for o in rest
+    ]
+    near = [rest[i] for i in np.argsort(apart, kind="stable") if apart[i] <= REACH]
+    return [o.object_id for o in (moved + near)[: max(MOST, len(moved))]]
+
+
+def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
+    given, velocity = subject.physics, subject.velocity
+    turn: Float = np.eye(3)
+    if velocity is not None and velocity.frame == "object":
+        turn = quaternion_to_matrix(subject.trajectory.pose(start)[1])
+    linear = velocity.linear if velocity is not None else None
+    angular = velocity.angular if velocity is not None else None
+    return ObjectPhysics(
+        mass=given.mass if given else None,
+        material=MATERIALS[given.material]() if given and given.material else None,
+        friction=given.friction if given else None,
+        restitution=given.restitution if given else None,
+        velocity=None if linear is None else turn @ np.array(linear),
+        angular_velocity=None if angular is None else turn @ np.array(angular),
+    )
+
+
+def _colliders(state: ScenarioState) -> list[Collider]:
+    colliders: list[Collider] = []
+    grounds = [c for c in state.standing_colliders if isinstance(c.shape, GroundShape)]
+    if not grounds:
+        colliders.append(_height_field(state, GROUND, offset=0.0, friction=None))
+    return colliders + [_collider(state, c) for c in state.standing_colliders]
+
+
+def _collider(state: ScenarioState, given: AddCollider) -> Collider:
+    name = given.collider_id or "collider"
+    match given.shape:
+        case PlaneShape() as plane:
+            return Plane(name=name, point=plane.point, normal=plane.normal, friction=given.friction)
+        case BoxShape() as box:
+            pose = transform_from(box.position, box.quaternion)
+            return Box(name=name, T_world_box=pose, size=box.size, friction=given.friction)
+        case GroundShape() as ground:
+            # Tyres roll on what has this name.
+            return _height_field(state, GROUND, offset=ground.offset, friction=given.friction)
+        case _:
+            assert_never(given.shape)
+
+
+def _height_field(
+    state: ScenarioState, name: str, *, offset: float, friction: float | None
+) -> HeightField:
+    positions = [o.trajectory.positions[:, :2] for o in state.visible]
+    at = np.concatenate([state.extent, *positions])
+    low = np.floor(at.min(axis=0) - GROUND_MARGIN)
+    high = at.max(axis=0) + GROUND_MARGIN
+    # Objects far outside must not make a grid that fills the memory.
+    low = np.maximum(low, state.extent[0] - 300.0)
+    high = np.minimum(high, state.extent[1] + 300.0)
+    counts = np.ceil((high - low) / GROUND_SPACING).astype(int) + 1
+    grid = np.indices(tuple(counts)).reshape(2, -1).T * GROUND_SPACING + low
+    ground: RecordedGround = state.ground
+    heights = ground(grid).reshape(tuple(counts)) + offset
+    return HeightField(
+        name=name, heights=heights, origin=low, spacing=GROUND_SPACING, friction=friction
+    )
+
+
+def _rounded(values: Any) -> Any:
+    return np.round(np.asarray(values, dtype=np.float64), 6).tolist()

@@ -1,0 +1,1 @@
+"""Scenes and assets of a worker: on disk and in memory."""

@@ -1,0 +1,287 @@
+"""Which scenes are in memory."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import structlog
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.scenes import SceneState
+
+from ...scene import BundleError, Scene
+from ...scene.io import SceneSummary, load_scene
+from ..http.problems import ServiceError
+from ..rendering.engine import Engine
+from .scene_catalog import Listing, SceneCatalog
+
+T = TypeVar("T")
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass
+class _Resident:
+    scene: Scene
+    summary: SceneSummary
+    pins: int = 0
+    used_at: float = 0.0
+
+
+class SceneCache:
+    """Scenes of the scene folder, loaded when they are needed and evicted when memory is.
+
+    One scene object serves all its users. A session pins its scene; scenes that nobody pins leave
+    memory in the order of their last use. Belongs to the event loop: its methods are not for
+    other threads.
+
+    Args:
+        library: the scene folder.
+        engine: puts loaded scenes onto the device.
+        budget_bytes: of all resident scenes together.
+        device: where their tensors live.
+        on_load: called with the seconds each load took.
+    """
+
+    def __init__(
+        self,
+        library: SceneCatalog,
+        engine: Engine,
+        *,
+        budget_bytes: int,
+        device: str = "cpu",
+        on_load: Callable[[float], None] | None = None,
+    ) -> None:
+        self.library = library
+        self.budget_bytes = budget_bytes
+        self.device = device
+        self._engine = engine
+        self._on_load = on_load
+        self._listings: dict[str, Listing] = {}
+        self._resident: dict[str, _Resident] = {}
+        self._loading: dict[str, asyncio.Task[Scene]] = {}
+        self._reserved: dict[str, int] = {}
+        # Reading and hashing bundles is disk work: on the engine it would hold up every session,
+        # on the loop everything. One thread, because disks and memory serve one best.
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="scenes")
+
+    def close(self) -> None:
+        """Forget all scenes and end the disk thread."""
+        self._disk.shutdown(cancel_futures=True)
+        self._resident.clear()
+
+    async def on_disk_thread(self, fn: Callable[[], T]) -> T:
+        """``fn()`` on the thread that reads and writes bundles."""
+        return await asyncio.get_running_loop().run_in_executor(self._disk, fn)
+
+    # --- looking ----------------------------------------------------------------------------
+
+    async def refresh(self) -> dict[str, Listing]:
+        """Look into the scene folder; all scenes by name."""
+        self._listings = await asyncio.to_thread(self.library.scan)
+        return self._listings
+
+    async def listing(self, name: str) -> Listing:
+        """The bundle of that name.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENE, with the names there are.
+        """
+        known = self._listings.get(name) or (await self.refresh()).get(name)
+        if known is None:
+            names = ", ".join(list(self._listings)[:20]) or "none"
+            raise ServiceError(
+                ErrorCode.UNKNOWN_SCENE,
+                f"no scene {name!r}; there are: {names}",
+                hint="GET /v1/scenes lists them; POST /v1/scenes imports one",
+            )
+        return known
+
+    async def summary(self, name: str) -> SceneSummary:
+        """What the scene of that name holds: of the one in memory, else of the bundle on disk.
+
+        A bundle that was replaced on disk counts from the next load on.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENE or SCENE_BROKEN.
+        """
+        if (resident := self._resident.get(name)) is not None:
+            return resident.summary
+        listing = await self.listing(name)
+        if listing.summary is None:
+            # It may have been mended since.
+            listing = (await self.refresh()).get(name, listing)
+        if listing.summary is None:
+            raise _broken(name, listing.reason)
+        return listing.summary
+
+    def state(self, name: str) -> SceneState:
+        """Where a listed scene is on its way into memory."""
+        if name in self._resident:
+            return SceneState.RESIDENT
+        if name in self._loading:
+            return SceneState.LOADING
+        listing = self._listings.get(name)
+        return SceneState.BROKEN if listing and listing.reason else SceneState.AVAILABLE
+
+    def counters(self) -> dict[SceneState, Callable[[], float]]:
+        """For each state, a function that counts the scenes in it."""
+
+        def count(state: SceneState) -> float:
+            return sum(self.state(name) is state for name in list(self._listings))
+
+        return {state: partial(count, state) for state in SceneState}
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory of all resident scenes."""
+        return sum(r.scene.nbytes for r in self._resident.values())
+
+    # --- using ------------------------------------------------------------------------------
+
+    async def get(self, name: str) -> Scene:
+        """The scene, loaded if need be. Whoever holds it keeps it alive; it is not pinned.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENE, SCENE_BROKEN, or OUT_OF_MEMORY.
+        """
+        return (await self._ensure(name)).scene
+
+    async def pin(self, name: str) -> Scene:
+        """The scene, kept in memory until :meth:`unpin`. Raises like :meth:`get`."""
+        resident = await self._ensure(name)
+        resident.pins += 1
+        return resident.scene
+
+    def unpin(self, name: str) -> None:
+        """Give back one pin."""
+        resident = self._resident[name]
+        if resident.pins <= 0:
+            raise RuntimeError(f"scene {name!r} is not pinned")
+        resident.pins -= 1
+        resident.used_at = time.monotonic()
+
+    @asynccontextmanager
+    async def pinned(self, name: str) -> AsyncIterator[Scene]:
+        """The scene, in memory for the length of the block. Raises like :meth:`get`."""
+        scene = await self.pin(name)
+        try:
+            yield scene
+        finally:
+            self.unpin(name)
+
+    async def unload(self, name: str) -> None:
+        """Take the scene out of memory; nothing to do when it is not there.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENE, or SCENE_IN_USE while sessions pin it.
+        """
+        await self.listing(name)
+        resident = self._resident.get(name)
+        if resident is None:
+            return
+        if resident.pins:
+            raise ServiceError(
+                ErrorCode.SCENE_IN_USE,
+                f"{resident.pins} sessions use scene {name!r}",
+                hint="close them first: DELETE /v1/sessions/{id}",
+            )
+        self._forget(name)
+
+    # --- inside -----------------------------------------------------------------------------
+
+    async def _ensure(self, name: str) -> _Resident:
+        while (resident := self._resident.get(name)) is None:
+            task = self._loading.get(name)
+            if task is None:
+                summary = await self.summary(name)
+                if name in self._resident or name in self._loading:
+                    continue
+                self._make_room(name, summary.nbytes)
+                self._reserved[name] = summary.nbytes
+                task = asyncio.create_task(self._load(name, summary), name=f"load {name}")
+                # Read the outcome even when all who waited have left.
+                task.add_done_callback(lambda t: t.cancelled() or t.exception())
+                self._loading[name] = task
+            # Others may wait for the same load; one who leaves must not end it.
+            await asyncio.shield(task)
+        resident.used_at = time.monotonic()
+        return resident
+
+    async def _load(self, name: str, summary: SceneSummary) -> Scene:
+        started = time.monotonic()
+        try:
+            scene = await self.on_disk_thread(lambda: load_scene(summary.path))
+            scene = await self._engine.call(scene.to, self.device, label="load")
+        except BundleError as error:
+            reason = self.library.public(error)
+            listing = Listing(name, summary.path, None, reason)
+            self._listings = self._listings | {name: listing}
+            await asyncio.to_thread(self.library.mark_broken, listing, reason)
+            log.warning("scene broken", scene=name, reason=reason)
+            raise _broken(name, reason) from error
+        finally:
+            self._reserved.pop(name, None)
+            self._loading.pop(name, None)
+        self._resident[name] = _Resident(scene, summary, used_at=time.monotonic())
+        seconds = time.monotonic() - started
+        if self._on_load:
+            self._on_load(seconds)
+        log.info("scene loaded", scene=name, bytes=scene.nbytes, seconds=round(seconds, 3))
+        return scene
+
+    def _make_room(self, name: str, needed: int) -> None:
+        """Evict unpinned scenes, longest unused first, until ``needed`` bytes fit.
+
+        Raises:
+            ServiceError: OUT_OF_MEMORY; then nothing was evicted.
+        """
+        if needed > self.budget_bytes:
+            raise _out_of_memory(
+                f"scene {name!r} needs {needed} bytes, the budget is {self.budget_bytes}",
+                hint="raise REAL2SIM_SCENE_MEMORY_BYTES, or thin the scene out",
+                needed=needed,
+                free=self.budget_bytes,
+            )
+        idle = sorted(
+            (n for n, r in self._resident.items() if not r.pins),
+            key=lambda n: self._resident[n].used_at,
+        )
+        free = self.budget_bytes - self.resident_bytes - sum(self._reserved.values())
+        if needed > free + sum(self._resident[n].scene.nbytes for n in idle):
+            raise _out_of_memory(
+                f"scene {name!r} needs {needed} bytes; of the budget of {self.budget_bytes} all "
+                f"but {free} are taken by scenes that sessions use",
+                hint="close sessions on other scenes, or raise REAL2SIM_SCENE_MEMORY_BYTES",
+                needed=needed,
+                free=free,
+            )
+        for candidate in idle:
+            if needed <= free:
+                return
+            free += self._resident[candidate].scene.nbytes
+            self._forget(candidate)
+
+    def _forget(self, name: str) -> None:
+        del self._resident[name]
+        log.info("scene unloaded", scene=name)
+
+
+def _broken(name: str, reason: str | None) -> ServiceError:
+    return ServiceError(
+        ErrorCode.SCENE_BROKEN,
+        f"scene {name!r} cannot be read: {reason}",
+        hint="copy or import the bundle again; the worker notices by itself",
+    )
+
+
+def _out_of_memory(detail: str, *, hint: str, needed: int, free: int) -> ServiceError:
+    extra = {"needed_bytes": needed, "free_bytes": free}
+    return ServiceError(ErrorCode.OUT_OF_MEMORY, detail, hint=hint, extra=extra)

@@ -1,0 +1,118 @@
+"""From scenes and scenarios to what the wire says about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from real2sim_proto.base import Track
+from real2sim_proto.scenes import CameraInfo, ObjectInfo, SceneInfo, SceneState
+
+from ...edit import ObjectState
+from ...scene import Camera, Trajectory
+from ...scene.io import SceneSummary
+from .scene_catalog import Listing
+
+
+def scene_info(
+    listing: Listing, state: SceneState, *, summary: SceneSummary | None, tracks: bool
+) -> SceneInfo:
+    """What is said about a scene.
+
+    Args:
+        listing: of the scene folder.
+        state: where it is on its way into memory.
+        summary: what it holds; None when it is broken.
+        tracks: whether ego path and trajectories are given.
+    """
+    if summary is None:
+        return SceneInfo(scene=listing.name, state=state, reason=listing.reason)
+    low, high = summary.bounds or (None, None)
+    return SceneInfo(
+        scene=listing.name,
+        state=state,
+        content_hash=summary.content_hash,
+        gaussians=summary.gaussian_count,
+        bytes=summary.nbytes,
+        start_us=summary.start_us,
+        end_us=summary.end_us,
+        frame_times_us=summary.frame_times_us.tolist(),
+        cameras=[camera_info(c) for c in summary.rig],
+        objects=scene_objects(summary, tracks=tracks),
+        extent_min=low,
+        extent_max=high,
+        ego=track(summary.ego) if tracks else None,
+        provenance=dict(summary.provenance),
+    )
+
+
+def scene_objects(summary: SceneSummary, *, tracks: bool) -> list[ObjectInfo]:
+    """The objects of an unedited scene; instance ids as the renderer gives them."""
+    return [
+        ObjectInfo(
+            object_id=o.object_id,
+            category=o.category,
+            size=o.size,
+            instance_id=1 + index,
+            gaussians=o.gaussians,
+            start_us=o.trajectory.start_us,
+            end_us=o.trajectory.end_us,
+            trajectory=track(o.trajectory) if tracks else None,
+        )
+        for index, o in enumerate(summary.objects)
+    ]
+
+
+def edited_objects(
+    objects: Iterable[ObjectState], summary: SceneSummary, *, tracks: bool
+) -> list[ObjectInfo]:
+    """The objects of a scenario."""
+    gaussians = {o.object_id: o.gaussians for o in summary.objects}
+    return [
+        ObjectInfo(
+            object_id=o.object_id,
+            category=o.category,
+            size=o.scaled_size,
+            instance_id=o.instance_id,
+            gaussians=o.asset.gaussians if o.asset else gaussians[o.source_id],
+            start_us=o.trajectory.start_us,
+            end_us=o.trajectory.end_us,
+            trajectory=track(o.trajectory) if tracks else None,
+            recorded_id=None if o.asset else o.source_id,
+            asset_id=o.asset.asset_id if o.asset else None,
+            physics=o.physics,
+            velocity=o.velocity,
+        )
+        for o in objects
+    ]
+
+
+def camera_info(camera: Camera) -> CameraInfo:
+    """A camera as the wire has it."""
+    return CameraInfo(
+        name=camera.name,
+        width=camera.width,
+        height=camera.height,
+        K=camera.K.tolist(),
+        T_vehicle_camera=camera.T_vehicle_camera.tolist(),
+    )
+
+
+def camera_infos(cameras: Sequence[Camera]) -> list[CameraInfo]:
+    """Cameras in order."""
+    return [camera_info(camera) for camera in cameras]
+
+
+def track(trajectory: Trajectory) -> Track:
+    """A trajectory as the wire has it."""
+    # Values were checked when the trajectory was made; validating thousands of poses again
+    # would hold up the event loop.
+    return Track.model_construct(
+        times_us=trajectory.times_us.tolist(),
+        positions=[tuple(p) for p in trajectory.positions.tolist()],
+        quaternions=[tuple(q) for q in trajectory.quaternions.tolist()],
+    )
+
+
+def etag(revision: int) -> str:
+    """Value of ETag and If-Match for a revision."""
+    return f'"r{revision}"'

@@ -1,0 +1,1 @@
+"""Scenarios of a worker: edited one at a time, on record before they take effect."""

@@ -1,0 +1,333 @@
+"""Scenarios of a worker: edited under a lock each, on record before they take effect."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.operations import Operation
+from real2sim_proto.scenarios import (
+    History,
+    HistoryEntry,
+    OperationResult,
+    ScenarioCreate,
+    ScenarioDocument,
+    ScenarioFork,
+    ScenarioInfo,
+)
+
+from ...edit import AssetLookup, EditError, LogEntry, Planned, Scenario, ScenarioState
+from ...scene.io import SceneSummary
+from ..http.disconnects import to_its_end
+from ..http.idempotency import IdempotentRequest
+from ..http.metrics import Metrics
+from ..http.problems import ServiceError
+from ..library.scene_cache import SceneCache
+from ..library.scene_catalog import BUNDLE_SUFFIX
+from ..storage.snapshots import Snapshots
+from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply, now_us
+from .replies import (
+    ScenarioView,
+    asset_hashes,
+    changed_elsewhere,
+    created_headers,
+    history_entry,
+    iso_time,
+    listed_info,
+    operation_result,
+    replayed,
+    stale_revision,
+    tag,
+)
+from .scenario_cache import HeldScenario, HeldScenarios
+
+__all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
+
+
+class Scenarios:
+    """All scenarios of a worker. Belongs to the event loop."""
+
+    def __init__(
+        self,
+        store: Store,
+        residency: SceneCache,
+        metrics: Metrics,
+        *,
+        assets: AssetLookup | None = None,
+    ) -> None:
+        self._store = store
+        self._assets = assets
+        self._residency = residency
+        self._metrics = metrics
+        self._snapshots = Snapshots(store)
+        self._held = HeldScenarios(store, residency, self._snapshots, assets)
+
+    # --- life -------------------------------------------------------------------------------
+
+    async def create(self, request: ScenarioCreate, *, once: IdempotentRequest) -> ScenarioInfo:
+        """A new scenario, stored. Raises ServiceError: UNKNOWN_SCENE or SCENE_BROKEN."""
+        summary = await self._residency.summary(request.scene)
+        return await self._create(request.name, request.scene, summary, [], once=once)
+
+    async def fork(
+        self, scenario_id: str, request: ScenarioFork, *, once: IdempotentRequest
+    ) -> ScenarioInfo:
+        """A new scenario with the same history, up to a revision.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENARIO, or INVALID_REQUEST for a revision that is not there.
+        """
+        held = await self._held.get(scenario_id)
+        entries = list(held.scenario.entries)
+        revision = len(entries) if request.revision is None else request.revision
+        if revision > len(entries):
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"scenario {scenario_id!r} has {len(entries)} revisions; {revision} is not there",
+                hint="leave revision out to fork what it is now",
+            )
+        name = held.row.name if request.name is None else request.name
+        log = [history_entry(e) for e in entries[:revision]]
+        return await self._create(name, held.row.scene, held.summary, log, once=once)
+
+    async def export(self, scenario_id: str) -> ScenarioDocument:
+        """The scenario as one file. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
+        held = await self._held.get(scenario_id)
+        return ScenarioDocument(
+            name=held.row.name,
+            scene=held.row.scene,
+            scene_hash=held.row.scene_hash,
+            assets=asset_hashes(held.scenario.entries, self._assets),
+            entries=[history_entry(e) for e in held.scenario.entries],
+            exported_at=iso_time(now_us()),
+        )
+
+    async def import_(self, document: ScenarioDocument, *, once: IdempotentRequest) -> ScenarioInfo:
+        """A new scenario from a file, on the scene of its hash.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENE or UNKNOWN_ASSET where what it names is not here;
+                INVALID_OPERATION for a log that does not fit its scene.
+        """
+        summary = await self._summary_of(document)
+        for asset_id, content_hash in document.assets.items():
+            found = self._assets(asset_id) if self._assets else None
+            if found is None or getattr(found, "content_hash", "") != content_hash:
+                raise ServiceError(
+                    ErrorCode.UNKNOWN_ASSET,
+                    f"the scenario uses asset {asset_id!r} with hash {content_hash[:12]}; it is "
+                    "not in this library",
+                    hint="add it with POST /v1/assets under that id first",
+                )
+        scene = summary.path.name.removesuffix(BUNDLE_SUFFIX)
+        return await self._create(document.name, scene, summary, document.entries, once=once)
+
+    async def delete(self, scenario_id: str) -> None:
+        """Remove a scenario and its history. Raises ServiceError: UNKNOWN_SCENARIO."""
+        async with self._held.exclusive(scenario_id):
+            self._held.drop(scenario_id)
+            self._snapshots.forget(scenario_id)
+            await self._store.delete_scenario(scenario_id)
+
+    async def settle(self) -> None:
+        """Wait for what is still written behind the answers; none may be asked for after."""
+        await self._snapshots.written()
+
+    # --- reading ----------------------------------------------------------------------------
+
+    async def list(self) -> list[ScenarioInfo]:
+        """All scenarios, oldest first, without their objects; those of missing scenes too."""
+        kinds = await self._store.scenario_kinds()
+        rows = await self._store.scenarios()
+        return [listed_info(row, kinds.get(row.scenario_id, [])) for row in rows]
+
+    async def view(self, scenario_id: str) -> ScenarioView:
+        """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
+        return _view(await self._held.get(scenario_id))
+
+    async def state_at(self, scenario_id: str, revision: int) -> ScenarioState:
+        """What the scenario was at a revision. Raises ServiceError: UNKNOWN_SCENARIO."""
+        held = await self._held.get(scenario_id)
+        if revision == held.scenario.revision:
+            return held.scenario.state
+        log = [history_entry(e) for e in held.scenario.entries[:revision]]
+        earlier = await asyncio.to_thread(replayed, held.row, held.summary, log, self._assets)
+        return earlier.state
+
+    async def history(self, scenario_id: str, *, after: int = 0) -> History:
+        """Revisions behind ``after``, oldest first."""
+        scenario = (await self._held.get(scenario_id)).scenario
+        return History(
+            revision=scenario.revision,
+            can_undo=scenario.can_undo,
+            can_redo=scenario.can_redo,
+            entries=[history_entry(e) for e in scenario.entries[max(0, after) :]],
+        )
+
+    async def with_asset(self, asset_id: str) -> Sequence[str]:
+        """Ids of the scenarios whose history names an asset, edits that are under way included."""
+        await self._held.settled()
+        return await self._store.scenarios_naming(asset_id)
+
+    @property
+    def assets(self) -> AssetLookup | None:
+        """Where scenarios find what they insert."""
+        return self._assets
+
+    # --- editing ----------------------------------------------------------------------------
+
+    async def edit(
+        self,
+        scenario_id: str,
+        operations: Sequence[Operation],
+        *,
+        expected: int | None,
+        dry_run: bool,
+        once: IdempotentRequest,
+        who: str = "",
+    ) -> OperationResult:
+        """Apply operations, all or none.
+
+        Args:
+            scenario_id: of the scenario.
+            operations: in order.
+            expected: revision they were made for; None for any.
+            dry_run: check and answer, change nothing.
+            once: what the answer is stored under.
+            who: goes on record.
+
+        Raises:
+            ServiceError: UNKNOWN_SCENARIO; STALE_REVISION, with the missed entries as member
+                ``missed``; UNKNOWN_OBJECT or INVALID_OPERATION.
+        """
+        result = await self._change(
+            scenario_id,
+            lambda s: s.plan_edit(operations, who=who),
+            expected,
+            dry_run=dry_run,
+            once=once,
+        )
+        if not dry_run:
+            for op, count in Counter(o.op for o in operations).items():
+                self._metrics.edits.labels(op).inc(count)
+        return result
+
+    async def undo(
+        self, scenario_id: str, *, expected: int | None, once: IdempotentRequest, who: str = ""
+    ) -> OperationResult:
+        """Take back the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
+        result = await self._change(
+            scenario_id, lambda s: s.plan_undo(who=who), expected, once=once
+        )
+        self._metrics.edits.labels("undo").inc()
+        return result
+
+    async def redo(
+        self, scenario_id: str, *, expected: int | None, once: IdempotentRequest, who: str = ""
+    ) -> OperationResult:
+        """Bring back the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
+        result = await self._change(
+            scenario_id, lambda s: s.plan_redo(who=who), expected, once=once
+        )
+        self._metrics.edits.labels("redo").inc()
+        return result
+
+    # --- inside -----------------------------------------------------------------------------
+
+    async def _create(
+        self,
+        name: str,
+        scene: str,
+        summary: SceneSummary,
+        log: Sequence[HistoryEntry],
+        *,
+        once: IdempotentRequest,
+    ) -> ScenarioInfo:
+        row = ScenarioRow(
+            scenario_id=f"sc_{secrets.token_hex(8)}",
+            name=name,
+            scene=scene,
+            scene_hash=summary.content_hash,
+            created_us=now_us(),
+        )
+        scenario = await asyncio.to_thread(replayed, row, summary, log, self._assets)
+        held = HeldScenario(row, scenario, summary)
+        info = _view(held).info(tracks=False)
+        reply = once.reply(info, status=201, headers=created_headers(info))
+        entries = [entry.model_dump(mode="json") for entry in log]
+        await self._store.create_scenario(row, entries=entries, reply=reply)
+        self._held.keep(held)
+        return info
+
+    async def _summary_of(self, document: ScenarioDocument) -> SceneSummary:
+        for listing in (await self._residency.refresh()).values():
+            if listing.summary and listing.summary.content_hash == document.scene_hash:
+                return listing.summary
+        raise ServiceError(
+            ErrorCode.UNKNOWN_SCENE,
+            f"the scenario was made on scene {document.scene!r} with hash "
+            f"{document.scene_hash[:12]}; no scene here has it",
+            hint="put that bundle into the scene folder, or POST /v1/scenes to import it",
+        )
+
+    @to_its_end
+    async def _change(
+        self,
+        scenario_id: str,
+        plan: Callable[[Scenario], Planned],
+        expected: int | None,
+        *,
+        dry_run: bool = False,
+        once: IdempotentRequest,
+    ) -> OperationResult:
+        async with self._held.exclusive(scenario_id) as held:
+            scenario = held.scenario
+            if expected is not None and expected != scenario.revision:
+                self._metrics.edit_conflicts.inc()
+                raise stale_revision(scenario, expected)
+
+            def change() -> tuple[Planned, OperationResult]:
+                # Overlap checks of large batches take milliseconds; they need no device.
+                planned = plan(scenario)
+                revision = scenario.revision if dry_run else planned.entry.revision
+                result = operation_result(planned, revision=revision, dry_run=dry_run)
+                if not dry_run:
+                    reply = once.reply(result, status=200, headers=tag(result))
+                    self._record(scenario_id, planned.entry, reply)
+                return planned, result
+
+            try:
+                planned, result = await asyncio.to_thread(change)
+            except EditError:
+                raise
+            except Exception as error:
+                # Only the store knows whether the entry is in the log.
+                self._held.drop(scenario_id)
+                if isinstance(error, ConflictError):
+                    raise changed_elsewhere(scenario_id) from error
+                raise
+            if not dry_run:
+                scenario.commit(planned)
+                self._snapshots.offer(scenario_id, scenario.revision, scenario.state)
+            return result
+
+    def _record(self, scenario_id: str, entry: LogEntry, reply: StoredReply | None) -> None:
+        fields = history_entry(entry).model_dump(mode="json")
+        self._store.record_revision(
+            scenario_id, entry.revision, fields, created_us=now_us(), reply=reply
+        )
+
+
+def _view(held: HeldScenario) -> ScenarioView:
+    scenario = held.scenario
+    return ScenarioView(
+        row=held.row,
+        summary=held.summary,
+        state=scenario.state,
+        revision=scenario.revision,
+        can_undo=scenario.can_undo,
+        can_redo=scenario.can_redo,
+    )

@@ -1,0 +1,107 @@
+"""How long a session waits for its controller: deadlines of plans, wall-clock time of episodes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Awaitable, Callable
+
+import structlog
+
+from .session import Session
+from .step import Stepper
+from .wire import Message
+
+log = structlog.get_logger(__name__)
+
+Tell = Callable[[Message], Awaitable[None]]
+
+
+class DeadlineTimer:
+    """Waits for the action that is due, on behalf of one connected controller.
+
+    The clock of a deadline runs from the moment the observation has been sent until the action
+    has arrived; neither computing nor a lost connection counts. Nothing here holds up another
+    session: what a fallback computes waits in the same queue as any step.
+
+    Args:
+        session: whose controller is connected.
+        stepper: makes the fallback's step.
+        tell: sends an observation that nobody asked for.
+    """
+
+    def __init__(self, session: Session, stepper: Stepper, tell: Tell) -> None:
+        self._session = session
+        self._stepper = stepper
+        self._tell = tell
+        self._waiting: asyncio.Task[None] | None = None
+        self._sent_at = time.monotonic()
+
+    def begin(self) -> None:
+        """An observation has been sent."""
+        self._sent_at = time.monotonic()
+        self.end()
+        session = self._session
+        if session.world is None or session.world.over:
+            return
+        deadline, cap = session.spec.deadline_ms, session.expires_at
+        if (deadline is not None and not session.late) or cap is not None:
+            self._waiting = asyncio.create_task(self._wait(session.world.steps))
+
+    def end(self) -> None:
+        """The action has arrived, or the controller has left."""
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
+
+    @property
+    def waiting(self) -> bool:
+        """Whether an action is being waited for."""
+        return self._waiting is not None and not self._waiting.done()
+
+    @property
+    def waited_us(self) -> int:
+        """Time since the newest observation was sent [us]."""
+        return int((time.monotonic() - self._sent_at) * 1e6)
+
+    async def _wait(self, step: int) -> None:
+        try:
+            while (until := self._next(step)) is not None:
+                await asyncio.sleep(max(until - time.monotonic(), 0.0))
+                # The fallback itself must not be broken off half way by an action that arrives.
+                await asyncio.shield(asyncio.ensure_future(self._run_out(step)))
+                step = self._session.lockstep.step or 0
+        except Exception:
+            log.exception("fallback failed", session_id=self._session.session_id)
+
+    def _next(self, step: int) -> float | None:
+        """Monotonic time at which patience ends; None where it does not."""
+        session = self._session
+        if session.world is None or session.world.over or session.lockstep.step != step:
+            return None
+        times = [] if session.expires_at is None else [session.expires_at]
+        if session.spec.deadline_ms is not None and not session.late:
+            times.append(self._sent_at + session.spec.deadline_ms * 1e-3)
+        return min(times, default=None)
+
+    async def _run_out(self, step: int) -> None:
+        session = self._session
+        async with session.lock:
+            if session.closed is not None or session.lockstep.step != step:
+                return
+            if session.world is None or session.world.over:
+                return
+            if session.expired:
+                message = await self._stepper.stop(session, "wall_clock")
+            elif session.spec.on_timeout == "pause":
+                session.late = True
+                return
+            elif session.spec.on_timeout == "fail":
+                message = await self._stepper.stop(session, "deadline")
+            else:
+                message = await self._stepper.miss(session)
+            self._sent_at = time.monotonic()
+        with contextlib.suppress(Exception):
+            await self._tell(message)
+        self._sent_at = time.monotonic()

@@ -1,0 +1,1 @@
+"""Durable memory of a worker: tables, rows, migrations of state."""

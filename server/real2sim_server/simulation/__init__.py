@@ -1,0 +1,23 @@
+"""Bodies of a scene in time: rigid, deforming, at rest."""
+
+from .fill import Filling, fill_object
+from .masses import CLASS_MASSES, default_mass
+from .playback import Playback
+from .presets import PRESETS, ObjectPhysics
+from .result import ContactRecord, ObjectResult, SimulationResult
+from .rollout import SimulateOptions, simulate
+
+__all__ = [
+    "CLASS_MASSES",
+    "PRESETS",
+    "ContactRecord",
+    "Filling",
+    "ObjectPhysics",
+    "ObjectResult",
+    "Playback",
+    "SimulateOptions",
+    "SimulationResult",
+    "default_mass",
+    "fill_object",
+    "simulate",
+]

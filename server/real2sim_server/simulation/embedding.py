@@ -1,0 +1,143 @@
+"""Gaussians in moving matter: each follows the particles around it.
+
+A Gaussian's map is the weighted least-squares affine fit to the motion of its nearest particles
+(moving least squares). The fit is linear in particle displacements, so its coefficients are found
+once. Any affine motion of the particles is reproduced exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..geometry.rotation import Float, matrix_to_quaternion, quaternion_to_matrix
+from ..scene import GaussianCloud
+from ..scene.harmonics import sh_basis
+
+NEIGHBOURS = 20
+FLAT = 0.05
+"""Second moments below this share of spacing^2 say nothing about the gradient along their axis."""
+STRETCH_LIMITS = (0.2, 2.0)
+"""Bounds on what a Gaussian is stretched by: across a tear it must not become a sheet."""
+TURNED = 1e-3
+"""Smallest rotation, as matrix entry, for which colours are turned."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deformed:
+    """Maps of G Gaussians: positions [G, 3] [m], F [G, 3, 3], its rotation part [G, 3, 3]."""
+
+    positions: Float
+    F: Float
+    rotations: Float
+
+
+class Embedding:
+    """Points in a solid of particles at rest.
+
+    Args:
+        rest: [N, 3] particles at rest [m].
+        points: [G, 3] points in the same frame [m].
+        spacing: distance of particles [m].
+    """
+
+    def __init__(self, rest: Float, points: Float, *, spacing: float) -> None:
+        from scipy.spatial import cKDTree
+
+        count = min(NEIGHBOURS, len(rest))
+        distance, index = cKDTree(rest).query(points, k=count)
+        distance, index = distance.reshape(-1, count), index.reshape(-1, count)
+        reach = np.maximum(2.0 * spacing, 1.6 * distance[:, [min(4, count - 1)]])
+        weights = np.maximum(1 - (distance / reach) ** 2, 0) ** 2 + 1e-9
+        weights /= weights.sum(axis=1, keepdims=True)
+        self._index: NDArray[np.int64] = index
+        self._weights = weights
+        centre = np.einsum("gk,gki->gi", weights, rest[index])
+        r = rest[index] - centre[:, None]
+        second = np.einsum("gk,gki,gkj->gij", weights, r, r)
+        value, axes = np.linalg.eigh(second)
+        solid = value > FLAT * spacing**2
+        inverse = np.einsum(
+            "gij,gj,gkj->gik", axes, np.where(solid, 1 / np.maximum(value, 1e-12), 0), axes
+        )
+        self._slopes = np.einsum("gk,gki,gij->gkj", weights, r, inverse)
+        self._centre = centre
+        self._offset = points - centre
+        # Far from all matter only rotation is trusted.
+        beyond = np.linalg.norm(self._offset, axis=1) / spacing
+        self._trust = np.clip(2.5 - beyond, 0, 1)[:, None, None]
+
+    def follow(self, displacements: Float) -> Deformed:
+        """Where the points are when particles are displaced by ``displacements`` [N, 3] [m]."""
+        u = np.asarray(displacements, dtype=np.float64)[self._index]
+        F = np.eye(3) + np.einsum("gki,gkj->gij", u, self._slopes)
+        left, stretch, right = np.linalg.svd(F)
+        left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+        rotations = left @ right
+        clamped = (left * np.clip(stretch, *STRETCH_LIMITS)[:, None, :]) @ right
+        F = self._trust * clamped + (1 - self._trust) * rotations
+        mean = np.einsum("gk,gki->gi", self._weights, u)
+        moved = self._centre + mean + np.einsum("gij,gj->gi", F, self._offset)
+        return Deformed(moved, F, rotations)
+
+
+def deform_cloud(cloud: GaussianCloud, deformed: Deformed) -> GaussianCloud:
+    """The Gaussians moved: mean, covariance F S F^T, colours turned by the rotation part of F.
+
+    Opacities stay. Covariances are decomposed into unit quaternions and scales again.
+    """
+    axes = quaternion_to_matrix(cloud.quats.detach().cpu().numpy())
+    scales = cloud.scales.detach().cpu().numpy().astype(np.float64)
+    left, stretch, _ = np.linalg.svd(deformed.F @ (axes * scales[:, None, :]))
+    left[:, :, 2] *= np.sign(np.linalg.det(left))[:, None]
+    return GaussianCloud(
+        means=_tensor(deformed.positions, cloud),
+        quats=_tensor(matrix_to_quaternion(left), cloud),
+        scales=_tensor(stretch, cloud),
+        opacities=cloud.opacities,
+        sh=_turned(cloud, deformed.rotations),
+    )
+
+
+def stretched(cloud: GaussianCloud, factors: tuple[float, float, float]) -> GaussianCloud:
+    """The cloud scaled by ``factors`` along its frame's axes, as an edit's scale does."""
+    if factors == (1.0, 1.0, 1.0):
+        return cloud
+    F = np.tile(np.diag(np.asarray(factors, dtype=np.float64)), (len(cloud), 1, 1))
+    means = cloud.means.detach().cpu().numpy().astype(np.float64)
+    return deform_cloud(cloud, Deformed(means * factors, F, np.tile(np.eye(3), (len(cloud), 1, 1))))
+
+
+def _tensor(values: Float, like: GaussianCloud) -> torch.Tensor:
+    return torch.from_numpy(values.astype(np.float32)).to(like.device)
+
+
+def _turned(cloud: GaussianCloud, rotations: Float) -> torch.Tensor:
+    """Harmonics of each Gaussian turned by its own rotation."""
+    degree = cloud.sh_degree
+    turned = np.abs(rotations - np.eye(3)).max(axis=(1, 2)) > TURNED
+    if degree == 0 or not turned.any():
+        return cloud.sh
+    index = np.flatnonzero(turned)
+    sh = cloud.sh.detach().cpu().numpy().astype(np.float64)
+    directions = _directions()
+    # The turned function at R d is the old one at d: fit through fixed directions.
+    before = sh_basis(directions, degree)
+    turned_basis = sh_basis(np.einsum("nij,dj->ndi", rotations[index], directions), degree)
+    for band in range(1, degree + 1):
+        part = slice(band * band, (band + 1) ** 2)
+        after = turned_basis[..., part]
+        own = np.einsum("dk,nkc->ndc", before[:, part], sh[index][:, part])
+        gram = np.einsum("ndj,ndk->njk", after, after)
+        sh[index, part] = np.linalg.solve(gram, np.einsum("ndj,ndc->njc", after, own))
+    return torch.from_numpy(sh.astype(np.float32)).to(cloud.device)
+
+
+def _directions(count: int = 32) -> Float:
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    radius, angle = np.sqrt(1 - z * z), np.pi * (1 + 5**0.5) * k
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)

@@ -1,0 +1,269 @@
+"""Pictures of a rollout: film, strip of stills, curves."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float, apply_transform, invert_transform
+from ...physics.colliders import Plane
+from ...physics.errors import PhysicsError
+from ...render import Instance, RasterOptions, render_cameras
+from ...scene import Camera, GaussianCloud
+from ..body import MODES
+from ..playback import Playback
+from ..result import ENERGIES, SimulationResult
+from .setups import Experiment
+
+Image = NDArray[np.uint8]
+
+RGB_ONLY = RasterOptions(depth=False, instance=False)
+FILM_RATE = 15.0
+STILLS = 5
+CLEAR = 0.8
+"""Of the distance from a near view to what it looks at."""
+WALL_HALF_WIDTH, WALL_DOWN, WALL_UP = 1.3, 0.7, 0.9
+"""What is drawn of a virtual wall, around the focus [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera of the film.
+
+    Attributes:
+        camera: fixed in the world: ``T_vehicle_camera`` is ``T_world_camera``.
+        background: what of it is drawn.
+        clear: what takes no part is left out when it comes this near [m]; nobody ever saw it from
+            there, and it would hide what is to be seen.
+    """
+
+    camera: Camera
+    background: GaussianCloud
+    clear: float = 0.0
+
+
+def views(playback: Playback, experiment: Experiment) -> list[View]:
+    """The scene's first camera where it stood at the start, and one near the subjects."""
+    scene = playback.scene
+    recorded = scene.rig.cameras[0]
+    stood = recorded.pose(scene.ego.transform(experiment.options.start_us))
+    viewer = experiment.focus + experiment.distance * experiment.side / np.linalg.norm(
+        experiment.side
+    )
+    near = look_at(viewer, experiment.focus)
+    K = np.array(recorded.K)
+    K[0, 0] = K[1, 1] = 0.9 * recorded.width
+    K[0, 2], K[1, 2] = recorded.width / 2, recorded.height / 2
+    return [
+        View(
+            Camera("scene", recorded.width, recorded.height, np.array(recorded.K), stood),
+            scene.background,
+        ),
+        View(
+            Camera("near", recorded.width, recorded.height, K, near),
+            _before(scene.background, viewer, experiment),
+            clear=CLEAR * experiment.distance,
+        ),
+    ]
+
+
+def _before(cloud: GaussianCloud, viewer: Float, experiment: Experiment) -> GaussianCloud:
+    """The background without trees and posts between a near viewer and the focus."""
+    means = cloud.means.detach().cpu().numpy()
+    near = np.linalg.norm(means - viewer, axis=1) < CLEAR * experiment.distance
+    hides = torch.from_numpy(near & (means[:, 2] > experiment.focus[2]))
+    return cloud.select(~hides.to(cloud.device))
+
+
+def walls(experiment: Experiment) -> list[Float]:
+    """Corners [4, 3] [m] of what is drawn of each virtual wall, near the experiment's focus."""
+    drawn = []
+    for collider in experiment.options.colliders:
+        if not isinstance(collider, Plane) or collider.name in experiment.options.road:
+            continue
+        point, normal = np.asarray(collider.point), np.asarray(collider.normal)
+        foot = experiment.focus - ((experiment.focus - point) @ normal) * normal
+        across = np.cross([0.0, 0.0, 1.0], normal)
+        across = WALL_HALF_WIDTH * across / max(float(np.linalg.norm(across)), 1e-9)
+        low, high = np.array([0, 0, -WALL_DOWN]), np.array([0, 0, WALL_UP])
+        drawn.append(foot + np.array([-across + low, across + low, across + high, -across + high]))
+    return drawn
+
+
+def look_at(viewer: Float, focus: Float) -> Float:
+    """``T_world_camera`` [4, 4] of an upright OpenCV camera at ``viewer`` that sees ``focus``."""
+    z = (focus - viewer) / np.linalg.norm(focus - viewer)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    pose[:3, 3] = viewer
+    return pose
+
+
+def draw(playback: Playback, shown: Sequence[View], frame: int, backend: str) -> list[Image]:
+    """RGB images of a frame, one for each view."""
+    images = []
+    for view in shown:
+        _, *objects = playback.instances(frame, without=_bystanders(playback, view, frame))
+        [drawn] = render_cameras(
+            [Instance(view.background), *objects],
+            [view.camera],
+            np.eye(4),
+            sky=playback.scene.sky,
+            options=RGB_ONLY,
+            backend=backend,
+        )
+        images.append(drawn.rgb)
+    return images
+
+
+def _bystanders(playback: Playback, view: View, frame: int) -> set[str]:
+    """What takes no part and is too near to the view to be shown."""
+    t_us, eye = playback.time_us(frame), view.camera.T_vehicle_camera[:3, 3]
+    return {
+        o.object_id
+        for o in playback.state.visible
+        if o.object_id not in playback.result.objects
+        and o.trajectory.covers(t_us)
+        and float(np.linalg.norm(o.trajectory.transform(t_us)[:3, 3] - eye))
+        < view.clear + o.scaled_size[0] / 2
+    }
+
+
+def leave_film(
+    playback: Playback,
+    shown: Sequence[View],
+    folder: Path,
+    *,
+    outlines: Sequence[Float] = (),
+    backend: str = "auto",
+    on_progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write ``film.mp4``, the views side by side, and ``strip.png``, stills row by row.
+
+    Args:
+        playback: what is shown.
+        shown: as ``views`` gives them.
+        folder: for the files.
+        outlines: of things without looks, see ``walls``.
+        backend: of the renderer.
+        on_progress: called with (pictures done, pictures).
+
+    Raises:
+        PhysicsError: when OpenCV cannot encode.
+    """
+    import cv2
+
+    result = playback.result
+    stride = max(round(float(result.figures["frame_rate"]) / FILM_RATE), 1)
+    frames = list(range(0, result.frames, stride))
+    stills = {frames[round(k * (len(frames) - 1) / (STILLS - 1))] for k in range(STILLS)}
+    temporary = folder / ".film.tmp.mp4"
+    writer, kept = None, []
+    for done, frame in enumerate(frames):
+        images = [
+            _outlined(image, view.camera, outlines)
+            for image, view in zip(draw(playback, shown, frame, backend), shown, strict=True)
+        ]
+        picture = _even(_captioned(np.concatenate(images, axis=1), float(result.times_s[frame])))
+        if writer is None:
+            size = (picture.shape[1], picture.shape[0])
+            rate = float(result.figures["frame_rate"]) / stride
+            writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+            if not writer.isOpened():
+                raise PhysicsError(f"{temporary}: OpenCV here cannot write MPEG-4 video")
+        writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
+        if frame in stills:
+            kept.append([_captioned(i, float(result.times_s[frame])) for i in images])
+        if on_progress is not None:
+            on_progress(done + 1, len(frames))
+    assert writer is not None
+    writer.release()
+    os.replace(temporary, folder / "film.mp4")
+    rows = [np.concatenate([still[c] for still in kept], axis=1) for c in range(len(shown))]
+    write_png(folder / "strip.png", np.concatenate(rows, axis=0))
+
+
+def write_png(path: Path, image: Image) -> None:
+    """Write an RGB image, whole or not at all."""
+    import cv2
+
+    from ..._files import atomic_file
+
+    done, data = cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))
+    if not done:
+        raise PhysicsError(f"{path}: the image could not be encoded")
+    with atomic_file(path) as file:
+        file.write(data.tobytes())
+
+
+def draw_curves(result: SimulationResult, path: Path) -> None:
+    """Speed, height, impulses and energies over time, deforming marked; PNG or SVG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 7), dpi=110)
+    FigureCanvasAgg(figure)
+    (speed, height), (impulse, energy) = figure.subplots(2, 2)
+    t = result.times_s
+    for name, o in result.objects.items():
+        [line] = speed.plot(t, np.linalg.norm(o.velocities, axis=1), label=name)
+        height.plot(t, o.positions[:, 2], color=line.get_color())
+        deforming = o.modes == MODES.index("deforming")
+        speed.plot(t[deforming], np.zeros(deforming.sum()), ".", ms=3, color=line.get_color())
+    for c, contact in enumerate(result.contacts):
+        size = np.linalg.norm(result.impulses[:, c], axis=1)
+        impulse.plot(t, size * 1e-3, label=f"{contact.object_id} by {contact.other}")
+    for k, name in enumerate(ENERGIES):
+        values = result.energies[:, k] * 1e-3
+        energy.plot(t, values - (values.min() if name == "gravity" else 0), label=name)
+    speed.set_ylabel("speed [m/s]; dots: deforming")
+    height.set_ylabel("height of box centre [m]")
+    impulse.set_ylabel("impulse so far [kN s]")
+    energy.set_ylabel("energy [kJ]")
+    for axes in (speed, impulse, energy):
+        if axes.lines:
+            axes.legend(fontsize=7, frameon=False)
+    for axes in (speed, height, impulse, energy):
+        axes.set_xlabel("time [s]")
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _outlined(image: Image, camera: Camera, outlines: Sequence[Float]) -> Image:
+    import cv2
+
+    picture = np.ascontiguousarray(image)
+    for corners in outlines:
+        seen_at = apply_transform(invert_transform(camera.T_vehicle_camera), corners)
+        if seen_at[:, 2].min() < 0.5:
+            continue
+        pixels = seen_at[:, :2] / seen_at[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+        cv2.polylines(picture, [np.rint(pixels).astype(np.int32)], True, (255, 90, 30), 1, 16)
+    return picture
+
+
+def _captioned(image: Image, time: float) -> Image:
+    import cv2
+
+    picture = np.ascontiguousarray(image)
+    for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(
+            picture, f"{time:.2f} s", (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, width, 16
+        )
+    return picture
+
+
+def _even(image: Image) -> Image:
+    return np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
+
+
+__all__ = ["View", "draw", "draw_curves", "leave_film", "look_at", "views", "walls", "write_png"]

@@ -1,0 +1,264 @@
+"""The paper's three experiments, set up on the vehicles of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...geometry.rotation import Float
+from ...physics.colliders import Collider, HeightField, Plane
+from ...physics.errors import PhysicsError
+from ...physics.materials import FixedCorotated
+from ...scene import Scene
+from ..ground import find_road
+from ..playback import PlacedObject, PlacedObjects
+from ..presets import VEHICLES, ObjectPhysics, preset_of
+from ..rollout import SimulateOptions
+from ..spawn import matter_of
+from .viewing import in_view, seen
+
+WALL_GAP = 0.5
+"""Between the vehicle and the wall at the start [m]: contact after 1 s at 0.5 m/s."""
+DROP_HEIGHT = 1.225
+"""Free fall of 0.5 s [m]."""
+DAMPED = FixedCorotated(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
+"""The paper's medium for the fall. Its table has no damping, with which a block of this size jumps
+back up by a third of the height; this much leaves a slight bounce."""
+PAIR_GAP = 1.5
+"""Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
+SIDEWAYS, SLANT_MIN = 2.0, 0.25
+"""Near views stand at most so many times as far to the side as the recording saw it from, and at
+least so far."""
+DEPTH_RANGE = (4.0, 45.0)
+OPAQUE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A simulation and where to look.
+
+    Attributes:
+        name: ``wall``, ``pair`` or ``drop``.
+        options: what to simulate.
+        subjects: objects to look at.
+        focus: [3] point of the world to look at from near by [m].
+        side: [3] direction from the focus to a near-by viewer, unit.
+        distance: of that viewer [m].
+    """
+
+    name: str
+    options: SimulateOptions
+    subjects: tuple[str, ...]
+    focus: Float
+    side: Float
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    scene: Scene
+    state: PlacedObjects
+    chosen: tuple[PlacedObject, ...]
+    named: bool
+    start_us: int
+    preset: str
+    speed: float | None
+
+
+def set_up(
+    name: str,
+    scene: Scene,
+    state: PlacedObjects,
+    *,
+    preset: str = "paper",
+    speed: float | None = None,
+    objects: tuple[str, ...] = (),
+) -> Experiment:
+    """An experiment of the paper on a scene.
+
+    Args:
+        name: ``wall``: one vehicle against a virtual wall; ``pair``: two vehicles into standing
+            ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground.
+        preset: of the materials.
+        speed: [m/s]; the paper's 2.5 and 3.5 by default.
+        objects: ids to take; by default vehicles in view, those that were seen best where it hits.
+
+    Raises:
+        PhysicsError: unknown name or objects, or no vehicles in view.
+    """
+    builders = {"wall": _wall, "pair": _pair, "drop": _drop}
+    if name not in builders:
+        raise PhysicsError(f"unknown experiment {name!r}; allowed are {', '.join(builders)}")
+    there = {o.object_id: o for o in state.visible}
+    unknown = [o for o in objects if o not in there]
+    if unknown:
+        raise PhysicsError(f"no objects {unknown}; there are {sorted(there)}")
+    start_us = int(scene.frame_times_us[0])
+    chosen = [there[o] for o in objects] or most_visible(scene, state, start_us)
+    if not chosen:
+        raise PhysicsError(f"no vehicles in view at {start_us} us; name some with objects")
+    return builders[name](
+        _Asked(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
+    )
+
+
+def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedObject]:
+    """Vehicles before the first camera, the largest on its image first."""
+    camera = scene.rig.cameras[0]
+    ego = scene.ego.transform(t_us)
+    found = []
+    for subject in state.visible:
+        if subject.category not in VEHICLES or not subject.trajectory.covers(t_us):
+            continue
+        place = subject.trajectory.transform(t_us)[:3, 3]
+        near, far = DEPTH_RANGE
+        if in_view(camera, ego, place, nearest=near, farthest=far):
+            z = float((camera.viewmat(ego) @ np.append(place, 1.0))[2])
+            found.append((z / subject.scaled_size[2], subject.object_id, subject))
+    return [subject for _, _, subject in sorted(found, key=lambda f: f[:2])]
+
+
+def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
+    """The road as the background's Gaussians have it, under all boxes there at ``t_us``."""
+    boxes = [
+        (o.trajectory.transform(t_us), o.scaled_size)
+        for o in state.visible
+        if o.trajectory.covers(t_us)
+    ]
+    cloud = scene.background
+    solid = cloud.opacities.detach().cpu().numpy() > OPAQUE
+    means = cloud.means.detach().cpu().numpy()[solid].astype(np.float64)
+    return find_road(means, boxes).field
+
+
+def _wall(asked: _Asked) -> Experiment:
+    start_us = asked.start_us
+    # What is to be crushed must have been seen.
+    subject = max(asked.chosen, key=lambda s: seen(asked.scene, s).front)
+    speed = 2.5 if asked.speed is None else asked.speed
+    pose = subject.trajectory.transform(start_us)
+    forward, length = _level(pose[:3, 0]), subject.scaled_size[0]
+    front = pose[:3, 3] + _reach(asked, subject)[1][0] * forward
+    wall = Plane(name="wall", point=front + WALL_GAP * forward, normal=-forward, friction=0.3)
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects={subject.object_id: ObjectPhysics(velocity=speed * forward, friction=_ROLLS)},
+        colliders=[_standing_road(asked, subject), wall],
+        start_us=start_us,
+        duration=WALL_GAP / speed + 1.0,
+    )
+    view = _viewer(asked.scene, subject, pose, slant=0.8)
+    return Experiment(
+        "wall", options, (subject.object_id,), front - 0.3 * length * forward, view, 6.5
+    )
+
+
+_ROLLS = 0.0
+"""In the paper's preset a vehicle has no wheels; that it rolls means it slides freely."""
+
+
+def _standing_road(asked: _Asked, subject: PlacedObject) -> Collider:
+    """The road; without wheels it must not reach into the vehicle's underside."""
+    if asked.preset != "paper":
+        return scene_road(asked.scene, asked.state, asked.start_us)
+    pose = subject.trajectory.transform(asked.start_us)
+    return Plane(
+        name="ground",
+        point=pose[:3, 3] + _reach(asked, subject)[0][2] * pose[:3, 2],
+        normal=pose[:3, 2],
+        friction=0.0,
+    )
+
+
+def _pair(asked: _Asked) -> Experiment:
+    """Two vehicles start behind standing ones, half a width off centre, as traffic hits."""
+    speed, start_us = 3.5 if asked.speed is None else asked.speed, asked.start_us
+    chosen = asked.chosen
+    if len(chosen) < 2:
+        raise PhysicsError("two vehicles in view are needed; name four or two with objects")
+    count = min(len(chosen) // 2, 2)
+    if asked.named:
+        runners, standing = chosen[:count], chosen[count : 2 * count]
+    else:
+        looks = {s.object_id: seen(asked.scene, s) for s in chosen}
+        runners = sorted(chosen, key=lambda s: -looks[s.object_id].front)[:count]
+        rest = [s for s in chosen if s not in runners]
+        standing = sorted(rest, key=lambda s: -looks[s.object_id].rear)[:count]
+    objects: dict[str, ObjectPhysics] = {}
+    meeting = []
+    for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
+        own = runner.trajectory.transform(start_us)
+        forward = _level(own[:3, 0])
+        away = _reach(asked, runner)[1][0] + PAIR_GAP - _reach(asked, hit)[0][0]
+        target = np.array(own)
+        target[:3, 3] += away * forward
+        target[:3, 3] += (0.25 - 0.5 * k) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
+        target[2, 3] += (hit.scaled_size[2] - runner.scaled_size[2]) / 2
+        objects[runner.object_id] = ObjectPhysics(velocity=speed * forward, T_world_object=own)
+        objects[hit.object_id] = ObjectPhysics(velocity=(0, 0, 0), T_world_object=target)
+        meeting.append((own[:3, 3] + target[:3, 3]) / 2)
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects=objects,
+        start_us=start_us,
+        duration=PAIR_GAP / speed + 0.8,
+        gravity=(0.0, 0.0, 0.0),
+    )
+    view = _viewer(asked.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
+    return Experiment("pair", options, tuple(objects), meeting[0], view, 9.0)
+
+
+def _drop(asked: _Asked) -> Experiment:
+    subjects, start_us = asked.chosen[:3], asked.start_us
+    objects = {}
+    for subject in subjects:
+        pose = subject.trajectory.transform(start_us)
+        pose[2, 3] += DROP_HEIGHT
+        down = (0.0, 0.0, -(asked.speed or 0.0))
+        objects[subject.object_id] = ObjectPhysics(
+            T_world_object=pose, velocity=down, material=DAMPED if asked.preset == "paper" else None
+        )
+    options = SimulateOptions(
+        preset=asked.preset,
+        objects=objects,
+        colliders=[scene_road(asked.scene, asked.state, start_us)],
+        start_us=start_us,
+        duration=2.0,
+    )
+    shown = max(subjects, key=lambda s: abs(float(seen(asked.scene, s).direction[1])))
+    pose = shown.trajectory.transform(start_us)
+    view = _viewer(asked.scene, shown, pose, slant=1.0, rise=0.15)
+    focus = pose[:3, 3] + np.array([0.0, 0.0, DROP_HEIGHT / 3])
+    return Experiment("drop", options, tuple(objects), focus, view, 8.0)
+
+
+def _reach(asked: _Asked, subject: PlacedObject) -> tuple[Float, Float]:
+    """How far an object's matter reaches back and forth along its own axes, [3] and [3] [m].
+
+    Tracked boxes are not that exact: matter reaches up to a voxel out of them.
+    """
+    preset = preset_of(asked.preset)
+    matter = matter_of(asked.scene, subject, preset, asked.start_us).positions
+    return matter.min(axis=0) - preset.spacing / 2, matter.max(axis=0) + preset.spacing / 2
+
+
+def _level(direction: Float) -> Float:
+    flat = np.array([direction[0], direction[1], 0.0])
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def _viewer(
+    scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
+) -> Float:
+    """Direction [3] to a viewer on the side and at the end from which the subject was seen.
+
+    Args:
+        slant: how much to the side, against along the subject; less for a side hardly seen.
+        rise: how much up.
+    """
+    x, y, _ = seen(scene, subject).direction
+    slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
+    along = (1.0 if x >= 0 else -1.0) * _level(pose[:3, 0])
+    side = (1.0 if y >= 0 else -1.0) * slant * _level(np.cross([0, 0, 1], pose[:3, 0]))
+    return _level(along + side) + np.array([0.0, 0.0, rise])

@@ -1,0 +1,240 @@
+"""An object's Gaussians as particles, with the inside filled.
+
+Voxels that Gaussians cover are the shell. What can be reached from outside along an axis without
+crossing the shell is outside, the rest is inside. Where next to nothing of a side was seen,
+typically the underside, the side across or the tracked box closes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..geometry.rotation import Float, quaternion_to_matrix
+from ..physics.errors import ParticleError
+from ..physics.model import check_memory
+from ..physics.particles import Particles
+from ..scene import GaussianCloud
+from .masses import default_mass
+
+OPACITY_MIN = 0.05
+"""Fainter Gaussians are haze and carry no matter."""
+BOX_SLACK, BOX_SLACK_MAX = 0.1, 0.15
+"""Gaussians further outside the box than this share of its size, and at most so much [m], are not
+matter of the object."""
+SEEN_SHARE = 0.5
+"""A side is seen when this share of its silhouette shows matter of that side."""
+SAMPLES_MAX = 7
+"""A Gaussian's extent is sampled by at most this many points along each of its axes."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Filling:
+    """How a body was filled, to be looked at before it is simulated.
+
+    Attributes:
+        particles: Gaussians and interior, in the object's frame.
+        shell, inside: [X, Y, Z] voxels.
+        origin: [3] corner of voxel (0, 0, 0) [m].
+        spacing: edge of a voxel [m].
+        sealed: sides closed by the box, such as ``-z``.
+    """
+
+    particles: Particles
+    shell: Mask
+    inside: Mask
+    origin: Float
+    spacing: float
+    sealed: tuple[str, ...]
+
+    def lattice(self, *, above: float = -np.inf) -> Particles:
+        """One particle at the centre of each voxel of the largest connected piece.
+
+        Even particles make a smoother solid than Gaussians do, and fewer of them; Gaussians then
+        follow by :class:`~.coupling.Embedding`. Masses sum to those of ``particles``.
+
+        Args:
+            above: voxels with centres below this height in the object's frame are left out [m].
+        """
+        solid = self.shell | self.inside
+        heights = self.origin[2] + (np.arange(solid.shape[2]) + 0.5) * self.spacing
+        solid = solid & (heights >= above)
+        pieces, count = ndimage.label(solid)
+        if count == 0:
+            raise ParticleError(f"no matter lies above {above:.2f} m in the object's frame")
+        largest = 1 + int(np.bincount(pieces[pieces > 0])[1:].argmax())
+        index = np.argwhere(pieces == largest)
+        volumes = np.full(len(index), self.spacing**3)
+        positions = self.origin + (index + 0.5) * self.spacing
+        source = np.full(len(index), -1)
+        return Particles(positions, volumes, volumes, source).with_mass(self.particles.mass)
+
+
+def fill_object(
+    cloud: GaussianCloud,
+    size: Sequence[float],
+    *,
+    spacing: float,
+    mass: float | None = None,
+    category: str = "",
+) -> Filling:
+    """Turn an object into particles whose masses sum to its mass.
+
+    A voxel's volume is shared by the Gaussians in it; a voxel without any gets one particle at
+    its centre.
+
+    Args:
+        cloud: Gaussians in the object's frame, origin at the box centre.
+        size: (length, width, height) of the box [m].
+        spacing: edge of a voxel [m]; about half a grid cell gives 8 particles per cell.
+        mass: of the object [kg]; the category's default when not given.
+        category: class of the object, for the default mass.
+
+    Raises:
+        ParticleError: for an object without matter, a spacing that is not positive or too fine
+            for this machine, or a mass that is not positive.
+    """
+    edges = np.asarray(size, dtype=np.float64)
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise ParticleError(f"spacing must be positive [m], not {spacing!r}")
+    counts = np.maximum(np.ceil(edges * (1 + 2 * BOX_SLACK) / spacing).astype(int), 1)
+    check_memory(int(counts.prod()), "single")
+    origin = -counts * spacing / 2
+    matter = _matter(cloud, edges)
+    shell = np.zeros(counts, dtype=bool)
+    covered = np.floor((_covered_points(cloud, matter, spacing) - origin) / spacing).astype(int)
+    covered = covered[((covered >= 0) & (covered < counts)).all(axis=1)]
+    shell[tuple(covered.T)] = True
+    inside, sealed = _inside(shell, edges, origin, spacing)
+    particles = _particles(cloud, matter, shell | inside, origin, spacing)
+    wanted = default_mass(category, size) if mass is None else mass
+    return Filling(particles.with_mass(wanted), shell, inside, origin, spacing, sealed)
+
+
+def _matter(cloud: GaussianCloud, size: Float) -> NDArray[np.int64]:
+    """Indices of the Gaussians that are matter of the object."""
+    means = cloud.means.detach().cpu().numpy().astype(np.float64)
+    solid = cloud.opacities.detach().cpu().numpy() >= OPACITY_MIN
+    slack = np.minimum(size * BOX_SLACK, BOX_SLACK_MAX)
+    near = (np.abs(means) <= size / 2 + slack).all(axis=1)
+    index = np.flatnonzero(solid & near & np.isfinite(means).all(axis=1))
+    if len(index) == 0:
+        raise ParticleError(
+            f"none of {len(cloud)} Gaussians is in the box {tuple(size)} with opacity of at least "
+            f"{OPACITY_MIN}; there is nothing to simulate"
+        )
+    return index
+
+
+def _covered_points(cloud: GaussianCloud, index: NDArray[np.int64], spacing: float) -> Float:
+    """Points [K, 3] that cover each Gaussian out to one standard deviation, a voxel apart."""
+    means = cloud.means.detach().cpu().numpy()[index].astype(np.float64)
+    scales = cloud.scales.detach().cpu().numpy()[index].astype(np.float64)
+    axes = quaternion_to_matrix(cloud.quats.detach().cpu().numpy()[index])
+    steps = np.clip(np.ceil(2 * scales / spacing), 1, SAMPLES_MAX).astype(int)
+    points = []
+    for shape in np.unique(steps, axis=0):
+        own = (steps == shape).all(axis=1)
+        ticks = [np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in shape]
+        local = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        offsets = np.einsum("nij,nkj->nki", axes[own], local[None] * scales[own][:, None])
+        points.append((means[own][:, None] + offsets).reshape(-1, 3))
+    return np.concatenate(points)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A side of the box: how deep below it matter still counts as that side's own."""
+
+    axis: int
+    sign: int
+    depth: float
+
+    @property
+    def name(self) -> str:
+        return f"{'-+'[self.sign > 0]}{'xyz'[self.axis]}"
+
+
+# A bonnet lies far below the roof line and a windscreen far behind the bumper.
+SIDES = (
+    _Side(0, -1, 0.45), _Side(0, 1, 0.45),
+    _Side(1, -1, 0.35), _Side(1, 1, 0.35),
+    _Side(2, -1, 0.35), _Side(2, 1, 0.7),
+)  # fmt: skip
+
+
+def _inside(
+    shell: Mask, size: Float, origin: Float, spacing: float
+) -> tuple[Mask, tuple[str, ...]]:
+    """Voxels that cannot be reached straight from outside, and the sides that the box closed.
+
+    From each side everything before the first matter is carved away. Holes in what a side shows
+    are closed from around them; a side hardly seen takes the depths of the side across where that
+    was seen (things on a street are alike left and right), or the face of the box.
+    """
+    solid = np.ones(shell.shape, dtype=bool)
+    sealed = []
+    for side in SIDES:
+        depth, seen = _depth(shell, side)
+        if not seen:
+            sealed.append(side.name)
+            face = (size[side.axis] / 2 + origin[side.axis]) / spacing
+            opposite = _Side(side.axis, -side.sign, side.depth)
+            other, other_seen = _depth(shell, opposite) if side.axis == 1 else (depth, False)
+            rim = np.full_like(depth, max(round(-face), 0))
+            depth = np.where(depth < len_along(shell, side), other if other_seen else rim, depth)
+        along = _facing(solid, side)
+        along &= np.arange(len(along))[:, None, None] >= depth
+    return solid & ~shell, tuple(sealed)
+
+
+def _facing(mask: Mask, side: _Side) -> Mask:
+    """A view with the side's layer first."""
+    along = np.moveaxis(mask, side.axis, 0)
+    return along if side.sign < 0 else along[::-1]
+
+
+def len_along(mask: Mask, side: _Side) -> int:
+    """Voxels across the box, from that side to the one across."""
+    return int(mask.shape[side.axis])
+
+
+def _depth(shell: Mask, side: _Side) -> tuple[NDArray[np.int64], bool]:
+    """Layers [A, B] before the first matter, all of them beside the silhouette; was it seen."""
+    along = _facing(shell, side)
+    hit = along.any(axis=0)
+    silhouette = ndimage.binary_closing(np.pad(hit, 4), iterations=4)[4:-4, 4:-4]
+    silhouette = ndimage.binary_fill_holes(silhouette)
+    first = np.where(hit, along.argmax(axis=0), len(along))
+    own = hit & (first <= side.depth * len(along))
+    seen = bool(own.sum() >= SEEN_SHARE * silhouette.sum())
+    if own.any():
+        nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
+        first = first[tuple(nearest)]
+        first = ndimage.median_filter(first, size=3, mode="nearest")
+    return np.where(silhouette, first, len(along)), seen
+
+
+def _particles(
+    cloud: GaussianCloud, matter: NDArray[np.int64], solid: Mask, origin: Float, spacing: float
+) -> Particles:
+    """Gaussians in solid voxels, and one particle for each solid voxel without any."""
+    means = cloud.means.detach().cpu().numpy()[matter].astype(np.float64)
+    voxel = np.floor((means - origin) / spacing).astype(int)
+    voxel = np.clip(voxel, 0, np.array(solid.shape) - 1)
+    held = np.zeros(solid.shape, dtype=np.int64)
+    np.add.at(held, tuple(voxel.T), 1)
+    empty = np.argwhere(solid & (held == 0))
+    volumes = np.concatenate([spacing**3 / held[tuple(voxel.T)], np.full(len(empty), spacing**3)])
+    return Particles(
+        positions=np.concatenate([means, origin + (empty + 0.5) * spacing]),
+        volumes=volumes,
+        masses=volumes,
+        source=np.concatenate([matter, np.full(len(empty), -1)]),
+    )

@@ -1,0 +1,53 @@
+"""Default masses of the things on a street."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..physics.errors import ParticleError
+
+
+@dataclass(frozen=True)
+class ClassMass:
+    """Default mass of a category.
+
+    Attributes:
+        per_volume: mass per volume of the object's box [kg/m^3].
+        source: where the figure comes from.
+    """
+
+    per_volume: float
+    source: str
+
+
+CAR = ClassMass(
+    125.0, "2015 Chevrolet Malibu as tested, 3639 lb in 4.87 x 1.85 x 1.47 m (NHTSA frontal test)"
+)
+PERSON = ClassMass(270.0, "Hybrid III 50th percentile dummy, 78 kg in 1.75 x 0.50 x 0.33 m")
+CLASS_MASSES = {
+    "car": CAR,
+    "vehicle": CAR,
+    "van": ClassMass(115.0, "large panel van, about 2000 kg kerb in 5.9 x 2.0 x 1.45 m of box"),
+    "truck": ClassMass(130.0, "two-axle lorry, half laden: about 11 t in 8.5 x 2.5 x 4.0 m"),
+    "bus": ClassMass(125.0, "12 m city bus, about 12 t kerb in 12 x 2.55 x 3.1 m"),
+    "pedestrian": PERSON,
+    "cyclist": ClassMass(85.0, "78 kg rider and 14 kg bicycle in 1.8 x 0.6 x 1.0 m of box"),
+    "motorcycle": ClassMass(150.0, "200 kg machine and 78 kg rider in 2.1 x 0.8 x 1.1 m of box"),
+}
+"""Typical figures for want of better ones; give a mass where it is known."""
+OTHER = ClassMass(100.0, "between empty furniture and wood; no better guess")
+
+
+def default_mass(category: str, size: Sequence[float]) -> float:
+    """Mass [kg] of an object of that category and box size (length, width, height) [m].
+
+    Raises:
+        ParticleError: for a size that is not three positive lengths.
+    """
+    edges = np.asarray(size, dtype=np.float64)
+    if edges.shape != (3,) or not (edges > 0).all():
+        raise ParticleError(f"size must be three positive lengths [m], not {size!r}")
+    return CLASS_MASSES.get(category, OTHER).per_volume * float(edges.prod())

@@ -1,0 +1,153 @@
+"""Frames of a simulation as what the renderer draws."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..physics.errors import PhysicsError
+from ..render.types import Instance
+from ..scene import GaussianCloud, Scene, Trajectory
+from .embedding import Embedding, deform_cloud, stretched
+from .result import SimulationResult
+
+WHEEL_RADIUS, WHEEL_HALF_WIDTH = 0.36, 0.2
+"""What Gaussians of a vehicle are its wheels: so far around the axle and along it [m]."""
+
+
+class PlacedObject(Protocol):
+    """What is needed of an object of a scenario."""
+
+    @property
+    def object_id(self) -> str: ...  # noqa: D102
+    @property
+    def source_id(self) -> str: ...  # noqa: D102
+    @property
+    def category(self) -> str: ...  # noqa: D102
+    @property
+    def scaled_size(self) -> tuple[float, float, float]: ...  # noqa: D102
+    @property
+    def scale(self) -> tuple[float, float, float]: ...  # noqa: D102
+    @property
+    def trajectory(self) -> Trajectory: ...  # noqa: D102
+    @property
+    def instance_id(self) -> int: ...  # noqa: D102
+
+
+class PlacedObjects(Protocol):
+    """What is needed of a scenario's state."""
+
+    @property
+    def visible(self) -> tuple[PlacedObject, ...]: ...  # noqa: D102
+
+
+class Playback:
+    """A result over its scene.
+
+    Args:
+        scene: holds the Gaussians.
+        state: the scenario's objects, the ones that were simulated.
+        result: of ``simulate`` on both.
+
+    Raises:
+        PhysicsError: when the result has objects that the state has not.
+    """
+
+    def __init__(self, scene: Scene, state: PlacedObjects, result: SimulationResult) -> None:
+        self.scene, self.state, self.result = scene, state, result
+        missing = set(result.objects) - {o.object_id for o in state.visible}
+        if missing:
+            raise PhysicsError(f"the simulation holds {sorted(missing)}, the scenario does not")
+        self._clouds: dict[str, GaussianCloud] = {}
+        self._embeddings: dict[str, Embedding] = {}
+        self._deformed: dict[str, tuple[tuple[int, bytes], GaussianCloud]] = {}
+        self._wheels: dict[str, NDArray[np.bool_]] = {}
+
+    def instances(self, frame: int, *, without: Collection[str] = ()) -> list[Instance]:
+        """Background, then simulated objects as they are at ``frame``, others as recorded.
+
+        Args:
+            frame: of the result.
+            without: ids of objects that are left out.
+
+        Raises:
+            PhysicsError: for a frame that there is not.
+        """
+        if not 0 <= frame < self.result.frames:
+            raise PhysicsError(f"frame {frame}; there are 0 to {self.result.frames - 1}")
+        t_us = self.time_us(frame)
+        instances = [Instance(self.scene.background)]
+        for subject in self.state.visible:
+            if subject.object_id in without:
+                continue
+            if subject.object_id in self.result.objects:
+                instances.append(self._simulated(subject, frame))
+            elif subject.trajectory.covers(t_us):
+                cloud = self.scene.object(subject.source_id).cloud_at(t_us)
+                pose = subject.trajectory.transform(t_us)
+                instances.append(Instance(cloud, pose, subject.instance_id, subject.scale))
+        return instances
+
+    def time_us(self, frame: int) -> int:
+        """Scene time of a frame [us]."""
+        return self.result.start_us + round(float(self.result.times_s[frame]) * 1e6)
+
+    def _simulated(self, subject: PlacedObject, frame: int) -> Instance:
+        own = self.result.objects[subject.object_id]
+        pose, row = own.transform(frame), int(own.shape_index[frame])
+        lifts = own.wheel_lifts[frame]
+        if row < 0 and not lifts.any():
+            return Instance(self._cloud(subject), pose, subject.instance_id)
+        kept, key = self._deformed.get(subject.object_id), (row, lifts.tobytes())
+        if kept is None or kept[0] != key:
+            cloud = self._cloud(subject)
+            if row >= 0:
+                deformed = self._embedding(subject).follow(own.shapes[row].astype(np.float64))
+                cloud = deform_cloud(cloud, deformed)
+            if lifts.any():
+                cloud = self._lifted(subject, cloud, lifts)
+            kept = (key, cloud)
+            self._deformed[subject.object_id] = kept
+        return Instance(kept[1], pose, subject.instance_id)
+
+    def _lifted(
+        self, subject: PlacedObject, cloud: GaussianCloud, lifts: NDArray[np.float32]
+    ) -> GaussianCloud:
+        """Wheels stay on the road when the body comes down on its springs."""
+        key = subject.object_id
+        if key not in self._wheels:
+            rest = self._cloud(subject).means.detach().cpu().numpy()
+            self._wheels[key] = _in_wheels(rest, self.result.objects[key].wheels)
+        shift = torch.zeros_like(cloud.means)
+        shift[:, 2] = torch.from_numpy(self._wheels[key] @ lifts).to(shift)
+        return replace(cloud, means=cloud.means + shift)
+
+    def _cloud(self, subject: PlacedObject) -> GaussianCloud:
+        """At rest, in the colours of the start: deforming light is not recorded anywhere."""
+        key = subject.object_id
+        if key not in self._clouds:
+            source = self.scene.object(subject.source_id)
+            self._clouds[key] = stretched(source.cloud_at(self.result.start_us), subject.scale)
+        return self._clouds[key]
+
+    def _embedding(self, subject: PlacedObject) -> Embedding:
+        key = subject.object_id
+        if key not in self._embeddings:
+            own = self.result.objects[key]
+            means = self._cloud(subject).means.detach().cpu().numpy().astype(np.float64)
+            self._embeddings[key] = Embedding(
+                own.rest.astype(np.float64), means, spacing=own.spacing
+            )
+        return self._embeddings[key]
+
+
+def _in_wheels(means: NDArray[np.float32], wheels: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """[G, W] which Gaussians belong to which wheel, by undersides [W, 3] in the same frame."""
+    offset = means[:, None] - (wheels + np.array([0, 0, WHEEL_RADIUS], dtype=np.float32))
+    in_disc = np.hypot(offset[..., 0], offset[..., 2]) < WHEEL_RADIUS + 0.02
+    return in_disc & (np.abs(offset[..., 1]) < WHEEL_HALF_WIDTH)

@@ -1,0 +1,192 @@
+"""What a simulation leaves: poses, shapes, contacts, energies; compact on disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from .._files import atomic_folder
+from ..geometry.rotation import Float, transform_from
+from ..physics.errors import PhysicsError
+
+FORMAT = "real2sim-simulation"
+VERSION = 2
+ENERGIES = ("kinetic", "elastic", "gravity", "friction_heat", "collider_work", "dissipated")
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectResult:
+    """One object over F frames.
+
+    Attributes:
+        object_id: in the scenario.
+        mass: [kg].
+        spacing: of its particles [m].
+        rest: [N, 3] float32, particles at rest, object frame [m].
+        positions, quaternions: [F, 3] float64 [m], [F, 4] wxyz: ``T_world_object``.
+        velocities, angular_velocities: [F, 3] of the centre of mass, world [m/s], [rad/s].
+        modes: [F] uint8, index into ``coupling.actor.MODES``.
+        shape_index: [F] int32, row of ``shapes`` that holds at a frame; -1 for undeformed.
+        shapes: [S, N, 3] float16, displacements of particles in the object's frame [m].
+        wheels: [W, 3] float32 undersides of its wheels, object frame [m]; W is 4 or 0.
+        wheel_lifts: [F, W] float32, how far each wheel was pushed up into its arch [m].
+    """
+
+    object_id: str
+    mass: float
+    spacing: float
+    rest: NDArray[np.float32]
+    positions: Float
+    quaternions: Float
+    velocities: Float
+    angular_velocities: Float
+    modes: NDArray[np.uint8]
+    shape_index: NDArray[np.int32]
+    shapes: NDArray[np.float16]
+    wheels: NDArray[np.float32]
+    wheel_lifts: NDArray[np.float32]
+
+    def transform(self, frame: int) -> Float:
+        """``T_world_object`` [4, 4] at a frame."""
+        return transform_from(self.positions[frame], self.quaternions[frame])
+
+    def displacements(self, frame: int) -> NDArray[np.float16] | None:
+        """[N, 3] [m] at a frame; None while undeformed."""
+        row = int(self.shape_index[frame])
+        return None if row < 0 else self.shapes[row]
+
+
+@dataclass(frozen=True)
+class ContactRecord:
+    """What an object had got from another or from a collider, up to the end.
+
+    Attributes:
+        object_id, other: who, by whom or what.
+        impulse: [3] on the object [N s].
+        delta_v: length of the impulse over the object's mass [m/s].
+        first_s, last_s: when the impulse began and ceased to change [s].
+        heat: rubbed away [J].
+    """
+
+    object_id: str
+    other: str
+    impulse: tuple[float, float, float]
+    delta_v: float
+    first_s: float
+    last_s: float
+    heat: float
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationResult:
+    """A rollout.
+
+    Attributes:
+        objects: simulated objects by id.
+        times_s: [F] since the start [s].
+        start_us: scene time of the start [us].
+        energies: [F, 6] [J], columns ENERGIES.
+        contacts: at the end.
+        impulses: [F, C, 3] of each contact up to each frame [N s].
+        stopped: ``done`` or ``cancelled``; then there are the frames made until then.
+        figures: preset, gravity, cells, steps, rollbacks (JSON values only).
+    """
+
+    objects: Mapping[str, ObjectResult]
+    times_s: Float
+    start_us: int
+    energies: Float
+    contacts: tuple[ContactRecord, ...]
+    impulses: Float
+    stopped: str = "done"
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames F."""
+        return len(self.times_s)
+
+    def save(self, path: Path) -> None:
+        """Write a folder of two files: ``simulation.json`` and ``frames.safetensors``."""
+        tensors: dict[str, NDArray[Any]] = {
+            "times_s": self.times_s,
+            "energies": self.energies,
+            "impulses": self.impulses,
+        }
+        for object_id, o in self.objects.items():
+            for name in ARRAYS:
+                tensors[f"{object_id}/{name}"] = np.ascontiguousarray(getattr(o, name))
+        document = {
+            "format": FORMAT,
+            "version": VERSION,
+            "start_us": self.start_us,
+            "stopped": self.stopped,
+            "figures": dict(self.figures),
+            "objects": {k: {"mass": o.mass, "spacing": o.spacing} for k, o in self.objects.items()},
+            "contacts": [vars(c) for c in self.contacts],
+        }
+        with atomic_folder(path) as folder:
+            (folder / "simulation.json").write_text(json.dumps(document, indent=1))
+            save_file(tensors, folder / "frames.safetensors")
+
+    @classmethod
+    def load(cls, path: Path) -> SimulationResult:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            PhysicsError: missing, or no simulation of this version.
+        """
+        try:
+            document = json.loads((path / "simulation.json").read_text())
+            tensors = load_file(path / "frames.safetensors")
+        except (OSError, ValueError, SafetensorError) as error:
+            raise PhysicsError(f"{path}: no readable simulation: {error}") from error
+        if document.get("format") != FORMAT or document.get("version") != VERSION:
+            raise PhysicsError(
+                f"{path}: is {document.get('format')!r} version {document.get('version')!r}, "
+                f"not {FORMAT!r} version {VERSION}"
+            )
+        try:
+            objects = {
+                k: ObjectResult(
+                    k, o["mass"], o["spacing"], **{name: tensors[f"{k}/{name}"] for name in ARRAYS}
+                )
+                for k, o in document["objects"].items()
+            }
+            contacts = tuple(
+                ContactRecord(**{**c, "impulse": tuple(c["impulse"])}) for c in document["contacts"]
+            )
+            return cls(
+                objects,
+                tensors["times_s"],
+                document["start_us"],
+                tensors["energies"],
+                contacts,
+                tensors["impulses"],
+                document["stopped"],
+                document["figures"],
+            )
+        except (KeyError, TypeError) as error:
+            raise PhysicsError(f"{path}: the simulation lacks {error}; save it again") from error
+
+
+ARRAYS = (
+    "rest",
+    "positions",
+    "quaternions",
+    "velocities",
+    "angular_velocities",
+    "modes",
+    "shape_index",
+    "shapes",
+    "wheels",
+    "wheel_lifts",
+)

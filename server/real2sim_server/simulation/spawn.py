@@ -1,0 +1,246 @@
+"""From a scenario's objects to bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..geometry.box import box_penetration
+from ..geometry.rotation import Float, apply_transform, is_rigid
+from ..physics.colliders import Collider
+from ..physics.errors import PhysicsError
+from ..physics.particles import Particles
+from ..physics.restitution import fit_restitution
+from ..physics.solver import SolverOptions
+from ..scene import Scene
+from .body import DeformableBody
+from .embedding import stretched
+from .fill import fill_object
+from .playback import PlacedObject, PlacedObjects
+from .presets import VEHICLES, ObjectPhysics, Preset
+from .tyres import Tyres
+
+STANDS_WITHIN = 0.4
+"""A vehicle starts on its tyres when they are no further from the road than this [m]."""
+SPEED_MAX = 200.0
+"""Faster things are no traffic, and would cross bodies within a step [m/s]."""
+SPIN_MAX = 100.0
+"""[rad/s]"""
+COARSEST = 4.0
+"""Bodies of fewer particles than this across their shortest side no longer deform."""
+DEEP = 0.3
+"""What is further inside something else than this was put there by mistake [m]."""
+SHARED = 0.01
+"""Bodies overlap when this share of one's particles is among the other's."""
+RESTITUTION_SPEED = 2.0
+"""Approach at which a wanted restitution is fitted when the object itself stands [m/s]."""
+
+
+def spawn_bodies(
+    scene: Scene,
+    state: PlacedObjects,
+    wanted: Mapping[str, ObjectPhysics],
+    *,
+    preset: Preset,
+    start_us: int,
+    colliders: Sequence[Collider],
+    road: Sequence[str],
+    gravity: Float,
+    max_particles: int,
+) -> list[DeformableBody]:
+    """A body for each wanted object, as it is at the start.
+
+    Raises:
+        PhysicsError: for an object that is not there at ``start_us``, for things that reach into
+            one another, and as ``fill_object``.
+    """
+    subjects = _subjects(state, wanted, start_us)
+    preset = _coarse_enough(preset, subjects, max_particles)
+    carrying = [c for c in colliders if c.name in road]
+    actors = [
+        _actor(scene, subject, physics, preset, start_us, colliders=carrying, gravity=gravity)
+        for subject, physics in zip(subjects, wanted.values(), strict=True)
+    ]
+    boxes = [(a.T_world_object, s.scaled_size) for a, s in zip(actors, subjects, strict=True)]
+    require_apart(actors, boxes, [c for c in colliders if c.name not in road])
+    return actors
+
+
+def _subjects(
+    state: PlacedObjects, wanted: Mapping[str, ObjectPhysics], start_us: int
+) -> list[PlacedObject]:
+    there = {o.object_id: o for o in state.visible}
+    subjects = []
+    for object_id, physics in wanted.items():
+        if object_id not in there:
+            raise PhysicsError(f"no object {object_id!r} to simulate; there are {sorted(there)}")
+        subject = there[object_id]
+        if physics.T_world_object is None and not subject.trajectory.covers(start_us):
+            raise PhysicsError(
+                f"object {object_id!r} is not there at {start_us} us; it is from "
+                f"{subject.trajectory.start_us} to {subject.trajectory.end_us} us"
+            )
+        subjects.append(subject)
+    return subjects
+
+
+def _coarse_enough(preset: Preset, subjects: Sequence[PlacedObject], most: int) -> Preset:
+    """The preset with particles so far apart that boxes full of them would hold ``most``."""
+    sizes = np.array([s.scaled_size for s in subjects])
+    spacing = max(preset.spacing, float(np.cbrt(sizes.prod(axis=1).sum() / most)))
+    needed = int(np.ceil(sizes.prod(axis=1).sum() / preset.spacing**3))
+    for subject, size in zip(subjects, sizes, strict=True):
+        if spacing > preset.spacing and size.min() < COARSEST * spacing:
+            raise PhysicsError(
+                f"{len(subjects)} objects would take {needed:,} particles {preset.spacing} m "
+                f"apart; {most:,} of them are {spacing:.2g} m apart, too coarse for "
+                f"{subject.object_id!r} of {size.min():.2g} m: simulate fewer objects, or raise "
+                "max_particles"
+            )
+    return replace(preset, spacing=spacing)
+
+
+def require_apart(
+    actors: Sequence[DeformableBody],
+    boxes: Sequence[tuple[Float, Sequence[float]]],
+    colliders: Sequence[Collider],
+) -> None:
+    """Refuse a start at which bodies are inside one another or inside a collider.
+
+    What overlaps by less than DEEP is left to contact: tracked boxes of parked cars do.
+
+    Args:
+        actors: bodies.
+        boxes: of each, pose [4, 4] and size; matter may reach a little out of them.
+        colliders: that carry no tyres.
+
+    Raises:
+        PhysicsError: with the names.
+    """
+    for k, a in enumerate(actors):
+        for b, box in list(zip(actors, boxes, strict=True))[k + 1 :]:
+            depth = float(box_penetration(*boxes[k], *box))
+            # Corners of boxes may share room in which neither has matter.
+            if depth > DEEP and _share_room(a, b):
+                raise PhysicsError(
+                    f"objects {a.name!r} and {b.name!r} are {depth:.2f} m inside each other at the "
+                    "start; move one, or leave one out"
+                )
+        for collider in colliders:
+            depth = -a.gap_to_colliders([collider])[0]
+            if depth > DEEP:
+                raise PhysicsError(
+                    f"object {a.name!r} is {depth:.2f} m inside collider {collider.name!r} at the "
+                    "start; move one, or leave one out"
+                )
+
+
+def _share_room(a: DeformableBody, b: DeformableBody) -> bool:
+    from scipy.spatial import cKDTree
+
+    mine = apply_transform(a.T_world_object, a.shape.positions)
+    theirs = apply_transform(b.T_world_object, b.shape.positions)
+    near, _ = cKDTree(theirs).query(mine, distance_upper_bound=a.spacing)
+    return int(np.isfinite(near).sum()) > SHARED * len(mine)
+
+
+def _actor(
+    scene: Scene,
+    subject: PlacedObject,
+    physics: ObjectPhysics,
+    preset: Preset,
+    start_us: int,
+    *,
+    colliders: Sequence[Collider],
+    gravity: Float,
+) -> DeformableBody:
+    size = subject.scaled_size
+    wheels = preset.wheels and subject.category in VEHICLES
+    particles = matter_of(scene, subject, preset, start_us, mass=physics.mass)
+    materials, regions_of = preset.build(subject.category, size[0])
+    regions = regions_of(particles.positions[:, 0])
+    if physics.material is not None:
+        materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
+    if preset.by_density and physics.mass is None:
+        particles = particles.with_mass(materials[0].density * float(particles.volumes.sum()))
+    pose = _pose(subject, physics, start_us)
+    recorded = subject.trajectory.velocity(start_us) if physics.velocity is None else None
+    velocity = _vector(physics.velocity, recorded, f"velocity of {subject.object_id!r}", SPEED_MAX)
+    name = f"angular_velocity of {subject.object_id!r}"
+    spin = _vector(physics.angular_velocity, np.zeros(3), name, SPIN_MAX)
+    tyres = None
+    if wheels:
+        weight = particles.mass * float(np.linalg.norm(gravity))
+        standing = float(np.linalg.norm(velocity)) < 0.1
+        brake = physics.brake if physics.brake is not None else float(standing)
+        centre = particles.centre_of_mass
+        tyres = Tyres.of(size, centre, max(weight, 1e-6), brake=brake)
+        tyres = tyres.standing(pose, colliders, STANDS_WITHIN)
+    actor = DeformableBody(
+        subject.object_id,
+        particles,
+        materials,
+        regions,
+        friction=preset.friction if physics.friction is None else physics.friction,
+        cell=2 * preset.spacing,
+        T_world_object=pose,
+        velocity=velocity,
+        angular_velocity=spin,
+        tyres=tyres,
+    )
+    if physics.restitution is not None:
+        _fit(actor, physics.restitution)
+    return actor
+
+
+def matter_of(
+    scene: Scene, subject: PlacedObject, preset: Preset, start_us: int, *, mass: float | None = None
+) -> Particles:
+    """What an object is filled with, object frame; without the room between wheels.
+
+    Raises:
+        ParticleError: as ``fill_object``.
+    """
+    size = subject.scaled_size
+    cloud = stretched(scene.object(subject.source_id).cloud_at(start_us), subject.scale)
+    filling = fill_object(cloud, size, spacing=preset.spacing, mass=mass, category=subject.category)
+    wheels = preset.wheels and subject.category in VEHICLES
+    return filling.lattice(above=-size[2] / 2 + preset.clearance if wheels else -np.inf)
+
+
+def _pose(subject: PlacedObject, physics: ObjectPhysics, start_us: int) -> Float:
+    if physics.T_world_object is None:
+        return subject.trajectory.transform(start_us)
+    pose = np.array(physics.T_world_object, dtype=np.float64)
+    if not is_rigid(pose):
+        raise PhysicsError(f"T_world_object of {subject.object_id!r} must be rigid: {pose!r}")
+    return pose
+
+
+def _vector(given: object, otherwise: Float | None, name: str, most: float) -> Float:
+    """[3] as given, or otherwise; refused beyond ``most``."""
+    vector = np.array(otherwise if given is None else given, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise PhysicsError(f"{name} must be 3 finite numbers, not {given!r}")
+    if float(np.linalg.norm(vector)) > most:
+        unit = "rad/s" if most == SPIN_MAX else "m/s"
+        raise PhysicsError(
+            f"{name} is {vector.tolist()} {unit}; at most {most:g} {unit} is allowed"
+        )
+    return vector
+
+
+def _fit(actor: DeformableBody, restitution: float) -> None:
+    """Add the viscosity that lets the body bounce as wanted, along its own way."""
+    speed = float(np.linalg.norm(actor.motion.velocity))
+    along = actor.motion.velocity / speed if speed > 0.1 else actor.motion.rotation[:, 0]
+    fitted = fit_restitution(
+        replace(actor.body(), particle_velocities=None, particle_gradients=None),
+        restitution,
+        speed=speed if speed > 0.1 else RESTITUTION_SPEED,
+        normal=-along,
+        options=SolverOptions(dx=actor.cell, gravity=(0.0, 0.0, 0.0)),
+    )
+    actor.materials = fitted.body.materials

@@ -1,0 +1,241 @@
+"""The synthetic drive as a DrivingLog, with access to the truth from any pose."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..geometry.rotation import Float, apply_transform, invert_transform
+from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
+from ..logs.native_writer import write_native_log
+from ..scene import CameraRig
+from .bvh import build_geometry
+from .casting import Instances
+from .config import SyntheticConfig
+from .sensors import shoot_image, shoot_lidar
+from .shading import World
+from .surroundings import build_surroundings
+from .traffic import Drive, Vehicle, plan_drive, poses_at
+from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
+
+LIDAR_POSITION = (0.9, 0.0, 1.73)
+LIDAR_ELEVATION = (np.radians(-25.0), np.radians(3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticLog(DrivingLog):
+    """A synthetic drive; images and sweeps are ray-cast whenever they are asked for."""
+
+    def render(
+        self, T_world_camera: ArrayLike, k: ArrayLike, width: int, height: int, t_us: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
+        """The truth from any pose at any time of the drive.
+
+        Args:
+            T_world_camera: [4, 4], OpenCV camera frame.
+            k: [3, 3] intrinsics [px], pixel centres at +0.5.
+            width, height: image size [px].
+            t_us: time [us]; outside the drive vehicles go straight on.
+
+        Returns:
+            RGB uint8 [H, W, 3]; depth float32 [H, W] along the camera's z [m], 0 in the sky;
+            instance uint16 [H, W], 0 for the static world, else 1 + index into ``tracks``.
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        return source.render(np.asarray(T_world_camera), np.asarray(k), width, height, t_us)
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticSource:
+    """Casts the rays of a synthetic drive.
+
+    Attributes:
+        config: of the drive.
+        world: surroundings and vehicle shapes.
+        drive: vehicles in the order of the log's tracks.
+        roots: node [S] of each vehicle shape's mesh.
+        body_paints: row [I] of each vehicle's body in the paint table.
+        rig: as in the log.
+    """
+
+    config: SyntheticConfig
+    world: World
+    drive: Drive
+    roots: NDArray[np.int64]
+    body_paints: NDArray[np.int64]
+    rig: CameraRig
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """RGB uint8 [H, W, 3] of a camera."""
+        lens = self.rig[camera]
+        t_us = int(self.drive.frame_times_us[frame])
+        pose = lens.pose(self.drive.ego.transform(t_us))
+        return self.render(pose, lens.K, lens.width, lens.height, t_us)[0]
+
+    def render(
+        self, T_world_camera: Float, k: Float, width: int, height: int, t_us: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
+        """See :meth:`SyntheticLog.render`."""
+        return shoot_image(
+            self.world,
+            self.instances(t_us),
+            np.ascontiguousarray(T_world_camera, dtype=np.float64),
+            np.ascontiguousarray(k, dtype=np.float64),
+            width,
+            height,
+            self.config.samples,
+        )
+
+    def instances(self, t_us: int) -> Instances:
+        """Where all vehicles are at ``t_us``."""
+        sweeps = self._instances_over(np.array([float(t_us)]))
+        return sweeps._replace(to_object=sweeps.to_object[0], to_world=sweeps.to_world[0])
+
+    def _instances_over(self, times_us: Float) -> Instances:
+        shapes = np.array([v.shape for v in self.drive.vehicles], dtype=np.int64)
+        to_world = np.zeros((len(times_us), len(self.drive.vehicles), 4, 4))
+        for i, vehicle in enumerate(self.drive.vehicles):
+            to_world[:, i] = poses_at(vehicle.trajectory, times_us)
+        half = np.array([SHAPES[s].size for s in shapes]).reshape(-1, 3) / 2
+        return Instances(
+            to_object=np.ascontiguousarray(invert_transform(to_world)[..., :3, :]),
+            to_world=np.ascontiguousarray(to_world[..., :3, :]),
+            radius=np.linalg.norm(half, axis=1) + 0.05,
+            root=self.roots[shapes],
+            shape=shapes,
+            paint=self.body_paints,
+            half_size=half,
+        )
+
+    def lidar(self, frame: int) -> LidarSweep:
+        """One turn of the LiDAR, clockwise, looking ahead at the frame's time stamp.
+
+        Every column is cast with the vehicles and the sensor where they are at its own instant;
+        the sensor's motion is then taken out exactly, that of the vehicles is left in.
+        """
+        config, t_us = self.config, int(self.drive.frame_times_us[frame])
+        if config.lidar_beams == 0:
+            return _sweep(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+        step = (np.arange(config.lidar_columns) + 0.5) / config.lidar_columns
+        offsets_us = np.round((step - 0.5) * config.frame_period_us)
+        poses = poses_at(self.drive.ego, t_us + offsets_us)
+        local = _beam_directions(np.pi - 2 * np.pi * step, config.lidar_beams)
+        directions = np.einsum("cij,cbj->cbi", poses[:, :3, :3], local)
+        origins = apply_transform(poses, np.array([LIDAR_POSITION]))[:, 0]
+        ranges, reflected = shoot_lidar(
+            self.world,
+            self._instances_over(t_us + offsets_us),
+            np.ascontiguousarray(origins),
+            np.ascontiguousarray(directions),
+            config.lidar_range,
+        )
+        rng = np.random.default_rng([config.seed, frame, 77])
+        measured = ranges + config.lidar_noise * rng.standard_normal(ranges.shape)
+        kept = (ranges > 0) & ~_lost(ranges, reflected, config.lidar_range, rng)
+        column, beam = np.nonzero(kept)
+        points = origins[column] + directions[column, beam] * measured[kept][:, None]
+        in_vehicle = apply_transform(invert_transform(self.drive.ego.transform(t_us)), points)
+        return _sweep(in_vehicle, reflected[kept], offsets_us[column])
+
+
+def _beam_directions(azimuth: Float, beams: int) -> Float:
+    """Unit directions [C, B, 3] in the vehicle frame."""
+    elevation = np.linspace(*LIDAR_ELEVATION, beams)[None]
+    azimuth = azimuth[:, None]
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1)
+
+
+def _lost(
+    ranges: NDArray[np.float32],
+    reflected: NDArray[np.float32],
+    limit: float,
+    rng: np.random.Generator,
+) -> NDArray[np.bool_]:
+    """Which returns get lost: one in a hundred, and dark surfaces far away."""
+    dim = 1 - np.minimum(reflected / 0.08, 1.0)
+    lost: NDArray[np.bool_] = rng.random(ranges.shape) < 0.01 + 0.8 * dim * (ranges / limit)
+    return lost
+
+
+def _sweep(points: Float, intensity: ArrayLike, offsets_us: ArrayLike) -> LidarSweep:
+    return LidarSweep(
+        points=points.astype(np.float32),
+        intensity=np.asarray(intensity, dtype=np.float32),
+        offset_us=np.asarray(offsets_us).astype(np.int32),
+        origin=np.array(LIDAR_POSITION, dtype=np.float32),
+    )
+
+
+def generate_log(config: SyntheticConfig) -> SyntheticLog:
+    """The drive that ``config`` describes; the world is built now, pictures are cast on demand."""
+    drive = plan_drive(config)
+    paints: list[tuple[float, ...]] = []
+    house_rng = np.random.default_rng([config.seed, 2])
+    meshes = [build_surroundings(drive.street, paints, house_rng)]
+    meshes += [build_vehicle(shape, paints) for shape in SHAPES]
+    body_paints = len(paints) + np.arange(len(drive.vehicles), dtype=np.int64)
+    paints += [(*v.colour, 0.0, 0.0, 0.0, 0.0, 0.0) for v in drive.vehicles]
+    geometry, roots = build_geometry(meshes)
+    world = World(
+        *geometry,
+        np.array(paints),
+        np.array([shape_row(shape) for shape in SHAPES]),
+        np.array([roof_heights(shape) for shape in SHAPES]),
+        config.seed % 1_000_003 * 131,
+    )
+    source = SyntheticSource(config, world, drive, roots[1:], body_paints, config.rig())
+    return SyntheticLog(
+        name=f"synthetic_{config.seed}",
+        rig=source.rig,
+        frame_times_us=drive.frame_times_us,
+        ego=drive.ego,
+        tracks=_tracks(drive.vehicles),
+        source=source,
+        provenance={
+            "dataset": "synthetic street",
+            "licence": "free to use",
+            "reader": "synthetic",
+            "config": dataclasses.asdict(config),
+        },
+    )
+
+
+def _tracks(vehicles: tuple[Vehicle, ...]) -> tuple[ObjectTrack, ...]:
+    seen: Counter[str] = Counter()
+    tracks = []
+    for vehicle in vehicles:
+        shape = SHAPES[vehicle.shape]
+        object_id = f"{shape.category}_{seen[shape.category]}"
+        seen[shape.category] += 1
+        tracks.append(ObjectTrack(object_id, shape.category, shape.size, vehicle.trajectory))
+    return tuple(tracks)
+
+
+def synthesize(
+    config: SyntheticConfig,
+    out: str | Path,
+    *,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Generate a drive and write it in the native layout to the new folder ``out``.
+
+    Args:
+        config: of the drive.
+        out: a folder that is new or empty.
+        on_progress: called with (done, total) after each image and each sweep.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        LogError: the folder is not empty.
+    """
+    return write_native_log(generate_log(config), out, on_progress=on_progress)

@@ -1,0 +1,207 @@
+"""The static world: ground, houses, trees, lamps and signs along a street."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..geometry.rotation import Float
+from .buildings import Facade, add_house, design_house
+from .materials import BARK, EARTH, KERB_STONE, LEAVES, PAVING, PLAIN, ROAD, SIGN
+from .mesh import Mesh, MeshBuilder
+from .street import FACADE, KERB, KERB_HEIGHT, LANE, Street
+
+TREE_ROW = KERB + 0.7
+LAMP_ROW = KERB + 0.5
+
+
+def build_surroundings(
+    street: Street, paints: list[tuple[float, ...]], rng: np.random.Generator
+) -> Mesh:
+    """Everything that stands still, apart from parked vehicles."""
+    builder = MeshBuilder(paints)
+    _add_ground(builder, street)
+    for side in (-1.0, 1.0):
+        _add_house_row(builder, street, side, rng)
+        _add_street_furniture(builder, street, side, rng)
+    _close_street(builder, street, rng)
+    return builder.build()
+
+
+def _add_ground(builder: MeshBuilder, street: Street) -> None:
+    road = builder.mix(0.1, 0.1, 0.105, street.crossing, LANE, KERB)
+    stone, slab = builder.mix(0.3, 0.29, 0.27), builder.mix(0.27, 0.26, 0.245)
+    earth = builder.mix(0.09, 0.13, 0.04)
+    s = np.arange(street.start, street.end + 0.5)
+    strips = [((-KERB, 0.0), (KERB, 0.0), ROAD, road)]
+    for side in (-1.0, 1.0):
+        inner, outer = side * KERB, side * (KERB + 0.14)
+        strips += [
+            ((inner, -0.02), (inner, KERB_HEIGHT), KERB_STONE, stone),
+            ((inner, KERB_HEIGHT), (outer, KERB_HEIGHT), KERB_STONE, stone),
+            ((outer, KERB_HEIGHT), (side * FACADE, KERB_HEIGHT), PAVING, slab),
+            ((side * FACADE, KERB_HEIGHT - 0.01), (side * 45, KERB_HEIGHT - 0.01), EARTH, earth),
+        ]
+    for (d0, z0), (d1, z1), material, paint in strips:
+        d, z = np.array([d0, d1]), np.array([z0, z1])
+        xy = street.point(s[:, None], d[None])
+        heights = np.broadcast_to(z, xy.shape[:2])
+        across = d if d0 != d1 else z
+        uv = np.stack(np.broadcast_arrays(s[:, None], across[None]), axis=-1).astype(np.float64)
+        points = np.concatenate([xy, heights[..., None]], axis=2)
+        builder.grid(points, uv, material, paint)
+
+
+def _add_house_row(
+    builder: MeshBuilder, street: Street, side: float, rng: np.random.Generator
+) -> None:
+    s = street.start
+    while s < street.end - 8:
+        width = min(rng.uniform(9, 17), street.end - s)
+        setback = float(rng.choice([0.0, 0.0, 0.4, 0.8, 5.0], p=[0.4, 0.15, 0.15, 0.15, 0.15]))
+        ends = street.point([s, s + width], side * (FACADE + setback))
+        # The street must lie to the right of a front's direction.
+        start, end = ends if side > 0 else ends[::-1]
+        house = design_house(rng, builder)
+        add_house(Facade(builder, start, end), house, rng)
+        if setback > 2:
+            _add_front_garden(builder, street, side, (s, s + width), rng)
+        s += width
+
+
+def _add_front_garden(
+    builder: MeshBuilder,
+    street: Street,
+    side: float,
+    span: tuple[float, float],
+    rng: np.random.Generator,
+) -> None:
+    hedge = builder.mix(0.05, 0.11, 0.025, 0.8)
+    middle = (span[0] + span[1]) / 2
+    for a, b in ((span[0] + 0.3, middle - 0.8), (middle + 0.8, span[1] - 0.3)):
+        ends = street.point([a, b], side * (FACADE + 0.45))
+        front = Facade(builder, *(ends if side > 0 else ends[::-1]))
+        front.box([0, -0.45, 0], [front.width, 0.3, rng.uniform(0.9, 1.3)], LEAVES, hedge)
+    _add_tree(builder, street.point(middle - 2.5, side * (FACADE + 2.6)), 0.7, rng)
+
+
+def _add_street_furniture(
+    builder: MeshBuilder, street: Street, side: float, rng: np.random.Generator
+) -> None:
+    s = street.start + rng.uniform(2, 8)
+    while s < street.end - 5:
+        if abs(s - street.crossing) > 4:
+            _add_tree(builder, street.point(s, side * TREE_ROW), rng.uniform(0.8, 1.1), rng)
+        s += rng.uniform(11, 19)
+    s = street.start + (6 if side > 0 else 19)
+    while s < street.end:
+        _add_lamp(builder, street, s, side)
+        s += 26
+    for at, colour in ((street.crossing - 2.6 * side, (0.03, 0.1, 0.45)), (58, (0.5, 0.03, 0.03))):
+        _add_sign(builder, street, at, side, colour)
+    for k in range(4):
+        at = street.crossing + (-1) ** k * (2.6 + 1.4 * (k // 2))
+        base = np.array([*street.point(at, side * (KERB + 0.35)), KERB_HEIGHT])
+        post = builder.mix(0.06, 0.065, 0.07)
+        builder.tube([base, _above(base, 0.95)], [0.06, 0.05], PLAIN, post)
+        builder.tube([_above(base, 0.95), _above(base, 1.0)], [0.065, 0.02], PLAIN, post)
+
+
+def _add_tree(builder: MeshBuilder, at: Float, size: float, rng: np.random.Generator) -> None:
+    ground = np.array([*at, KERB_HEIGHT])
+    bark = builder.mix(0.13, 0.1, 0.075)
+    green = np.array([0.095, 0.17, 0.035]) * rng.uniform(0.75, 1.2) * [rng.uniform(0.8, 1.35), 1, 1]
+    leaves = builder.mix(*green, 1.0)
+    height = size * rng.uniform(2.7, 3.2)
+    lean = np.array([*rng.uniform(-0.15, 0.15, 2), 0.0])
+    levels = np.array([0, 0.15, 0.6, 1.0, 1.6])
+    path = ground + levels[:, None] * (np.array([0, 0, height]) + lean)
+    builder.tube(path, size * np.array([0.2, 0.15, 0.13, 0.11, 0.05]), BARK, bark)
+    fork = path[3]
+    for k in range(6):
+        angle = k * 2.4 + rng.uniform(0, 0.8)
+        reach = size * rng.uniform(0.5, 1.15) if k else 0.0
+        shift = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.35, 1.3)]) * reach
+        centre = _above(fork + shift, size * (1.0 if k else 1.9))
+        builder.tube([_above(fork, -0.2), centre], [0.07 * size, 0.02], BARK, bark, sides=5)
+        _add_foliage(builder, centre, size * rng.uniform(0.95, 1.35), leaves, rng)
+
+
+def _add_foliage(
+    builder: MeshBuilder, centre: Float, radius: float, paint: int, rng: np.random.Generator
+) -> None:
+    """A lump of leaves: a ball of loose quads, so that light and sky come through its rim."""
+    count = 230
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    depth = rng.uniform(0.45, 1.05, (count, 1)) ** 0.5
+    at = centre + direction * depth * radius * [1, 1, 0.8]
+    normal = direction + rng.normal(scale=0.45, size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    first = np.cross(normal, rng.normal(size=(count, 3)))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    size = radius * rng.uniform(0.1, 0.22, (count, 1))
+    corners = np.stack(
+        [at - size * first, at + size * second, at + size * first, at - size * second], axis=1
+    )
+    split = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+    # Leaves are lit as the lump they belong to, not one by one: that is how crowns look.
+    soft = direction * 0.8 + normal * 0.2
+    soft /= np.linalg.norm(soft, axis=1, keepdims=True)
+    normals = np.repeat(np.repeat(soft, 2, axis=0)[:, None], 3, axis=1)
+    uv = np.stack([split[..., 0] + split[..., 2], split[..., 1] - split[..., 2]], axis=-1)
+    builder.triangles(split, normals, LEAVES, paint, uv)
+
+
+def _add_lamp(builder: MeshBuilder, street: Street, s: float, side: float) -> None:
+    metal, glass = builder.mix(0.16, 0.18, 0.17), builder.mix(0.75, 0.75, 0.7)
+    base = np.array([*street.point(s, side * LAMP_ROW), KERB_HEIGHT])
+    head = np.array([*street.point(s, side * (LAMP_ROW - 1.7)), 6.9])
+    knee = np.array([*base[:2], 6.4])
+    builder.tube([base, _above(base, 1.0)], [0.11, 0.1], PLAIN, metal)
+    middle = _above((knee + head) / 2, 0.18)
+    builder.tube([_above(base, 1.0), knee, middle, head], [0.075, 0.055, 0.045, 0.04], PLAIN, metal)
+    builder.box(
+        head - np.array([0.28, 0.16, 0.09]), head + np.array([0.28, 0.16, 0.05]), PLAIN, metal
+    )
+    builder.box(
+        head - np.array([0.22, 0.12, 0.12]), head + np.array([0.22, 0.12, -0.09]), PLAIN, glass
+    )
+
+
+def _add_sign(
+    builder: MeshBuilder,
+    street: Street,
+    s: float,
+    side: float,
+    colour: tuple[float, float, float],
+) -> None:
+    metal, face = builder.mix(0.3, 0.31, 0.32), builder.mix(*colour)
+    base = np.array([*street.point(s, side * (KERB + 0.55)), KERB_HEIGHT])
+    builder.tube([base, _above(base, 2.95)], [0.032, 0.032], PLAIN, metal)
+    heading = float(street.heading(s)) + (np.pi if side < 0 else 0.0)
+    forward = np.array([np.cos(heading), np.sin(heading), 0.0])
+    across = np.array([-forward[1], forward[0], 0.0])
+    centre = _above(base, 2.6) + 0.05 * forward
+    corners = [
+        centre + 0.32 * (a * across + b * np.array([0, 0, 1.0]))
+        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    builder.quad(corners, SIGN, face, [[-1, -1], [1, -1], [1, 1], [-1, 1]])
+
+
+def _close_street(builder: MeshBuilder, street: Street, rng: np.random.Generator) -> None:
+    """Houses across both ends, so that no view ends in nothing."""
+    for s, facing in ((street.start, 1.0), (street.end, -1.0)):
+        heading = float(street.heading(s))
+        across = np.array([-np.sin(heading), np.cos(heading)]) * facing
+        outward = -facing * np.array([np.cos(heading), np.sin(heading)])
+        middle = street.point(s, 0.0) - outward * 0.5
+        for k in range(-2, 2):
+            ends = middle + across * 14.0 * k, middle + across * 14.0 * (k + 1)
+            add_house(Facade(builder, *ends), design_house(rng, builder), rng)
+
+
+def _above(point: Float, height: float) -> Float:
+    raised: Float = point + np.array([0.0, 0.0, height])
+    return raised

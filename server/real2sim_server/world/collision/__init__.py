@@ -1,0 +1,1 @@
+"""Collisions: who touches whom, impulses exchanged, and what they leave."""

@@ -1,0 +1,92 @@
+"""Which boxes the ego box may overlap, now or within a step, in one call."""
+# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..._numba import compiled
+
+
+@compiled
+def shifted(transform, ahead, up):
+    """A transform [4, 4] whose origin is moved ``ahead`` and ``up`` along its own axes [m]."""
+    found = transform.copy()
+    for i in range(3):
+        found[i, 3] += transform[i, 0] * ahead + transform[i, 2] * up
+    return found
+
+
+@compiled
+def within_reach(T_world_box, size, transforms, sizes):
+    """Numbers [H] int64 of the boxes whose enclosing ball meets that of one box, of K boxes.
+
+    Args:
+        T_world_box: [4, 4] float64.
+        size: (length, width, height) of that box [m].
+        transforms: [K, 4, 4] float64, ``T_world_object``.
+        sizes: [K, 3] float64 [m].
+    """
+    near, count = np.empty(len(transforms), np.int64), 0
+    diagonal = math.sqrt(size[0] * size[0] + size[1] * size[1] + size[2] * size[2])
+    for k in range(len(transforms)):
+        between = squares = 0.0
+        for i in range(3):
+            apart = transforms[k, i, 3] - T_world_box[i, 3]
+            between += apart * apart
+            squares += sizes[k, i] * sizes[k, i]
+        reach = (diagonal + math.sqrt(squares)) / 2
+        if between < reach * reach:
+            near[count] = k
+            count += 1
+    return near[:count]
+
+
+@compiled
+def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
+    """Whether a vehicle could touch one of K boxes within a step, by boxes along its heading.
+
+    Args:
+        ego: x, y of the middle of its box [m], yaw [rad], speed, lateral speed [m/s], yaw rate
+            [rad/s]; at the start of the step.
+        size: length and width of its box [m].
+        dt: the step [s].
+        positions, quaternions, velocities, sizes: [K, 3], [K, 4], [K, 3], [K, 3] float64, of the
+            boxes at the end of the step, world [m], [m/s].
+    """
+    x, y, yaw, forward, lateral, yaw_rate = ego
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    speed = math.hypot(forward, lateral)
+    # The vehicle may turn, brake or speed up within the step.
+    drift = dt * (0.15 * speed + abs(lateral) + abs(yaw_rate) * size[0])
+    for k in range(len(positions)):
+        dx, dy = positions[k, 0] - x, positions[k, 1] - y
+        vx, vy = velocities[k, 0], velocities[k, 1]
+        turned = heading(quaternions[k]) - yaw
+        c, s = abs(math.cos(turned)), abs(math.sin(turned))
+        half_length, half_width = sizes[k, 0] / 2, sizes[k, 1] / 2
+        slack_along = dt * (speed + abs(vx * cos + vy * sin) + 2.0) + 0.3
+        slack_aside = drift + dt * abs(vy * cos - vx * sin) + 0.3
+        along = size[0] / 2 + half_length * c + half_width * s + slack_along
+        aside = size[1] / 2 + half_length * s + half_width * c + slack_aside
+        if abs(dx * cos + dy * sin) < along and abs(dy * cos - dx * sin) < aside:
+            return True
+    return False
+
+
+@compiled
+def headings(quaternions):
+    """Headings [K] [rad] of quaternions [K, 4] wxyz, as ``scene.rotation.quaternion_yaw``."""
+    found = np.empty(len(quaternions))
+    for k in range(len(quaternions)):
+        found[k] = heading(quaternions[k])
+    return found
+
+
+@compiled
+def heading(quaternion):
+    """Heading [rad] in (-pi, pi] of a quaternion [4] wxyz."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)

@@ -1,0 +1,1 @@
+"""The ego vehicle: plans, trackers and dynamics."""

@@ -1,0 +1,206 @@
+"""From plans to motion: which plan holds when, and what holds where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol, assert_never
+
+import numpy as np
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.episode import EgoSpec, ResetSpec
+from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
+
+from ...edit.tracks import sample
+from ...scene import Trajectory
+from ..driving import Command
+from ..errors import WorldError
+from .reference import PlannedTrajectory, Pose, Reference
+from .trackers import make_tracker
+from .vehicle import Motion, drive, holding, placed
+
+Plan = TrajectoryPlan | Control | PoseCommand
+Planned = PlannedTrajectory | Control | PoseCommand
+
+LOG_SPACING_US = 100_000
+"""Where there is no plan, the log is followed by poses this far apart at most [us]."""
+
+EMERGENCY_BRAKING = 6.0
+"""Deceleration of the fallback ``brake``, where the vehicle can [m/s^2]."""
+
+
+class Controller(Protocol):
+    """Moves the ego until another one takes over."""
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later; ``since`` seconds after the controller began."""
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """What it would do in a motion, ``t`` seconds after it began."""
+
+
+@dataclass(frozen=True)
+class ConstantCommand:
+    """The same command all the time."""
+
+    asked: Command
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later."""
+        return drive(motion, holding(self.asked), self.spec, dt_us)
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """That command."""
+        return self.asked
+
+
+@dataclass(frozen=True)
+class Teleport:
+    """The vehicle is put somewhere and stays there."""
+
+    pose: Pose
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle at its place, with the velocity that brought it there."""
+        return placed(motion, self.pose, self.spec, dt_us)
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """Brakes: whoever is put somewhere has no driver."""
+        return Command(-EMERGENCY_BRAKING, motion.steering)
+
+
+@dataclass(frozen=True)
+class PendingPlan:
+    """A plan that has not taken effect yet.
+
+    Attributes:
+        from_us: when it does [us].
+        plan: in the world.
+    """
+
+    from_us: int
+    plan: Planned
+
+    @property
+    def course(self) -> PlannedTrajectory | None:
+        """The plan where it is a trajectory."""
+        return self.plan if isinstance(self.plan, PlannedTrajectory) else None
+
+
+@dataclass(frozen=True, eq=False)
+class EgoController:
+    """What moves the ego, and what will. Immutable.
+
+    Attributes:
+        spec: of the episode.
+        ego: as it was recorded; followed while there is no plan.
+        controller: holds now; None before the first plan.
+        since_us: when it took over [us].
+        coming: plans on their way, in the order in which they take effect.
+    """
+
+    spec: ResetSpec
+    ego: Trajectory
+    controller: Controller | None = None
+    since_us: int = 0
+    coming: tuple[PendingPlan, ...] = ()
+
+    def told(self, plan: Plan, motion: Motion, t_us: int, from_us: int) -> EgoController:
+        """With one more plan.
+
+        Args:
+            plan: of the planner.
+            motion: that it answers.
+            t_us: of that observation [us].
+            from_us: when it takes effect [us].
+
+        Raises:
+            WorldError: INVALID_ACTION for another kind than the reset named, or times that are
+                over.
+        """
+        if plan.kind != self.spec.action:
+            raise WorldError(
+                ErrorCode.INVALID_ACTION,
+                f"a plan of kind {plan.kind!r} in an episode that was reset for "
+                f"{self.spec.action!r}",
+                hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}",
+            )
+        if isinstance(plan, TrajectoryPlan) and plan.times_us[0] <= t_us:
+            raise WorldError(
+                ErrorCode.INVALID_ACTION,
+                f"the plan begins at {plan.times_us[0]} us; it is {t_us} us already",
+                hint="times_us are absolute simulation times after t_us of the observation",
+            )
+        kept = tuple(c for c in self.coming if c.from_us < from_us)
+        coming = (*kept, PendingPlan(from_us, _in_world(plan, motion)))
+        return EgoController(self.spec, self.ego, self.controller, self.since_us, coming)
+
+    def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
+        """Pilot and vehicle ``us`` later than ``t_us``."""
+        pilot, end_us = self, t_us + us
+        while t_us < end_us:
+            pilot = pilot._now(motion, t_us)
+            until = min([end_us, *(c.from_us for c in pilot.coming)])
+            since = (t_us - pilot.since_us) * 1e-6
+            assert pilot.controller is not None
+            motion = pilot.controller.advance(motion, since, until - t_us)
+            t_us = until
+        return pilot, motion
+
+    def begun(self, motion: Motion, t_us: int) -> EgoController:
+        """With whatever holds from ``t_us`` on."""
+        return self._now(motion, t_us)
+
+    def _now(self, motion: Motion, t_us: int) -> EgoController:
+        """With the newest plan that has taken effect in charge."""
+        pilot = self
+        while pilot.coming and pilot.coming[0].from_us <= t_us:
+            controller = pilot._controller(pilot.coming[0].plan, motion, t_us)
+            pilot = EgoController(self.spec, self.ego, controller, t_us, pilot.coming[1:])
+        if pilot.controller is None:
+            log = pilot._follow_log(motion, t_us)
+            pilot = replace(pilot, controller=log, since_us=t_us)
+        return pilot
+
+    def _controller(self, plan: Planned, motion: Motion, t_us: int) -> Controller:
+        match plan:
+            case PlannedTrajectory():
+                return self._tracker(motion, t_us, plan.after(t_us))
+            case Control():
+                return ConstantCommand(Command(plan.acceleration, plan.steering), self.spec.ego)
+            case PoseCommand():
+                return Teleport((plan.x, plan.y, plan.yaw), self.spec.ego)
+            case _:
+                assert_never(plan)
+
+    def _follow_log(self, motion: Motion, t_us: int) -> Controller:
+        # Even spacing: some logs have poses milliseconds apart, whose differences are noise.
+        end_us = self.ego.end_us
+        count = max(-(-(end_us - t_us) // LOG_SPACING_US), 1)
+        times = np.linspace(t_us, max(end_us, t_us + 1), count + 1).astype(np.int64)[1:]
+        transforms, _ = sample(self.ego, times)
+        yaws = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
+        poses = np.column_stack([transforms[:, :2, 3], yaws])
+        return self._tracker(motion, t_us, PlannedTrajectory(times, poses))
+
+    def _tracker(self, motion: Motion, t_us: int, course: PlannedTrajectory) -> Controller:
+        spec = self.spec.ego
+        return make_tracker(Reference(motion, start_us=t_us, course=course, spec=spec), spec)
+
+
+def braking(pilot: EgoController, motion: Motion, spec: EgoSpec) -> Controller:
+    """The fallback of a planner that is late: brake, and keep the wheels as they are."""
+    if pilot.spec.action == "pose":
+        return Teleport((motion.x, motion.y, motion.yaw), spec)
+    return ConstantCommand(
+        Command(-min(EMERGENCY_BRAKING, spec.max_braking), motion.steering), spec
+    )
+
+
+def _in_world(plan: Plan, motion: Motion) -> Planned:
+    if not isinstance(plan, TrajectoryPlan):
+        return plan
+    frame = (motion.x, motion.y, motion.yaw) if plan.frame == "vehicle" else None
+    return PlannedTrajectory.of(plan.times_us, plan.poses, frame)

@@ -1,0 +1,99 @@
+"""A planned trajectory that a vehicle is to follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.episode import EgoSpec
+
+from ..driving import curve_at, plan_curve, vehicle_of, world_poses
+from ..path import Float
+from .vehicle import Driver, Motion
+
+Pose = tuple[float, float, float]
+"""x, y [m], yaw [rad] in the world."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedTrajectory:
+    """Where a planner wants to be when.
+
+    Attributes:
+        times_us: [N] int64, increasing [us].
+        poses: [N, 3] float64, x, y [m], yaw [rad], world.
+    """
+
+    times_us: NDArray[np.int64]
+    poses: Float
+
+    @staticmethod
+    def of(
+        times_us: Sequence[int], poses: Sequence[Pose], frame: Pose | None = None
+    ) -> PlannedTrajectory:
+        """The course through poses of a frame, given by its pose in the world; None: world."""
+        numbers = np.array(poses, np.float64)
+        if frame is not None:
+            numbers = world_poses(numbers, frame)
+        return PlannedTrajectory(np.array(times_us, np.int64), numbers)
+
+    def after(self, t_us: int) -> PlannedTrajectory:
+        """What of it is still to come: its end, at once, where all of it is over."""
+        over = int(np.searchsorted(self.times_us, t_us, side="right"))
+        if over == 0:
+            return self
+        if over == len(self.times_us):
+            return PlannedTrajectory(np.array([t_us + 1]), self.poses[-1:])
+        return PlannedTrajectory(self.times_us[over:], self.poses[over:])
+
+
+class Reference:
+    """A course as a smooth curve over time, see :mod:`.driving.curve`."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        *,
+        start_us: int,
+        course: PlannedTrajectory,
+        spec: EgoSpec,
+    ) -> None:
+        """The curve of a vehicle that is in ``motion`` at ``start_us``.
+
+        Args:
+            motion: of the vehicle.
+            start_us: now [us].
+            course: after ``start_us``.
+            spec: of the vehicle.
+        """
+        self._curve = plan_curve(
+            motion.numbers,
+            course.times_us,
+            start_us,
+            course.poses,
+            tuple(vehicle_of(spec)),
+        )
+
+    @property
+    def end(self) -> float:
+        """Time of the last pose, from the start [s]."""
+        return float(self._curve[0][-1, 0])
+
+    @property
+    def last_pose(self) -> Pose:
+        """x, y [m], yaw [rad] in the world."""
+        _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
+        return x, y, yaw
+
+    def driver(self, kind: int) -> Driver:
+        """Who follows the plan: PURSUIT, LQR or ILQR."""
+        return Driver(kind, *self._curve)
+
+    def at(self, t: float) -> tuple[float, float, float, float, float]:
+        """x, y [m], velocity x, y [m/s] and planned heading [rad] in the world, ``t`` >= 0 seconds
+        after the start."""
+        x, y, vx, vy, yaw = curve_at(self._curve, float(t))
+        return x, y, vx, vy, yaw

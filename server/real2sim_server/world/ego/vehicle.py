@@ -1,0 +1,162 @@
+"""The controlled vehicle: a bicycle on the plane, referred to its rear axle."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from real2sim_proto.episode import EgoSpec
+
+from ...geometry.rotation import quaternion_yaw
+from ...scene import Trajectory
+from ..driving import HOLD, Command, PlanarState, asked_of, driven, vehicle_of
+from ..path import Float
+
+SLOW = 0.1
+"""Below this speed the steering angle cannot be told from the motion [m/s]."""
+
+NO_PLAN = np.empty((0, 6))
+NOTHING_PENDING = np.empty((0, 2))
+
+
+class Motion(NamedTuple):
+    """Planar state of the vehicle: a :class:`.driving.PlanarState`, and what is on its way.
+
+    Attributes:
+        pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
+    """
+
+    x: float
+    y: float
+    yaw: float
+    speed: float = 0.0
+    acceleration: float = 0.0
+    steering: float = 0.0
+    yaw_rate: float = 0.0
+    lateral_speed: float = 0.0
+    drive: float = 0.0
+    pending: tuple[Command, ...] = ()
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Of the rear axle in the world [m/s]."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return (
+            self.speed * cos - self.lateral_speed * sin,
+            self.speed * sin + self.lateral_speed * cos,
+        )
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All but the pending commands, as :mod:`.driving` takes a state."""
+        return tuple(map(float, self[: len(PlanarState._fields)]))
+
+
+class Driver(NamedTuple):
+    """Who drives: see :func:`.driving.driven`.
+
+    Attributes:
+        kind: HOLD, PURSUIT, LQR or ILQR.
+        knots, turn_rate: the plan that trackers follow.
+        hold: the command of who holds one.
+    """
+
+    kind: int
+    knots: Float = NO_PLAN
+    turn_rate: float = 0.0
+    hold: tuple[float, float] = (0.0, 0.0)
+
+    def after(self, since: float) -> tuple[int, Float, float, float, tuple[float, float]]:
+        """The driver ``since`` seconds after the plan began, as :mod:`.driving` takes it."""
+        return self.kind, self.knots, self.turn_rate, since, self.hold
+
+
+def holding(command: Command) -> Driver:
+    """Who gives the same command all the time."""
+    return Driver(HOLD, hold=(float(command.acceleration), float(command.steering)))
+
+
+def drive(
+    motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int, *, since: float = 0.0
+) -> Motion:
+    """The vehicle ``dt_us`` later, see :func:`.driving.driven`.
+
+    Args:
+        motion: now.
+        driver: of it.
+        spec: of the vehicle.
+        dt_us: how far to go [us].
+        since: time since the driver's plan began [s].
+    """
+    pending = np.array(motion.pending) if motion.pending else NOTHING_PENDING
+    vehicle = tuple(vehicle_of(spec))
+    state, waiting = driven(motion.numbers, pending, driver.after(since), vehicle, dt_us)
+    return Motion(*state, pending=tuple(Command(*row) for row in waiting.tolist()))
+
+
+def asked(motion: Motion, driver: Driver, spec: EgoSpec, *, since: float = 0.0) -> Command:
+    """What the driver would do, ``since`` seconds after its plan began."""
+    return Command(*asked_of(motion.numbers, driver.after(since), tuple(vehicle_of(spec))))
+
+
+def placed(motion: Motion, pose: tuple[float, float, float], spec: EgoSpec, dt_us: int) -> Motion:
+    """The vehicle put to ``pose`` x, y [m], yaw [rad]; its velocities follow from the way there.
+
+    The way is taken as the arc that ends with the new heading, so that a pose sequence along a
+    circle has the speed along the circle.
+    """
+    x, y, yaw = pose
+    seconds = dt_us * 1e-6
+    turn = math.remainder(yaw - motion.yaw, math.tau)
+    middle = motion.yaw + turn / 2
+    chord = (x - motion.x) * math.cos(middle) + (y - motion.y) * math.sin(middle)
+    speed = chord / float(np.sinc(turn / math.tau)) / seconds
+    return Motion(
+        x=x,
+        y=y,
+        yaw=motion.yaw + turn,
+        speed=speed,
+        acceleration=(speed - motion.speed) / seconds,
+        steering=_steering_of(speed, turn / seconds, spec),
+        yaw_rate=turn / seconds,
+    )
+
+
+def logged_motion(ego: Trajectory, t_us: int, spec: EgoSpec) -> Motion:
+    """The recorded vehicle at ``t_us``, with the speed and turn rate of its logged segment.
+
+    Raises:
+        TimeOutOfRangeError: outside the log.
+    """
+    position, quaternion = ego.pose(t_us)
+    yaw = float(quaternion_yaw(quaternion))
+    velocity = ego.velocity(t_us)
+    speed = float(velocity[0] * math.cos(yaw) + velocity[1] * math.sin(yaw))
+    yaw_rate = _logged_yaw_rate(ego, t_us)
+    return Motion(
+        x=float(position[0]),
+        y=float(position[1]),
+        yaw=yaw,
+        speed=speed,
+        steering=_steering_of(speed, yaw_rate, spec),
+        yaw_rate=yaw_rate,
+    )
+
+
+def _logged_yaw_rate(ego: Trajectory, t_us: int) -> float:
+    if len(ego.times_us) == 1:
+        return 0.0
+    after = int(np.searchsorted(ego.times_us, t_us, side="right"))
+    after = min(max(after, 1), len(ego.times_us) - 1)
+    before_yaw, after_yaw = quaternion_yaw(ego.quaternions[after - 1 : after + 1]).tolist()
+    seconds = int(ego.times_us[after] - ego.times_us[after - 1]) * 1e-6
+    return math.remainder(after_yaw - before_yaw, math.tau) / seconds
+
+
+def _steering_of(speed: float, yaw_rate: float, spec: EgoSpec) -> float:
+    if abs(speed) < SLOW:
+        return 0.0
+    angle = math.atan(spec.wheelbase * yaw_rate / speed)
+    return min(max(angle, -spec.max_steer), spec.max_steer)

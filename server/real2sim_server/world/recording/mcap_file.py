@@ -1,0 +1,264 @@
+"""An episode as an MCAP file, for Foxglove, Rerun and whatever else reads it.
+
+Messages are JSON with Foxglove's well-known schemas where there is one. The recording itself is
+attached, so nothing is lost: :func:`recording_in` gets it back.
+
+Needs the ``mcap`` extra.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from .. import scoring
+from ..scoring import Instant
+from .recording import Recording, RecordingError, load_recording, to_bytes
+
+MEDIA_TYPE = "application/vnd.real2sim.episode"
+ATTACHMENT = "episode.r2e"
+EGO_COLOUR, OBJECT_COLOUR, ROUTE_COLOUR = (0.4, 0.9, 0.4), (1.0, 0.55, 0.25), (0.6, 0.6, 0.6)
+
+Topic = tuple[str, str]
+"""Name of a topic and of its schema."""
+TRANSFORM: Topic = ("/tf", "foxglove.FrameTransform")
+SCENE: Topic = ("/scene", "foxglove.SceneUpdate")
+PLAN: Topic = ("/plan", "foxglove.PosesInFrame")
+EGO: Topic = ("/ego", "real2sim.Ego")
+METRICS: Topic = ("/metrics", "real2sim.Metrics")
+CONTACT: Topic = ("/contact", "real2sim.Contact")
+IMAGE_SCHEMA = "foxglove.CompressedImage"
+
+
+def save_mcap(recording: Recording, path: Path) -> Path:
+    """Write the episode atomically: poses, objects, plans, contacts, scores and images by topic.
+
+    Raises:
+        RecordingError: the ``mcap`` extra is not installed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = mcap_bytes(recording)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    return path
+
+
+def mcap_bytes(recording: Recording) -> bytes:
+    """The file; the same bytes for the same episode. Raises RecordingError like save_mcap()."""
+    writer_class = _mcap("writer").Writer
+    file = io.BytesIO()
+    writer = writer_class(file)
+    writer.start(profile="", library="real2sim")
+    channels: dict[str, int] = {}
+    for topic, t_us, message in _messages(recording):
+        name, schema = topic
+        if name not in channels:
+            channels[name] = _channel(writer, name, schema, message)
+        body = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
+        writer.add_message(channels[name], t_us * 1000, body, t_us * 1000)
+    first = recording.instants[0].t_us * 1000
+    writer.add_attachment(first, first, ATTACHMENT, MEDIA_TYPE, to_bytes(recording))
+    writer.add_metadata("real2sim", {"scene": recording.scene, "scene_hash": recording.scene_hash})
+    writer.finish()
+    return file.getvalue()
+
+
+def recording_in(path: Path) -> Recording:
+    """The recording that an MCAP file of ours holds.
+
+    Raises:
+        RecordingError: there is none in it, or the ``mcap`` extra is not installed.
+        OSError: the file cannot be read.
+    """
+    reader_module, exceptions = _mcap("reader"), _mcap("exceptions")
+    with path.open("rb") as file:
+        try:
+            found = [
+                a.data
+                for a in reader_module.make_reader(file).iter_attachments()
+                if a.name == ATTACHMENT and a.media_type == MEDIA_TYPE
+            ]
+        except exceptions.McapError as error:
+            raise RecordingError(f"{path} is no MCAP file, or is broken: {error}") from error
+    if not found:
+        raise RecordingError(f"{path} holds no episode of this program")
+    with tempfile.TemporaryDirectory() as folder:
+        extracted = Path(folder) / ATTACHMENT
+        extracted.write_bytes(found[0])
+        return load_recording(extracted)
+
+
+def _mcap(module: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(f"mcap.{module}")
+    except ImportError as error:
+        raise RecordingError(
+            "MCAP files need the mcap extra: pip install 'real2sim[mcap]'"
+        ) from error
+
+
+def _messages(recording: Recording) -> Iterator[tuple[Topic, int, dict[str, Any]]]:
+    """Topic, time and content of every message, by time."""
+    frames = _frames_by_step(recording.frames)
+    for instant, tally in zip(recording.instants, recording.tallies(), strict=True):
+        t_us, stamp = instant.t_us, _stamp(instant.t_us)
+        yield TRANSFORM, t_us, _transform(instant, stamp)
+        yield SCENE, t_us, _scene(recording, instant, stamp)
+        yield EGO, t_us, {"timestamp": stamp, **instant.ego._asdict()}
+        if instant.plan is not None:
+            yield PLAN, t_us, _plan(instant, stamp)
+        for contact in instant.contacts:
+            noted = asdict(contact) | {"impulse": list(contact.impulse)}
+            yield CONTACT, t_us, {"timestamp": stamp, **noted}
+        metrics = scoring.running(tally, recording.context)
+        yield METRICS, t_us, {"timestamp": stamp, **metrics}
+        for name, suffix, data in frames.get(instant.step, ()):
+            yield (f"/camera/{name}", IMAGE_SCHEMA), t_us, _image(name, suffix, data, stamp)
+
+
+def _frames_by_step(frames: Mapping[str, bytes]) -> dict[int, list[tuple[str, str, bytes]]]:
+    found: dict[int, list[tuple[str, str, bytes]]] = {}
+    for path, data in sorted(frames.items()):
+        _, camera, modality, file = path.split("/")
+        step, suffix = file.split(".")
+        found.setdefault(int(step), []).append((f"{camera}/{modality}", suffix, data))
+    return found
+
+
+def _stamp(t_us: int) -> dict[str, int]:
+    return {"sec": t_us // 1_000_000, "nsec": t_us % 1_000_000 * 1000}
+
+
+def _transform(instant: Instant, stamp: dict[str, int]) -> dict[str, Any]:
+    ego = instant.ego
+    return {
+        "timestamp": stamp,
+        "parent_frame_id": "world",
+        "child_frame_id": "ego",
+        "translation": {"x": ego.x, "y": ego.y, "z": ego.z},
+        "rotation": _rotation(ego.yaw),
+    }
+
+
+def _scene(recording: Recording, instant: Instant, stamp: dict[str, int]) -> dict[str, Any]:
+    others, size = instant.others, recording.context.ego_size
+    ahead = {"x": recording.context.centre_ahead, "y": 0.0, "z": size[2] / 2}
+    cube = {"pose": {"position": ahead, "orientation": _rotation(0.0)}}
+    entities = [_entity("ego", "ego", stamp, cubes=[cube | _sized(size, EGO_COLOUR)])]
+    for k, object_id in enumerate(others.ids):
+        pose = {
+            "position": _vector(others.centres[k]),
+            "orientation": _rotation(float(others.yaws[k])),
+        }
+        cube = {"pose": pose, **_sized(others.sizes[k], OBJECT_COLOUR)}
+        labels = {"category": others.categories[k]}
+        entities.append(_entity(object_id, "world", stamp, cubes=[cube], labels=labels))
+    if instant.step == 0:
+        entities.append(_entity("route", "world", stamp, lines=[_route(recording, instant.ego.z)]))
+    return {"deletions": [], "entities": entities}
+
+
+def _entity(
+    name: str,
+    frame: str,
+    stamp: dict[str, int],
+    *,
+    cubes: Iterable[dict[str, Any]] = (),
+    lines: Iterable[dict[str, Any]] = (),
+    labels: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    return {
+        "timestamp": stamp,
+        "frame_id": frame,
+        "id": name,
+        "lifetime": {"sec": 0, "nsec": 0},
+        "frame_locked": frame == "ego",
+        "metadata": [{"key": k, "value": v} for k, v in (labels or {}).items()],
+        "cubes": list(cubes),
+        "lines": list(lines),
+    }
+
+
+def _route(recording: Recording, z: float) -> dict[str, Any]:
+    return {
+        "type": 0,
+        "pose": {"position": _vector((0.0, 0.0, 0.0)), "orientation": _rotation(0.0)},
+        "thickness": 0.1,
+        "scale_invariant": False,
+        "points": [_vector((x, y, z)) for x, y in recording.context.route.tolist()],
+        "color": _colour(ROUTE_COLOUR),
+    }
+
+
+def _plan(instant: Instant, stamp: dict[str, int]) -> dict[str, Any]:
+    assert instant.plan is not None
+    poses = [
+        {"position": _vector((x, y, instant.ego.z)), "orientation": _rotation(yaw)}
+        for x, y, yaw in instant.plan.poses.tolist()
+    ]
+    return {"timestamp": stamp, "frame_id": "world", "poses": poses}
+
+
+def _image(name: str, suffix: str, data: bytes, stamp: dict[str, int]) -> dict[str, Any]:
+    return {
+        "timestamp": stamp,
+        "frame_id": name.split("/", maxsplit=1)[0],
+        "data": base64.b64encode(data).decode(),
+        "format": "jpeg" if suffix == "jpg" else suffix,
+    }
+
+
+def _sized(size: Any, colour: tuple[float, float, float]) -> dict[str, Any]:
+    return {"size": _vector(size), "color": _colour(colour)}
+
+
+def _vector(values: Any) -> dict[str, float]:
+    return {axis: float(value) for axis, value in zip("xyz", values, strict=True)}
+
+
+def _rotation(yaw: float) -> dict[str, float]:
+    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+
+
+def _colour(colour: tuple[float, float, float]) -> dict[str, float]:
+    r, g, b = colour
+    return {"r": r, "g": g, "b": b, "a": 0.7}
+
+
+# --- schemas ----------------------------------------------------------------------------------
+
+
+def _channel(writer: Any, name: str, schema: str, example: dict[str, Any]) -> int:
+    """A topic whose JSON schema says what its first message shows."""
+    described = _described(example) | {"title": schema}
+    if schema == IMAGE_SCHEMA:
+        described["properties"]["data"]["contentEncoding"] = "base64"
+    data = json.dumps(described).encode()
+    schema_id = writer.register_schema(schema, "jsonschema", data)
+    channel: int = writer.register_channel(name, "json", schema_id)
+    return channel
+
+
+def _described(value: Any) -> dict[str, Any]:
+    if isinstance(value, dict):
+        return {"type": "object", "properties": {k: _described(v) for k, v in value.items()}}
+    if isinstance(value, list):
+        return {"type": "array", "items": _described(value[0]) if value else {}}
+    known = {bool: "boolean", int: "integer", float: "number", str: "string"}
+    return {"type": known[type(value)]} if type(value) in known else {}

@@ -1,0 +1,355 @@
+"""An episode as one file: what was asked for, what came of it, and enough to score it again.
+
+The file is a zip archive:
+
+- ``episode.json``: format, scene and hash, scenario, seed, versions of scores, scores, cameras;
+- ``log.msgpack``: entries of the session from its reset on (kind, step, payload);
+- ``instants.msgpack``: what the scores saw of every step, and a digest of its observation;
+- ``context.msgpack``: what stays the same for the scores;
+- ``state.msgpack``: how the scenario differed from the scene, where it began from one;
+- ``frames/<camera>/<step>.jpg`` and ``.png``: images, where they were asked for.
+
+Everything but the frames is the same bytes for the same episode.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from real2sim_proto import CodecError, decode, encode
+
+from ...edit import AssetLookup, ScenarioState, pack_state, unpack_state
+from ...scene import Scene
+from .. import scoring
+from ..ego.reference import PlannedTrajectory
+from ..scoring import (
+    ContactNote,
+    EgoSample,
+    Instant,
+    MetricAccumulator,
+    Others,
+    Score,
+    ScoringContext,
+    metrics_version,
+)
+from ..world import World
+from .replay import Entry, Replayer
+
+FORMAT = "real2sim-episode"
+VERSION = 1
+MAX_PART_BYTES = 1 << 30
+
+
+class RecordingError(ValueError):
+    """A file that is no recording, or one that this version does not read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One episode.
+
+    Attributes:
+        scene, scene_hash: what it ran on.
+        scenario_id, scenario_revision: what it began from; None for the bare scene.
+        entries: of the session, its reset first.
+        context: of the scores.
+        instants: of every committed state, step 0 first.
+        digests: SHA-256 of every observation without images, by instant.
+        scores: at the end, as they were when it was recorded.
+        metrics: versions of the scores.
+        state: the objects that it began with, see :func:`~real2sim_server.edit.pack_state`; None
+            for the bare scene.
+        frames: file names in the archive by camera and step, for images.
+    """
+
+    scene: str
+    scene_hash: str
+    scenario_id: str | None
+    scenario_revision: int | None
+    entries: tuple[Entry, ...]
+    context: ScoringContext
+    instants: tuple[Instant, ...]
+    digests: tuple[str, ...]
+    scores: tuple[dict[str, Any], ...]
+    metrics: str
+    state: bytes | None = field(default=None, repr=False)
+    frames: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+
+    def fresh(self, scene: Scene, assets: AssetLookup | None = None) -> Replayer:
+        """The session before its first entry.
+
+        Args:
+            scene: that it ran on.
+            assets: finds those that its scenario shows.
+
+        Raises:
+            EditError: UNKNOWN_ASSET.
+            RecordingError: it began from a scenario, and an old file does not tell how that was.
+        """
+        begun = ScenarioState.of(scene, assets=assets)
+        if self.state is not None:
+            begun = unpack_state(begun, self.state)
+        elif self.scenario_id is not None:
+            raise RecordingError(
+                f"the episode began from scenario {self.scenario_id!r} at revision "
+                f"{self.scenario_revision}, which is not in the file; it can still be scored"
+            )
+        return Replayer.on(scene, begun)
+
+    def rescore(self) -> list[Score]:
+        """Scores by the formulas of this version, from the recorded instants alone."""
+        return scoring.scores_of(self.tallies()[-1], self.context)
+
+    def tallies(self) -> list[MetricAccumulator]:
+        """What the episode had come to at every instant."""
+        tally = scoring.begin(self.instants[0], self.context)
+        tallies = [tally]
+        for instant in self.instants[1:]:
+            tally = scoring.after(tally, instant, self.context)
+            tallies.append(tally)
+        return tallies
+
+
+def digest(world: World) -> str:
+    """SHA-256 of everything that a world lets be observed, apart from images."""
+    fields = world.observe().obs_fields()
+    fields["agents"] = [
+        world.agents.positions,
+        world.agents.quaternions,
+        world.agents.velocities,
+        [o.object_id for o in world.agents.objects],
+    ]
+    return hashlib.sha256(encode(fields)).hexdigest()
+
+
+def record(
+    retold: Replayer,
+    entries: Sequence[Entry],
+    *,
+    scene_hash: str,
+    scenario: tuple[str, int] | None = None,
+    state: ScenarioState | None = None,
+    no_action_impact: float | None = None,
+) -> Recording:
+    """The recording of an episode, by living through it again.
+
+    Args:
+        retold: fresh, on the episode's scene.
+        entries: of the episode, its reset first; returns to snapshots cut off what they undo.
+        scene_hash: of the scene's bundle.
+        scenario: id and revision.
+        state: of that scenario.
+        no_action_impact: for NeuroNCAP, see :func:`~.history.no_action_impact`.
+    """
+    instants: list[Instant] = []
+    digests: list[str] = []
+    for entry in entries:
+        world = retold.tell(entry)
+        if entry.kind == "snapshot":
+            continue
+        # A step adds an instant; what changes the present one replaces it; a return cuts off.
+        del instants[world.steps :], digests[world.steps :]
+        instants.append(world.instant)
+        digests.append(digest(world))
+    context = _with_impact(world.context, no_action_impact)
+    scores = scoring.scores_of(world.tally, context)
+    return Recording(
+        scene=world.scene.name,
+        scene_hash=scene_hash,
+        scenario_id=scenario[0] if scenario else None,
+        scenario_revision=scenario[1] if scenario else None,
+        entries=tuple(entries),
+        context=context,
+        instants=tuple(instants),
+        digests=tuple(digests),
+        scores=tuple(s.fields() for s in scores),
+        metrics=metrics_version(),
+        state=pack_state(state) if state is not None else None,
+    )
+
+
+def _with_impact(context: ScoringContext, impact: float | None) -> ScoringContext:
+    if impact is None:
+        return context
+    return ScoringContext.from_fields(context.fields() | {"no_action_impact": impact})
+
+
+# --- file -------------------------------------------------------------------------------------
+
+
+def to_bytes(recording: Recording) -> bytes:
+    """The recording as a file."""
+    about = {
+        "format": FORMAT,
+        "version": VERSION,
+        "scene": recording.scene,
+        "scene_hash": recording.scene_hash,
+        "scenario_id": recording.scenario_id,
+        "scenario_revision": recording.scenario_revision,
+        "metrics": recording.metrics,
+        "scores": list(recording.scores),
+        "steps": len(recording.instants) - 1,
+    }
+    entries = [[e.kind, e.step, e.payload] for e in recording.entries]
+    rows = [_row(i, d) for i, d in zip(recording.instants, recording.digests, strict=True)]
+    parts = {
+        "episode.json": json.dumps(about, indent=2, allow_nan=False).encode(),
+        "log.msgpack": encode({"entries": entries}),
+        "instants.msgpack": encode({"instants": rows}),
+        "context.msgpack": encode(recording.context.fields()),
+        **({"state.msgpack": recording.state} if recording.state is not None else {}),
+        **recording.frames,
+    }
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in parts.items():
+            # A fixed date, so that the same episode is the same file.
+            info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            packed = zipfile.ZIP_STORED if name.startswith("frames/") else zipfile.ZIP_DEFLATED
+            archive.writestr(info, data, compress_type=packed)
+    return file.getvalue()
+
+
+def save_recording(recording: Recording, path: Path) -> Path:
+    """Write the recording atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(to_bytes(recording))
+        Path(name).replace(path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            Path(name).unlink()
+        raise
+    return path
+
+
+def load_recording(path: Path) -> Recording:
+    """The recording in a file.
+
+    Raises:
+        RecordingError: no recording, broken, or of a newer version.
+        OSError: the file cannot be read.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            about = json.loads(_part(archive, "episode.json"))
+            if about.get("format") != FORMAT or about.get("version") != VERSION:
+                raise RecordingError(
+                    f"{path} has format {about.get('format')!r} version {about.get('version')!r}; "
+                    f"this program reads {FORMAT!r} version {VERSION}"
+                )
+            log, instants, context = (
+                decode(_part(archive, f"{name}.msgpack"), max_bytes=MAX_PART_BYTES)
+                for name in ("log", "instants", "context")
+            )
+            there = "state.msgpack" in archive.namelist()
+            state = _part(archive, "state.msgpack") if there else None
+            frames = {n: _part(archive, n) for n in archive.namelist() if n.startswith("frames/")}
+        rows = [_instant(row) for row in instants["instants"]]
+        return Recording(
+            scene=about["scene"],
+            scene_hash=about["scene_hash"],
+            scenario_id=about["scenario_id"],
+            scenario_revision=about["scenario_revision"],
+            entries=tuple(Entry(kind, step, payload) for kind, step, payload in log["entries"]),
+            context=ScoringContext.from_fields(context),
+            instants=tuple(instant for instant, _ in rows),
+            digests=tuple(found for _, found in rows),
+            scores=tuple(about["scores"]),
+            metrics=about["metrics"],
+            state=state,
+            frames=frames,
+        )
+    except (zipfile.BadZipFile, CodecError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise RecordingError(f"{path} is no episode recording, or is broken: {error}") from error
+
+
+def _part(archive: zipfile.ZipFile, name: str) -> bytes:
+    info = archive.getinfo(name)
+    if info.file_size > MAX_PART_BYTES:
+        raise RecordingError(f"{name!r} has {info.file_size} bytes; {MAX_PART_BYTES} are allowed")
+    return archive.read(info)
+
+
+def _row(instant: Instant, found: str) -> dict[str, Any]:
+    others = instant.others
+    row: dict[str, Any] = {
+        "step": instant.step,
+        "t_us": instant.t_us,
+        "ego": list(instant.ego),
+        "ids": list(others.ids),
+        "categories": list(others.categories),
+        "centres": others.centres,
+        "yaws": others.yaws,
+        "sizes": others.sizes,
+        "velocities": others.velocities,
+        "contacts": [asdict(c) | {"impulse": list(c.impulse)} for c in instant.contacts],
+        "secondary": instant.secondary,
+        "digest": found,
+    }
+    if instant.plan is not None:
+        row["plan"] = [instant.plan.times_us.tolist(), instant.plan.poses.tolist()]
+    return row
+
+
+def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
+    plan = None
+    if "plan" in row:
+        times, poses = row["plan"]
+        plan = PlannedTrajectory(np.array(times, np.int64), np.array(poses, np.float64))
+    instant = Instant(
+        step=row["step"],
+        t_us=row["t_us"],
+        ego=EgoSample(*row["ego"]),
+        others=Others(
+            ids=tuple(row["ids"]),
+            categories=tuple(row["categories"]),
+            # Copies, since kernels are compiled anew for arrays that must not be written to.
+            centres=np.array(row["centres"]),
+            yaws=np.array(row["yaws"]),
+            sizes=np.array(row["sizes"]),
+            velocities=np.array(row["velocities"]),
+        ),
+        contacts=tuple(
+            ContactNote(**c | {"impulse": (c["impulse"][0], c["impulse"][1])})
+            for c in row["contacts"]
+        ),
+        secondary=row["secondary"],
+        plan=plan,
+    )
+    return instant, row["digest"]
+
+
+def first_difference(recording: Recording, retold: Replayer) -> int | None:
+    """The first step at which living through it again differs; None where all bits are the same.
+
+    Args:
+        recording: of the episode.
+        retold: fresh, on the same scene.
+    """
+    digests: list[str] = []
+    for entry in recording.entries:
+        world = retold.tell(entry)
+        if entry.kind == "snapshot":
+            continue
+        del digests[world.steps :]
+        digests.append(digest(world))
+    pairs = zip(digests, recording.digests, strict=False)
+    differing = [k for k, (now, then) in enumerate(pairs) if now != then]
+    if not differing and len(digests) != len(recording.digests):
+        return min(len(digests), len(recording.digests))
+    return differing[0] if differing else None

@@ -1,0 +1,185 @@
+"""An episode as the list of what was asked for: enough to live through it again, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from real2sim_proto import decode, encode
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.operations import Operation
+from real2sim_proto.plans import PLAN, Plan
+
+from ...edit import ScenarioState
+from ...scene import Scene
+from ..world import World
+
+KINDS = ("reset", "action", "edit", "agent", "snapshot", "restore", "stop")
+_OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing that happened to a session.
+
+    Attributes:
+        kind: one of ``KINDS``.
+        step: of the clock when it took effect.
+        payload: msgpack, made by one of the functions below.
+    """
+
+    kind: str
+    step: int
+    payload: bytes
+
+
+def reset_payload(spec: ResetSpec) -> bytes:
+    """Of the beginning of an episode."""
+    return encode({"spec": spec.model_dump(mode="json")})
+
+
+def plan_payload(plan: Plan | None) -> bytes:
+    """Of a plan; None goes on with the one before. Equal plans have equal bytes."""
+    return encode({"plan": None if plan is None else plan.model_dump()})
+
+
+def action_payload(plan: Plan | None, *, latency_us: int = 0, missed: bool = False) -> bytes:
+    """Of a step: its plan, how long that took to make, whether it missed its deadline."""
+    fields: dict[str, Any] = {"plan": None if plan is None else plan.model_dump()}
+    if latency_us:
+        fields["latency_us"] = latency_us
+    if missed:
+        fields["missed"] = True
+    return encode(fields)
+
+
+def edit_payload(operations: Sequence[Operation]) -> bytes:
+    """Of an edit."""
+    return encode({"operations": [o.model_dump(mode="json") for o in operations]})
+
+
+def agent_payload(
+    object_id: str, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
+) -> bytes:
+    """Of a plan for an externally driven object."""
+    fields = {"object_id": object_id, "times_us": list(times_us), "poses": [list(p) for p in poses]}
+    return encode(fields)
+
+
+def name_payload(name: str) -> bytes:
+    """Of a snapshot or of the return to one."""
+    return encode({"name": name})
+
+
+def stop_payload(reason: str) -> bytes:
+    """Of an end that no step brought about."""
+    return encode({"reason": reason})
+
+
+KEPT_PLAN = action_payload(None)
+"""Payload of an action that goes on with the plan before it."""
+
+
+@dataclass(eq=False)
+class Replayer:
+    """A session lived through again.
+
+    Attributes:
+        begin: makes the world of an episode.
+        world: as far as it was told; None before the first reset. Never changed in place.
+        snapshots: by name.
+    """
+
+    begin: Callable[[ResetSpec], World]
+    world: World | None = None
+    snapshots: dict[str, World] = field(default_factory=dict)
+
+    @classmethod
+    def on(cls, scene: Scene, state: ScenarioState) -> Replayer:
+        """A session on a scene, with objects as they were at its creation."""
+        return cls(lambda spec: World(scene, state, spec))
+
+    def tell(self, entry: Entry) -> World:
+        """The world after one more entry.
+
+        Raises:
+            ValueError: the entries do not fit together, or an entry of an unknown kind.
+            WorldError, EditError: an entry that never took effect.
+        """
+        fields = decode(entry.payload)
+        if entry.kind == "reset":
+            self.world = self.begin(ResetSpec.model_validate(fields["spec"]))
+            return self.world
+        if self.world is None:
+            raise ValueError(f"a log cannot begin with {entry.kind!r}; a reset comes first")
+        if entry.kind == "restore":
+            self.world = self.snapshots[fields["name"]]
+            return self.world
+        if entry.kind == "snapshot":
+            self.snapshots[fields["name"]] = self.world
+            return self.world
+        self.world = self.world.light_copy()
+        _happen(self.world, entry.kind, fields)
+        return self.world
+
+
+def _happen(world: World, kind: str, fields: dict[str, Any]) -> None:
+    match kind:
+        case "action":
+            plan = None if fields["plan"] is None else PLAN.validate_python(fields["plan"])
+            world.step(
+                plan,
+                latency_us=fields.get("latency_us", 0),
+                missed=fields.get("missed", False),
+            )
+        case "edit":
+            world.apply(_OPERATIONS.validate_python(fields["operations"]))
+        case "agent":
+            poses = [(x, y, yaw) for x, y, yaw in fields["poses"]]
+            world.steer(fields["object_id"], fields["times_us"], poses)
+        case "stop":
+            world.stop(fields["reason"])
+        case _:
+            raise ValueError(f"a log entry of kind {kind!r}; known are {', '.join(KINDS)}")
+
+
+def worlds_of(retold: Replayer, entries: Iterable[Entry]) -> Iterator[tuple[Entry, World]]:
+    """Every entry with the world after it."""
+    for entry in entries:
+        yield entry, retold.tell(entry)
+
+
+def no_action_impact(retold: Replayer, entries: Sequence[Entry]) -> float:
+    """Relative speed [m/s] at the first contact of a run in which the ego keeps to the recorded
+    drive whatever happens; 0 where it touches nothing. v_r of NeuroNCAP.
+
+    Everything but plans happens as in ``entries``: edits, other agents.
+
+    Args:
+        retold: fresh, on the same scene.
+        entries: of the episode, its reset first.
+    """
+    first, *rest = entries
+    spec = ResetSpec.model_validate(decode(first.payload)["spec"])
+    steady = spec.model_copy(update={"on_collision": "terminate", "deadline_ms": None})
+    world = retold.begin(steady)
+    others: dict[int, list[Entry]] = {}
+    for entry in rest:
+        if entry.kind in {"edit", "agent"}:
+            others.setdefault(entry.step, []).append(entry)
+    while not world.over:
+        for entry in others.get(world.steps, ()):
+            _happen(world, entry.kind, decode(entry.payload))
+        for event in world.step():
+            if event.type == "collision":
+                return event.data["relative_speed"]
+    return 0.0
+
+
+def last_episode(entries: Sequence[Entry]) -> list[Entry]:
+    """Entries from the last reset on."""
+    resets = [k for k, e in enumerate(entries) if e.kind == "reset"]
+    return list(entries[resets[-1] :]) if resets else []

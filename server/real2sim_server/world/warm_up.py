@@ -1,0 +1,81 @@
+"""What a world compiles, made before anybody waits for a step."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from real2sim_proto.episode import AgentsSpec, ContactSpec, EgoSpec, ResetSpec
+from real2sim_proto.operations import Translate
+from real2sim_proto.plans import TrajectoryPlan
+
+from ..edit import ScenarioState
+from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
+from .ego.reference import PlannedTrajectory, Reference
+from .ego.trackers import make_tracker
+from .world import World
+
+PERIOD_US = 100_000
+STEPS = 20
+"""More than fill the window in which comfort is judged."""
+
+
+def warm_up() -> None:
+    """Compile the kernels of a step and of an edit, or load them from the disk cache.
+
+    A small episode uses them all: afterwards neither waits for the compiler.
+    """
+    scene = _street()
+    spec = ResetSpec(
+        dt_us=PERIOD_US,
+        on_collision="continue",
+        contact=ContactSpec(background=False),
+        agents=AgentsSpec(default="idm"),
+    )
+    world = World(scene, ScenarioState.of(scene), spec)
+    for _ in range(STEPS):
+        times = tuple(world.t_us + k * PERIOD_US for k in range(1, 11))
+        x, y, yaw = world.motion.x, world.motion.y, world.motion.yaw
+        poses = [(x + 0.1 * k, y, yaw) for k in range(1, 11)]
+        world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
+        world.observe()
+    # What only perfect tracking and vehicles that were pushed call.
+    ego = EgoSpec(tracker="perfect")
+    course = PlannedTrajectory.of([PERIOD_US], [(1.0, 0.0, 0.0)], (0.0, 0.0, 0.0))
+    ahead = Reference(world.motion, start_us=0, course=course, spec=ego)
+    tracker = make_tracker(ahead, ego)
+    tracker.command(tracker.advance(world.motion, 0.0, PERIOD_US // 2), 0.0)
+    # An edit that brings the cars near each other, for only then their boxes are compared.
+    world.apply([Translate(object_id="ahead", x=-9.0)])
+
+
+def _street() -> Scene:
+    """The ego behind one car and beside another, touching neither, in a scene of one Gaussian."""
+    cloud = GaussianCloud(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 0.1),
+        opacities=torch.full((1,), 0.5),
+        sh=torch.zeros(1, 1, 3),
+    )
+    times = np.arange(STEPS + 2) * PERIOD_US
+    camera = Camera("front", 16, 16, np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), np.eye(4))
+    return Scene(
+        "warm-up",
+        cloud,
+        {
+            name: SceneObject(name, "car", (4.0, 2.0, 1.5), cloud, _drive(times, *place))
+            for name, place in {"ahead": (12.0, 0.0), "beside": (1.0, 3.0)}.items()
+        },
+        None,
+        CameraRig((camera,)),
+        _drive(times, 0.0, 0.0),
+        times,
+    )
+
+
+def _drive(times_us: np.ndarray, x: float, y: float) -> Trajectory:
+    """Straight on at 1 m/s from (x, y) [m]."""
+    positions = np.zeros((len(times_us), 3))
+    positions[:, 0], positions[:, 1] = x + times_us * 1e-6, y
+    return Trajectory(times_us, positions, np.tile([1.0, 0.0, 0.0, 0.0], (len(times_us), 1)))

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from real2sim_server.service.http.disconnects import to_its_end
+
+
+def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():
+    async def work() -> list[str]:
+        done: list[str] = []
+        begun, go_on = asyncio.Event(), asyncio.Event()
+
+        @to_its_end
+        async def change() -> None:
+            begun.set()
+            await go_on.wait()
+            done.append("changed")
+
+        caller = asyncio.create_task(change())
+        await begun.wait()
+        caller.cancel()
+        await asyncio.sleep(0)
+        assert not caller.done()
+        go_on.set()
+        with pytest.raises(asyncio.CancelledError):
+            await caller
+        return done
+
+    assert asyncio.run(work()) == ["changed"]
+
+
+def test_answers_and_errors_come_through():
+    @to_its_end
+    async def divided(a: float, b: float) -> float:
+        return a / b
+
+    assert asyncio.run(divided(1, 2)) == 0.5
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(divided(1, 0))

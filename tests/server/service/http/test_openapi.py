@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from real2sim_proto.assets import AssetCut
+from real2sim_proto.jobs import ExportRequest, SimulateRequest
+from real2sim_proto.scenarios import (
+    OperationBatch,
+    ScenarioCreate,
+    ScenarioDocument,
+    ScenarioFork,
+)
+from real2sim_server.service.app import create_app
+from real2sim_server.service.http.openapi import BODIES, document, operations, text_of
+from real2sim_server.service.serve import running_worker
+
+COMMITTED = Path(__file__).resolve().parents[4] / "docs" / "openapi.json"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> dict[str, Any]:
+    from real2sim_server.settings import Settings
+
+    return document(create_app(Settings(data_dir=tmp_path_factory.mktemp("openapi"))))
+
+
+def test_the_committed_document_is_that_of_the_routes(made):
+    assert COMMITTED.read_text() == text_of(made), "run `make schema` and commit docs/openapi.json"
+
+
+def test_every_operation_is_described_and_has_an_example(made):
+    lacking = []
+    for path, method, operation in operations(made):
+        if not operation.get("description"):
+            lacking.append(f"{method} {path}: description")
+        for parameter in operation.get("parameters", ()):
+            if parameter.get("required") and "example" not in parameter:
+                lacking.append(f"{method} {path}: example of {parameter['name']}")
+        body = operation.get("requestBody", {}).get("content", {}).get("application/json")
+        if body is not None and "example" not in body:
+            lacking.append(f"{method} {path}: example of the body")
+        if "curl" not in operation["x-codeSamples"][0]["source"]:
+            lacking.append(f"{method} {path}: call")
+    assert lacking == []
+
+
+def test_operation_ids_are_unique_and_errors_are_problem_documents(made):
+    found = list(operations(made))
+    ids = [operation["operationId"] for _, _, operation in found]
+    assert len(set(ids)) == len(ids)
+    for path, method, operation in found:
+        content = operation["responses"]["default"]["content"]
+        assert list(content) == ["application/problem+json"], f"{method} {path}"
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        OperationBatch,
+        ScenarioCreate,
+        ScenarioDocument,
+        ScenarioFork,
+        SimulateRequest,
+        ExportRequest,
+    ],
+)
+def test_examples_are_valid(model):
+    model.model_validate_json(json.dumps(BODIES[model.__name__]))
+
+
+def test_the_example_of_a_cut_is_valid(made):
+    body = made["paths"]["/v1/assets"]["post"]["requestBody"]["content"]["application/json"]
+    AssetCut.model_validate(body["example"])
+
+
+# Answers of these are streams that end with the job, or sockets and pages of other programs.
+UNFUZZED = ("/events", "/docs", "/ui")
+
+
+def examples(most: int) -> settings:
+    return settings(
+        max_examples=most,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+@pytest.mark.network
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "most", [6, pytest.param(30, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+)
+def test_any_request_gets_a_documented_answer_and_none_breaks_the_worker(make_settings, made, most):
+    schemathesis = pytest.importorskip(
+        "schemathesis", reason="not installed: pip install 'real2sim[dev]'"
+    )
+    from schemathesis.checks import not_a_server_error
+    from schemathesis.specs.openapi.checks import content_type_conformance, status_code_conformance
+
+    checks = [not_a_server_error, status_code_conformance, content_type_conformance]
+    asked = 0
+    with running_worker(make_settings()) as worker:
+
+        def ask(case) -> None:
+            nonlocal asked
+            asked += 1
+            response = case.call(base_url=worker.url, timeout=30)
+            case.validate_response(response, checks=checks)
+
+        for found in schemathesis.openapi.from_dict(made).get_all_operations():
+            operation = found.ok()
+            if not any(part in operation.path for part in UNFUZZED):
+                examples(most)(given(case=operation.as_strategy())(ask))()
+        assert httpx2.get(f"{worker.url}/livez", trust_env=False).status_code == 200
+    assert asked > 100

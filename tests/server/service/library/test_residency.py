@@ -1,0 +1,222 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+from contextlib import asynccontextmanager
+from dataclasses import replace
+
+import pytest
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.scenes import SceneState
+from real2sim_server.scene.io import read_scene_summary, save_scene
+from real2sim_server.service.http.problems import ServiceError
+from real2sim_server.service.library import scene_cache as residency_module
+from real2sim_server.service.library.scene_cache import SceneCache
+from real2sim_server.service.library.scene_catalog import SceneCatalog
+from real2sim_server.service.rendering.engine import Engine
+
+NAMES = ("a", "b", "c")
+
+
+@pytest.fixture
+def folder(tmp_path, tiny_scene):
+    for name in NAMES:
+        save_scene(replace(tiny_scene, name=name), tmp_path / f"{name}.r2s")
+    return tmp_path
+
+
+@pytest.fixture
+def one_scene(folder) -> int:
+    return read_scene_summary(folder / "a.r2s").nbytes
+
+
+def run(folder, work, *, budget_bytes: int = 10**9):
+    """Run ``work(residency)`` with an engine of its own."""
+
+    @asynccontextmanager
+    async def running():
+        engine = Engine()
+        engine.start()
+        residency = SceneCache(SceneCatalog(folder), engine, budget_bytes=budget_bytes)
+        try:
+            yield residency
+        finally:
+            residency.close()
+            await asyncio.to_thread(engine.stop)
+
+    async def inside():
+        async with running() as residency:
+            return await work(residency)
+
+    return asyncio.run(inside())
+
+
+def resident(residency) -> list[str]:
+    return [name for name in NAMES if residency.state(name) is SceneState.RESIDENT]
+
+
+def test_a_scene_is_loaded_when_it_is_first_needed(folder):
+    async def work(residency):
+        await residency.refresh()
+        before = residency.state("a")
+        scene = await residency.get("a")
+        return before, residency.state("a"), len(scene.objects)
+
+    assert run(folder, work) == (SceneState.AVAILABLE, SceneState.RESIDENT, 3)
+
+
+def test_all_users_share_one_scene_object_and_one_load(folder, monkeypatch):
+    loads = []
+    load = residency_module.load_scene
+    monkeypatch.setattr(
+        residency_module, "load_scene", lambda path: loads.append(path) or load(path)
+    )
+
+    async def work(residency):
+        return await asyncio.gather(*(residency.get("a") for _ in range(5)))
+
+    scenes = run(folder, work)
+    assert all(scene is scenes[0] for scene in scenes)
+    assert len(loads) == 1
+
+
+def test_a_scene_is_loading_while_it_is_read(folder):
+    async def work(residency):
+        task = asyncio.create_task(residency.get("a"))
+        states = set()
+        while not task.done():
+            states.add(residency.state("a"))
+            await asyncio.sleep(0)
+        return states
+
+    assert SceneState.LOADING in run(folder, work)
+
+
+def test_one_who_stops_waiting_does_not_end_the_load_for_the_others(folder):
+    async def work(residency):
+        first = asyncio.create_task(residency.get("a"))
+        second = asyncio.create_task(residency.get("a"))
+        while residency.state("a") is not SceneState.LOADING:
+            await asyncio.sleep(0)
+        first.cancel()
+        return await second
+
+    assert run(folder, work).name == "a"
+
+
+def test_the_longest_unused_scene_leaves_first(folder, one_scene):
+    async def work(residency):
+        for name in ("a", "b", "a", "c"):
+            await residency.get(name)
+        return resident(residency)
+
+    assert run(folder, work, budget_bytes=2 * one_scene) == ["a", "c"]
+
+
+def test_a_pinned_scene_never_leaves(folder, one_scene):
+    async def work(residency):
+        await residency.pin("a")
+        for name in ("b", "c"):
+            await residency.get(name)
+        return resident(residency)
+
+    assert run(folder, work, budget_bytes=2 * one_scene) == ["a", "c"]
+
+
+def test_when_all_is_pinned_another_scene_is_refused_with_the_bytes(folder, one_scene):
+    async def work(residency):
+        await residency.pin("a")
+        with pytest.raises(ServiceError) as caught:
+            await residency.get("b")
+        return caught.value, resident(residency)
+
+    error, left = run(folder, work, budget_bytes=one_scene + 10)
+    assert error.code is ErrorCode.OUT_OF_MEMORY
+    assert error.extra["needed_bytes"] == one_scene
+    assert left == ["a"]
+
+
+def test_unpinned_again_it_makes_room(folder, one_scene):
+    async def work(residency):
+        async with residency.pinned("a"):
+            pass
+        await residency.get("b")
+        return resident(residency)
+
+    assert run(folder, work, budget_bytes=one_scene + 10) == ["b"]
+
+
+def test_a_scene_above_the_budget_is_refused_and_nothing_leaves(folder, one_scene, tiny_scene):
+    big = replace(tiny_scene, name="big", background=tiny_scene.background.with_sh_degree(3))
+    save_scene(big, folder / "big.r2s")
+
+    async def work(residency):
+        await residency.get("a")
+        with pytest.raises(ServiceError, match=f"the budget is {one_scene + 10}") as caught:
+            await residency.get("big")
+        return caught.value.code, resident(residency)
+
+    assert run(folder, work, budget_bytes=one_scene + 10) == (ErrorCode.OUT_OF_MEMORY, ["a"])
+
+
+def test_loads_under_way_count_against_the_budget(folder, one_scene, monkeypatch):
+    go_on, load = threading.Event(), residency_module.load_scene
+    monkeypatch.setattr(residency_module, "load_scene", lambda path: go_on.wait(60) and load(path))
+
+    async def work(residency):
+        asked = [asyncio.create_task(residency.get(name)) for name in NAMES]
+        (refused,), loading = await asyncio.wait(asked, return_when=asyncio.FIRST_COMPLETED)
+        go_on.set()
+        await asyncio.gather(*loading)
+        return refused.exception()
+
+    assert run(folder, work, budget_bytes=2 * one_scene).code == ErrorCode.OUT_OF_MEMORY
+
+
+def test_a_scene_in_use_is_not_unloaded(folder):
+    async def work(residency):
+        await residency.pin("a")
+        with pytest.raises(ServiceError, match="1 sessions use scene 'a'") as caught:
+            await residency.unload("a")
+        residency.unpin("a")
+        await residency.unload("a")
+        return caught.value.code, residency.state("a")
+
+    assert run(folder, work) == (ErrorCode.SCENE_IN_USE, SceneState.AVAILABLE)
+
+
+def test_an_unknown_scene_is_refused_with_the_names_there_are(folder):
+    async def work(residency):
+        await residency.get("zzz")
+
+    with pytest.raises(ServiceError, match="there are: a, b, c") as caught:
+        run(folder, work)
+    assert caught.value.code is ErrorCode.UNKNOWN_SCENE
+
+
+def test_a_bundle_changed_byte_is_found_while_loading_and_the_others_work(folder):
+    tensors = folder / "a.r2s" / "background.safetensors"
+    content = bytearray(tensors.read_bytes())
+    content[-5] ^= 0xFF
+    tensors.write_bytes(content)
+
+    async def work(residency):
+        await residency.refresh()
+        before = residency.state("a")
+        with pytest.raises(ServiceError) as caught:
+            await residency.get("a")
+        await residency.get("b")
+        return before, caught.value.code, residency.state("a")
+
+    broken = (SceneState.AVAILABLE, ErrorCode.SCENE_BROKEN, SceneState.BROKEN)
+    assert run(folder, work) == broken
+
+
+def test_a_scene_added_later_is_found(folder, tiny_scene):
+    async def work(residency):
+        await residency.refresh()
+        save_scene(replace(tiny_scene, name="late"), folder / "late.r2s")
+        return await residency.get("late")
+
+    assert run(folder, work).name == "late"

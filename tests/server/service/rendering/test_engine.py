@@ -1,0 +1,316 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+
+import pytest
+import torch
+
+from real2sim_server.service.rendering.engine import (
+    DeviceLostError,
+    Engine,
+    EngineStoppedError,
+    QueueFullError,
+)
+
+
+@pytest.fixture
+def make_engine():
+    engines = []
+
+    def make(**options) -> Engine:
+        engine = Engine(**options)
+        engine.start()
+        engines.append(engine)
+        return engine
+
+    yield make
+    for engine in engines:
+        engine.stop(drain=False, timeout_s=10)
+
+
+class Gate:
+    """A job that occupies the engine until it is opened."""
+
+    def __init__(self) -> None:
+        self.entered = threading.Event()
+        self._opened = threading.Event()
+
+    def job(self) -> str:
+        self.entered.set()
+        assert self._opened.wait(10)
+        return "through"
+
+    def open(self) -> None:
+        self._opened.set()
+
+
+async def until_entered(gate: Gate) -> None:
+    assert await asyncio.to_thread(gate.entered.wait, 10)
+
+
+def test_a_call_returns_what_the_function_returns(make_engine):
+    engine = make_engine()
+    assert asyncio.run(engine.call(divmod, 7, 2)) == (3, 1)
+    assert engine.call_sync(int, "ff", base=16) == 255
+
+
+def test_an_engine_goes_on_when_the_loop_that_asked_is_gone(make_engine):
+    engine, gate = make_engine(), Gate()
+
+    async def ask_and_leave() -> None:
+        # Held by nobody else, and never cancelled, as when a loop is stopped at once.
+        asyncio.ensure_future(engine.call(gate.job))  # noqa: RUF006
+        await until_entered(gate)
+
+    loop = asyncio.new_event_loop()
+    loop.run_until_complete(ask_and_leave())
+    loop.close()
+    gate.open()
+    assert engine.call_sync(int, "7") == 7
+
+
+def test_whoever_is_to_know_first_is_told_on_the_loop_before_the_caller(make_engine):
+    engine, told = make_engine(), []
+
+    async def ask() -> None:
+        def first(result: int) -> None:
+            told.append((result, threading.get_ident()))
+
+        assert await engine.call(int, "7", first=first) == 7
+        assert told == [(7, threading.get_ident())]
+
+    asyncio.run(ask())
+
+
+def test_an_error_of_whoever_is_told_first_reaches_the_caller(make_engine):
+    engine = make_engine()
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(engine.call(int, "0", first=lambda result: 1 // result))
+    assert engine.call_sync(int, "7") == 7
+
+
+def test_nobody_is_told_first_of_a_job_that_failed(make_engine):
+    engine, told = make_engine(), []
+    with pytest.raises(ValueError, match="invalid literal"):
+        asyncio.run(engine.call(int, "seven", first=told.append))
+    assert told == []
+
+
+def test_all_jobs_run_on_the_same_thread_and_none_on_the_callers(make_engine):
+    engine = make_engine()
+
+    async def ask() -> list[int]:
+        return await asyncio.gather(*(engine.call(threading.get_ident) for _ in range(5)))
+
+    idents = set(asyncio.run(ask()))
+    assert len(idents) == 1
+    assert threading.get_ident() not in idents
+
+
+def test_jobs_run_in_the_order_they_came(make_engine):
+    engine = make_engine()
+    order: list[int] = []
+
+    async def ask() -> None:
+        await asyncio.gather(*(engine.call(order.append, i) for i in range(50)))
+
+    asyncio.run(ask())
+    assert order == list(range(50))
+
+
+def test_exceptions_travel_to_the_caller_and_the_engine_goes_on(make_engine):
+    engine = make_engine()
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(engine.call(divmod, 1, 0))
+    assert engine.call_sync(abs, -1) == 1
+
+
+def test_a_cancelled_caller_takes_the_waiting_job_along(make_engine):
+    engine, gate, ran = make_engine(), Gate(), []
+
+    async def ask() -> None:
+        first = asyncio.create_task(engine.call(gate.job))
+        await until_entered(gate)
+        second = asyncio.create_task(engine.call(ran.append, "second"))
+        await asyncio.sleep(0)
+        assert engine.queue_depth == 1
+        second.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await second
+        assert engine.queue_depth == 0
+        gate.open()
+        assert await first == "through"
+        await engine.call(ran.append, "third")
+
+    asyncio.run(ask())
+    assert ran == ["third"]
+
+
+def test_a_running_job_finishes_although_its_caller_was_cancelled(make_engine):
+    engine, gate, ran = make_engine(), Gate(), []
+
+    def job() -> None:
+        gate.job()
+        ran.append("finished")
+
+    async def ask() -> None:
+        task = asyncio.create_task(engine.call(job))
+        await until_entered(gate)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        gate.open()
+        await engine.call(lambda: None)
+
+    asyncio.run(ask())
+    assert ran == ["finished"]
+
+
+def test_a_full_queue_refuses_at_once_and_names_the_limit(make_engine):
+    engine, gate = make_engine(queue_length=2), Gate()
+
+    async def ask() -> None:
+        tasks = [asyncio.create_task(engine.call(gate.job))]
+        await until_entered(gate)
+        tasks += [asyncio.create_task(engine.call(lambda: None)) for _ in range(2)]
+        await asyncio.sleep(0)
+        with pytest.raises(QueueFullError, match="2 jobs wait for the engine, 2 may"):
+            await engine.call(lambda: None)
+        gate.open()
+        await asyncio.gather(*tasks)
+        await engine.call(lambda: None)
+
+    asyncio.run(ask())
+
+
+def test_stop_finishes_what_waits(make_engine):
+    engine, gate = make_engine(), Gate()
+
+    async def ask() -> list[object]:
+        tasks = [asyncio.create_task(engine.call(gate.job))]
+        await until_entered(gate)
+        tasks.append(asyncio.create_task(engine.call(lambda: "waited")))
+        await asyncio.sleep(0)
+        stopping = asyncio.create_task(asyncio.to_thread(engine.stop))
+        gate.open()
+        await stopping
+        return await asyncio.gather(*tasks)
+
+    assert asyncio.run(ask()) == ["through", "waited"]
+    assert not engine.alive
+
+
+def test_stop_without_draining_refuses_what_waits(make_engine):
+    engine, gate = make_engine(), Gate()
+
+    async def ask() -> None:
+        first = asyncio.create_task(engine.call(gate.job))
+        await until_entered(gate)
+        second = asyncio.create_task(engine.call(lambda: None))
+        await asyncio.sleep(0)
+        stopping = asyncio.create_task(asyncio.to_thread(engine.stop, drain=False))
+        with pytest.raises(EngineStoppedError):
+            await second
+        gate.open()
+        await stopping
+        assert await first == "through"
+
+    asyncio.run(ask())
+
+
+def test_a_stopped_engine_refuses_jobs(make_engine):
+    engine = make_engine()
+    engine.stop()
+    with pytest.raises(EngineStoppedError):
+        engine.call_sync(lambda: None)
+
+
+def test_stop_says_which_job_does_not_end(make_engine):
+    engine, gate = make_engine(), Gate()
+    caller = threading.Thread(target=engine.call_sync, args=(gate.job,), kwargs={"label": "slow"})
+    caller.start()
+    gate.entered.wait(10)
+    with pytest.raises(TimeoutError, match="'slow' still runs"):
+        engine.stop(timeout_s=0.05)
+    gate.open()
+    caller.join(10)
+
+
+def test_a_job_may_call_the_engine_without_waiting_for_itself(make_engine):
+    engine = make_engine()
+    assert engine.call_sync(lambda: engine.call_sync(lambda: "inner")) == "inner"
+
+
+def test_call_sync_gives_up_after_its_timeout(make_engine):
+    engine, gate = make_engine(), Gate()
+    with pytest.raises(TimeoutError):
+        engine.call_sync(gate.job, timeout_s=0.05)
+    gate.open()
+
+
+def test_the_heartbeat_ages_only_while_a_job_runs(make_engine):
+    engine, gate = make_engine(), Gate()
+    time.sleep(0.6)
+    assert engine.seconds_since_tick < 0.5
+
+    async def ask() -> None:
+        task = asyncio.create_task(engine.call(gate.job, label="long"))
+        await until_entered(gate)
+        await asyncio.sleep(0.6)
+        assert engine.seconds_since_tick > 0.5
+        assert engine.running == "long"
+        gate.open()
+        await task
+
+    asyncio.run(ask())
+
+
+def test_a_sticky_device_error_ends_the_engine_and_refuses_all_others(make_engine):
+    engine, gate, told = make_engine(), Gate(), []
+    engine.on_failure = lambda: told.append(True)
+
+    def lose() -> None:
+        gate.job()
+        raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+    async def ask() -> None:
+        first = asyncio.create_task(engine.call(lose))
+        await until_entered(gate)
+        second = asyncio.create_task(engine.call(lambda: None))
+        await asyncio.sleep(0)
+        gate.open()
+        with pytest.raises(RuntimeError, match="illegal memory access"):
+            await first
+        with pytest.raises(DeviceLostError):
+            await second
+        with pytest.raises(DeviceLostError):
+            await engine.call(lambda: None)
+
+    asyncio.run(ask())
+    assert told == [True]
+    assert not engine.alive
+
+
+def test_running_out_of_device_memory_does_not_end_the_engine(make_engine):
+    engine = make_engine()
+
+    def allocate() -> None:
+        raise torch.OutOfMemoryError("CUDA error: out of memory")
+
+    with pytest.raises(torch.OutOfMemoryError):
+        engine.call_sync(allocate)
+    assert engine.alive
+
+
+def test_jobs_are_reported_with_their_label_and_durations():
+    reports: list[tuple[str, float, float]] = []
+    engine = Engine(on_job=lambda *report: reports.append(report))
+    engine.start()
+    engine.call_sync(time.sleep, 0.02, label="nap")
+    engine.stop()
+    label, waited, ran = reports[-1]
+    assert label == "nap"
+    assert ran >= 0.02
+    assert waited >= 0

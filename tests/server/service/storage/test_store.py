@@ -1,0 +1,299 @@
+from __future__ import annotations
+
+import asyncio
+import json
+import sqlite3
+from dataclasses import replace
+
+import pytest
+import sqlalchemy as sa
+
+from real2sim_proto.jobs import JobInfo, JobState
+from real2sim_server.service.storage import tables
+from real2sim_server.service.storage.job_log import JobLog
+from real2sim_server.service.storage.store import (
+    ConflictError,
+    ScenarioRow,
+    SessionEntry,
+    SessionRow,
+    SnapshotRow,
+    Store,
+    StoredReply,
+    StoreError,
+    Write,
+    now_us,
+)
+
+from ..postgres import Postgres
+
+SCENARIO = ScenarioRow("sc_1", "first", "tiny", "0" * 64, 1)
+SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "secret", 1)
+REPLY = StoredReply("key", "f" * 64, 201, {"ETag": '"r1"'}, b'{"a": 1}')
+
+
+@pytest.fixture
+def sqlite_url(tmp_path) -> str:
+    return f"sqlite:///{tmp_path / 'deep' / 'store.db'}"
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request, sqlite_url) -> str:
+    """An empty database of each kind; what holds for one holds for the other."""
+    if request.param == "sqlite":
+        return sqlite_url
+    server: Postgres = request.getfixturevalue("postgres")
+    return server.new_database()
+
+
+def run(url: str, work):
+    """Run ``work(store)`` on a store opened for it."""
+
+    async def inside():
+        store = Store(url)
+        await store.open()
+        try:
+            return await work(store)
+        finally:
+            await store.close()
+
+    return asyncio.run(inside())
+
+
+def entry(text: str) -> dict:
+    return {"kind": "edit", "text": text}
+
+
+def test_a_scenario_and_its_log_survive_closing(url):
+    async def write(store):
+        await store.create_scenario(SCENARIO)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1)
+        store.record_revision("sc_1", 2, entry("b"), created_us=2)
+
+    async def read(store):
+        return await store.scenario("sc_1"), await store.scenario_entries("sc_1")
+
+    run(url, write)
+    assert run(url, read) == (SCENARIO, [entry("a"), entry("b")])
+
+
+def test_a_revision_can_be_written_only_once(url):
+    async def write(store):
+        await store.create_scenario(SCENARIO)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1)
+        with pytest.raises(ConflictError):
+            store.record_revision("sc_1", 1, entry("b"), created_us=1)
+        return await store.scenario_entries("sc_1")
+
+    assert run(url, write) == [entry("a")]
+
+
+def test_an_entry_without_its_scenario_is_refused(url):
+    async def write(store):
+        with pytest.raises(ConflictError):
+            store.record_revision("sc_9", 1, entry("a"), created_us=1)
+
+    run(url, write)
+
+
+def test_deleting_a_scenario_takes_its_log_along(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1)
+        assert await store.delete_scenario("sc_1") is True
+        assert await store.delete_scenario("sc_1") is False
+        return await store.scenarios(), await store.scenario_kinds()
+
+    assert run(url, work) == ([], {})
+
+
+def test_the_last_snapshot_of_a_scenario_is_kept(url):
+    async def write(store):
+        await store.create_scenario(SCENARIO)
+        for revision in (128, 256):
+            await store.keep_snapshot(SnapshotRow("sc_1", revision, "1", bytes([revision % 255])))
+        return await store.snapshot("sc_1"), await store.snapshot("sc_2")
+
+    assert run(url, write) == (SnapshotRow("sc_1", 256, "1", b"\x01"), None)
+
+
+def test_snapshots_go_with_their_scenario(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        await store.keep_snapshot(SnapshotRow("sc_1", 128, "1", b"state"))
+        await store.delete_scenario("sc_1")
+        with pytest.raises(ConflictError):
+            await store.keep_snapshot(SnapshotRow("sc_1", 256, "1", b"state"))
+        return await store.snapshot("sc_1")
+
+    assert run(url, work) is None
+
+
+def test_scenarios_are_listed_oldest_first(url):
+    async def work(store):
+        await store.create_scenario(replace(SCENARIO, scenario_id="late", created_us=9))
+        await store.create_scenario(replace(SCENARIO, scenario_id="early", created_us=3))
+        return [row.scenario_id for row in await store.scenarios()]
+
+    assert run(url, work) == ["early", "late"]
+
+
+def test_a_reply_is_stored_with_its_effect_or_not_at_all(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        store.record_revision("sc_1", 1, entry("a"), created_us=1, reply=REPLY)
+        other = replace(REPLY, key="other")
+        with pytest.raises(ConflictError):
+            store.record_revision("sc_1", 1, entry("b"), created_us=1, reply=other)
+        return await store.reply("key"), await store.reply("other")
+
+    assert run(url, work) == (REPLY, None)
+
+
+def test_a_reply_is_forgotten_after_a_day(url, monkeypatch):
+    async def work(store):
+        await store.create_scenario(SCENARIO, reply=REPLY)
+        day_us = 24 * 3600 * 1_000_000
+        monkeypatch.setattr(
+            "real2sim_server.service.storage.store.now_us", lambda: now_us() + day_us
+        )
+        gone = await store.reply("key")
+        await store.create_scenario(replace(SCENARIO, scenario_id="sc_2"), reply=REPLY)
+        return gone, await store.reply("key")
+
+    assert run(url, work) == (None, REPLY)
+
+
+def test_a_session_log_is_appended_all_or_nothing(url):
+    first, second = (SessionEntry(i, "action", i, b"\x80", 1) for i in range(2))
+
+    async def work(store):
+        await store.create_session(SESSION)
+        await store.append_session_entries("w0.1", [first])
+        with pytest.raises(ConflictError):
+            await store.append_session_entries("w0.1", [second, first])
+        kept = await store.session_entries("w0.1")
+        await store.append_session_entries("w0.1", [second])
+        return kept, await store.session_entries("w0.1", after=0)
+
+    assert run(url, work) == ([first], [second])
+
+
+def test_open_sessions_are_those_of_the_worker_that_were_not_closed(url):
+    async def work(store):
+        for session_id, worker_id in (("w0.1", "w0"), ("w0.2", "w0"), ("w1.1", "w1")):
+            row = replace(SESSION, session_id=session_id, worker_id=worker_id)
+            await store.create_session(row)
+        await store.close_session("w0.1", reason="done")
+        await store.close_session("w0.1", reason="again")
+        return await store.open_sessions("w0"), await store.session("w0.1")
+
+    still_open, closed = run(url, work)
+    assert [row.session_id for row in still_open] == ["w0.2"]
+    assert closed.reason == "done"
+    assert closed.closed_us is not None
+
+
+def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        return (tmp_path / "deep" / "store.db-wal").exists()
+
+    assert run(sqlite_url, work)
+
+
+def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
+    async def nothing(store):
+        pass
+
+    run(sqlite_url, nothing)
+    connection = sqlite3.connect(tmp_path / "deep" / "store.db")
+    connection.execute("UPDATE schema_version SET version = 99")
+    connection.commit()
+    connection.close()
+    with pytest.raises(StoreError, match="schema version 99, this worker reads 1"):
+        run(sqlite_url, nothing)
+
+
+def test_a_file_that_is_no_database_is_refused(sqlite_url, tmp_path):
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "store.db").write_bytes(b"not a database at all" * 100)
+
+    async def nothing(store):
+        pass
+
+    with pytest.raises(StoreError, match="cannot open the store"):
+        run(sqlite_url, nothing)
+
+
+def test_a_password_in_the_url_is_not_shown():
+    async def nothing(store):
+        pass
+
+    with pytest.raises(StoreError) as caught:
+        run("nosuchdb://user:hunter2@host/db", nothing)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_what_was_handed_over_is_written_although_the_caller_was_cancelled(url):
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        row = {"scenario_id": "sc_1", "revision": 1, "kind": "edit", "created_us": 1}
+        row["entry"] = json.dumps(entry("a"))
+        task = asyncio.create_task(store.write(Write(sa.insert(tables.scenario_log), [row])))
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        return await store.scenario_entries("sc_1")
+
+    assert run(url, work) == [entry("a")]
+
+
+def test_a_store_in_memory_works_too():
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        return await store.scenario("sc_1")
+
+    assert run("sqlite://", work) == SCENARIO
+
+
+def test_appending_nothing_is_allowed(url):
+    async def work(store):
+        await store.create_session(SESSION)
+        await store.append_session_entries("w0.1", [])
+        return await store.session_entries("w0.1")
+
+    assert run(url, work) == []
+
+
+def test_jobs_survive_closing_and_are_found_by_state_and_subject(url):
+    done = JobInfo(job_id="job_1", kind="export", subject="a", state="succeeded", created_at="then")
+    stuck = JobInfo(job_id="job_2", kind="simulate", subject="b", state="running", created_at="now")
+
+    async def write(store):
+        log = JobLog(store, "w0")
+        await log.add(done, reply=None)
+        await log.add(stuck.model_copy(update={"state": JobState.QUEUED}), reply=None)
+        await log.update(stuck)
+
+    async def read(store):
+        log = JobLog(store, "w0")
+        other = await JobLog(store, "w1").unfinished()
+        by_subject = await log.newest(subject="a", limit=5)
+        return await log.get("job_2"), await log.unfinished(), other, by_subject
+
+    run(url, write)
+    assert run(url, read) == (stuck, [stuck], [], [done])
+
+
+def test_a_scenario_is_created_with_its_log_or_not_at_all(url):
+    log = [entry("a") | {"revision": 1}, entry("b") | {"revision": 2}]
+
+    async def work(store):
+        await store.create_scenario(SCENARIO, entries=log)
+        twice = replace(SCENARIO, scenario_id="sc_2")
+        with pytest.raises(ConflictError):
+            await store.create_scenario(twice, entries=[log[0], log[0]])
+        return await store.scenario_entries("sc_1"), await store.scenario("sc_2")
+
+    assert run(url, work) == (log, None)
