@@ -15,7 +15,7 @@ from real2sim_server.physics import SolverError
 from real2sim_server.physics.backends.cuda.backend import CudaBackend
 
 ROOT = Path(__file__).parents[3]
-MATERIALS = ("Jelly", "NeoHookean", "Metal", "Foam", "Sand", "Snow")
+MATERIALS = ("FixedCorotated", "NeoHookean", "Metal", "Foam", "Sand", "Snow")
 SCENES = (
     *MATERIALS,
     "slope",

@@ -26,8 +26,8 @@ from .scenes import cube, solve
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: FixedCorotated(young=-1), "young of Jelly must be positive"),
-        (lambda: FixedCorotated(young=0), "young of Jelly must be positive"),
+        (lambda: FixedCorotated(young=-1), "young of FixedCorotated must be positive"),
+        (lambda: FixedCorotated(young=0), "young of FixedCorotated must be positive"),
         (lambda: FixedCorotated(young=float("nan")), "finite"),
         (lambda: FixedCorotated(young="soft"), "finite"),
         (lambda: FixedCorotated(young=1e5, poisson=0.5), "0.5 is incompressible"),

@@ -84,7 +84,7 @@ SIMULATION = """
 import numpy as np, torch
 from real2sim_server.render import Instance
 from real2sim_server.render.backends.base import RasterRequest, place_instances
-from real2sim_server.render.backends.cuda_instance import find_instances
+from real2sim_server.render.backends.cuda.instance import find_instances
 from real2sim_server.render.backends.reference import ReferenceBackend, _concatenate, _project
 from real2sim_server.render.types import RasterOptions
 from real2sim_server.scene import GaussianCloud

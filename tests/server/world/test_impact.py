@@ -11,9 +11,8 @@ import torch
 from real2sim_proto.operations import SetPhysics
 from real2sim_proto.plans import Control
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.world.collision import manifold as touch
 from real2sim_server.world.collision.body import Body, Solid, integrate_sliding
-from real2sim_server.world.collision.manifold import corners, exchange
+from real2sim_server.world.collision.manifold import corners, exchange, touch
 
 COAST = Control(acceleration=0.0, steering=0.0)
 GO_ON = {"action": "control", "on_collision": "continue", "privileged": True}

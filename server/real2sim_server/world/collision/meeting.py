@@ -19,12 +19,11 @@ from ..ego.vehicle import Motion
 from ..path import Float
 from ..scoring.boxes import side_of_contact
 from ..scoring.instant import ContactNote
-from . import resolve
 from .contact import Contact, ego_box, touching
 from .contact_kernels import may_overlap
 from .model import Impact, ImpactedObject, ego_body, ego_solid
 from .obstacles import Obstacles
-from .resolve import Bout, Outcome
+from .resolve import Bout, Outcome, resolve
 
 BACKGROUND = "background"
 

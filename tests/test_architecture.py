@@ -1,0 +1,187 @@
+"""The architecture, as a test: who may import whom.
+
+``ARCHITECTURE.md`` draws the same layers for people.
+"""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SERVER = "real2sim_server"
+ROOTS = {
+    "real2sim_proto": REPOSITORY / "proto" / "real2sim_proto",
+    "real2sim": REPOSITORY / "client" / "real2sim",
+    SERVER: REPOSITORY / "server" / SERVER,
+}
+
+LAYERS = (
+    "_numba",
+    "_files",
+    "console",
+    "settings",
+    "geometry",
+    "scene",
+    "render",
+    "physics",
+    "simulation",
+    "logs",
+    "synthetic",
+    "reconstruct",
+    "edit",
+    "world",
+    "service",
+    "demo",
+    "policies",
+    "benchmarks",
+    "cli",
+)
+"""Packages and single modules of the server, lowest first: each imports only those before it."""
+
+PLAY_THEIR_OWN_USER = {"demo", "policies", "benchmarks", "cli"}
+"""Only these use the client SDK, since there the program plays its own user."""
+
+FORBIDDEN = {
+    "real2sim_proto": {"real2sim", SERVER, "torch", "fastapi", "numba", "cv2"},
+    "real2sim": {SERVER, "torch", "fastapi", "numba"},
+}
+"""What a distribution's contract and SDK never import, at the top of a file or inside."""
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the three packages by its dotted name; a package stands for its __init__."""
+    found = {}
+    for name, root in ROOTS.items():
+        for path in sorted(root.rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            parts = parts[:-1] if parts[-1] == "__init__" else parts
+            found[".".join((name, *parts))] = path
+    return found
+
+
+@cache
+def imports(module: str) -> frozenset[str]:
+    """What a module imports, anywhere in it: modules of the project, others by their full name.
+
+    ``from . import x`` and ``from package import x`` count as the module ``x`` where there is one.
+    """
+    path = modules()[module]
+    package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*base, *([node.module] if node.module else [])])
+            inner = {alias.name: f"{source}.{alias.name}" for alias in node.names}
+            names |= {full if full in modules() else source for full in inner.values()}
+    return frozenset(names)
+
+
+def layer(module: str) -> str:
+    """The package or single module right below ``real2sim_server`` that a module belongs to."""
+    return module.split(".")[1]
+
+
+def server_modules() -> list[str]:
+    return [m for m in modules() if m.startswith(f"{SERVER}.")]
+
+
+def circle(edges: dict[str, set[str]]) -> list[str]:
+    """Names along one circle of the graph; empty where there is none."""
+    try:
+        TopologicalSorter(edges).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_the_layers_are_the_packages_that_exist():
+    there = {layer(name) for name in server_modules()}
+    assert there == set(LAYERS)
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_a_package_imports_only_packages_below_it(name):
+    above = set(LAYERS[LAYERS.index(name) + 1 :])
+    wrong = [
+        f"{module} imports {imported}"
+        for module in server_modules()
+        if layer(module) == name
+        for imported in imports(module)
+        if imported.startswith(f"{SERVER}.") and layer(imported) in above
+    ]
+    assert not wrong
+
+
+def test_no_files_import_each_other_in_a_circle():
+    edges = {m: {i for i in imports(m) if i in modules() and i != m} for m in modules()}
+    assert not circle(edges)
+
+
+@pytest.mark.parametrize("package", ["service", "world", "reconstruct", "physics", "render"])
+def test_folders_of_a_package_import_each_other_in_no_circle(package):
+    prefix = f"{SERVER}.{package}."
+    edges: dict[str, set[str]] = {}
+    for module in server_modules():
+        if not module.startswith(prefix):
+            continue
+        own = module.removeprefix(prefix).split(".")[0]
+        others = {
+            name.removeprefix(prefix).split(".")[0]
+            for name in imports(module)
+            if name.startswith(prefix)
+        }
+        edges.setdefault(own, set()).update(others - {own})
+    assert not circle(edges)
+
+
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_contract_and_sdk_import_nothing_of_the_worker(package):
+    wrong = [
+        f"{module} imports {imported}"
+        for module in modules()
+        if module.split(".")[0] == package
+        for imported in imports(module)
+        if imported.split(".")[0] in FORBIDDEN[package]
+    ]
+    assert not wrong
+
+
+def test_the_worker_uses_the_sdk_only_where_it_plays_its_own_user():
+    wrong = [
+        f"{module} imports {imported}"
+        for module in server_modules()
+        if layer(module) not in PLAY_THEIR_OWN_USER
+        for imported in imports(module)
+        if imported.split(".")[0] == "real2sim"
+    ]
+    assert not wrong
+
+
+def test_every_package_says_what_it_is():
+    silent = [
+        name
+        for name, path in modules().items()
+        if path.name == "__init__.py"
+        and not ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert not silent
+
+
+def test_a_relative_import_of_a_package_is_seen():
+    """What ``from .. import world`` brings in is the package, not the name of the one above."""
+    assert f"{SERVER}.cli" not in imports(f"{SERVER}.console")
+    assert any(layer(name) == "geometry" for name in imports(f"{SERVER}.scene.scene"))
+
+
+def test_a_circle_is_found():
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) != []
+    assert circle({"a": {"b"}, "b": {"c"}}) == []
