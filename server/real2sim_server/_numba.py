@@ -1,45 +1,241 @@
-"""How the small numerics of scenes, edits and worlds are compiled."""
+"""How kernels are compiled and kept on disk: the one place of the server that says so.
+
+Two decorators, bare or with options of ``numba.njit``, which are handed through:
+
+``@kernel``
+    What Python calls. Kept on disk, so that only the first run compiles it.
+``@func``
+    What only kernels and other funcs call. Compiled with them and kept as part of them.
+
+    from .._numba import func, kernel
+
+    @func
+    def squared(x):
+        return x * x
+
+    @kernel(nogil=True, parallel=True)
+    def norms(points): ...
+
+Both divide as NumPy does (``error_model="numpy"``) unless told otherwise. A family of kernels that
+shares options binds them once: ``entry = functools.partial(kernel, nogil=True, fastmath=True)``.
+Without ``nogil`` a kernel keeps the interpreter's lock: right for those that take microseconds,
+since whoever gives the lock up may wait milliseconds to get it back.
+
+A kernel on disk cannot be stale. Numba's own key of what it keeps is the file that defines the
+function and that function's bytecode. It misses whatever a kernel takes from elsewhere: constants,
+functions that it calls, code generators of intrinsics, the order of a tuple's fields, options of
+the compiler. :func:`fingerprint` covers all of these: it walks from the function over every global
+name and closure cell it can reach, as they are at the first call. It reads no source file, so
+importing costs nothing, and comments or docstrings elsewhere compile nothing anew.
+
+Out of its sight stays what Numba finds by type or by registration and not by name: bodies given to
+``numba.extending.overload`` and options given to ``register_jitable`` (its functions are seen).
+"""
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Callable, Iterable
-from functools import partial
-from pathlib import Path
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from enum import Enum
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
-from numba import njit
-
-compiled = njit(cache=True, error_model="numpy")
-"""For functions that take microseconds: kept on disk, divisions as in NumPy.
-
-Without ``nogil``, since whoever gives up the interpreter's lock may have to wait milliseconds to
-get it back. Such a function calls none of another file, see :func:`compiled_from`.
-"""
-
-inner: Any = partial(njit, error_model="numpy")
-"""Compiles functions that only compiled ones call; they are cached as part of those."""
+import numpy as np
+from numba import njit, types
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+from numba.core.extending import _Intrinsic
 
 
-def compiled_from(folder: Path) -> Callable[[Callable[..., Any]], Any]:
-    """Like ``compiled``, for functions that call others of their folder.
+def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
+    """Compile what Python calls; machine code is kept on disk, see the module.
 
-    Numba's disk cache looks at the file that a function is in and at no other: after an upgrade
-    that changes one of those it would go on with the old machine code. So the name of each
-    carries a fingerprint of all sources in the folder.
+    Args:
+        function: to compile; absent when the decorator is used with options.
+        **options: of ``numba.njit``; ``error_model`` is "numpy" unless given.
+
+    Returns:
+        A Numba dispatcher, or the decorator that makes one.
     """
-    mark = fingerprint(sorted(folder.glob("*.py")))
+    if function is None:
+        return functools.partial(kernel, **options)
+    compiled = func(function, **options)
+    if isinstance(compiled, Dispatcher):  # else NUMBA_DISABLE_JIT is set
+        compiled._cache = _KernelCache(compiled)  # type: ignore[attr-defined]
+    return compiled
 
-    def decorate(function: Callable[..., Any]) -> Any:
-        function.__qualname__ += f"_{mark}"
-        return compiled(function)
 
-    return decorate
+def func(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
+    """Compile what only kernels and other funcs call; kept on disk as part of the kernels.
+
+    Args and result as of :func:`kernel`.
+    """
+    if function is None:
+        return functools.partial(func, **options)
+    return njit(**{"error_model": "numpy", **options})(function)
 
 
-def fingerprint(sources: Iterable[Path]) -> str:
-    """Eight hexadecimal digits that change with any of the files."""
+def fingerprint(compiled: Any) -> str:
+    """64 hexadecimal digits that change with anything a kernel is made of.
+
+    Args:
+        compiled: what :func:`kernel` or :func:`func` returned.
+    """
+    reach = _Reach()
+    reach.reference(compiled)
     digest = hashlib.sha256()
-    for path in sources:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]
+    for part in reach.parts:  # grows on the way
+        digest.update(reach.describe(part).encode())
+    return digest.hexdigest()
+
+
+class _KernelCache(FunctionCache):
+    """Numba's disk cache of one function, with a key that nothing slips through."""
+
+    def __init__(self, compiled: Dispatcher) -> None:
+        super().__init__(compiled.py_func)  # type: ignore[no-untyped-call]
+        self._compiled = compiled
+
+    def _index_key(self, sig: tuple[Any, ...], codegen: Any) -> tuple[Any, ...]:
+        return sig, codegen.magic_tuple(), self._fingerprint, tuple(_tuple_fields(sig))
+
+    @functools.cached_property
+    def _fingerprint(self) -> str:
+        return fingerprint(self._compiled)
+
+
+def _tuple_fields(signature: Any) -> Iterator[tuple[str, ...]]:
+    """Field names of the named tuples in a signature: Numba tells them apart by class alone."""
+    for kind in signature:
+        if isinstance(kind, types.BaseTuple):
+            yield tuple(getattr(kind, "fields", ()))
+            yield from _tuple_fields(kind)
+
+
+class _Reach:
+    """All functions and classes that a kernel reaches, numbered in the order they are met.
+
+    Attributes:
+        parts: dispatchers, intrinsics, functions and classes; :meth:`describe` adds to them.
+    """
+
+    def __init__(self) -> None:
+        self.parts: list[Any] = []
+        self._numbers: dict[int, int] = {}
+
+    def reference(self, part: Any) -> str:
+        """Short text that stands for a part."""
+        number = self._numbers.setdefault(id(part), len(self.parts))
+        if number == len(self.parts):
+            self.parts.append(part)
+        return f"#{number}"
+
+    def describe(self, part: Any) -> str:
+        """Full text of a part, with references to the parts that it uses."""
+        if isinstance(part, Dispatcher):
+            return f"compiled {self._value(part.py_func)} {self._value(part.targetoptions)}"
+        if isinstance(part, _Intrinsic):
+            return f"intrinsic {self._value(part._defn)}"
+        if isinstance(part, FunctionType):
+            return self._describe_function(part)
+        return self._describe_class(part)
+
+    def _describe_function(self, function: FunctionType) -> str:
+        names: set[str] = set()
+        code = self._code(function.__code__, function.__doc__, names)
+        cells = [_content(cell) for cell in function.__closure__ or ()]
+        defaults = (function.__defaults__, function.__kwdefaults__)
+        outside = [
+            f"{name}={self._value(value)}"
+            for name, value in _lookup(names, function.__globals__, set())
+        ]
+        return f"function {code} {self._value(cells)} {self._value(defaults)} {outside}"
+
+    def _code(self, code: CodeType, doc: str | None, names: set[str]) -> str:
+        """Text of a function's code; adds what it may look up outside to ``names``."""
+        names.update(code.co_names)
+        constants = [
+            self._code(constant, None, names)
+            if isinstance(constant, CodeType)
+            else self._value(constant)
+            for constant in code.co_consts
+            if doc is None or constant != doc
+        ]
+        variables = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
+        return f"{code.co_code.hex()} {variables} {constants}"
+
+    def _describe_class(self, kind: type) -> str:
+        if issubclass(kind, Enum):
+            return f"enum {[(name, self._value(m.value)) for name, m in kind.__members__.items()]}"
+        members = [
+            f"{name}={self._value(value)}"
+            for name, value in sorted(vars(kind).items())
+            if not name.startswith("__") or isinstance(value, FunctionType)
+        ]
+        return f"class {[self._value(base) for base in kind.__bases__]} {members}"
+
+    def _value(self, value: Any) -> str:
+        """Text of a value, which is the same in each process."""
+        if isinstance(value, (Dispatcher, _Intrinsic)):
+            return self.reference(value)
+        if isinstance(value, (FunctionType, type)):
+            outside = _of_library(value.__module__)
+            return value.__qualname__ if outside else self.reference(value)
+        if isinstance(value, ModuleType):
+            return value.__name__
+        if isinstance(value, Enum):
+            return f"{self._value(type(value))}.{value.name}"
+        if isinstance(value, np.ndarray):
+            return f"{value.dtype!r}{value.shape}{hashlib.sha256(value.tobytes()).hexdigest()}"
+        return self._wrapped(value) or self._collection(value) or _ADDRESS.sub("", repr(value))
+
+    def _wrapped(self, value: Any) -> str | None:
+        if isinstance(value, (staticmethod, classmethod)):
+            return self._value(value.__func__)
+        if isinstance(value, property):
+            return self._value(value.fget)
+        if isinstance(value, functools.partial):
+            return self._value((value.func, value.args, value.keywords))
+        return None
+
+    def _collection(self, value: Any) -> str | None:
+        if isinstance(value, (tuple, list)):
+            return f"{self._value(type(value))}{[self._value(item) for item in value]}"
+        if isinstance(value, (set, frozenset)):
+            return f"set{sorted(self._value(item) for item in value)}"
+        if isinstance(value, Mapping):
+            return f"{sorted((self._value(k), self._value(v)) for k, v in value.items())}"
+        return None
+
+
+def _content(cell: CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # a function that its own body has not yet defined
+        return None
+
+
+def _lookup(
+    names: set[str], scope: Mapping[str, Any], modules: set[str]
+) -> Iterator[tuple[str, Any]]:
+    """Values of ``names`` in a scope and, for modules of ours among them, also in these."""
+    for name in sorted(names & scope.keys()):
+        value = scope[name]
+        yield name, value
+        if isinstance(value, ModuleType) and value.__name__ not in modules:
+            modules.add(value.__name__)
+            if not _of_library(value.__name__):
+                yield from _lookup(names, vars(value), modules)
+
+
+def _of_library(module: str | None) -> bool:
+    """Whether what stands in a module changes with Python, NumPy or Numba alone."""
+    root = (module or "builtins").partition(".")[0]
+    return root in _LIBRARIES or (root in sys.stdlib_module_names and root != "__main__")
+
+
+_LIBRARIES = frozenset({"llvmlite", "numba", "numpy"})
+_ADDRESS = re.compile(r"0x[0-9a-f]+")

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from .._numba import compiled
+from .._numba import kernel
 
 KNOT = 11
 """Numbers of a knot: position [3], quaternion wxyz [4], velocity [3], and whether the quaternion
 of the next knot is another one."""
 
 
-@compiled
+@kernel
 def poses_at(t_us, ends, times, knots):
     """Poses and velocities of the trajectories that cover an instant, K of N.
 
@@ -46,7 +46,7 @@ def poses_at(t_us, ends, times, knots):
     return known, positions, quaternions, velocities, transforms
 
 
-@compiled
+@kernel
 def _covering(t_us, ends, times):
     """Trajectories that cover ``t_us`` [K], and the first knot of each that is not before it."""
     known, after = np.empty(len(ends) - 1, np.int64), np.empty(len(ends) - 1, np.int64)
@@ -66,7 +66,7 @@ def _covering(t_us, ends, times):
     return known[:count], after[:count]
 
 
-@compiled
+@kernel
 def _slerp(start, end, share, found):
     """Quaternion [4] between two knots, on the shorter arc; as ``scene.rotation.slerp``."""
     dot = 0.0
@@ -87,7 +87,7 @@ def _slerp(start, end, share, found):
         found[c] /= length
 
 
-@compiled
+@kernel
 def _put(position, quaternion, transform):
     """``T_world_object`` [4, 4] of a position [3] and a unit quaternion [4]."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]

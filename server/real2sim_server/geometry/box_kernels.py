@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .._numba import compiled
+from .._numba import kernel
 
 LEAST_OVERLAP = 1e-9
 """Boxes that overlap by no more than this only touch [m]."""
@@ -15,7 +15,7 @@ PARALLEL = 1e-6
 """Sine of the angle below which two edges span no axis of their own."""
 
 
-@compiled
+@kernel
 def boxes_overlap(T_world_a, size_a, T_world_b, size_b):
     """Whether two boxes share volume; boxes that only touch do not.
 
@@ -41,7 +41,7 @@ def boxes_overlap(T_world_a, size_a, T_world_b, size_b):
     )
 
 
-@compiled
+@kernel
 def first_overlap(ways, sizes, covered, reach, standing):
     """Number of the first of S samples at which two boxes on their ways share volume; S for none.
 
@@ -67,7 +67,7 @@ def first_overlap(ways, sizes, covered, reach, standing):
     return len(one)
 
 
-@compiled
+@kernel
 def _faces_overlap(turn, centre, half_a, half_b):
     """Whether two boxes overlap along the normals of the faces of both.
 
@@ -88,7 +88,7 @@ def _faces_overlap(turn, centre, half_a, half_b):
     return True
 
 
-@compiled
+@kernel
 def _edges_overlap(turn, centre, half_a, half_b):
     """Whether two boxes overlap along the products of an edge of each; see above.
 

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from .._numba import compiled
+from .._numba import kernel
 
 KNOT = 11
 
@@ -33,7 +33,7 @@ SIDE = 0.3
 """Room beside a box that counts as in the way [m]."""
 
 
-@compiled
+@kernel
 def nearest_point(knots, x, y, near_s):
     """The nearest point of the path to (x, y) [m].
 
@@ -69,7 +69,7 @@ def nearest_point(knots, x, y, near_s):
     )
 
 
-@compiled
+@kernel
 def waypoints(knots, s, pose, count, spacing):
     """Places along the path, seen from a vehicle; beyond its end the path goes straight on.
 
@@ -97,13 +97,13 @@ def waypoints(knots, s, pose, count, spacing):
     return found
 
 
-@compiled
+@kernel
 def turn_between(knots, here, there):
     """Change of heading [rad] between two distances along the path [m]."""
     return _along(knots, there, 4) - _along(knots, here, 4)
 
 
-@compiled
+@kernel
 def point_at(knots, s):
     """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; before the start and after the
     end of the path straight on."""
@@ -117,7 +117,7 @@ def point_at(knots, s):
     )
 
 
-@compiled
+@kernel
 def sharpest_turn(knots, s, reach):
     """Largest curvature [1/m] of the path over the next ``reach`` metres, in pieces of 4 m."""
     most, before = 0.0, _along(knots, s, 4)
@@ -127,7 +127,7 @@ def sharpest_turn(knots, s, reach):
     return most / PIECE
 
 
-@compiled
+@kernel
 def next_in_strip(knots, s, box, bodies, own):
     """The body that is next in the strip a box sweeps along the path.
 
@@ -170,7 +170,7 @@ def next_in_strip(knots, s, box, bodies, own):
     return gap, speed
 
 
-@compiled
+@kernel
 def _nearest_row(strip, x, y):
     nearest, least = 0, math.inf
     for i in range(len(strip)):
@@ -180,7 +180,7 @@ def _nearest_row(strip, x, y):
     return nearest
 
 
-@compiled
+@kernel
 def _first_not_before(knots, s):
     """Number of the first pose at distance ``s`` or farther; that of poses where there is none."""
     low, high = 0, len(knots)
@@ -193,7 +193,7 @@ def _first_not_before(knots, s):
     return low
 
 
-@compiled
+@kernel
 def _along(knots, s, column):
     """A column of the path at distance ``s``, linear between poses, constant beyond both ends."""
     after = _first_not_before(knots, s)
@@ -205,7 +205,7 @@ def _along(knots, s, column):
     return a[column] + (b[column] - a[column]) / (b[0] - a[0]) * (s - a[0])
 
 
-@compiled
+@kernel
 def _foot(knots, x, y, first, last):
     """Nearest segment from ``first`` to before ``last``, share of it, and the distance from there,
     positive on the left [m]."""

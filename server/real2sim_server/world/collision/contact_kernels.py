@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
-from ..._numba import compiled
+from ..._numba import kernel
 
 
-@compiled
+@kernel
 def shifted(transform, ahead, up):
     """A transform [4, 4] whose origin is moved ``ahead`` and ``up`` along its own axes [m]."""
     found = transform.copy()
@@ -19,7 +19,7 @@ def shifted(transform, ahead, up):
     return found
 
 
-@compiled
+@kernel
 def within_reach(T_world_box, size, transforms, sizes):
     """Numbers [H] int64 of the boxes whose enclosing ball meets that of one box, of K boxes.
 
@@ -44,7 +44,7 @@ def within_reach(T_world_box, size, transforms, sizes):
     return near[:count]
 
 
-@compiled
+@kernel
 def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
     """Whether a vehicle could touch one of K boxes within a step, by boxes along its heading.
 
@@ -76,7 +76,7 @@ def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
     return False
 
 
-@compiled
+@kernel
 def headings(quaternions):
     """Headings [K] [rad] of quaternions [K, 4] wxyz, as ``scene.rotation.quaternion_yaw``."""
     found = np.empty(len(quaternions))
@@ -85,7 +85,7 @@ def headings(quaternions):
     return found
 
 
-@compiled
+@kernel
 def heading(quaternion):
     """Heading [rad] in (-pi, pi] of a quaternion [4] wxyz."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]

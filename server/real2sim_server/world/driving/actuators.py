@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from ..._numba import inner
+from ..._numba import func
 from .state import Command, clamped
 
 
-@inner
+@func
 def begun(pending, vehicle, h):
     """Room for the commands that are on their way in substeps of ``h`` seconds, and one more.
 
@@ -30,7 +30,7 @@ def begun(pending, vehicle, h):
     return line, waiting
 
 
-@inner
+@func
 def left(line, waiting):
     """The commands still on their way: [W, 2] float64, newest first."""
     pending = np.empty((min(waiting, len(line) - 1), 2))
@@ -39,7 +39,7 @@ def left(line, waiting):
     return pending
 
 
-@inner
+@func
 def sent(line, waiting, asked):
     """Puts a command at the head of those on their way; how many they are now.
 
@@ -55,7 +55,7 @@ def sent(line, waiting, asked):
     return waiting
 
 
-@inner
+@func
 def at_wheels(line, waiting, state, vehicle, h):
     """What engine, brakes and steering gear aim at in this substep of ``h`` seconds.
 
@@ -74,12 +74,12 @@ def at_wheels(line, waiting, state, vehicle, h):
     )
 
 
-@inner
+@func
 def _waits(delay, h):
     return math.floor(delay / h + 0.5)
 
 
-@inner
+@func
 def _approached(value, wanted, h, lag):
     """Where a first-order lag is ``h`` seconds later."""
     if lag == 0.0:

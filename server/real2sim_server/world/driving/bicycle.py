@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from ..._numba import inner
+from ..._numba import func
 from .state import PlanarState, clamped
 from .tyres import integrate, tyre_share
 from .vehicle import GRAVITY
 
 
-@inner
+@func
 def moved_on(state, command, vehicle, h):
     """The vehicle ``h`` seconds later."""
     if not vehicle.slips:
@@ -18,7 +18,7 @@ def moved_on(state, command, vehicle, h):
     return _slipped(state, command, vehicle, h)
 
 
-@inner
+@func
 def _rolled(state, command, acceleration, vehicle, h):
     """Kinematic bicycle: wheels go where they point; what brings ``acceleration`` about may be
     asked for more."""
@@ -41,7 +41,7 @@ def _rolled(state, command, acceleration, vehicle, h):
     )
 
 
-@inner
+@func
 def _slipped(state, command, vehicle, h):
     """Dynamic bicycle; fades into the kinematic one where it is slow."""
     most = vehicle.friction * GRAVITY
@@ -76,14 +76,14 @@ def _slipped(state, command, vehicle, h):
     )
 
 
-@inner
+@func
 def _steered(steering, wanted, vehicle, h):
     most = vehicle.max_steer_rate * h
     wanted = clamped(wanted, -vehicle.max_steer, vehicle.max_steer)
     return steering + clamped(wanted - steering, -most, most)
 
 
-@inner
+@func
 def _sped_up(speed, wanted, vehicle, h):
     """Speed after ``h`` seconds and distance covered; linear in time until a limit is met."""
     acceleration = clamped(wanted, -vehicle.max_braking, vehicle.max_acceleration)
@@ -97,7 +97,7 @@ def _sped_up(speed, wanted, vehicle, h):
     return limit, (speed + limit) / 2 * until_limit + limit * (h - until_limit)
 
 
-@inner
+@func
 def sinc(angle):
     """sin(angle) / angle, by its series near 0 where the quotient loses its digits."""
     if abs(angle) < 1e-4:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..._numba import inner
+from ..._numba import func
 from .state import clamped, wrapped
 
 T, X, Y, YAW, VX, VY = range(6)
@@ -42,7 +42,7 @@ class Curve(NamedTuple):
     turn_rate: float
 
 
-@inner
+@func
 def curve_through(state, seconds, poses, vehicle):
     """The plan of a vehicle in a state.
 
@@ -66,13 +66,13 @@ def curve_through(state, seconds, poses, vehicle):
     return Curve(knots, _last_turn_rate(knots, state, vehicle))
 
 
-@inner
+@func
 def end_of(curve):
     """Time of the last pose [s]."""
     return curve.knots[len(curve.knots) - 1, T]
 
 
-@inner
+@func
 def at(curve, t):
     """x, y [m] and velocity x, y [m/s] in the world, ``t`` >= 0 seconds after the start."""
     knots = curve.knots
@@ -89,7 +89,7 @@ def at(curve, t):
     return x, y, vx, vy
 
 
-@inner
+@func
 def planned(curve, t):
     """Like :func:`at`, but where the plan itself would be before its first pose: on the arc that
     leads there. The vehicle's distance from it is its error, which :func:`at` hides.
@@ -106,7 +106,7 @@ def planned(curve, t):
     return _along_arc(knots[1], rate, t - first)
 
 
-@inner
+@func
 def heading(curve, t):
     """Planned heading [rad] at the first pose not before ``t``, or at the last one."""
     i = 0
@@ -115,7 +115,7 @@ def heading(curve, t):
     return curve.knots[i, YAW]
 
 
-@inner
+@func
 def _slope(knots, i):
     """Velocity [m/s] at a pose after the vehicle's own: the slope there of the parabola through
     three neighbours.
@@ -133,7 +133,7 @@ def _slope(knots, i):
     return _mean_slope(knots, i)
 
 
-@inner
+@func
 def _chord(knots, i):
     """Mean velocity [m/s] from pose ``i`` to the next."""
     a, b = knots[i], knots[i + 1]
@@ -141,7 +141,7 @@ def _chord(knots, i):
     return (b[X] - a[X]) / h, (b[Y] - a[Y]) / h
 
 
-@inner
+@func
 def _mean_slope(knots, i):
     """Velocity [m/s] at pose ``i`` of the parabola through it and its two neighbours."""
     (ax, ay), (bx, by) = _chord(knots, i - 1), _chord(knots, i)
@@ -150,13 +150,13 @@ def _mean_slope(knots, i):
     return ax + share * (bx - ax), ay + share * (by - ay)
 
 
-@inner
+@func
 def _far_slope(chord, slope):
     """Slope at the far end of a parabola's chord, from that at its near end."""
     return 2 * chord[0] - slope[0], 2 * chord[1] - slope[1]
 
 
-@inner
+@func
 def _arrival(knots, speed, vehicle):
     """Velocity [m/s] at a single planned pose: that of the way there, as far as in reach.
 
@@ -174,7 +174,7 @@ def _arrival(knots, speed, vehicle):
     return dx * share, dy * share
 
 
-@inner
+@func
 def _along_heading(velocity, yaw):
     """The velocity turned into the planned heading, where that is roughly where it goes."""
     vx, vy = velocity
@@ -185,7 +185,7 @@ def _along_heading(velocity, yaw):
     return velocity
 
 
-@inner
+@func
 def _last_turn_rate(knots, state, vehicle):
     """Turn rate [rad/s] at the last pose, as far as the vehicle can turn."""
     last = len(knots) - 1
@@ -199,7 +199,7 @@ def _last_turn_rate(knots, state, vehicle):
     return clamped(rate, -most, most)
 
 
-@inner
+@func
 def _along_arc(knot, rate, since):
     """Place and velocity on an arc, ``since`` seconds after a knot; before it where negative."""
     vx, vy = knot[VX], knot[VY]
@@ -212,7 +212,7 @@ def _along_arc(knot, rate, since):
     return x, y, cos * vx - sin * vy, sin * vx + cos * vy
 
 
-@inner
+@func
 def _hermite(start, end, h, t):
     """Value and slope at ``t`` in [0, h] of the cubic with these values and slopes at its ends."""
     (a, a_slope), (b, b_slope) = start, end

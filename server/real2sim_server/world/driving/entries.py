@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
-from ..._numba import compiled_from, inner
+from ..._numba import func, kernel
 from .actuators import at_wheels, begun, left, sent
 from .bicycle import moved_on
 from .curve import Curve, at, curve_through, end_of, heading
@@ -22,10 +21,8 @@ HOLD, PURSUIT, LQR, ILQR = range(4)
 
 SUBSTEP_US = 10_000
 
-entry = compiled_from(Path(__file__).parent)
 
-
-@entry
+@kernel
 def world_poses(poses, frame):
     """Poses x, y [m], yaw [rad] of a frame in the world.
 
@@ -46,7 +43,7 @@ def world_poses(poses, frame):
     return moved
 
 
-@entry
+@kernel
 def plan_curve(state, times_us, start_us, poses, vehicle):
     """A plan as a curve, see :class:`.curve.Curve`.
 
@@ -65,7 +62,7 @@ def plan_curve(state, times_us, start_us, poses, vehicle):
     return curve.knots, curve.turn_rate
 
 
-@entry
+@kernel
 def curve_at(curve, t):
     """x, y [m], velocity x, y [m/s] and planned heading [rad], ``t`` seconds after the start."""
     named = Curve(*curve)
@@ -73,7 +70,7 @@ def curve_at(curve, t):
     return x, y, vx, vy, heading(named, t)
 
 
-@entry
+@kernel
 def driven(state, pending, driver, vehicle, dt_us):
     """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
 
@@ -114,7 +111,7 @@ def driven(state, pending, driver, vehicle, dt_us):
     return _numbers(now, start.speed, substeps * h), left(line, waiting)
 
 
-@entry
+@kernel
 def asked_of(state, driver, vehicle):
     """What a driver asks for: acceleration [m/s^2] and road-wheel angle [rad]; arguments as in
     :func:`driven`. Who plans ahead does here what the plain LQR would."""
@@ -122,7 +119,7 @@ def asked_of(state, driver, vehicle):
     return command.acceleration, command.steering
 
 
-@inner
+@func
 def _asked(driver, state, t, vehicle):
     kind, knots, turn_rate, _, (acceleration, steering) = driver
     if kind == HOLD:
@@ -132,7 +129,7 @@ def _asked(driver, state, t, vehicle):
     return regulate(state, Curve(knots, turn_rate), t, vehicle)
 
 
-@inner
+@func
 def _numbers(state, speed_before, seconds):
     return (
         state.x,

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ..._numba import inner
+from ..._numba import func
 from .lqr import point_at
 from .state import Command, clamped, wrapped
 
@@ -33,7 +33,7 @@ INPUT_COST = np.array([0.05, 0.5])
 NX, NU = 5, 2
 
 
-@inner
+@func
 def played(schedule, state, t, vehicle):
     """What to do, ``t`` seconds after the schedule was made."""
     states, inputs = schedule
@@ -48,7 +48,7 @@ def played(schedule, state, t, vehicle):
     return Command(inputs[k, 0], ahead)
 
 
-@inner
+@func
 def scheduled(state, curve, since, vehicle):
     """The schedule of a vehicle that is ``since`` seconds into its plan."""
     wanted = _wanted(state, curve, since)
@@ -78,7 +78,7 @@ def scheduled(state, curve, since, vehicle):
     return states, inputs
 
 
-@inner
+@func
 def _wanted(state, curve, since):
     """Wanted states [STEPS + 1, 5]; yaws continuous from the vehicle's."""
     wanted = np.zeros((STEPS + 1, NX))
@@ -91,7 +91,7 @@ def _wanted(state, curve, since):
     return wanted
 
 
-@inner
+@func
 def _rollout(tried, schedule, change, vehicle):
     """Writes to ``tried`` the schedule that a share of the change of the inputs leads to, within
     limits."""
@@ -106,7 +106,7 @@ def _rollout(tried, schedule, change, vehicle):
         _step(tried_states, tried_inputs, k, vehicle)
 
 
-@inner
+@func
 def _step(states, inputs, k, vehicle):
     """Holds the limits of a row of inputs and writes the state that it leads to."""
     before, after = states[k], states[k + 1]
@@ -123,7 +123,7 @@ def _step(states, inputs, k, vehicle):
     inputs[k, 0], inputs[k, 1] = a, (end - steering) / STEP
 
 
-@inner
+@func
 def _cost(schedule, wanted):
     states, inputs = schedule
     cost = 0.0
@@ -136,7 +136,7 @@ def _cost(schedule, wanted):
     return cost
 
 
-@inner
+@func
 def _backward(states, inputs, wanted, wheelbase):
     """Changes of the inputs [STEPS, 2] and feedback gains [STEPS, 2, 5]."""
     forward, feedback = np.empty((STEPS, NU)), np.empty((STEPS, NU, NX))
@@ -176,7 +176,7 @@ def _backward(states, inputs, wanted, wheelbase):
     return forward, feedback
 
 
-@inner
+@func
 def _linearised(state, after, wheelbase):
     """Derivatives of the next state by state [5, 5] and by input [5, 2]."""
     way = (state[3] + after[3]) / 2 * STEP
@@ -201,7 +201,7 @@ def _linearised(state, after, wheelbase):
     return A, B
 
 
-@inner
+@func
 def _product(M, N):
     """M N."""
     result = np.zeros((M.shape[0], N.shape[1]))
@@ -212,7 +212,7 @@ def _product(M, N):
     return result
 
 
-@inner
+@func
 def _dual(M, N):
     """M^T N."""
     result = np.zeros((M.shape[1], N.shape[1]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..._numba import inner
+from ..._numba import func
 from .curve import MOVING, YAW, X, Y, end_of, heading, planned
 from .state import GENTLE_BRAKING, Command, wrapped
 
@@ -30,7 +30,7 @@ class Point(NamedTuple):
     curvature: float
 
 
-@inner
+@func
 def regulate(state, curve, t, vehicle):
     """What to do, ``t`` seconds after the plan's start.
 
@@ -53,7 +53,7 @@ def regulate(state, curve, t, vehicle):
     return Command(acceleration, _steering_onto(point, state, vehicle))
 
 
-@inner
+@func
 def point_at(curve, t):
     """The plan ``t`` seconds after its start, with derivatives."""
     x, y, vx, vy = planned(curve, t)
@@ -67,7 +67,7 @@ def point_at(curve, t):
     return Point(x, y, yaw, speed, acceleration, turn / (speed * DIFFERENCE))
 
 
-@inner
+@func
 def _steering_onto(point, state, vehicle):
     """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``."""
     dx, dy = state.x - point.x, state.y - point.y

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..._numba import inner
+from ..._numba import func
 from .curve import YAW, X, Y, at, end_of, heading
 from .state import GENTLE_BRAKING, Command, clamped
 
@@ -19,7 +19,7 @@ MAX_LAG = 2.0
 """Distance behind or ahead of the plan beyond which the controller hurries no more [m]."""
 
 
-@inner
+@func
 def pursue(state, curve, t, vehicle):
     """What to do, ``t`` seconds after the plan's start.
 
@@ -39,7 +39,7 @@ def pursue(state, curve, t, vehicle):
     return Command(acceleration, _steering(state, x, y, vehicle))
 
 
-@inner
+@func
 def _steering(state, x, y, vehicle):
     """Road-wheel angle [rad] of the arc from the rear axle to (x, y)."""
     dx, dy = x - state.x, y - state.y
@@ -51,7 +51,7 @@ def _steering(state, x, y, vehicle):
     return rolling + vehicle.understeer * state.speed**2 * curvature
 
 
-@inner
+@func
 def _farther_aim(state, curve, t):
     """The first place of the plan after ``t`` that is far enough.
 
@@ -66,7 +66,7 @@ def _farther_aim(state, curve, t):
     return _straight_on(state, x, y, heading(curve, t))
 
 
-@inner
+@func
 def _straight_on(state, x, y, yaw):
     """A place to aim at, on the line from (x, y) along ``yaw``."""
     dx, dy = math.cos(yaw), math.sin(yaw)
@@ -75,7 +75,7 @@ def _straight_on(state, x, y, yaw):
     return x + reach * dx, y + reach * dy
 
 
-@inner
+@func
 def _acceleration(state, dx, dy, vx, vy):
     """Acceleration [m/s^2] to close a gap [m] to a plan of a velocity [m/s] in the look-ahead
     time; both in the world."""
@@ -86,7 +86,7 @@ def _acceleration(state, dx, dy, vx, vy):
     return 2 * (lag / LOOKAHEAD + planned - state.speed) / LOOKAHEAD
 
 
-@inner
+@func
 def _arc_length(ahead, left):
     """Length of the arc that starts along x and ends at (ahead, left); negative when behind."""
     if ahead <= 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..._numba import inner
+from ..._numba import func
 
 GENTLE_BRAKING = 2.0
 """Deceleration after a plan's end [m/s^2]."""
@@ -43,13 +43,13 @@ class Command(NamedTuple):
     steering: float
 
 
-@inner
+@func
 def clamped(value, least, most):
     """``value``, or the bound that it is beyond."""
     return min(max(value, least), most)
 
 
-@inner
+@func
 def wrapped(angle):
     """The angle [rad] less the full turns in it: within half a turn."""
     return angle - math.tau * math.floor(angle / math.tau + 0.5)

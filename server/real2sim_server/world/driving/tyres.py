@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..._numba import inner
+from ..._numba import func
 from .state import clamped
 from .vehicle import GRAVITY
 
@@ -13,13 +13,13 @@ SLOWEST, FASTER = 2.0, 4.0
 its lateral motion fades into that of the tyres [m/s]."""
 
 
-@inner
+@func
 def tyre_share(speed):
     """How much of the lateral motion is that of the tyres, 0 to 1; the rest is rolling."""
     return clamped((speed - SLOWEST) / (FASTER - SLOWEST), 0.0, 1.0)
 
 
-@inner
+@func
 def integrate(vehicle, state, steering, acceleration, h):
     """The state ``h`` seconds later, by the classical Runge-Kutta method.
 
@@ -47,7 +47,7 @@ def integrate(vehicle, state, steering, acceleration, h):
     return _moved(state, mean, h)
 
 
-@inner
+@func
 def rates(vehicle, state, steering, acceleration):
     """Time derivative of (x, y, yaw, vx, vy, yaw rate) of the centre of mass: place and heading in
     the world, velocity in the vehicle frame."""
@@ -65,7 +65,7 @@ def rates(vehicle, state, steering, acceleration):
     )
 
 
-@inner
+@func
 def axle_forces(vehicle, moving, steering, acceleration):
     """Lateral forces [N] of front and rear axle, each across its wheels.
 
@@ -93,7 +93,7 @@ def axle_forces(vehicle, moving, steering, acceleration):
     )
 
 
-@inner
+@func
 def fiala(slip, stiffness, limit):
     """Lateral force [N] of a tyre: linear for small slip, ``limit`` when it slides.
 
@@ -113,7 +113,7 @@ def fiala(slip, stiffness, limit):
     return 3 * limit * share * (1 - abs(share) + share * share / 3)
 
 
-@inner
+@func
 def _moved(state, rate, h):
     x, y, yaw, vx, vy, turn = state
     return (

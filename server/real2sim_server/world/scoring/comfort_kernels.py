@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..._numba import compiled
+from ..._numba import kernel
 
 PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
 """Greatest RMS difference of successive plans in acceleration, jerk, yaw rate, yaw acceleration
@@ -17,7 +17,7 @@ SHORTEST_OVERLAP = 6
 """Fewer common times than these say nothing."""
 
 
-@compiled
+@kernel
 def slid(samples, speed, yaw, window):
     """Samples [n, 2] of speed and yaw with one more at their end, the last ``window`` of them."""
     kept = min(len(samples), window - 1)
@@ -27,7 +27,7 @@ def slid(samples, speed, yaw, window):
     return found
 
 
-@compiled
+@kernel
 def summed(values, value, window):
     """Values [n] with one more at their end, the last ``window`` of them; and their sum."""
     kept = min(len(values), window - 1)
@@ -40,7 +40,7 @@ def summed(values, value, window):
     return found, total
 
 
-@compiled
+@kernel
 def derivatives(weights, samples):
     """Weighted sums of speed and yaw.
 
@@ -61,7 +61,7 @@ def derivatives(weights, samples):
     return speed, acceleration, jerk, rate, yaw_acceleration
 
 
-@compiled
+@kernel
 def make_continuous(poses):
     """Add whole turns to the yaws of poses [N, 3] (x, y, yaw [rad]), so that none is more than
     half a turn from the one before, as ``np.unwrap``."""
@@ -77,7 +77,7 @@ def make_continuous(poses):
         poses[k, 2] += added
 
 
-@compiled
+@kernel
 def plans_alike(times_a, poses_a, times_b, poses_b):
     """Whether two plans feel alike where both say something: RMS differences of acceleration,
     jerk, yaw rate and yaw acceleration, by finite differences in steps of 0.1 s.
@@ -110,7 +110,7 @@ def plans_alike(times_a, poses_a, times_b, poses_b):
     return 1 if alike else 0
 
 
-@compiled
+@kernel
 def _differentiate(times, poses, first, speeds, rates):
     """Write speeds and yaw rates [T] of a plan between times in steps of 0.1 s from ``first``."""
     k = 1
@@ -132,13 +132,13 @@ def _differentiate(times, poses, first, speeds, rates):
             rates[i - 1] = (yaw - before[2]) / PLAN_STEP
 
 
-@compiled
+@kernel
 def _slopes(values):
     """Finite differences [T - 1] of values [T] in steps of 0.1 s."""
     return (values[1:] - values[:-1]) / PLAN_STEP
 
 
-@compiled
+@kernel
 def _within(values, bound):
     """Whether the RMS of values [T] is at most ``bound``."""
     squares = 0.0

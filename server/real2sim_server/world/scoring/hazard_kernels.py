@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from ..._numba import compiled
+from ..._numba import kernel
 
 HORIZON, STEP = 3.0, 0.1
 STEPS = 31
@@ -15,7 +15,7 @@ AHEAD, BEHIND = math.radians(30), math.radians(150)
 """Bearings within which an object counts as ahead, beyond which as behind (nuPlan)."""
 
 
-@compiled
+@kernel
 def first_meeting(ego, size, centre_ahead, everywhere, others, ignored):
     """The first step of 0.1 s up to 3 s at which the ego box overlaps that of an object.
 
@@ -63,7 +63,7 @@ def first_meeting(ego, size, centre_ahead, everywhere, others, ignored):
     return first if first < STEPS else -1
 
 
-@compiled
+@kernel
 def _closest(x, y, vx, vy):
     """Smallest distance [m] within the horizon of a point at (x, y) [m] that moves [m/s]."""
     squared = max(vx * vx + vy * vy, 1e-12)
@@ -71,7 +71,7 @@ def _closest(x, y, vx, vy):
     return math.hypot(x + vx * t, y + vy * t)
 
 
-@compiled
+@kernel
 def _overlap(x, y, yaw, size, other_yaw, other_size):
     """Whether two boxes overlap on the plane, the second's middle being (x, y) off: separating
     axes."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..._numba import compiled
+from ..._numba import kernel
 
 DENSITY = 0.25
 """Distance between points of the lines that roads are made of [m]."""
@@ -15,7 +15,7 @@ LONGEST_SPACING = DENSITY * (1 + 1e-9)
 """Spacings exceed ``DENSITY`` by rounding; the margin keeps the search exact [m]."""
 
 
-@compiled
+@kernel
 def off_road(middle, size, route, lanes, half_widths):
     """How far a box is off the road, and how many of its quarters have their middle on it.
 
@@ -51,7 +51,7 @@ def off_road(middle, size, route, lanes, half_widths):
     return max(beyond[0], beyond[1], beyond[2], beyond[3]), inside
 
 
-@compiled
+@kernel
 def _narrow(beyond, places, lines, half_width):
     """Lower ``beyond`` [P] [m] to how far places [P, 2] [m] are off the strips along lines."""
     distance = math.inf
@@ -65,7 +65,7 @@ def _narrow(beyond, places, lines, half_width):
         beyond[k] = min(beyond[k], distance - half_width)
 
 
-@compiled
+@kernel
 def _rough_distance(x, y, points):
     """Distance [m] from (x, y) to the nearest of every 64th point."""
     least = math.inf
@@ -75,7 +75,7 @@ def _rough_distance(x, y, points):
     return math.sqrt(least)
 
 
-@compiled
+@kernel
 def _distance(x, y, lines, bound):
     """Distance [m] from (x, y) to the nearest point of lines, which is at most ``bound``.
 

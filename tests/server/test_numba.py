@@ -1,0 +1,159 @@
+"""Kernels on disk are used again as long as nothing changed that they are made of, and no longer.
+
+A small package in a temporary folder takes parts of its kernel from a second file. Each run of it
+is a process of its own that reports what the kernel returned and whether it was compiled.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import real2sim_server
+
+KERNEL = """
+from typing import NamedTuple
+from real2sim_server._numba import func, kernel
+from . import parts
+from .parts import FACTOR, Pair, generated, registered, shifted
+
+@func
+def inside(x):
+    return shifted(x) * FACTOR + registered(x)
+
+@kernel
+def computed(pair):
+    return inside(pair.first) + parts.TABLE[1] + generated(pair.first)
+"""
+
+PARTS = '''
+from typing import NamedTuple
+from numba import types
+from numba.extending import intrinsic, register_jitable
+from real2sim_server._numba import func
+
+FACTOR = 2.0
+TABLE = (0.0, 100.0)
+EMITTED = 10_000.0
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+@func
+def shifted(x):
+    """Documented."""
+    return x + 1.0
+
+@register_jitable
+def registered(x):
+    return 1000.0 * x
+
+def emit(builder, value):
+    return builder.fmul(value, value.type(EMITTED))
+
+@intrinsic
+def generated(typingctx, x):
+    def generate(context, builder, signature, arguments):
+        return emit(builder, arguments[0])
+    return types.float64(types.float64), generate
+'''
+
+RUN = """
+import json
+from small.kernels import computed
+from small.parts import Pair
+print(json.dumps([computed(Pair(1.0, 3.0)), sum(computed.stats.cache_misses.values())]))
+"""
+
+BEFORE = 2.0 * 2.0 + 1000.0 + 100.0 + 10_000.0
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A folder with the package after its first run."""
+    root = tmp_path_factory.mktemp("compiled")
+    folder = root / "small"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (folder / "kernels.py").write_text(KERNEL)
+    (folder / "parts.py").write_text(PARTS)
+    assert run(root) == (BEFORE, "compiled")
+    return root
+
+
+@pytest.fixture
+def package(compiled, tmp_path):
+    """A copy of it, with times of files and compiled kernels."""
+    shutil.copytree(compiled, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def run(folder: Path, seed: int = 0) -> tuple[float, str]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{folder}{os.pathsep}{Path(real2sim_server.__file__).parents[1]}",
+        "PYTHONHASHSEED": str(seed),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    environment.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", RUN],
+        check=False,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    result, misses = json.loads(done.stdout)
+    return result, "compiled" if misses else "kept"
+
+
+def change(package: Path, old: str, new: str) -> None:
+    path = package / "small" / "parts.py"
+    source = path.read_text()
+    assert source.count(old) == 1
+    path.write_text(source.replace(old, new))
+
+
+def test_a_kernel_is_compiled_once(package):
+    assert run(package, seed=1) == (BEFORE, "kept")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "difference"),
+    [
+        ("FACTOR = 2.0", "FACTOR = 3.0", 2.0),
+        ("(0.0, 100.0)", "(0.0, 200.0)", 100.0),
+        ("EMITTED = 10_000.0", "EMITTED = 10_001.0", 1.0),
+        ("return x + 1.0", "return x + 2.0", 2.0),
+        ("return 1000.0 * x", "return 1001.0 * x", 1.0),
+        ("builder.fmul(value,", "builder.fadd(value,", 1.0),
+    ],
+    ids=["constant", "constant of a module", "constant of an intrinsic", "func", "jitable", "emit"],
+)
+def test_a_change_in_another_file_compiles_anew(package, old, new, difference):
+    change(package, old, new)
+    assert run(package) == (BEFORE + difference, "compiled")
+
+
+def test_a_changed_order_of_a_tuples_fields_compiles_anew(package):
+    fields = "    first: float\n    second: float"
+    change(package, fields, "    second: float\n    first: float")
+    three = 4.0 * 2.0 + 3000.0 + 100.0 + 30_000.0
+    assert run(package) == (three, "compiled")
+
+
+def test_changed_options_of_a_func_compile_anew(package):
+    change(package, "@func\ndef shifted", "@func(fastmath=True)\ndef shifted")
+    assert run(package) == (BEFORE, "compiled")
+
+
+def test_words_in_another_file_compile_nothing(package):
+    change(package, '"""Documented."""', '"""Documented anew."""  # and why')
+    assert run(package) == (BEFORE, "kept")
