@@ -1,16 +1,28 @@
-# `make demo` and `make test` need nothing but Python 3.11+ and a network that reaches PyPI.
+# Everything here needs nothing but Python 3.11+ and a network that reaches PyPI.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PYTEST := $(BIN)/python -m pytest -q
 
-.PHONY: demo test lint format schema bench clean
+# What a change breaks first: the contract, the SDK, the layers, and the packages whose tests
+# compile little. The others belong to `make test`.
+FAST := tests/test_architecture.py tests/proto tests/client \
+	tests/server/geometry tests/server/scene tests/server/edit tests/server/cli
+
+.PHONY: demo check test test-slow lint format schema coverage bench docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
 
+check: lint
+	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile $(FAST)
+
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile
+
+test-slow: $(STAMP)
+	$(PYTEST) -n 0 --run-slow -m "slow or gpu or ray"
 
 lint: $(STAMP)
 	$(BIN)/ruff check proto client server tests
@@ -25,6 +37,9 @@ schema: $(STAMP)
 	$(BIN)/python -m real2sim_proto.schema proto/schema
 	$(BIN)/python -m real2sim_server.service.http.openapi docs/openapi.json
 
+coverage: $(STAMP)
+	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile --cov --cov-report=html:out/coverage --cov-report=term
+
 bench: $(STAMP)
 	$(BIN)/real2sim bench render --json out/bench_render.json
 	$(BIN)/real2sim bench serve --json out/bench_serve.json
@@ -35,4 +50,4 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) out build dist
+	rm -rf $(VENV) out build dist site
