@@ -37,7 +37,7 @@ from real2sim_proto.operations import (
 )
 
 from ..demo.street import unpack_street
-from ..demo.worker import own_worker
+from ..demo.worker import worker_process
 from ..scene.io import save_scene
 from .dragging import drag
 from .serve import percentiles
@@ -77,20 +77,20 @@ def run(effort: Effort | None = None) -> Figures:
         places = {"scenes": root / "scenes", "data": root}
         with (
             console.status(f"{effort.operations} edits"),
-            own_worker(**places, log_file=root / "writing.log") as worker,
+            worker_process(**places, log_file=root / "writing.log") as worker,
         ):
             scenario_id, append = _append(worker.url, effort.operations)
             worker.process.kill()
         opened, described = [], []
         for n in range(OPENINGS):
-            with own_worker(**places, log_file=root / f"opening_{n}.log") as worker:
+            with worker_process(**places, log_file=root / f"opening_{n}.log") as worker:
                 times = _open(worker.url, scenario_id, revision=effort.operations)
                 opened.append(times[0])
                 described += times[1:]
                 worker.process.kill()
         with (
             console.status(f"{effort.previews} previews"),
-            own_worker(**places, log_file=root / "dragging.log") as worker,
+            worker_process(**places, log_file=root / "dragging.log") as worker,
         ):
             preview, size = drag(worker.url, scene=DRAGGED, frames=effort.previews)
     figures = {

@@ -20,7 +20,7 @@ from rich.console import Console
 import real2sim
 
 from ..demo.street import unpack_street
-from ..demo.worker import own_worker
+from ..demo.worker import worker_process
 from ..scene.io import save_scene
 from .drive_probe import DriveProbe, straight_on
 from .loop_lag import loop_lag
@@ -83,7 +83,7 @@ def run(effort: Effort | None = None) -> Figures:
             save_scene(scene, root / "scenes" / f"{SCENE}.r2s")
             unpack_street(root / "scenes", f"{REAL_TIME}.r2s")
         log_file = root / "worker.log"
-        with own_worker(scenes=root / "scenes", data=root, log_file=log_file) as worker:
+        with worker_process(scenes=root / "scenes", data=root, log_file=log_file) as worker:
             figures = _measure(console, effort, url=worker.url, pid=worker.process.pid)
     figures["machine"] = machine
     print_report(console, figures)

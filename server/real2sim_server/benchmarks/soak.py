@@ -20,7 +20,7 @@ from rich.table import Table
 
 import real2sim
 
-from ..demo.worker import own_worker
+from ..demo.worker import worker_process
 from ..scene.io import save_scene
 from .serve import percentiles, resident_bytes
 from .soak_planners import HABITS, Planner
@@ -91,7 +91,7 @@ def run(effort: Effort | None = None) -> Figures:
             street(SCENE, gaussians=effort.gaussians, **size), root / "scenes" / "street.r2s"
         )
         places = {"scenes": root / "scenes", "data": root, "log_file": root / "worker.log"}
-        with own_worker(**places) as worker, real2sim.connect(worker.url) as client:
+        with worker_process(**places) as worker, real2sim.connect(worker.url) as client:
             client.wait_ready()
             client.scenes.load(SCENE)
             figures = _soak(console, client, effort, pid=worker.process.pid)

@@ -1,10 +1,51 @@
-"""The worker's part of the ``real2sim`` command.
+"""The worker's part of the ``real2sim`` command: a module for each command, named after it.
 
-This module is imported by every ``real2sim --help``, so it loads nothing heavy: each command
-checks that its extra is installed and only then imports its room.
+This package is imported by every ``real2sim --help``, so its modules load nothing heavy: a command
+imports what it needs when it runs.
 """
 
-from . import logs, scenes, physics, episodes, worker, bench  # noqa: I001 - the order of the help
-from .options import app
+from . import (  # noqa: I001 - the order of the help
+    synth,
+    log_info,
+    track,
+    reconstruct,
+    import_,
+    export,
+    render,
+    evaluate,
+    validate,
+    simulate,
+    ground,
+    evaluate_policy,
+    train_policy,
+    replay,
+    serve,
+    demo,
+    doctor,
+    bench,
+)
+from .command import app
 
-__all__ = ["app", "bench", "episodes", "logs", "physics", "scenes", "worker"]
+app.add_typer(bench.app, name="bench")
+
+__all__ = [
+    "app",
+    "bench",
+    "demo",
+    "doctor",
+    "evaluate",
+    "evaluate_policy",
+    "export",
+    "ground",
+    "import_",
+    "log_info",
+    "reconstruct",
+    "render",
+    "replay",
+    "serve",
+    "simulate",
+    "synth",
+    "track",
+    "train_policy",
+    "validate",
+]

@@ -1,4 +1,4 @@
-"""``real2sim bench``."""
+"""``real2sim bench``: what this machine takes for the work of a worker."""
 
 from __future__ import annotations
 
@@ -7,75 +7,100 @@ from typing import Annotated
 
 import typer
 
-from .options import JsonFile, bench, run_command
+from ..console import print_figures, progress, write_json
+from .command import command
+from .options import JsonFile
+
+app = typer.Typer(no_args_is_help=True, help="Measure this machine; ratios to a reference.")
 
 
-@bench.command("render")
-def bench_render(
+class SoakFailedError(RuntimeError):
+    """The worker did not do what it should, or its memory grew."""
+
+
+@command("render", group=app)
+def render(
+    *,
     splat: Annotated[Path | None, typer.Option(help="Splat file for the first case.")] = None,
     json: JsonFile = None,
 ) -> None:
     """Milliseconds by stage and Gaussians per second, as ratio to the plain reference."""
-    from . import bench_render as command
+    from ..benchmarks import render
 
-    run_command(command.run, splat=splat, json_path=json)
+    write_json(json, render.run(splat=splat))
 
 
-@bench.command("reconstruct")
-def bench_reconstruct(json: JsonFile = None) -> None:
+@command("reconstruct", group=app)
+def reconstruct(*, json: JsonFile = None) -> None:
     """Training iterations per second by stage, at 76,000 Gaussians and 621x188."""
-    from . import bench_reconstruct as command
+    from ..benchmarks import reconstruct
 
-    run_command(command.run, json_path=json)
+    figures = reconstruct.run()
+    stages = {f"{name} [ms]": ms for name, ms in figures["stage_ms"].items()}
+    others = {name: value for name, value in figures.items() if name != "stage_ms"}
+    print_figures("training", others | stages)
+    write_json(json, figures)
 
 
-@bench.command("physics")
-def bench_physics(
+@command("physics", group=app)
+def physics(
+    *,
     peers: Annotated[
         bool, typer.Option("--peers", help="Also measure Taichi and Warp, where installed.")
     ] = False,
     json: JsonFile = None,
 ) -> None:
     """Particle-substeps per second, and what they depend on."""
-    from . import bench_physics as command
+    from ..benchmarks import physics
 
-    run_command(command.run, peers=peers, json_path=json)
+    with progress("measuring") as report:
+        figures = physics.run(peers=peers, on_progress=report)
+    print_figures("particle-substeps per second", physics.as_rows(figures))
+    write_json(json, figures)
 
 
-@bench.command("serve")
-def bench_serve(json: JsonFile = None) -> None:
+@command("serve", group=app)
+def serve(*, json: JsonFile = None) -> None:
     """Latency of a drive step, share of rendering, lag of the event loop, memory per session."""
-    from . import bench_serve as command
+    from ..benchmarks import serve
 
-    run_command(command.run, json_path=json)
+    write_json(json, serve.run())
 
 
-@bench.command("world")
-def bench_world(json: JsonFile = None) -> None:
+@command("world", group=app)
+def world(*, json: JsonFile = None) -> None:
     """Time of a step of the world alone: vehicle, traffic, contact, scores; also uncompiled."""
-    from . import bench_world as command
+    from ..benchmarks import world
 
-    run_command(command.run, json_path=json)
+    write_json(json, world.run())
 
 
-@bench.command("soak")
-def bench_soak(
+@command("soak", group=app)
+def soak(
+    *,
     sessions: Annotated[int, typer.Option(min=1, max=32)] = 16,
     minutes: Annotated[float, typer.Option(min=0.1, max=1440)] = 10.0,
     rate: Annotated[float, typer.Option(min=0.1, max=1000, help="Steps/s of a session.")] = 10.0,
     json: JsonFile = None,
 ) -> None:
     """Many sessions side by side, misbehaving planners among them; every answer, and memory."""
-    from . import bench_soak as command
+    from ..benchmarks import soak
 
-    run_command(command.run, sessions=sessions, minutes=minutes, rate=rate, json_path=json)
+    figures = soak.run(soak.Effort(sessions=sessions, minutes=minutes, rate_hz=rate))
+    write_json(json, figures)
+    if figures["failures"]:
+        raise SoakFailedError(f"{len(figures['failures'])} planners were let down; see above")
+    if figures["grows"]:
+        raise SoakFailedError("the worker's memory grew; see above")
 
 
-@bench.command("edit")
-def bench_edit(
-    operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000, json: JsonFile = None
+@command("edit", group=app)
+def edit(
+    *,
+    operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000,
+    json: JsonFile = None,
 ) -> None:
     """Time of an edit, and of opening a scenario that has had many."""
-    from . import bench_edit as command
+    from ..benchmarks import edit
 
-    run_command(command.run, operations=operations, json_path=json)
+    write_json(json, edit.run(edit.Effort(operations=operations)))

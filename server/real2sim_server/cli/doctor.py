@@ -7,12 +7,14 @@ import importlib.util
 import os
 import platform
 import time
-from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
 from ..console import SERVER_MODULES, console, write_json
+from .command import app
+from .options import JsonFile
 
 DISTRIBUTIONS = (
     "real2sim",
@@ -26,8 +28,15 @@ DISTRIBUTIONS = (
 )
 
 
-def run(*, warm: bool, json_path: Path | None) -> None:
-    """Print a table of findings; exit code 1 when a worker cannot run here."""
+@app.command("doctor")
+def doctor(
+    *,
+    warm: Annotated[
+        bool, typer.Option("--warm", help="Compile all kernels into the cache.")
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Say what this machine can do, what is missing, and how to mend it."""
     findings = {"python": platform.python_version(), "cores": str(os.cpu_count())}
     findings |= {name: _version(name) for name in DISTRIBUTIONS}
     missing = [name for name in SERVER_MODULES if importlib.util.find_spec(name) is None]
@@ -39,7 +48,7 @@ def run(*, warm: bool, json_path: Path | None) -> None:
     if warm and not missing:
         findings["kernels compiled in"] = f"{_warm_seconds():.1f} s"
     _print(findings, backends, advice)
-    write_json(json_path, {"findings": findings, "backends": backends, "advice": advice})
+    write_json(json, {"findings": findings, "backends": backends, "advice": advice})
     if missing:
         raise typer.Exit(1)
 

@@ -2,55 +2,55 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from ..console import CommandError, console, print_figures, staged_progress, write_json
-from ..logs.open import open_log
-from ..reconstruct.evaluation import EvaluateOptions, Evaluation, evaluate_scene, write_report
-from ..scene.io import load_scene
+from .command import command
+from .options import JsonFile, LogFormat, RenderBackend, SceneBundle, Sequence
+
+if TYPE_CHECKING:
+    from ..reconstruct.evaluation import Evaluation
 
 
-@dataclass(frozen=True)
-class Asked:
-    """The options as they were typed.
-
-    Attributes:
-        frames: ``held-out``, ``all``, or numbers with commas between them.
-        shifts: distances [m] with commas between them, or ``none``.
-        width: of the compared images [px].
-        backend: of the renderer.
-        around: whether to look at vehicles from all sides.
-    """
-
-    frames: str = "held-out"
-    shifts: str = "1,2,3"
-    width: int | None = None
-    backend: str = "auto"
-    around: bool = False
-
-
-def run(
+@command("evaluate")
+def evaluate(
     *,
-    scene: Path,
-    log: Path,
-    asked: Asked,
-    log_format: str | None,
-    sequence: str | None,
-    report: Path | None,
-    json_path: Path | None,
+    scene: SceneBundle,
+    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    frames: Annotated[
+        str, typer.Option(help="held-out, all, or numbers such as 3,7,11")
+    ] = "held-out",
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Of images [px].")] = None,
+    shifts: Annotated[
+        str, typer.Option(help="Metres beside the path, for synthetic logs; or none.")
+    ] = "1,2,3",
+    around: Annotated[
+        bool, typer.Option("--around", help="Also see vehicles from all sides (synthetic logs).")
+    ] = False,
+    report: Annotated[Path | None, typer.Option(help="Folder for a page with images.")] = None,
+    backend: RenderBackend = "auto",
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    json: JsonFile = None,
 ) -> None:
-    """Compare the bundle ``scene`` with the log in folder ``log``; leave figures and a page."""
+    """Compare a scene with its log: images, moving objects, LiDAR depth, speed of rendering."""
+    from ..logs.open import open_log
+    from ..reconstruct.evaluation import EvaluateOptions, evaluate_scene, write_report
+    from ..scene.io import load_scene
+
     options = EvaluateOptions(
-        frames=_frames(asked.frames),
-        width=asked.width,
-        shifts=_shifts(asked.shifts),
-        backend=asked.backend,
-        around=asked.around,
+        frames=_parse_frames(frames),
+        width=width,
+        shifts=_parse_shifts(shifts),
+        backend=backend,
+        around=around,
     )
     loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)
-    with staged_progress() as tell:
-        result = evaluate_scene(loaded, opened, options=options, on_progress=tell)
+    with staged_progress() as on_progress:
+        result = evaluate_scene(loaded, opened, options=options, on_progress=on_progress)
     print_figures(f"{scene.name} against {opened.name}", _table(result))
     if not result.frames_unseen:
         console.print(
@@ -59,13 +59,13 @@ def run(
         )
     if result.no_shifted:
         console.print(result.no_shifted, soft_wrap=True)
-    write_json(json_path, result.as_json())
+    write_json(json, result.as_json())
     if report is not None:
         page = write_report(loaded, opened, result, report, options=options)
         console.print(f"report: {page}", soft_wrap=True)
 
 
-def _frames(text: str) -> str | tuple[int, ...]:
+def _parse_frames(text: str) -> str | tuple[int, ...]:
     if text in ("held-out", "all"):
         return text
     try:
@@ -76,7 +76,7 @@ def _frames(text: str) -> str | tuple[int, ...]:
         ) from None
 
 
-def _shifts(text: str) -> tuple[float, ...]:
+def _parse_shifts(text: str) -> tuple[float, ...]:
     if text == "none":
         return ()
     try:

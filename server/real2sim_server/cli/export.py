@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from ..console import print_figures, refuse_existing, write_json
-from ..scene.io import export_scene, load_scene
+from .command import command
+from .options import JsonFile, Overwrite, SceneBundle
 
 
-def run(
+@command("export")
+def export(
     *,
-    scene: Path,
-    out: Path,
-    file_format: str,
-    t_us: int | None,
-    objects: list[str] | None,
-    overwrite: bool,
-    json_path: Path | None,
+    scene: SceneBundle,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File, or folder of one per object.")],
+    file_format: Annotated[
+        str, typer.Option("--format", help="ply, compressed.ply, spz, splat or gltf")
+    ] = "ply",
+    t_us: Annotated[
+        int | None, typer.Option(help="Bake everything at this time into one file [us].")
+    ] = None,
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="Only these objects; repeat it.")
+    ] = None,
+    overwrite: Overwrite = False,
+    json: JsonFile = None,
 ) -> None:
-    """Write the bundle ``scene`` to ``out`` in another format; baked at ``t_us`` where given."""
+    """Write a scene for other programs: per object, baked at a time, or animated as glTF."""
+    from ..scene.io import export_scene, load_scene
+
     refuse_existing(out, overwrite=overwrite)
     loaded = load_scene(scene)
     # export_scene itself refuses formats and objects that it does not know, with those there are.
@@ -29,4 +42,4 @@ def run(
         "gaussians": loaded.gaussian_count,
     }
     print_figures(f"exported {scene.name}", figures)
-    write_json(json_path, figures)
+    write_json(json, figures)

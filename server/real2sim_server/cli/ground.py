@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+import typer
 
 from ..console import CommandError, console, print_figures, write_json
-from ..geometry.rotation import Float, apply_transform, invert_transform
-from ..logs import DrivingLog
-from ..logs.open import open_log
-from ..scene import Scene
-from ..scene.io import load_scene
-from ..simulation.experiments.film import look_at
-from ..simulation.ground import Road, find_road
+from .command import command
+from .options import JsonFile, SceneBundle
+
+if TYPE_CHECKING:
+    from ..geometry.rotation import Float
+    from ..logs import DrivingLog
+    from ..scene import Scene
+    from ..simulation.ground import Road
 
 SWEEPS_MAX = 12
 POINTS_DRAWN = 60_000
@@ -21,10 +23,22 @@ BOX_MARGIN = 0.3
 """Points this near a box are its own, not the ground's [m]."""
 
 
-def run(
-    *, scene: Path, log: Path | None, frame: int, picture: Path | None, json_path: Path | None
+@command("ground")
+def ground(
+    *,
+    scene: SceneBundle,
+    log: Annotated[Path | None, typer.Option(help="Its driving log, for LiDAR.")] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Whose boxes are projected down.")] = 0,
+    picture: Annotated[Path | None, typer.Option(help="PNG with inliers in red.")] = None,
+    json: JsonFile = None,
 ) -> None:
-    """Extract the road of the bundle ``scene`` at a frame, also from ``log``'s LiDAR if given."""
+    """Find the road surface under a scene's objects, from LiDAR and from Gaussians."""
+    import numpy as np
+
+    from ..logs.open import open_log
+    from ..scene.io import load_scene
+    from ..simulation.ground import find_road
+
     loaded = load_scene(scene)
     if frame >= len(loaded.frame_times_us):
         raise CommandError(f"--frame {frame}; it has 0 to {len(loaded.frame_times_us) - 1}")
@@ -49,15 +63,18 @@ def run(
             f"{name}: lean [deg]": float(np.degrees(np.arccos(min(normal[2], 1.0)))),
         }
     if len(roads) == 2:
-        figures["heights apart under boxes, median [m]"] = _apart(*roads.values(), boxes)
+        apart = _apart(roads["LiDAR"], roads["Gaussians"], boxes)
+        figures["heights apart under boxes, median [m]"] = apart
     print_figures(f"road of {scene.name}", figures)
-    write_json(json_path, figures)
+    write_json(json, figures)
     if picture is not None:
         _draw(sources, roads, loaded.ego.transform(t_us), picture)
         console.print(f"picture: {picture}", soft_wrap=True)
 
 
 def _gaussian_points(scene: Scene) -> Float:
+    import numpy as np
+
     solid = scene.background.opacities.detach().cpu().numpy() > 0.3
     means = scene.background.means.detach().cpu().numpy()
     return np.asarray(means[solid], dtype=np.float64)
@@ -65,6 +82,10 @@ def _gaussian_points(scene: Scene) -> Float:
 
 def _lidar_points(log: DrivingLog) -> Float:
     """Points [N, 3] of some sweeps in the world, without what lies in tracked boxes."""
+    import numpy as np
+
+    from ..geometry.rotation import apply_transform, invert_transform
+
     frames = np.unique(np.linspace(0, log.frame_count - 1, SWEEPS_MAX).astype(int))
     kept = []
     for frame in frames.tolist():
@@ -85,6 +106,8 @@ def _lidar_points(log: DrivingLog) -> Float:
 
 
 def _apart(a: Road, b: Road, boxes: list[tuple[Float, tuple[float, float, float]]]) -> float:
+    import numpy as np
+
     from ..simulation.surroundings import clearance
 
     places = np.array([pose[:3, 3] for pose, _ in boxes])
@@ -98,6 +121,9 @@ def _draw(
     """One panel for each source, seen from behind and above the vehicle; inliers in red."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+
+    from ..geometry.rotation import apply_transform, invert_transform
+    from ..simulation.experiments.film import look_at
 
     ahead = T_world_vehicle[:3, 0]
     here = T_world_vehicle[:3, 3]

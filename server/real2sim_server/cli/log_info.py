@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from ..console import console, write_json
-from ..logs import check_log, inspect_log
-from ..logs.open import open_log
+from .command import command
+from .options import JsonFile, LogFolder, LogFormat, Sequence
 
 
-def run(
+@command("log-info")
+def log_info(
     *,
-    log: Path,
-    out: Path | None,
-    log_format: str | None,
-    sequence: str | None,
-    check: bool,
-    json_path: Path | None,
+    log: LogFolder,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for pictures with boxes and LiDAR.")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Look at every file, as training does first.")
+    ] = False,
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    json: JsonFile = None,
 ) -> None:
-    """Print what the log in ``log`` holds; draw boxes and LiDAR on its images into ``out``."""
+    """Say what a log holds, and draw its boxes and LiDAR on its images."""
+    from ..logs import check_log, inspect_log
+    from ..logs.open import open_log
+
     opened = open_log(log, format=log_format, sequence=sequence)
     report = inspect_log(opened, out)
     for line in report.lines():
@@ -26,4 +37,4 @@ def run(
     if check:
         check_log(opened)
         console.print("every file of the log was looked at: none is missing or cut off")
-    write_json(json_path, report.as_json())
+    write_json(json, report.as_json())

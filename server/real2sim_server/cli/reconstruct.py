@@ -2,79 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from ..console import console, print_figures, refuse_existing, staged_progress, write_json
-from ..reconstruct import reconstruct
-from ..reconstruct.training.schedule import preset as training_preset
+from .command import command
+from .options import JsonFile, LogFolder, LogFormat, Overwrite, Sequence
+
+if TYPE_CHECKING:
+    from ..reconstruct.training.progress import TrainingProgress
 
 
-@dataclass(frozen=True)
-class Training:
-    """How to train.
-
-    Attributes:
-        preset: its name.
-        resume: whether a run that was broken off goes on.
-        width: of the training images [px]; by the preset where None.
-        box_noise: scatter added to boxes, a share of their size.
-    """
-
-    preset: str
-    resume: bool
-    width: int | None = None
-    box_noise: float = 0.0
-
-
-def run(
+@command("reconstruct")
+def reconstruct(
     *,
-    log: Path,
-    out: Path,
-    iterations: int,
-    training: Training,
-    log_format: str | None,
-    sequence: str | None,
-    overwrite: bool,
-    json_path: Path | None,
+    log: LogFolder,
+    out: Annotated[Path, typer.Option("--out", help="Scene bundle to write.")],
+    iterations: Annotated[
+        int, typer.Option(min=0, help="0 builds from LiDAR without training.")
+    ] = 0,
+    preset: Annotated[
+        str, typer.Option(help="Of training: cpu-small, standard or paper.")
+    ] = "cpu-small",
+    width: Annotated[
+        int | None, typer.Option(min=32, max=8192, help="Of training images [px].")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where training was broken off.")
+    ] = False,
+    box_noise: Annotated[
+        float, typer.Option(min=0, max=1, help="Scatter added to boxes, a share of their size.")
+    ] = 0.0,
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    overwrite: Overwrite = False,
+    json: JsonFile = None,
 ) -> None:
-    """Reconstruct the log in folder ``log`` into the bundle ``out``."""
+    """Turn a driving log into a scene of Gaussians."""
+    from ..reconstruct import reconstruct
+    from ..reconstruct.training.schedule import preset as training_preset
+
     refuse_existing(out, overwrite=overwrite)
-    options = training_preset(training.preset)
-    if training.width is not None:
-        options = replace(options, width=training.width, max_width=training.width)
-    with _told() as told:
+    training = training_preset(preset)
+    if width is not None:
+        training = replace(training, width=width, max_width=width)
+    with staged_progress() as report:
         result = reconstruct(
             log,
             out,
             iterations=iterations,
-            training=options if iterations else None,
-            resume=training.resume,
-            box_noise=training.box_noise,
+            training=training if iterations else None,
+            resume=resume,
+            box_noise=box_noise,
             log_format=log_format,
             sequence=sequence,
             overwrite=overwrite,
-            **told,
+            on_progress=report,
+            on_training=_training_bar(report),
         )
     figures = asdict(result)
     print_figures(f"scene {out}", {k: v for k, v in figures.items() if v is not None})
     console.print(f"next: real2sim render {out} --log {log} -o {out.name}.png")
-    write_json(json_path, figures)
+    write_json(json, figures)
 
 
-@contextmanager
-def _told() -> Iterator[dict[str, Any]]:
-    """Progress bars for the stages, and the figures of training in the bar of that stage."""
-    with staged_progress() as report:
+def _training_bar(report: Callable[..., None]) -> Callable[[TrainingProgress], None]:
+    """Shows the figures of training in the progress bar of that stage."""
 
-        def on_training(news: Any) -> None:
-            stage = (
-                f"training {news.rate:.1f}/s, loss {news.loss:.4f}, {news.psnr:.2f} dB, "
-                f"{news.gaussians:,} Gaussians"
-            )
-            report("training", news.iteration, news.iterations, stage)
+    def on_training(step: TrainingProgress) -> None:
+        text = (
+            f"training {step.rate:.1f}/s, loss {step.loss:.4f}, {step.psnr:.2f} dB, "
+            f"{step.gaussians:,} Gaussians"
+        )
+        report("training", step.iteration, step.iterations, text)
 
-        yield {"on_progress": report, "on_training": on_training}
+    return on_training

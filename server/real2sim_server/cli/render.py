@@ -2,68 +2,85 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from .._files import atomic_file
 from ..console import CommandError, console, print_figures, write_json
-from ..edit.apply import apply_operations
-from ..edit.compose import instances_at
-from ..edit.state import ScenarioState
-from ..render import Frame, RasterOptions, encode_image, render_cameras
-from ..scene import Scene
-from ..scene.io import load_scene
+from .command import command
+from .options import JsonFile, RenderBackend, SceneBundle
+
+if TYPE_CHECKING:
+    from ..edit.state import ScenarioState
+    from ..render import Frame
+    from ..scene import Scene
 
 CODEC_BY_SUFFIX = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+MODALITIES = ("rgb", "depth", "instance")
 
 
-@dataclass(frozen=True)
-class View:
-    """Which picture to draw: a camera at a recorded frame, or at a time stamp [us]."""
-
-    camera: str | None = None
-    frame: int | None = None
-    t_us: int | None = None
-    width: int | None = None
-    modality: str = "rgb"
-
-
-def run(
+@command("render")
+def render(
     *,
-    scene: Path,
-    out: Path,
-    view: View,
-    delete: list[str],
-    log: Path | None,
-    backend: str,
-    json_path: Path | None,
+    scene: SceneBundle,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Image to write: .png or .jpg")],
+    camera: Annotated[str | None, typer.Option(help="Default: the first one.")] = None,
+    frame: Annotated[int | None, typer.Option(min=0, help="Recorded frame; default 0.")] = None,
+    t_us: Annotated[int | None, typer.Option(help="Or a time stamp [us].")] = None,
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="[px]")] = None,
+    modality: Annotated[str, typer.Option(help="rgb, depth or instance")] = "rgb",
+    delete: Annotated[list[str] | None, typer.Option(help="Objects to leave out.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Compare with this log's image: PSNR.")] = None,
+    backend: RenderBackend = "auto",
+    json: JsonFile = None,
 ) -> None:
-    """Draw ``view`` of the bundle ``scene`` into ``out``; compare it with ``log`` where given."""
-    if log is not None and (view.t_us is not None or delete):
+    """Draw one logged camera of a scene; with --log print PSNR against the recorded image."""
+    from ..edit.compose import instances_at
+    from ..render import RasterOptions, render_cameras
+    from ..scene.io import load_scene
+
+    if log is not None and (t_us is not None or delete):
         raise CommandError("--log compares whole recorded frames: use --frame, and no --delete")
-    if out.suffix.lower() not in CODEC_BY_SUFFIX:
-        raise CommandError(f"--out {out}: the name must end in {', '.join(CODEC_BY_SUFFIX)}")
+    _check_output(out, modality)
     loaded = load_scene(scene)
-    t_us = _time_of(view, loaded)
-    picture = _draw(loaded, view, t_us, delete, backend)
-    _write(picture, view.modality, out)
+    time_us = _frame_time(loaded, frame or 0) if t_us is None else t_us
+    chosen = loaded.rig[camera] if camera else loaded.rig.cameras[0]
+    [picture] = render_cameras(
+        instances_at(loaded, _without(loaded, delete or ()), time_us),
+        [chosen if width is None else chosen.resized(width)],
+        loaded.ego.transform(time_us),
+        sky=loaded.sky,
+        options=RasterOptions(depth=modality == "depth", instance=modality == "instance"),
+        backend=backend,
+    )
+    _write_image(picture, modality, out)
     figures: dict[str, object] = {
         "image": str(out),
         "camera": picture.camera,
-        "t_us": t_us,
+        "t_us": time_us,
         "gaussians": loaded.gaussian_count,
     }
     figures |= {f"{stage}_ms": ms for stage, ms in picture.timing_ms.items()}
     if log is not None:
-        figures |= _compare(loaded, log, view, picture.camera)
+        figures |= _compare(loaded, log, frame or 0, picture.camera)
     print_figures(f"{scene.name}, camera {picture.camera}", figures)
-    write_json(json_path, figures)
+    write_json(json, figures)
 
 
-def _time_of(view: View, scene: Scene) -> int:
-    if view.t_us is not None:
-        return view.t_us
-    frame = view.frame or 0
+def _check_output(out: Path, modality: str) -> None:
+    suffix = out.suffix.lower()
+    if suffix not in CODEC_BY_SUFFIX:
+        raise CommandError(f"--out {out}: the name must end in {', '.join(CODEC_BY_SUFFIX)}")
+    if modality not in MODALITIES:
+        raise CommandError(f"--modality {modality!r}; allowed are {', '.join(MODALITIES)}")
+    if modality != "rgb" and CODEC_BY_SUFFIX[suffix] != "png":
+        raise CommandError(f"{modality} images are written as .png, not {out.suffix}")
+
+
+def _frame_time(scene: Scene, frame: int) -> int:
     if frame >= len(scene.frame_times_us):
         raise CommandError(
             f"--frame {frame}; scene {scene.name!r} has frames 0 to {len(scene.frame_times_us) - 1}"
@@ -71,47 +88,35 @@ def _time_of(view: View, scene: Scene) -> int:
     return int(scene.frame_times_us[frame])
 
 
-def _draw(scene: Scene, view: View, t_us: int, delete: list[str], backend: str) -> Frame:
+def _without(scene: Scene, deleted: Sequence[str]) -> ScenarioState:
     from real2sim_proto.operations import Delete
 
+    from ..edit.apply import apply_operations
+    from ..edit.state import ScenarioState
+
     state = ScenarioState.of(scene)
-    if delete:
-        state = apply_operations(state, [Delete(object_id=name) for name in delete]).state
-    camera = scene.rig[view.camera] if view.camera else scene.rig.cameras[0]
-    if view.width is not None:
-        camera = camera.resized(view.width)
-    wanted = RasterOptions(depth=view.modality == "depth", instance=view.modality == "instance")
-    [frame] = render_cameras(
-        instances_at(scene, state, t_us),
-        [camera],
-        scene.ego.transform(t_us),
-        sky=scene.sky,
-        options=wanted,
-        backend=backend,
-    )
-    return frame
+    if not deleted:
+        return state
+    return apply_operations(state, [Delete(object_id=name) for name in deleted]).state
 
 
-def _write(frame: Frame, modality: str, out: Path) -> None:
-    images = {"rgb": frame.rgb, "depth": frame.depth, "instance": frame.instance}
-    codec = CODEC_BY_SUFFIX[out.suffix.lower()]
-    if modality not in images:
-        raise CommandError(f"--modality {modality!r}; allowed are {', '.join(images)}")
-    image = images[modality]
-    if modality != "rgb" and codec != "png":
-        raise CommandError(f"{modality} images are written as .png, not {out.suffix}")
+def _write_image(frame: Frame, modality: str, out: Path) -> None:
+    from ..render import encode_image
+
+    image = {"rgb": frame.rgb, "depth": frame.depth, "instance": frame.instance}[modality]
+    assert image is not None
     with atomic_file(out) as file:
-        file.write(encode_image(image, modality, codec).data)
+        file.write(encode_image(image, modality, CODEC_BY_SUFFIX[out.suffix.lower()]).data)
 
 
-def _compare(scene: Scene, log_path: Path, view: View, camera: str) -> dict[str, float]:
+def _compare(scene: Scene, log_path: Path, frame: int, camera: str) -> dict[str, float]:
     from ..logs.open import open_log
     from ..reconstruct.evaluation import evaluate_views
 
     log = open_log(log_path)
     console.print(
-        f"comparing with {log.name}, frame {view.frame or 0}, over all pixels and over "
-        "those that LiDAR covers"
+        f"comparing with {log.name}, frame {frame}, over all pixels and over those that LiDAR "
+        "covers"
     )
-    report = evaluate_views(scene, log, frames=[view.frame or 0], cameras=[camera])
+    report = evaluate_views(scene, log, frames=[frame], cameras=[camera])
     return {"psnr_db": report.psnr, "psnr_lidar_db": report.psnr_lidar}

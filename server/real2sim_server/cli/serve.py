@@ -2,23 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import ValidationError
+import typer
 
 from ..console import CommandError
-from ..service import serve as worker
-from ..settings import Settings
+from .command import command
 
 
-def run(*, overrides: Mapping[str, Any]) -> None:
-    """Serve until stopped; ``overrides`` that are not None win over the environment."""
-    given = {name: value for name, value in overrides.items() if value is not None}
+@command("serve")
+def serve(
+    *,
+    host: Annotated[
+        str | None, typer.Option(help="Default 127.0.0.1; others need a token.")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 picks a free one.")] = None,
+    scenes: Annotated[Path | None, typer.Option(help="Folder of scene bundles.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder for scenarios and sessions.")] = None,
+    token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
+    backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda or reference")] = None,
+) -> None:
+    """Start a worker. Settings not given here come from REAL2SIM_* variables."""
+    from pydantic import ValidationError
+
+    from ..service import serve as worker
+    from ..settings import Settings
+
+    options: dict[str, Any] = {
+        "host": host,
+        "port": port,
+        "scenes_dir": scenes,
+        "data_dir": data,
+        "token": token,
+        "backend": backend,
+    }
+    given = {name: value for name, value in options.items() if value is not None}
     try:
         settings = Settings(**given)
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise CommandError(f"setting {name}: {first['msg']} (given: {first['input']!r})") from error
-    worker.run(settings)
+    if code := worker.run(settings):
+        raise typer.Exit(code)

@@ -2,127 +2,139 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+import typer
 
 from ..console import CommandError, console, print_figures, staged_progress, write_json
-from ..edit.state import ScenarioState
-from ..scene import Scene
-from ..scene.io import load_scene
-from ..simulation.experiments import (
-    Experiment,
-    draw_curves,
-    leave_film,
-    scene_road,
-    set_up,
-    views,
-    walls,
-)
-from ..simulation.playback import Playback
-from ..simulation.presets import ObjectPhysics
-from ..simulation.result import SimulationResult
-from ..simulation.rollout import SimulateOptions, simulate
+from .command import command
+from .options import JsonFile, SceneBundle
+
+if TYPE_CHECKING:
+    from ..edit.state import ScenarioState
+    from ..scene import Scene
+    from ..simulation.experiments import Experiment
+    from ..simulation.result import SimulationResult
 
 
-@dataclass(frozen=True)
-class Asked:
-    """The options as they were typed.
+@command("simulate")
+def simulate(
+    *,
+    scene: SceneBundle,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for film, curves, result.")],
+    experiment: Annotated[
+        str | None, typer.Option(help="Of the paper: wall, pair or drop.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="paper (soft) or vehicle (kilograms, crush, tyres).")
+    ] = None,
+    speed: Annotated[
+        float | None, typer.Option(min=0.01, max=100, help="Of an experiment [m/s].")
+    ] = None,
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="What takes part; repeat it.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option(min=0.01, max=600, help="[s]")] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
+    backend: Annotated[str, typer.Option(help="Of the solver.")] = "auto",
+    max_particles: Annotated[
+        int | None, typer.Option(min=100, help="Of all bodies; fewer are coarser and faster.")
+    ] = None,
+    film: Annotated[bool, typer.Option(help="Draw film and stills.")] = True,
+    json: JsonFile = None,
+) -> None:
+    """Let objects of a scene collide, deform and come to rest; leave film and curves."""
+    from ..edit.state import ScenarioState
+    from ..scene.io import load_scene
+    from ..simulation.experiments import draw_curves, set_up
+    from ..simulation.rollout import simulate
 
-    Attributes:
-        experiment: ``wall``, ``pair``, ``drop``, or None for the scene as it was driving.
-        preset: ``paper`` or ``vehicle``; None takes what the experiment is known for.
-        speed: of an experiment's vehicles [m/s].
-        objects: ids that take part.
-        duration: [s].
-        frame: recorded frame to start at.
-        backend: of solver and renderer.
-        film: whether pictures are drawn.
-        max_particles: of all bodies together; None takes the default.
-    """
-
-    experiment: str | None = None
-    preset: str | None = None
-    speed: float | None = None
-    objects: tuple[str, ...] = ()
-    duration: float | None = None
-    frame: int = 0
-    backend: str = "auto"
-    film: bool = True
-    max_particles: int | None = None
-
-
-def run(*, scene: Path, out: Path, asked: Asked, json_path: Path | None) -> None:
-    """Simulate on the bundle ``scene``; leave result, film, strip, curves in folder ``out``."""
     loaded = load_scene(scene)
     state = ScenarioState.of(loaded)
-    experiment = _experiment(loaded, state, asked)
+    taking_part = tuple(objects or ())
+    if experiment is None:
+        setup = _continue_driving(loaded, state, taking_part, frame, preset=preset or "vehicle")
+    else:
+        setup = set_up(
+            experiment, loaded, state, preset=preset or "paper", speed=speed, objects=taking_part
+        )
+    options = replace(setup.options, backend=backend)
+    if duration is not None:
+        options = replace(options, duration=duration)
+    if max_particles is not None:
+        options = replace(options, max_particles=max_particles)
     out.mkdir(parents=True, exist_ok=True)
-    with staged_progress() as tell:
+    with staged_progress() as report:
         result = simulate(
             loaded,
             state,
-            experiment.options,
-            on_progress=lambda done, total: tell("simulate", done, total),
+            options,
+            on_progress=lambda done, total: report("simulate", done, total),
         )
         result.save(out / "simulation")
         draw_curves(result, out / "curves.png")
-        if asked.film:
-            playback = Playback(loaded, state, result)
-            leave_film(
-                playback,
-                views(playback, experiment),
-                out,
-                outlines=walls(experiment),
-                on_progress=lambda done, total: tell("film", done, total),
-            )
+        if film:
+            _film(loaded, state, setup, result, out, report)
     figures = _figures(result)
-    print_figures(f"{experiment.name} on {scene.name}", figures)
+    print_figures(f"{setup.name} on {scene.name}", figures)
     console.print(f"in {out}: film.mp4, strip.png, curves.png, simulation/", highlight=False)
-    write_json(json_path, figures)
+    write_json(json, figures)
 
 
-def _experiment(scene: Scene, state: ScenarioState, asked: Asked) -> Experiment:
-    if asked.experiment is not None:
-        made = set_up(
-            asked.experiment,
-            scene,
-            state,
-            preset=asked.preset or "paper",
-            speed=asked.speed,
-            objects=asked.objects,
-        )
-    else:
-        made = _as_driven(scene, state, asked)
-    options = replace(made.options, backend=asked.backend)
-    if asked.duration is not None:
-        options = replace(options, duration=asked.duration)
-    if asked.max_particles is not None:
-        options = replace(options, max_particles=asked.max_particles)
-    return replace(made, options=options)
-
-
-def _as_driven(scene: Scene, state: ScenarioState, asked: Asked) -> Experiment:
+def _continue_driving(
+    scene: Scene, state: ScenarioState, objects: tuple[str, ...], frame: int, *, preset: str
+) -> Experiment:
     """Everything named goes on from where and how fast it was driving."""
-    if not asked.objects:
+    import numpy as np
+
+    from ..simulation.experiments import Experiment, scene_road
+    from ..simulation.presets import ObjectPhysics
+    from ..simulation.rollout import SimulateOptions
+
+    if not objects:
         raise CommandError("name what to simulate with --object, or take an --experiment")
-    if asked.frame >= len(scene.frame_times_us):
+    if frame >= len(scene.frame_times_us):
         last = len(scene.frame_times_us) - 1
-        raise CommandError(f"--frame {asked.frame}; the scene has frames 0 to {last}")
-    start_us = int(scene.frame_times_us[asked.frame])
+        raise CommandError(f"--frame {frame}; the scene has frames 0 to {last}")
+    start_us = int(scene.frame_times_us[frame])
     options = SimulateOptions(
-        preset=asked.preset or "vehicle",
-        objects={name: ObjectPhysics() for name in asked.objects},
+        preset=preset,
+        objects={name: ObjectPhysics() for name in objects},
         colliders=[scene_road(scene, state, start_us)],
         start_us=start_us,
     )
-    first = {o.object_id: o for o in state.visible}.get(asked.objects[0])
+    first = {o.object_id: o for o in state.visible}.get(objects[0])
     focus = np.zeros(3) if first is None else first.trajectory.transform(start_us)[:3, 3]
-    return Experiment("rollout", options, asked.objects, focus, np.array([-1.0, 1.0, 0.6]), 10.0)
+    return Experiment("rollout", options, objects, focus, np.array([-1.0, 1.0, 0.6]), 10.0)
+
+
+def _film(
+    scene: Scene,
+    state: ScenarioState,
+    setup: Experiment,
+    result: SimulationResult,
+    out: Path,
+    report: Callable[[str, int, int], None],
+) -> None:
+    from ..simulation.experiments import leave_film, views, walls
+    from ..simulation.playback import Playback
+
+    playback = Playback(scene, state, result)
+    leave_film(
+        playback,
+        views(playback, setup),
+        out,
+        outlines=walls(setup),
+        on_progress=lambda done, total: report("film", done, total),
+    )
 
 
 def _figures(result: SimulationResult) -> dict[str, object]:
+    import numpy as np
+
     figures: dict[str, object] = {k: v for k, v in result.figures.items() if k != "gravity"}
     figures["simulated [s]"] = float(result.times_s[-1])
     for name, o in result.objects.items():

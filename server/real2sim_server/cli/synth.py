@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from ..console import CommandError, console, print_figures, progress, refuse_existing, write_json
-from ..logs.open import open_log
-from ..synthetic import SyntheticConfig, synthesize
+from .command import command
+from .options import JsonFile
 
 
-def run(
+@command("synth")
+def synth(
     *,
-    out: Path,
-    sizes: Mapping[str, int],
-    cars: Mapping[str, int],
-    json_path: Path | None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the log to write.")],
+    frames: Annotated[int, typer.Option(min=2, max=10_000)] = 60,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    width: Annotated[int, typer.Option(min=32, max=4096, help="Image width [px].")] = 480,
+    height: Annotated[int, typer.Option(min=32, max=4096, help="Image height [px].")] = 320,
+    moving_cars: Annotated[int, typer.Option(min=0, max=40)] = 4,
+    parked_cars: Annotated[int, typer.Option(min=0, max=80)] = 14,
+    json: JsonFile = None,
 ) -> None:
-    """Generate the log that ``sizes`` and ``cars`` (fields of SyntheticConfig) describe."""
+    """Generate a driving log of a procedural street: cameras, LiDAR, exact poses and boxes."""
+    from ..logs.open import open_log
+    from ..synthetic import SyntheticConfig, synthesize
+
     refuse_existing(out, overwrite=False)
     try:
-        config = SyntheticConfig(**sizes, **cars)
+        config = SyntheticConfig(
+            frames=frames,
+            seed=seed,
+            width=width,
+            height=height,
+            moving_cars=moving_cars,
+            parked_cars=parked_cars,
+        )
     except ValueError as error:
         raise CommandError(str(error)) from error
     start = time.perf_counter()
@@ -37,4 +54,4 @@ def run(
     }
     print_figures("synthetic log", figures)
     console.print(f"next: real2sim reconstruct {out} --out out/scenes/{out.name}")
-    write_json(json_path, figures)
+    write_json(json, figures)

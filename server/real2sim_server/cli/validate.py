@@ -4,39 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .._files import atomic_file
 from ..console import console, progress, write_json
-from ..physics.validation.page import render_page
-from ..physics.validation.table import CaseResult, as_figures, run_table
+from .command import command
+from .options import JsonFile
+
+if TYPE_CHECKING:
+    from ..physics.validation.table import CaseResult
 
 
-def run(*, backend: str, cases: str | None, page: Path | None, json_path: Path | None) -> None:
-    """Run the table; leave figures and a page, which lies beside the figures by default.
+@command("validate")
+def validate(
+    *,
+    backend: Annotated[str, typer.Option(help="cpu or reference")] = "cpu",
+    cases: Annotated[
+        str | None, typer.Option(help="Names with commas between them; all by default.")
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="HTML page to write; default: beside the figures.")
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Hold the physics to cases with known answers; exit code 1 when a line fails."""
+    from ..physics.validation.page import render_page
+    from ..physics.validation.table import as_figures, run_table
 
-    Raises:
-        typer.Exit: with code 1 when a line fails.
-    """
     names = None if cases is None else [name.strip() for name in cases.split(",")]
     with progress("validating") as report:
         results = run_table(backend=backend, cases=names, on_progress=report)
     figures = as_figures(results, backend)
-    write_json(json_path, figures)
-    if page is None and json_path is not None:
-        page = json_path.with_suffix(".html")
+    write_json(json, figures)
+    if page is None and json is not None:
+        page = json.with_suffix(".html")
     if page is not None:
         with atomic_file(page) as file:
             file.write(render_page(results, backend=backend).encode())
-    _tell(results)
+    _print_results(results)
     if page is not None:
         console.print(f"page: {page}", highlight=False, soft_wrap=True)
     if not figures["passed"]:
         raise typer.Exit(1)
 
 
-def _tell(results: Sequence[CaseResult]) -> None:
+def _print_results(results: Sequence[CaseResult]) -> None:
     lines = 0
     for result in results:
         for check in result.checks:

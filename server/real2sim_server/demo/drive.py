@@ -21,7 +21,7 @@ STILLS = 3
 
 
 @dataclass
-class Drive:
+class FilmedDrive:
     """A driven episode.
 
     Attributes:
@@ -43,7 +43,7 @@ def drive_through(
     steps: int,
     dt_us: int,
     video_path: Path,
-) -> Drive:
+) -> FilmedDrive:
     """Let ``planner`` drive ``steps`` steps and film all cameras side by side.
 
     Args:
@@ -79,4 +79,4 @@ def drive_through(
             dt_us=dt_us,
             privileged=True,
         )
-    return Drive(summary=summary, path=np.array(path), stills=stills)
+    return FilmedDrive(summary=summary, path=np.array(path), stills=stills)

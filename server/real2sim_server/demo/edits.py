@@ -24,7 +24,7 @@ WIDTH = 960
 
 
 @dataclass(frozen=True)
-class Edits:
+class StreetEdits:
     """What was edited, and how it looks.
 
     Attributes:
@@ -44,7 +44,7 @@ class Edits:
     gaussians: int
 
 
-def make_room(scenario: Any, scene: SceneInfo, *, camera: str) -> Edits:
+def edit_street(scenario: Any, scene: SceneInfo, *, camera: str) -> StreetEdits:
     """Move one standing car and duplicate another, with the pictures before and after."""
     before = scenario.preview(camera=camera, width=WIDTH, codec="jpeg").array
     candidates = _standing_cars(scenario.info.objects, scene)
@@ -55,7 +55,7 @@ def make_room(scenario: Any, scene: SceneInfo, *, camera: str) -> Edits:
     objects = scenario.refresh().info.objects
     original = {info.object_id for info in scene.objects}
     edited = {moved.object_id} | {o.object_id for o in objects if o.object_id not in original}
-    return Edits(
+    return StreetEdits(
         moved=moved.object_id,
         duplicated=copied.object_id,
         before=before,

@@ -19,7 +19,7 @@ OBJECT_COLOUR = "#8b949e"
 EDITED_COLOUR = "#d1495b"
 
 
-class VideoSink(Protocol):
+class FrameSink(Protocol):
     """Takes frames of one size, in order."""
 
     def add(self, frame: Image) -> None:
@@ -49,7 +49,7 @@ class _Writer:
 
 
 @contextmanager
-def video(path: Path, *, frames_per_second: float) -> Iterator[VideoSink]:
+def video(path: Path, *, frames_per_second: float) -> Iterator[FrameSink]:
     """A WebM file that is complete when the block ends.
 
     Raises:

@@ -12,11 +12,11 @@ from real2sim import connect
 from real2sim.planners import FollowRoute
 
 from ..console import console, print_figures, write_json
-from .drive import Drive, drive_through
-from .edits import Edits, make_room
+from .drive import FilmedDrive, drive_through
+from .edits import StreetEdits, edit_street
 from .pictures import draw_map, write_png
 from .street import UNTRAINED_HZ, build_street, record_street, unpack_street
-from .worker import own_worker
+from .worker import worker_process
 
 SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
@@ -33,16 +33,16 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
             trained street that is shipped.
         leave_serving: keep the worker up until Ctrl-C, and print what to try next.
     """
-    clock = Clock()
+    clock = StageTimer()
     scenes = _prepare_street(out, steps, clock, from_log=from_log)
-    with own_worker(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
+    with worker_process(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
         with connect(worker.url) as client:
             with clock("start the worker"):
                 client.wait_ready()
                 client.scenes.load(SCENE)
             with clock("edit over REST"):
                 scenario = client.scenarios.create(scene=SCENE, name="demo")
-                edits = make_room(scenario, client.scenes.get(SCENE), camera="front")
+                edits = edit_street(scenario, client.scenes.get(SCENE), camera="front")
             with clock("drive over WebSocket"):
                 session = client.session(scenario=scenario.scenario_id)
                 drive = drive_through(
@@ -62,7 +62,7 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
             _stay(worker.url, scenario.scenario_id)
 
 
-class Clock:
+class StageTimer:
     """Wall seconds by stage."""
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Clock:
         self.seconds[stage] = time.perf_counter() - start
 
 
-def _prepare_street(out: Path, steps: int, clock: Clock, *, from_log: bool) -> Path:
+def _prepare_street(out: Path, steps: int, clock: StageTimer, *, from_log: bool) -> Path:
     log, scenes = out / "log", out / "scenes"
     for stale in (log, scenes, out / "worker"):
         shutil.rmtree(stale, ignore_errors=True)
@@ -92,7 +92,7 @@ def _prepare_street(out: Path, steps: int, clock: Clock, *, from_log: bool) -> P
     return scenes
 
 
-def _leave_pictures(out: Path, edits: Edits, drive: Drive) -> None:
+def _leave_pictures(out: Path, edits: StreetEdits, drive: FilmedDrive) -> None:
     write_png(out / "edit_before.png", edits.before)
     write_png(out / "edit_after.png", edits.after)
     for step, picture in drive.stills.items():
@@ -100,7 +100,7 @@ def _leave_pictures(out: Path, edits: Edits, drive: Drive) -> None:
     draw_map(out / "map.png", logged=edits.logged, driven=drive.path, boxes=edits.footprints)
 
 
-def _summary(edits: Edits, drive: Drive, clock: Clock) -> dict[str, object]:
+def _summary(edits: StreetEdits, drive: FilmedDrive, clock: StageTimer) -> dict[str, object]:
     return {
         "scene": SCENE,
         "gaussians": edits.gaussians,
@@ -113,7 +113,7 @@ def _summary(edits: Edits, drive: Drive, clock: Clock) -> dict[str, object]:
     }
 
 
-def _report(out: Path, drive: Drive, clock: Clock) -> None:
+def _report(out: Path, drive: FilmedDrive, clock: StageTimer) -> None:
     episode = drive.summary
     figures: dict[str, object] = {f"{k} [s]": v for k, v in clock.seconds.items()}
     figures |= {

@@ -20,7 +20,7 @@ class WorkerStartError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Worker:
+class WorkerProcess:
     """A running `real2sim serve`."""
 
     url: str
@@ -50,7 +50,7 @@ class Worker:
 
 
 @contextlib.contextmanager
-def own_worker(*, scenes: Path, data: Path, log_file: Path) -> Iterator[Worker]:
+def worker_process(*, scenes: Path, data: Path, log_file: Path) -> Iterator[WorkerProcess]:
     """Start ``real2sim serve`` on a free loopback port; it is stopped when the block ends.
 
     Args:
@@ -68,7 +68,7 @@ def own_worker(*, scenes: Path, data: Path, log_file: Path) -> Iterator[Worker]:
             command, stdout=output, stderr=subprocess.STDOUT, env=environment
         )
         try:
-            worker = Worker(f"http://127.0.0.1:{port}", process, log_file)
+            worker = WorkerProcess(f"http://127.0.0.1:{port}", process, log_file)
             worker.wait_until_it_answers(START_S)
             yield worker
         finally:

@@ -1,5 +1,5 @@
-"""Planners judged: many episodes of many planners, their scores, and a page that compares them.
+"""Planners compared: many episodes of many planners, their scores, a page that shows them, and a
+policy that is trained by behaviour cloning.
 
-This room stands above all others and plays the user: it drives by the SDK, and scores what the
-worker recorded.
+Episodes are driven by the SDK, as a user would, and scored from what the worker recorded.
 """

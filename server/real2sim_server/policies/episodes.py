@@ -15,7 +15,7 @@ from real2sim.planners import load_planner, needs_of, run_episode
 from real2sim.planners.planner import forward_camera
 
 from ..world.recording.recording import Recording, load_recording
-from .suite import Asked, Case
+from .suite import Case, EpisodeGrid
 
 if TYPE_CHECKING:
     from real2sim import DriveSession, Observation
@@ -25,8 +25,8 @@ STILLS, STILL_WIDTH = 6, 320
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where episodes run.
+class WorkerTarget:
+    """The worker that episodes run on.
 
     Attributes:
         url, token: of the worker.
@@ -41,15 +41,15 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
-    """One episode.
+class EpisodeResult:
+    """One episode that was driven.
 
     Attributes:
         policy, case, seed: which one.
         file: its recording.
         recording: as read back from there.
         reason: why it ended.
-        error: what its planner died of; such an episode has no scores.
+        error: what its planner raised; such an episode has no scores.
         figures: steps, seconds, times.
         stills: (seconds since the start, JPEG) of the camera that looks ahead.
     """
@@ -71,18 +71,18 @@ class Driven:
         return {score.name: score.fields() for score in self.recording.rescore()}
 
 
-def drive_all(
-    asked: Asked,
-    place: Place,
+def run_episodes(
+    grid: EpisodeGrid,
+    target: WorkerTarget,
     folder: Path,
     *,
     on_progress: Callable[[int, int], None] | None = None,
-) -> list[Driven]:
-    """Run every episode; in the order of ``asked.episodes()``.
+) -> list[EpisodeResult]:
+    """Run every episode; in the order of ``grid.episodes()``.
 
     Args:
-        asked: what to run.
-        place: where.
+        grid: what to run.
+        target: where.
         folder: recordings go there, as ``case/policy/seed.r2e``.
         on_progress: called with (done, all).
 
@@ -90,11 +90,11 @@ def drive_all(
         Real2SimError: the worker refuses or is gone.
         ValueError: a planner that does not exist, or cannot drive in a scene.
     """
-    for policy in asked.policies:
+    for policy in grid.policies:
         load_planner(policy)
-    episodes = asked.episodes()
-    with ThreadPoolExecutor(max(place.sessions, 1)) as pool:
-        futures = [pool.submit(_drive, *one, place, folder) for one in episodes]
+    episodes = grid.episodes()
+    with ThreadPoolExecutor(max(target.sessions, 1)) as pool:
+        futures = [pool.submit(_run_episode, *episode, target, folder) for episode in episodes]
         try:
             for done, future in enumerate(as_completed(futures), start=1):
                 future.result()
@@ -106,35 +106,37 @@ def drive_all(
         return [future.result() for future in futures]
 
 
-def _drive(policy: str, case: Case, seed: int, place: Place, folder: Path) -> Driven:
+def _run_episode(
+    policy: str, case: Case, seed: int, target: WorkerTarget, folder: Path
+) -> EpisodeResult:
     file = folder / case.name / _file_name(policy) / f"{seed}.r2e"
     planner = load_planner(policy)
     needs = needs_of(planner)
     with (
-        real2sim.connect(place.url, token=place.token, timeout=place.timeout) as client,
+        real2sim.connect(target.url, token=target.token, timeout=target.timeout) as client,
         client.session(scene=case.scene, scenario=case.scenario) as session,
     ):
         options: Any = case.reset_for(seed) | {
             "action": needs.action,
-            # One that does not say what it needs is told everything, as in `real2sim drive`.
+            # A planner that does not say what it needs gets everything, as in `real2sim drive`.
             "privileged": needs.privileged or not hasattr(planner, "needs"),
         }
-        driver = _Guarded(planner, session, case)
-        watch = _Watch(session, options) if seed == 0 else None
+        driver = _IsolatedPlanner(planner, session, case)
+        capture = _StillCapture(session, options) if seed == 0 else None
         summary = None
         try:
             summary = run_episode(
                 session,
                 driver,
                 sensors=needs.sensors(session.welcome.cameras),
-                on_observation=watch,
+                on_observation=capture,
                 **options,
             )
         except real2sim.InvalidActionError as error:
             driver.error = f"plan refused: {error}"
         session.save_recording(file)
     recording = load_recording(file)
-    return Driven(
+    return EpisodeResult(
         policy=policy,
         case=case.name,
         seed=seed,
@@ -143,11 +145,11 @@ def _drive(policy: str, case: Case, seed: int, place: Place, folder: Path) -> Dr
         reason=summary.reason or "over" if summary and not driver.error else "planner failed",
         error=driver.error,
         figures=_figures(summary, recording),
-        stills=watch.stills if watch else (),
+        stills=capture.stills if capture else (),
     )
 
 
-class _Guarded:
+class _IsolatedPlanner:
     """A planner whose exceptions end its own episode only; it applies the edits of the case."""
 
     def __init__(self, planner: Any, session: DriveSession, case: Case) -> None:
@@ -157,26 +159,26 @@ class _Guarded:
     def reset(self, obs: Observation) -> None:
         if self._case.operations:
             self._session.edit(self._case.operations)
-        with self._noting():
+        with self._catching_errors():
             self._planner.reset(obs)
 
     def plan(self, obs: Observation) -> Any:
         plan = None
         if self.error is None:
-            with self._noting():
+            with self._catching_errors():
                 plan = self._planner.plan(obs)
-        # What is left of a failed episode is driven standing, so that it ends as any other.
-        return plan if plan is not None else _standing(obs, needs_of(self._planner).action)
+        # The rest of a failed episode is driven standing still, so that it ends as any other.
+        return plan if plan is not None else _standstill_plan(obs, needs_of(self._planner).action)
 
     @contextlib.contextmanager
-    def _noting(self) -> Iterator[None]:
+    def _catching_errors(self) -> Iterator[None]:
         try:
             yield
         except Exception as error:
             self.error = f"{type(error).__name__}: {error}"
 
 
-def _standing(obs: Observation, action: str) -> dict[str, Any]:
+def _standstill_plan(obs: Observation, action: str) -> dict[str, Any]:
     if action == "control":
         return {"kind": "control", "acceleration": -4.0, "steering": 0.0}
     if action == "pose":
@@ -185,8 +187,8 @@ def _standing(obs: Observation, action: str) -> dict[str, Any]:
     return {"kind": "trajectory", "times_us": [obs.t_us + 1_000_000], "poses": [(0.0, 0.0, 0.0)]}
 
 
-class _Watch:
-    """Takes a few pictures of an episode, beside its loop."""
+class _StillCapture:
+    """Takes a few pictures of an episode on the way."""
 
     def __init__(self, session: DriveSession, options: Mapping[str, Any]) -> None:
         welcome = session.welcome

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from html import escape
 
 from ..world.scoring import VERSIONS
-from .episodes import Driven
-from .plots import curves, top_view
-from .summary import Group, Spread, groups_of
+from .episodes import EpisodeResult
+from .plots import plot_curves, plot_paths
+from .summary import ScoreGroup, ScoreStatistics, group_scores
 
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1250px;padding:0 1rem;
@@ -26,7 +26,7 @@ td{font-variant-numeric:tabular-nums}td small{color:#6a737d}.bad{color:#c0303f;f
 figcaption{font-size:.72rem;color:#4a525c}.scroll{overflow-x:auto}
 """
 
-SENSE = {
+SCORE_NOTES = {
     "kinematic_infeasibility": "0 is good",
     "delta_v": "m/s, 0 is good",
     "neuroncap": "of 5",
@@ -34,24 +34,24 @@ SENSE = {
 }
 
 
-def page(driven: Sequence[Driven], *, title: str) -> str:
+def render_page(results: Sequence[EpisodeResult], *, title: str) -> str:
     """The page for at least one episode."""
-    policies = list(dict.fromkeys(one.policy for one in driven))
-    cases = list(dict.fromkeys(one.case for one in driven))
-    groups = groups_of(driven)
-    parts = [_head(driven, title, policies, cases)]
+    policies = list(dict.fromkeys(one.policy for one in results))
+    cases = list(dict.fromkeys(one.case for one in results))
+    groups = group_scores(results)
+    parts = [_head(results, title, policies, cases)]
     parts += ["<h2>All cases</h2>", _table([g for g in groups if g.case is None])]
     for case in cases:
-        mine = [one for one in driven if one.case == case]
+        mine = [one for one in results if one.case == case]
         shown = [one for one in mine if one.seed == min(m.seed for m in mine)]
         parts += [
             f"<h2>{escape(case)}</h2>",
             _table([g for g in groups if g.case == case]),
-            _image(curves(mine, policies), "png", "speed, time to collision, error, progress"),
-            _image(top_view(shown, policies), "png", "driven paths from above"),
+            _image(plot_curves(mine, policies), "png", "speed, time to collision, error, progress"),
+            _image(plot_paths(shown, policies), "png", "driven paths from above"),
             *(_strip(one) for one in shown if one.stills),
         ]
-    parts += ["<h2>Episodes</h2>", _episodes(driven)]
+    parts += ["<h2>Episodes</h2>", _episodes(results)]
     body = "\n".join(parts)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
@@ -59,20 +59,23 @@ def page(driven: Sequence[Driven], *, title: str) -> str:
     )
 
 
-def _head(driven: Sequence[Driven], title: str, policies: list[str], cases: list[str]) -> str:
-    seeds = sorted({one.seed for one in driven})
+def _head(
+    results: Sequence[EpisodeResult], title: str, policies: list[str], cases: list[str]
+) -> str:
+    seeds = sorted({one.seed for one in results})
     return (
         f"<h1>{escape(title)}</h1><p>{len(policies)} planners, {len(cases)} cases, seeds "
-        f"{', '.join(map(str, seeds))}: {len(driven)} episodes. Scores are mean and standard "
-        "deviation over seeds, computed from the recordings; <code>real2sim replay FILE</code> "
+        f"{', '.join(map(str, seeds))}: {len(results)} episodes. Scores are the mean over "
+        "episodes, with the standard deviation where there are several, computed from the "
+        "recordings; <code>real2sim replay FILE</code> "
         "computes them again. Curves show the first seed strong and the others faint, a cross a "
         "collision; maps and pictures show the first seed.</p>"
     )
 
 
-def _table(groups: Sequence[Group]) -> str:
+def _table(groups: Sequence[ScoreGroup]) -> str:
     names = "".join(
-        f"<th>{name.replace('_', ' ')}<small>v{version} {SENSE.get(name, '')}</small></th>"
+        f"<th>{name.replace('_', ' ')}<small>v{version} {SCORE_NOTES.get(name, '')}</small></th>"
         for name, version in VERSIONS.items()
     )
     rows = [
@@ -82,8 +85,8 @@ def _table(groups: Sequence[Group]) -> str:
     return f'<div class="scroll"><table>{"".join(f"<tr>{row}</tr>" for row in rows)}</table></div>'
 
 
-def _row(group: Group) -> str:
-    cells = "".join(f"<td>{_spread(group.scores[name])}</td>" for name in VERSIONS)
+def _row(group: ScoreGroup) -> str:
+    cells = "".join(f"<td>{_score(group.scores[name])}</td>" for name in VERSIONS)
     hits = f"{group.collisions} <small>{group.at_fault}</small>"
     if group.at_fault:
         hits = f'<span class="bad">{hits}</span>'
@@ -91,13 +94,15 @@ def _row(group: Group) -> str:
     return f"<td>{escape(group.policy)}</td>{cells}<td>{hits}</td><td>{ended}</td>"
 
 
-def _spread(spread: Spread | None) -> str:
-    if spread is None:
+def _score(statistics: ScoreStatistics | None) -> str:
+    if statistics is None:
         return "–"
-    return f"{spread.mean:.3g} <small>±{spread.deviation:.2g}</small>"
+    if statistics.deviation is None:
+        return f"{statistics.mean:.3g}"
+    return f"{statistics.mean:.3g} <small>±{statistics.deviation:.2g}</small>"
 
 
-def _strip(one: Driven) -> str:
+def _strip(one: EpisodeResult) -> str:
     figures = "".join(
         f"<figure>{_image(data, 'jpeg', f'{seconds:.1f} s')}<figcaption>{seconds:.1f} s"
         "</figcaption></figure>"
@@ -106,10 +111,10 @@ def _strip(one: Driven) -> str:
     return f'<h3>{escape(one.policy)}, {escape(one.reason)}</h3><div class="strip">{figures}</div>'
 
 
-def _episodes(driven: Sequence[Driven]) -> str:
+def _episodes(results: Sequence[EpisodeResult]) -> str:
     heads = ("case", "planner", "seed", "ended by", "seconds", "metres", "least TTC", "plan ms")
     rows = ["".join(f"<th>{head}</th>" for head in (*heads, "recording"))]
-    for one in driven:
+    for one in results:
         found = one.figures
         cells = (
             escape(one.case),

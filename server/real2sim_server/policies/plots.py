@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..world.recording.recording import Recording
-from .episodes import Driven
+from .episodes import EpisodeResult
 
-COLOURS = ("#1f6feb", "#d1495b", "#2a9d5c", "#e08a00", "#7b4fc9", "#0e8f9e", "#8a5a2b", "#555e68")
+COLORS = ("#1f6feb", "#d1495b", "#2a9d5c", "#e08a00", "#7b4fc9", "#0e8f9e", "#8a5a2b", "#555e68")
 TTC_SHOWN = 4.0
 """Times to collision above this are drawn there [s]."""
 MARGIN = 14.0
@@ -21,32 +21,32 @@ MARGIN = 14.0
 Array = NDArray[np.float64]
 
 
-def curves(driven: Sequence[Driven], policies: Sequence[str]) -> bytes:
+def plot_curves(results: Sequence[EpisodeResult], policies: Sequence[str]) -> bytes:
     """Speed, time to collision, lateral error and progress over time, of one case.
 
     Args:
-        driven: episodes of the case; seed 0 is drawn strong, the others faint.
-        policies: all of them, in the order that gives them their colours.
+        results: episodes of the case; the first seed is drawn strong, the others faint.
+        policies: all of them, in the order that gives them their colors.
     """
     plt = _pyplot()
     figure, axes = plt.subplots(2, 2, figsize=(13, 6.4), dpi=90, sharex=True)
-    first = min(one.seed for one in driven)
-    for one in driven:
+    first = min(one.seed for one in results)
+    for one in results:
         strong = one.seed == first
-        colour = COLOURS[policies.index(one.policy) % len(COLOURS)]
+        color = COLORS[policies.index(one.policy) % len(COLORS)]
         times, series = _series(one.recording)
         for ax, values in zip(axes.flat, series, strict=True):
             ax.plot(
                 times,
                 values,
-                color=colour,
+                color=color,
                 lw=1.8 if strong else 0.7,
                 alpha=0.95 if strong else 0.4,
                 label=one.policy if strong else None,
             )
         if one.reason == "collision":
             for ax, values in zip(axes.flat, series, strict=True):
-                ax.plot(times[-1], values[-1], "x", color=colour, ms=8, mew=2)
+                ax.plot(times[-1], values[-1], "x", color=color, ms=8, mew=2)
     titles = (
         "speed [m/s]",
         f"time to collision, up to {TTC_SHOWN:g} [s]",
@@ -63,18 +63,18 @@ def curves(driven: Sequence[Driven], policies: Sequence[str]) -> bytes:
     return _png(figure)
 
 
-def top_view(driven: Sequence[Driven], policies: Sequence[str]) -> bytes:
-    """Driven paths from above, two in a row, with everybody where it ended."""
+def plot_paths(results: Sequence[EpisodeResult], policies: Sequence[str]) -> bytes:
+    """Driven paths from above, two in a row, with every object where it ended."""
     plt = _pyplot()
-    low, high = _extent([one.recording for one in driven])
-    rows = -(-len(driven) // 2)
+    low, high = _extent([one.recording for one in results])
+    rows = -(-len(results) // 2)
     height = 0.7 + 6.0 * (high[1] - low[1]) / max(high[0] - low[0], 1.0)
     figure, axes = plt.subplots(rows, 2, figsize=(13, height * rows), dpi=90, squeeze=False)
-    for ax in axes.flat[len(driven) :]:
+    for ax in axes.flat[len(results) :]:
         ax.set_visible(False)
-    for ax, one in zip(axes.flat, driven, strict=False):
-        colour = COLOURS[policies.index(one.policy) % len(COLOURS)]
-        _draw_episode(ax, one.recording, colour)
+    for ax, one in zip(axes.flat, results, strict=False):
+        color = COLORS[policies.index(one.policy) % len(COLORS)]
+        _draw_episode(ax, one.recording, color)
         ax.set_title(f"{one.policy}: {one.reason}", loc="left", fontsize=9)
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
@@ -94,21 +94,23 @@ def _series(recording: Recording) -> tuple[Array, tuple[Array, Array, Array, Arr
     )
 
 
-def _draw_episode(ax: Any, recording: Recording, colour: str) -> None:
+def _draw_episode(ax: Any, recording: Recording, color: str) -> None:
     context, last = recording.context, recording.instants[-1]
     ax.plot(context.route[:, 0], context.route[:, 1], color="black", lw=0.8, ls="--")
     for k, object_id in enumerate(last.others.ids):
         hit = any(object_id == c.object_id for i in recording.instants for c in i.contacts)
-        box = _box(last.others.centres[k, :2], last.others.yaws[k], last.others.sizes[k])
+        box = rectangle_corners(
+            last.others.centres[k, :2], last.others.yaws[k], last.others.sizes[k]
+        )
         ax.fill(*box.T, color="#d1495b" if hit else "#8b949e", alpha=0.8 if hit else 0.45, lw=0)
         track = _track(recording, object_id)
         if np.ptp(track, axis=0).max() > 1.0:
             ax.plot(*track.T, color="#8b949e", lw=0.6)
     path = np.array([(i.ego.x, i.ego.y) for i in recording.instants])
-    ax.plot(*path.T, color=colour, lw=2)
+    ax.plot(*path.T, color=color, lw=2)
     ahead = np.array([math.cos(last.ego.yaw), math.sin(last.ego.yaw)]) * context.centre_ahead
-    box = _box(path[-1] + ahead, last.ego.yaw, np.array(context.ego_size))
-    ax.fill(*box.T, color=colour, alpha=0.85, lw=0)
+    box = rectangle_corners(path[-1] + ahead, last.ego.yaw, np.array(context.ego_size))
+    ax.fill(*box.T, color=color, alpha=0.85, lw=0)
 
 
 def _track(recording: Recording, object_id: str) -> Array:
@@ -120,8 +122,8 @@ def _track(recording: Recording, object_id: str) -> Array:
     return np.array(places)
 
 
-def _box(centre: Array, yaw: float, size: Array) -> Array:
-    """[4, 2] corners."""
+def rectangle_corners(centre: Array, yaw: float, size: Array) -> Array:
+    """[4, 2] corners, in order around, of a box of ``size`` seen from above [m]."""
     c, s = math.cos(yaw), math.sin(yaw)
     local = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * size[:2] / 2
     corners: Array = local @ np.array([[c, s], [-s, c]]) + centre

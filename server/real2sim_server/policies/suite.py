@@ -1,4 +1,9 @@
-"""Which episodes a planner is judged by."""
+"""Suites: the cases that planners are compared in.
+
+A suite is a JSON file, ``{"cases": [{"name": ..., "scene": ..., "reset": {...}}, ...]}``; its
+format is described in docs/policies.md. Files in the folder ``suites`` are shipped, and known by
+their names: a new suite, or a new case of one, needs nothing but its JSON.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +23,10 @@ from real2sim_proto.operations import Operation
 
 from ..console import CommandError
 
-OWN = frozenset({"seed", "sensors", "action", "privileged"})
-"""Fields of reset that the evaluation sets: the seed, and what the planner needs."""
+SHIPPED_SUITES = Path(__file__).with_name("suites")
+DEMO_SUITE, DEMO_SCENE = "demo", "demo_street"
+SET_BY_EVALUATION = frozenset({"seed", "sensors", "action", "privileged"})
+"""Fields of reset that no case may name: the seed, and what the planner needs."""
 
 
 class Case(BaseModel):
@@ -27,7 +34,8 @@ class Case(BaseModel):
 
     Each seed but 0 varies it: every number of ``reset`` that ``jitter`` names by its path, such as
     ``agents.drivers.car_3.gap``, is drawn uniformly from its value plus or minus the one given.
-    Times (``_us``) are rounded to clock steps. Seed 0 is the case as it is written.
+    Times (``_us``) are rounded to clock steps. Seed 0 is the case as it is written. Nothing else in
+    an episode is random: a case without jitter is the same for every seed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -40,15 +48,20 @@ class Case(BaseModel):
     jitter: dict[str, float] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _is_whole(self) -> Case:
+    def _check(self) -> Case:
         if (self.scene is None) == (self.scenario is None):
             raise ValueError(f"case {self.name!r} needs exactly one of scene and scenario")
-        if own := sorted(OWN & set(self.reset)):
-            raise ValueError(f"reset of case {self.name!r} names {own[0]!r}, which is set for it")
+        if fixed := sorted(SET_BY_EVALUATION & set(self.reset)):
+            raise ValueError(f"reset of case {self.name!r} names {fixed[0]!r}, which is set for it")
         ResetSpec.model_validate(self.reset)
         for path in self.jitter:
             _number_at(self.reset, path)
         return self
+
+    @property
+    def is_random(self) -> bool:
+        """Whether its episodes differ by their seeds."""
+        return any(width != 0 for width in self.jitter.values())
 
     def reset_for(self, seed: int) -> dict[str, Any]:
         """Options of reset for a seed; the same for every planner."""
@@ -58,22 +71,22 @@ class Case(BaseModel):
             if seed == 0:
                 break
             value = _number_at(options, path)
-            draw = np.random.default_rng([seed, zlib.crc32(path.encode())]).uniform(-width, width)
-            varied: float = value + float(draw)
+            rng = np.random.default_rng([seed, zlib.crc32(path.encode())])
+            varied = value + float(rng.uniform(-width, width))
             if path.endswith("_us"):
                 varied = max(round(varied / dt_us), 0) * dt_us
-            _put(options, path, varied)
+            _set_at(options, path, varied)
         return options | {"seed": seed}
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is to be run.
+class EpisodeGrid:
+    """Which episodes are run: the product of planners, cases and seeds.
 
     Attributes:
         cases: kinds of episodes.
         policies: planners by name, as ``load_planner`` takes them.
-        seeds: of every case.
+        seeds: of every case that is random; the others are run with the first one alone.
     """
 
     cases: Sequence[Case]
@@ -81,61 +94,44 @@ class Asked:
     seeds: Sequence[int] = field(default=(0, 1, 2))
 
     def episodes(self) -> list[tuple[str, Case, int]]:
-        """Every planner in every case with every seed."""
-        return [(p, c, s) for c in self.cases for p in self.policies for s in self.seeds]
+        """(planner, case, seed) of every episode."""
+        return [
+            (policy, case, seed)
+            for case in self.cases
+            for policy in self.policies
+            for seed in (self.seeds if case.is_random else self.seeds[:1])
+        ]
 
 
-def load_suite(path: Path) -> list[Case]:
-    """Cases of a JSON file: ``{"cases": [{"name": ..., "scene": ..., "reset": {...}}, ...]}``.
+def load_suite(suite: str | Path) -> list[Case]:
+    """Cases of a JSON file, or of the shipped suite of that name where there is no such file.
 
     Raises:
-        CommandError: no such file, or a case that is not one; the sentence names it.
+        CommandError: no such file or suite, or a case that is not one; the sentence names it.
     """
+    path = Path(suite)
+    shipped = SHIPPED_SUITES / f"{suite}.json"
+    if not path.exists() and shipped.is_file():
+        path = shipped
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return _checked([Case.model_validate(case) for case in found["cases"]])
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return _checked([Case.model_validate(case) for case in content["cases"]])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CommandError(f"{path} is no suite: {_sentence(error)}") from error
 
 
-def cases_of(scenes: Sequence[str], scenarios: Sequence[str]) -> list[Case]:
-    """One case each, as recorded."""
+def cases_as_recorded(scenes: Sequence[str], scenarios: Sequence[str]) -> list[Case]:
+    """One case for each scene and each scenario, as it is.
+
+    Raises:
+        CommandError: none is given, or two that have one name.
+    """
     try:
-        found = [Case(name=_name(s), scene=s) for s in scenes]
-        return _checked(found + [Case(name=_name(s), scenario=s) for s in scenarios])
+        cases = [Case(name=_case_name(scene), scene=scene) for scene in scenes]
+        cases += [Case(name=_case_name(scenario), scenario=scenario) for scenario in scenarios]
+        return _checked(cases)
     except ValidationError as error:
         raise CommandError(_sentence(error)) from error
-
-
-def demo_cases(scene: str) -> list[Case]:
-    """The shipped street as it was recorded, and with its leading van made to be in the way.
-
-    In the recording the van keeps 10 m ahead at 8 m/s. In the two others it brakes at 7 m/s^2 to
-    a stop, and comes out of the lane beside the ego's to drive 3 m/s slower.
-    """
-    brakes = {"kind": "hard_brake", "delay": 1.5, "gap": 25.0, "braking": 7.0}
-    cuts_in = {"kind": "cut_in", "delay": 1.5, "gap": 6.0, "duration": 1.5, "speed_change": -3.0}
-    path = "agents.drivers.van_0."
-    return [
-        Case(
-            name="as_recorded",
-            scene=scene,
-            reset={"start_us": 500_000},
-            jitter={"start_us": 500_000},
-        ),
-        Case(
-            name="lead_brakes",
-            scene=scene,
-            reset={"agents": {"drivers": {"van_0": brakes}}},
-            jitter={path + "delay": 1.0, path + "braking": 1.5},
-        ),
-        Case(
-            name="cut_in",
-            scene=scene,
-            reset={"agents": {"drivers": {"van_0": cuts_in}}},
-            jitter={path + "delay": 1.0, path + "gap": 1.5, path + "speed_change": 1.0},
-        ),
-    ]
 
 
 def _checked(cases: list[Case]) -> list[Case]:
@@ -147,22 +143,22 @@ def _checked(cases: list[Case]) -> list[Case]:
     return cases
 
 
-def _name(text: str) -> str:
+def _case_name(text: str) -> str:
     return "".join(c if c.isalnum() or c in "_-" else "_" for c in text)[:60]
 
 
 def _number_at(options: Mapping[str, Any], path: str) -> float:
-    found: Any = options
+    value: Any = options
     for part in path.split("."):
-        found = found.get(part) if isinstance(found, Mapping) else None
-    if isinstance(found, bool) or not isinstance(found, int | float):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"jitter names {path!r}, which is no number in the reset of the case")
-    return float(found)
+    return float(value)
 
 
-def _put(options: dict[str, Any], path: str, value: float) -> None:
-    *folders, last = path.split(".")
-    for part in folders:
+def _set_at(options: dict[str, Any], path: str, value: float) -> None:
+    *parents, last = path.split(".")
+    for part in parents:
         options = options[part]
     options[last] = value
 

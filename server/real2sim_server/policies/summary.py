@@ -1,4 +1,4 @@
-"""What many episodes come to: mean and spread of every score, by planner and case."""
+"""Scores of many episodes: mean and standard deviation of each, by planner and case."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from typing import Any
 
 from ..world.recording.recording import load_recording
 from ..world.scoring import VERSIONS
-from .episodes import Driven
+from .episodes import EpisodeResult
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Mean and standard deviation (of the population) over ``count`` episodes."""
+class ScoreStatistics:
+    """Mean over ``count`` episodes, and standard deviation (of the population) over several."""
 
     mean: float
-    deviation: float
+    deviation: float | None
     count: int
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Spread | None:
+    def of(cls, values: Sequence[float]) -> ScoreStatistics | None:
         """Of some values; None without any."""
         if not values:
             return None
-        return cls(statistics.fmean(values), statistics.pstdev(values), len(values))
+        deviation = statistics.pstdev(values) if len(values) > 1 else None
+        return cls(statistics.fmean(values), deviation, len(values))
 
 
 @dataclass(frozen=True)
-class Group:
+class ScoreGroup:
     """Episodes of one planner: of one case, or of all where ``case`` is None.
 
     Attributes:
@@ -45,50 +46,50 @@ class Group:
     policy: str
     case: str | None
     episodes: int
-    scores: dict[str, Spread | None]
+    scores: dict[str, ScoreStatistics | None]
     collisions: int
     at_fault: int
     reasons: dict[str, int]
     failed: int
 
     @classmethod
-    def of(cls, policy: str, case: str | None, driven: Sequence[Driven]) -> Group:
+    def of(cls, policy: str, case: str | None, results: Sequence[EpisodeResult]) -> ScoreGroup:
         """Of at least one episode."""
-        failed = sum(one.error is not None for one in driven)
-        found = [one.scores() for one in driven]
-        scores: dict[str, Spread | None] = {}
+        failed = sum(one.error is not None for one in results)
+        found = [one.scores() for one in results]
+        scores: dict[str, ScoreStatistics | None] = {}
         for name in VERSIONS:
             values = [s[name]["value"] for s in found if name in s]
             defined = [v for v in values if v is not None]
-            scores[name] = None if failed else Spread.of(defined)
+            scores[name] = None if failed else ScoreStatistics.of(defined)
         return cls(
             policy=policy,
             case=case,
-            episodes=len(driven),
+            episodes=len(results),
             scores=scores,
-            collisions=sum(one.figures["collisions"] for one in driven),
-            at_fault=sum(one.figures["at_fault"] for one in driven),
-            reasons=dict(Counter(one.reason for one in driven)),
+            collisions=sum(one.figures["collisions"] for one in results),
+            at_fault=sum(one.figures["at_fault"] for one in results),
+            reasons=dict(Counter(one.reason for one in results)),
             failed=failed,
         )
 
 
-def groups_of(driven: Sequence[Driven]) -> list[Group]:
+def group_scores(results: Sequence[EpisodeResult]) -> list[ScoreGroup]:
     """Every planner over all cases, then every planner in every case; in their order."""
-    policies, cases = _unique(d.policy for d in driven), _unique(d.case for d in driven)
+    policies, cases = _unique(d.policy for d in results), _unique(d.case for d in results)
     groups = []
     for case in (None, *cases):
         for policy in policies:
-            mine = [d for d in driven if d.policy == policy and case in (None, d.case)]
-            groups.append(Group.of(policy, case, mine))
+            mine = [d for d in results if d.policy == policy and case in (None, d.case)]
+            groups.append(ScoreGroup.of(policy, case, mine))
     return groups
 
 
-def figures_of(driven: Sequence[Driven], folder: Path) -> dict[str, Any]:
+def report_figures(results: Sequence[EpisodeResult], folder: Path) -> dict[str, Any]:
     """Everything for JSON; files relative to ``folder``."""
     return {
         "metrics": dict(VERSIONS),
-        "groups": [asdict(group) for group in groups_of(driven)],
+        "groups": [asdict(group) for group in group_scores(results)],
         "episodes": [
             {
                 "policy": one.policy,
@@ -102,16 +103,16 @@ def figures_of(driven: Sequence[Driven], folder: Path) -> dict[str, Any]:
                 **one.figures,
                 "scores": list(one.scores().values()),
             }
-            for one in driven
+            for one in results
         ],
     }
 
 
-def recompute(figures: dict[str, Any], folder: Path) -> list[str]:
+def unconfirmed_scores(figures: dict[str, Any], folder: Path) -> list[str]:
     """Episodes of a report whose scores differ from those of their recordings; none if all agree.
 
     Args:
-        figures: as ``figures_of`` made them.
+        figures: as ``report_figures`` made them.
         folder: that their files are relative to.
     """
     differing = []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer
 
-from real2sim_server.cli import validate
+from real2sim_server.cli.validate import validate
 from real2sim_server.physics import PhysicsError
 from real2sim_server.physics.validation import CASES, Check, Curve
 from real2sim_server.physics.validation import table as table_module
@@ -99,7 +99,7 @@ def small_table(monkeypatch):
 def test_a_line_that_fails_leaves_the_command_with_code_1_and_all_figures(tmp_path):
     out = tmp_path / "table.json"
     with pytest.raises(typer.Exit) as left:
-        validate.run(backend="cpu", cases=None, page=None, json_path=out)
+        validate(json=out)
     assert left.value.exit_code == 1
     figures = json.loads(out.read_text())
     assert not figures["passed"]
@@ -111,7 +111,7 @@ def test_a_line_that_fails_leaves_the_command_with_code_1_and_all_figures(tmp_pa
 
 @pytest.mark.usefixtures("small_table")
 def test_lines_that_all_hold_leave_no_exit_code(tmp_path):
-    validate.run(backend="cpu", cases="fine", page=tmp_path / "page.html", json_path=None)
+    validate(cases="fine", page=tmp_path / "page.html")
     assert "all 1 lines hold" in (tmp_path / "page.html").read_text()
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from real2sim_server.policies.episodes import Driven, Place, drive_all
-from real2sim_server.policies.suite import Asked, Case
+from real2sim_server.policies.episodes import EpisodeResult, WorkerTarget, run_episodes
+from real2sim_server.policies.suite import Case, EpisodeGrid
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.serve import RunningWorker, running_worker
@@ -50,10 +50,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def driven(site: RunningWorker, folder: Path) -> list[Driven]:
-    """Both cases, two seeds; by a blind planner, one that sees, and one that dies."""
+def results(site: RunningWorker, folder: Path) -> list[EpisodeResult]:
+    """Both cases, two seeds; by a blind planner, one that sees, and one that raises."""
     with pytest.MonkeyPatch.context() as patch:
         (folder / "broken.py").write_text(BROKEN)
         patch.chdir(folder)
-        asked = Asked(CASES, ("pid", "idm", "broken:Dies"), (0, 1))
-        return drive_all(asked, Place(site.url, site.token), folder / "recordings")
+        grid = EpisodeGrid(CASES, ("pid", "idm", "broken:Dies"), (0, 1))
+        return run_episodes(grid, WorkerTarget(site.url, site.token), folder / "recordings")

@@ -7,7 +7,14 @@ from pydantic import ValidationError
 
 from real2sim_proto.episode import ResetSpec
 from real2sim_server.console import CommandError
-from real2sim_server.policies.suite import Asked, Case, cases_of, demo_cases, load_suite
+from real2sim_server.policies.suite import (
+    DEMO_SUITE,
+    SHIPPED_SUITES,
+    Case,
+    EpisodeGrid,
+    cases_as_recorded,
+    load_suite,
+)
 
 BRAKES = {"agents": {"drivers": {"car": {"kind": "hard_brake", "gap": 20.0}}}}
 
@@ -66,15 +73,41 @@ def test_a_file_that_is_no_suite_is_refused(tmp_path, text):
 
 def test_cases_need_names_of_their_own():
     with pytest.raises(CommandError, match="own"):
-        cases_of(["street", "street"], [])
+        cases_as_recorded(["street", "street"], [])
 
 
-def test_the_cases_of_the_demo_can_be_driven():
-    for case in demo_cases("demo_street"):
+@pytest.mark.parametrize("name", sorted(file.stem for file in SHIPPED_SUITES.glob("*.json")))
+def test_the_cases_of_shipped_suites_are_found_by_name_and_can_be_driven(name):
+    for case in load_suite(name):
         for seed in range(20):
             ResetSpec.model_validate(case.reset_for(seed))
 
 
-def test_episodes_are_the_product_of_cases_planners_and_seeds():
-    asked = Asked(cases_of(["a", "b"], []), ("pid", "idm"), (0, 1, 2))
-    assert len({(p, c.name, s) for p, c, s in asked.episodes()}) == 2 * 2 * 3
+def test_the_suite_of_the_demo_is_shipped():
+    assert {case.name for case in load_suite(DEMO_SUITE)} == {
+        "as_recorded",
+        "lead_brakes",
+        "cut_in",
+    }
+
+
+def test_a_file_goes_before_a_shipped_suite_of_the_same_name(tmp_path, monkeypatch):
+    (tmp_path / DEMO_SUITE).write_text('{"cases": [{"name": "mine", "scene": "s"}]}')
+    monkeypatch.chdir(tmp_path)
+    assert [case.name for case in load_suite(DEMO_SUITE)] == ["mine"]
+
+
+def test_episodes_are_the_product_of_random_cases_planners_and_seeds():
+    cases = [
+        Case(name=name, scene=name, reset=BRAKES, jitter={"agents.drivers.car.gap": 1.0})
+        for name in ("a", "b")
+    ]
+    grid = EpisodeGrid(cases, ("pid", "idm"), (0, 1, 2))
+    assert len({(p, c.name, s) for p, c, s in grid.episodes()}) == 2 * 2 * 3
+
+
+@pytest.mark.parametrize("jitter", [{}, {"agents.drivers.car.gap": 0.0}])
+def test_a_case_in_which_nothing_is_random_is_driven_once(jitter):
+    case = Case(name="a", scene="s", reset=BRAKES, jitter=jitter)
+    grid = EpisodeGrid([case], ("pid", "idm"), (0, 1, 2))
+    assert [(policy, seed) for policy, _, seed in grid.episodes()] == [("pid", 0), ("idm", 0)]

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import httpx2
 import pytest
 
-from real2sim_server.demo.worker import own_worker
+from real2sim_server.demo.worker import worker_process
 
 pytestmark = pytest.mark.network
 
@@ -27,7 +27,7 @@ def start(scenes_dir, tmp_path):
                 runs[-1].process.kill()
                 runs[-1].process.wait()
             log_file = tmp_path / f"worker_{len(runs)}.log"
-            worker = own_worker(scenes=scenes_dir, data=tmp_path / "data", log_file=log_file)
+            worker = worker_process(scenes=scenes_dir, data=tmp_path / "data", log_file=log_file)
             runs.append(stack.enter_context(worker))
             runs[-1].wait_until_it_answers(60)
             client = httpx2.Client(base_url=runs[-1].url, trust_env=False, timeout=60)

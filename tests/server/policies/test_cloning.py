@@ -11,53 +11,58 @@ from real2sim.cli import build_app
 from real2sim.planners import LearnedPolicy, load_planner
 from real2sim.planners.learned import PolicyShape, network, shrink
 from real2sim_server.console import CommandError
-from real2sim_server.policies.train import Asked, Lessons, driven_from, learn, lessons_of
-from real2sim_server.policies.views import Seen, scene_views
+from real2sim_server.policies.cloning import (
+    CloningDataset,
+    build_dataset,
+    expert_poses,
+    train_network,
+)
+from real2sim_server.policies.posed_images import PosedImage, scene_images
 from real2sim_server.scene.io import save_scene
 
 SHAPE = PolicyShape(camera="front", width=32, height=24, poses=2, spacing=0.5)
 
 
-def seen(*, t_us=0, aside=0.0, turn=0.0) -> Seen:
+def posed_image(*, t_us=0, aside=0.0, turn=0.0) -> PosedImage:
     """From the tiny scene's path: along x at 5 m/s."""
     c, s = np.cos(turn), np.sin(turn)
     x = 5.0 * t_us * 1e-6
     pose = np.array([[c, -s, 0, x], [s, c, 0, aside], [0, 0, 1, 0], [0, 0, 0, 1]])
-    return Seen(np.zeros((24, 32, 3), np.uint8), t_us, pose, 0, 1)
+    return PosedImage(np.zeros((24, 32, 3), np.uint8), t_us, pose, 0, 1)
 
 
 def test_on_the_path_the_answer_is_what_was_driven(tiny_scene):
-    answer = driven_from(tiny_scene.ego, SHAPE, seen())
+    answer = expert_poses(tiny_scene.ego, SHAPE, posed_image())
     assert answer * [20, 20, 1] == pytest.approx(np.array([[2.5, 0, 0], [5.0, 0, 0]]), abs=1e-5)
 
 
 def test_beside_the_path_the_answer_leads_back_to_it(tiny_scene):
     long = PolicyShape(camera="front", poses=4, spacing=0.5)
-    answer = driven_from(tiny_scene.ego, long, seen(aside=1.0)) * [20, 20, 1]
+    answer = expert_poses(tiny_scene.ego, long, posed_image(aside=1.0)) * [20, 20, 1]
     assert answer[:, 0] == pytest.approx([2.5, 5.0, 7.5, 10.0], abs=1e-5)
     # The vehicle is 1 m left of the path, so that the path lies at y = -1.
     assert answer[:, 1] == pytest.approx([-1 + (2 / 3) ** 2, -1 + (1 / 3) ** 2, -1, -1], abs=1e-5)
 
 
 def test_a_turned_view_sees_the_path_turned(tiny_scene):
-    answer = driven_from(tiny_scene.ego, SHAPE, seen(turn=0.1)) * [20, 20, 1]
+    answer = expert_poses(tiny_scene.ego, SHAPE, posed_image(turn=0.1)) * [20, 20, 1]
     assert answer[:, 2] == pytest.approx([-0.1, -0.1], abs=1e-5)
     assert answer[1, 1] == pytest.approx(-5.0 * np.sin(0.1), abs=1e-5)
 
 
 def test_views_that_the_recording_ends_after_teach_nothing(tiny_scene):
-    assert driven_from(tiny_scene.ego, SHAPE, seen(t_us=1_100_000)) is None
+    assert expert_poses(tiny_scene.ego, SHAPE, posed_image(t_us=1_100_000)) is None
     with pytest.raises(CommandError, match="views"):
-        lessons_of(tiny_scene.ego, SHAPE, [seen(t_us=1_100_000)])
+        build_dataset(tiny_scene.ego, SHAPE, [posed_image(t_us=1_100_000)])
 
 
 def test_views_of_a_scene_are_drawn_on_the_path_and_beside_it(tiny_scene):
-    views = list(scene_views(tiny_scene, SHAPE, shifted=2, seed=0))
+    views = list(scene_images(tiny_scene, SHAPE, shifted=2, seed=0))
     assert len(views) == 21 * 3 == views[0].count
     asides = np.array([v.T_world_vehicle[1, 3] for v in views]).reshape(21, 3)
     assert np.abs(asides[:, 0]).max() < 1e-9
     assert 0.3 < np.abs(asides[:, 1:]).mean() < 1.5
-    assert views[0].image.shape == (43, 64, 3)
+    assert views[0].rgb.shape == (43, 64, 3)
 
 
 def test_an_image_is_shrunk_by_averaging():
@@ -74,26 +79,26 @@ def test_shrinking_to_sizes_that_do_not_divide_keeps_the_mean():
     assert small.mean() == pytest.approx(image.mean() / 127.5 - 1, abs=1e-4)
 
 
-def lessons() -> Lessons:
+def dataset() -> CloningDataset:
     """The brighter the left half, the farther to the left it was driven."""
-    draw = np.random.default_rng(0)
-    side = draw.uniform(-1, 1, 80).astype(np.float32)
+    rng = np.random.default_rng(0)
+    side = rng.uniform(-1, 1, 80).astype(np.float32)
     images = np.zeros((80, 3, 24, 32), np.float32)
     images[..., :16], images[..., 16:] = side[:, None, None, None], -side[:, None, None, None]
     poses = np.zeros((80, 2, 3), np.float32)
     poses[:, :, 0], poses[:, :, 1] = 0.25, 0.2 * side[:, None]
     states = np.tile(np.array([0.5, 0, 1, 0], np.float32), (80, 1))
-    return Lessons(images, states, poses, np.arange(80) % 5 == 4)
+    return CloningDataset(images, states, poses, np.arange(80) % 5 == 4)
 
 
-def test_what_is_taught_is_learned_and_answered_where_it_was_not_seen():
-    _, figures = learn(lessons(), SHAPE, Asked(epochs=40))
-    untaught = float(np.abs(lessons().poses[..., 1]).mean()) * 20
+def test_what_is_taught_is_learned_and_answered_where_it_was_not_posed_image():
+    _, figures = train_network(dataset(), SHAPE, epochs=40)
+    untaught = float(np.abs(dataset().poses[..., 1]).mean()) * 20
     assert figures["error_unseen_m"] < 0.3 * untaught
 
 
 def test_the_same_seed_teaches_the_same_weights():
-    a, b = (learn(lessons(), SHAPE, Asked(epochs=1, seed=3))[0] for _ in range(2))
+    a, b = (train_network(dataset(), SHAPE, epochs=1, seed=3)[0] for _ in range(2))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 

@@ -1,0 +1,136 @@
+"""``real2sim evaluate-policy``: planners x cases x seeds, scored from their recordings."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from .._files import atomic_file
+from ..console import CommandError, console, staged_progress, write_json
+from .command import command
+
+if TYPE_CHECKING:
+    from ..policies.episodes import EpisodeResult
+    from ..policies.suite import Case
+
+RECORDINGS, PAGE, FIGURES = "recordings", "report.html", "report.json"
+
+
+@command("evaluate-policy")
+def evaluate_policy(
+    *,
+    out: Annotated[Path, typer.Option("--out", help="Folder for report and recordings.")],
+    policies: Annotated[
+        list[str],
+        typer.Option(
+            "--policy", help="follow_route, pid, idm, depth_sampling, learned=FILE, module:Class."
+        ),
+    ],
+    scenes: Annotated[
+        list[str] | None, typer.Option("--scene", help="To drive as recorded; repeat it.")
+    ] = None,
+    scenarios: Annotated[
+        list[str] | None, typer.Option("--scenario", help="Id, to drive as it is; repeat it.")
+    ] = None,
+    suite: Annotated[
+        Path | None,
+        typer.Option(help="JSON file of cases instead. With none: the demo's street, three ways."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="How many, from 0 on.")] = 3,
+    url: Annotated[
+        str | None, typer.Option(help="Of a running worker; default: one is started.")
+    ] = None,
+    token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
+    scenes_dir: Annotated[
+        Path | None, typer.Option("--scenes", help="Bundles for the worker that is started.")
+    ] = None,
+    sessions: Annotated[int, typer.Option(min=1, max=64, help="Episodes at a time.")] = 2,
+) -> None:
+    """Drive cases with planners; leave scores, recordings and a page that compares them."""
+    from ..policies.episodes import WorkerTarget, run_episodes
+    from ..policies.page import render_page
+    from ..policies.suite import EpisodeGrid
+    from ..policies.summary import report_figures, unconfirmed_scores
+
+    cases = _cases(scenes or (), scenarios or (), suite, demo=url is None and scenes_dir is None)
+    grid = EpisodeGrid(cases, policies, range(seeds))
+    with contextlib.ExitStack() as stack:
+        if url is None:
+            url, token = stack.enter_context(_own_worker(scenes_dir, out)), None
+        report = stack.enter_context(staged_progress())
+        try:
+            results = run_episodes(
+                grid,
+                WorkerTarget(url, token, sessions),
+                out / RECORDINGS,
+                on_progress=lambda done, count: report("drive", done, count),
+            )
+        except ValueError as error:
+            raise CommandError(str(error)) from error
+    figures = report_figures(results, out)
+    if differing := unconfirmed_scores(figures, out):
+        raise CommandError(f"the scores of {differing[0]} are not those of its recording")
+    write_json(out / FIGURES, figures)
+    with atomic_file(out / PAGE) as file:
+        file.write(render_page(results, title="Planners compared").encode())
+    _print_scores(results)
+    console.print(f"in {out}: {PAGE}, {FIGURES}, {RECORDINGS}/", highlight=False)
+
+
+def _cases(
+    scenes: Sequence[str], scenarios: Sequence[str], suite: Path | None, *, demo: bool
+) -> Sequence[Case]:
+    from ..policies.suite import DEMO_SUITE, cases_as_recorded, load_suite
+
+    if suite is not None:
+        if scenes or scenarios:
+            raise CommandError("give scenes and scenarios, or a suite that names its own")
+        return load_suite(suite)
+    if scenes or scenarios:
+        return cases_as_recorded(scenes, scenarios)
+    if not demo:
+        raise CommandError("name what to drive: --scene, --scenario or --suite")
+    return load_suite(DEMO_SUITE)
+
+
+@contextlib.contextmanager
+def _own_worker(scenes: Path | None, out: Path) -> Iterator[str]:
+    """A worker with the bundles in ``scenes``, or with the demo's street; its address."""
+    import real2sim
+
+    from ..demo.street import unpack_street
+    from ..demo.worker import worker_process
+    from ..policies.suite import DEMO_SCENE
+
+    with contextlib.ExitStack() as stack:
+        if scenes is None:
+            scenes = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="real2sim-")))
+            unpack_street(scenes, DEMO_SCENE)
+        worker = stack.enter_context(
+            worker_process(scenes=scenes, data=out / "worker", log_file=out / "worker.log")
+        )
+        with real2sim.connect(worker.url) as client:
+            client.wait_ready()
+        yield worker.url
+
+
+def _print_scores(results: Sequence[EpisodeResult]) -> None:
+    from ..policies.summary import group_scores
+
+    groups = [group for group in group_scores(results) if group.case is None]
+    table = Table(title="mean over cases and seeds", title_justify="left")
+    table.add_column("score")
+    for group in groups:
+        table.add_column(escape(group.policy), justify="right", overflow="fold")
+    for name in groups[0].scores:
+        scores = [group.scores[name] for group in groups]
+        table.add_row(name, *("–" if s is None else f"{s.mean:.3g}" for s in scores))
+    table.add_row("collisions at fault", *(str(group.at_fault) for group in groups))
+    console.print(table)

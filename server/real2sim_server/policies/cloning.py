@@ -1,0 +1,205 @@
+"""Behaviour cloning: a small network learns to drive as the recording vehicle did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim.planners.learned import REACH, PolicyShape, network, shrink, state_of
+
+from .._files import atomic_file
+from ..console import CommandError
+from ..geometry.rotation import quaternion_yaw, transform_from
+from ..scene import Trajectory
+from ..world.ego.route import command_ahead
+from ..world.path import LoggedPath
+from .posed_images import PosedImage
+
+if TYPE_CHECKING:
+    import torch
+
+BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 32, 2e-3, 1e-4
+HOLD_OUT_EVERY = 5
+"""Every fifth frame is kept from training, to measure the error where it was not trained."""
+YAW_WEIGHT = 4.0
+"""An error of a radian counts as much as one of so many units of position."""
+RECOVERY_TIME = 1.5
+"""In which a vehicle beside the path is brought back to it [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CloningDataset:
+    """What the network is trained on, N examples.
+
+    Attributes:
+        images: [N, 3, H, W] float32 in [-1, 1].
+        states: [N, 4] float32.
+        poses: [N, K, 3] float32, what was driven, in units of the network.
+        held_out: [N] bool, kept from training.
+    """
+
+    images: NDArray[np.float32]
+    states: NDArray[np.float32]
+    poses: NDArray[np.float32]
+    held_out: NDArray[np.bool_]
+
+
+def build_dataset(
+    ego: Trajectory, shape: PolicyShape, images: Iterable[PosedImage]
+) -> CloningDataset:
+    """Images with what the recording vehicle did next, in the frame of each of them.
+
+    A vehicle beside the path is brought back to it within ``RECOVERY_TIME``. Images so late that
+    the recording does not cover the plan are left out.
+
+    Args:
+        ego: the recorded drive.
+        shape: input and output of the network.
+        images: on the path of the drive, or beside it.
+
+    Raises:
+        CommandError: too few are left.
+    """
+    path = LoggedPath(ego)
+    inputs, states, poses, held_out = [], [], [], []
+    for image in images:
+        expert = expert_poses(ego, shape, image)
+        if expert is None:
+            continue
+        speed = float(np.linalg.norm(ego.velocity(image.t_us)[:2]))
+        near = path.nearest(*image.T_world_vehicle[:2, 3].tolist())
+        inputs.append(shrink(image.rgb, shape.width, shape.height))
+        states.append(state_of(speed, command_ahead(path, near.s)))
+        poses.append(expert)
+        held_out.append(image.frame % HOLD_OUT_EVERY == HOLD_OUT_EVERY - 1)
+    if len(inputs) < 2 * HOLD_OUT_EVERY:
+        raise CommandError(
+            f"the drive has {len(inputs)} views with {shape.poses * shape.spacing:g} s of driving "
+            f"after them; {2 * HOLD_OUT_EVERY} are needed"
+        )
+    return CloningDataset(np.stack(inputs), np.stack(states), np.stack(poses), np.array(held_out))
+
+
+def expert_poses(
+    ego: Trajectory, shape: PolicyShape, image: PosedImage
+) -> NDArray[np.float32] | None:
+    """[K, 3] poses (x, y, yaw) that the recording vehicle came to, in the frame of the image's
+    vehicle, in units of the network; None where the recording ends before."""
+    delays = (np.arange(shape.poses) + 1) * shape.spacing
+    times = image.t_us + np.round(delays * 1e6).astype(np.int64)
+    if times[-1] > ego.end_us:
+        return None
+    T_vehicle_world = np.linalg.inv(image.T_world_vehicle)
+    T_vehicle_ego = T_vehicle_world @ transform_from(*ego.pose(image.t_us))
+    # The offset from the path fades, with a slope of 0 at its end.
+    remaining = np.clip(1.0 - delays / RECOVERY_TIME, 0.0, 1.0) ** 2
+    poses = np.empty((shape.poses, 3))
+    for k, t_us in enumerate(times.tolist()):
+        position, quaternion = ego.pose(t_us)
+        local = T_vehicle_world[:3, :3] @ position + T_vehicle_world[:3, 3]
+        yaw = float(quaternion_yaw(quaternion)) - _yaw(image.T_world_vehicle)
+        poses[k, :2] = local[:2] - remaining[k] * T_vehicle_ego[:2, 3]
+        poses[k, 2] = np.arctan2(np.sin(yaw), np.cos(yaw))
+    scaled: NDArray[np.float32] = (poses / [REACH, REACH, 1.0]).astype(np.float32)
+    return scaled
+
+
+def train_network(
+    dataset: CloningDataset,
+    shape: PolicyShape,
+    *,
+    epochs: int = 60,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Train a policy by AdamW with a one-cycle learning rate.
+
+    Args:
+        dataset: examples.
+        shape: of the network.
+        epochs: passes over the dataset.
+        seed: of weights, order and brightness; the same seed gives the same bits.
+        on_progress: called with (epochs done, all).
+
+    Returns:
+        Weights by name, and figures: their number, mean errors of positions [m] on examples that
+        were trained on and on those held out.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    # The network is too small to share out, and one thread gives the same bits everywhere.
+    torch.set_num_threads(1)
+    try:
+        torch.manual_seed(seed)
+        model = network(shape)
+        tensors = tuple(map(torch.from_numpy, (dataset.images, dataset.states, dataset.poses)))
+        held_out = torch.from_numpy(dataset.held_out)
+        _optimise(model, tensors, torch.nonzero(~held_out)[:, 0], epochs, on_progress)
+        errors = _position_errors(model, tensors)
+    finally:
+        torch.set_num_threads(threads)
+    figures = {
+        "weights": sum(p.numel() for p in model.parameters()),
+        "error_seen_m": float(errors[~held_out].mean()),
+        "error_unseen_m": float(errors[held_out].mean()) if held_out.any() else None,
+    }
+    return dict(model.state_dict()), figures
+
+
+def _optimise(
+    model: torch.nn.Module,
+    tensors: tuple[torch.Tensor, ...],
+    train_rows: torch.Tensor,
+    epochs: int,
+    on_progress: Callable[[int, int], None] | None,
+) -> None:
+    import torch
+
+    images, states, poses = tensors
+    optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    steps = epochs * -(-len(train_rows) // BATCH_SIZE)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
+    weight = torch.tensor([1.0, 1.0, YAW_WEIGHT])
+    for epoch in range(epochs):
+        order = train_rows[torch.randperm(len(train_rows))]
+        for rows in torch.split(order, BATCH_SIZE):
+            brightness = 0.8 + 0.4 * torch.rand(len(rows), 1, 1, 1)
+            predicted = model(images[rows] * brightness, states[rows])
+            loss = torch.nn.functional.smooth_l1_loss(
+                predicted * weight, poses[rows] * weight, beta=0.05
+            )
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+            schedule.step()
+        if on_progress is not None:
+            on_progress(epoch + 1, epochs)
+
+
+def _position_errors(model: torch.nn.Module, tensors: tuple[torch.Tensor, ...]) -> torch.Tensor:
+    """[N] mean distance of predicted from driven positions [m]."""
+    import torch
+
+    images, states, poses = tensors
+    with torch.inference_mode():
+        error = (model.eval()(images, states) - poses)[..., :2]
+        distances: torch.Tensor = error.norm(dim=2).mean(1) * REACH
+    return distances
+
+
+def save_policy(weights: dict[str, torch.Tensor], shape: PolicyShape, out: Path) -> None:
+    """Write the weights as a ``.safetensors`` file that planner ``learned=FILE`` reads."""
+    from safetensors.torch import save
+
+    with atomic_file(out) as file:
+        file.write(save(weights, metadata=shape.metadata()))
+
+
+def _yaw(T_world_vehicle: NDArray[np.float64]) -> float:
+    return float(np.arctan2(T_world_vehicle[1, 0], T_world_vehicle[0, 0]))
