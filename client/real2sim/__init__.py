@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     from real2sim_proto.episode import SensorSpec
     from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 
-    from .client import AsyncClient, Client, connect, connect_async
-    from .drive_session import DriveSession
-    from .drive_session_async import AsyncDriveSession
+    from ._async.client import AsyncClient, connect_async
+    from ._async.drive_session import AsyncDriveSession
+    from ._sync.client import Client, connect
+    from ._sync.drive_session import DriveSession
     from .env import DriveEnv
     from .errors import (
         BadStepError,
@@ -106,11 +107,11 @@ __all__ = [
 ]
 
 _ELSEWHERE = {
-    "AsyncClient": "real2sim.client",
-    "AsyncDriveSession": "real2sim.drive_session_async",
-    "Client": "real2sim.client",
+    "AsyncClient": "real2sim._async.client",
+    "AsyncDriveSession": "real2sim._async.drive_session",
+    "Client": "real2sim._sync.client",
     "Control": "real2sim_proto.plans",
-    "DriveSession": "real2sim.drive_session",
+    "DriveSession": "real2sim._sync.drive_session",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",
     "Observation": "real2sim.observation",
@@ -118,8 +119,8 @@ _ELSEWHERE = {
     "SensorSpec": "real2sim_proto.episode",
     "TrajectoryPlan": "real2sim_proto.plans",
     "View": "real2sim.observation",
-    "connect": "real2sim.client",
-    "connect_async": "real2sim.client",
+    "connect": "real2sim._sync.client",
+    "connect_async": "real2sim._async.client",
 }
 
 

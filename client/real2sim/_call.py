@@ -30,7 +30,7 @@ class Request:
     form: dict[str, str] = field(default_factory=dict)
     upload: Path | None = None
     idempotent: bool = True
-    patient: bool = False
+    long_timeout: bool = False
     accepted: frozenset[int] = frozenset()
 
     def __str__(self) -> str:
@@ -79,7 +79,7 @@ def post(
     *,
     params: dict[str, str] | None = None,
     if_match: str | None = None,
-    patient: bool = False,
+    long_timeout: bool = False,
 ) -> Request:
     """A POST that may be tried again: the worker knows it by its Idempotency-Key."""
     headers = {"Idempotency-Key": new_key()}
@@ -88,7 +88,7 @@ def post(
     if if_match is not None:
         headers["If-Match"] = if_match
     content = None if body is None else json_of(body)
-    return Request("POST", path, params or {}, headers, content, patient=patient)
+    return Request("POST", path, params or {}, headers, content, long_timeout=long_timeout)
 
 
 def upload(path: str, file: Path, form: dict[str, str]) -> Request:
@@ -99,7 +99,7 @@ def upload(path: str, file: Path, form: dict[str, str]) -> Request:
         "Idempotency-Key": key,
         "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
     }
-    return Request("POST", path, headers=headers, form=form, upload=file, patient=True)
+    return Request("POST", path, headers=headers, form=form, upload=file, long_timeout=True)
 
 
 def json_of(body: BaseModel) -> bytes:
@@ -128,5 +128,5 @@ def image(path: str, view: ViewRequest) -> Call[Image]:
     params |= {} if view.t_us is None else {"t_us": str(view.t_us)}
     params |= {} if view.width is None else {"width": str(view.width)}
     headers = {"Accept": MEDIA_TYPES[view.codec]}
-    request = Request("GET", path, params, headers, patient=True)
+    request = Request("GET", path, params, headers, long_timeout=True)
     return Call(request, lambda reply: parse_image(reply, view.modality))

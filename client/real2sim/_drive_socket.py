@@ -1,4 +1,4 @@
-"""Opening and losing the drive socket, the same for both twins."""
+"""Opening and losing the drive socket, whoever waits for it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import websockets
 
 from real2sim_proto import DRIVE_SUBPROTOCOL
 
-from ._conversation import MAX_MESSAGE_BYTES
-from ._replies import Reply, refusal_error
-from ._transport import Target
+from ._protocol import MAX_MESSAGE_BYTES
+from ._replies import Reply, error_from_reply
+from ._target import Target
 from .errors import (
     ConnectionLostError,
     ProtocolMismatchError,
@@ -22,7 +22,7 @@ from .errors import (
 
 
 def socket_options(target: Target, session_id: str) -> dict[str, Any]:
-    """Arguments of both twins' connect: no compression, large frames, time limits on."""
+    """Arguments of a connection: no compression, large frames, time limits on."""
     return {
         "uri": target.drive_url(session_id),
         "subprotocols": [DRIVE_SUBPROTOCOL],
@@ -54,11 +54,11 @@ def handshake_errors(target: Target) -> Iterator[None]:
         response = error.response
         headers = {name.lower(): value for name, value in response.headers.raw_items()}
         reply = Reply(response.status_code, headers, bytes(response.body or b""))
-        raise refusal_error(reply) from error
-    except TimeoutError as error:
+        raise error_from_reply(reply) from error
+    except TimeoutError:
         raise ReplyTimeoutError(
             f"answer to the drive socket's handshake from {target.url}", target.timeout
-        ) from error
+        ) from None
     except websockets.exceptions.NegotiationError as error:
         raise ProtocolMismatchError(
             f"the worker did not agree to drive protocol {DRIVE_SUBPROTOCOL}: {error}",
@@ -68,7 +68,7 @@ def handshake_errors(target: Target) -> Iterator[None]:
         raise UnreachableError(
             f"the drive socket at {target.url} did not open: {error}",
             hint="is the worker up? see `real2sim status`",
-        ) from error
+        ) from None
 
 
 @contextlib.contextmanager
@@ -78,7 +78,7 @@ def lost_connection(target: Target, awaited: str) -> Iterator[None]:
         yield
     except websockets.exceptions.ConnectionClosed as error:
         close = error.rcvd
-        said = f"{close.code} {close.reason}".strip() if close else "no goodbye"
+        said = f"{close.code} {close.reason}".strip() if close else "without a close frame"
         leaving = close is not None and close.code in {1001, 1012}
         raise ConnectionLostError(
             f"the worker at {target.url} closed the drive socket ({said}) while "

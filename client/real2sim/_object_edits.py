@@ -1,6 +1,6 @@
-"""The edits of a scenario and of its objects, written once for both twins.
+"""The edits of a scenario and of its objects.
 
-``R`` is what an edit gives: an ``OperationResult``, or for the async twin an awaitable of one.
+``R`` is what an edit gives: an ``OperationResult``, or in the async client an awaitable of one.
 """
 
 from __future__ import annotations

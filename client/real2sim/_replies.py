@@ -14,7 +14,7 @@ from real2sim_proto.drive import Frame as WireFrame
 from real2sim_proto.scenarios import HistoryEntry
 
 from ._retry import parse_retry_after
-from .errors import InvalidValue, MalformedReplyError, Real2SimError, Refusal, error_for
+from .errors import ErrorDetails, InvalidValue, MalformedReplyError, Real2SimError, error_for
 from .images import Image, frame_from_wire
 from .observation import View, view_from_frames
 
@@ -37,7 +37,7 @@ class Reply:
         return self.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-def refusal_error(reply: Reply) -> Real2SimError:
+def error_from_reply(reply: Reply) -> Real2SimError:
     """The exception for an answer of status 400 or above, problem document or not."""
     try:
         problem = json.loads(reply.content)
@@ -47,9 +47,9 @@ def refusal_error(reply: Reply) -> Real2SimError:
     if not isinstance(problem, dict):
         text = reply.content[:200].decode("utf-8", "replace").strip() or "empty body"
         detail = f"the answer has status {reply.status} and is no problem document: {text!r}"
-        return error_for(Refusal(reply.status, "UNKNOWN", detail, retry_after=retry_after))
+        return error_for(ErrorDetails(reply.status, "UNKNOWN", detail, retry_after=retry_after))
     return error_for(
-        Refusal(
+        ErrorDetails(
             status=reply.status,
             code=str(problem.get("code", "UNKNOWN")),
             detail=str(problem.get("detail") or problem.get("title") or f"status {reply.status}"),
@@ -83,7 +83,7 @@ def _missed(values: Any) -> list[HistoryEntry]:
         try:
             entries.append(HistoryEntry.model_validate(value))
         except ValidationError:
-            # The refusal matters more than one entry that a newer worker writes differently.
+            # The error matters more than one entry that a newer worker writes differently.
             continue
     return entries
 

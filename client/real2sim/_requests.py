@@ -78,7 +78,7 @@ def get_scene(scene: str) -> Call[SceneInfo]:
 
 def load_scene(scene: str) -> Call[None]:
     path = f"/v1/scenes/{segment(scene)}/residency"
-    return Call(Request("PUT", path, patient=True), nothing)
+    return Call(Request("PUT", path, long_timeout=True), nothing)
 
 
 def unload_scene(scene: str) -> Call[None]:
@@ -87,7 +87,7 @@ def unload_scene(scene: str) -> Call[None]:
 
 def import_scene(path: str, scene: str | None) -> Call[SceneInfo]:
     body = checked(SceneImport, path=path, scene=scene)
-    return Call(post("/v1/scenes", body, patient=True), model_of(SceneInfo))
+    return Call(post("/v1/scenes", body, long_timeout=True), model_of(SceneInfo))
 
 
 def upload_scene(path: Path, scene: str | None) -> Call[SceneInfo]:
@@ -153,23 +153,25 @@ def fork_scenario(scenario_id: str, name: str | None, revision: int | None) -> C
 
 
 def export_scenario(scenario_id: str) -> Call[ScenarioDocument]:
-    request = Request("GET", f"{_scenario(scenario_id)}/export", patient=True)
+    request = Request("GET", f"{_scenario(scenario_id)}/export", long_timeout=True)
     return Call(request, model_of(ScenarioDocument))
 
 
 def import_scenario(document: ScenarioDocument) -> Call[ScenarioInfo]:
-    return Call(post("/v1/scenarios/import", document, patient=True), model_of(ScenarioInfo))
+    return Call(post("/v1/scenarios/import", document, long_timeout=True), model_of(ScenarioInfo))
 
 
 def simulate(scenario_id: str, body: SimulateRequest) -> Call[JobInfo]:
-    return Call(post(f"{_scenario(scenario_id)}/simulate", body, patient=True), model_of(JobInfo))
+    return Call(
+        post(f"{_scenario(scenario_id)}/simulate", body, long_timeout=True), model_of(JobInfo)
+    )
 
 
 # --- jobs and exports -------------------------------------------------------------------------
 
 
 def create_export(body: ExportRequest) -> Call[JobInfo]:
-    return Call(post("/v1/exports", body, patient=True), model_of(JobInfo))
+    return Call(post("/v1/exports", body, long_timeout=True), model_of(JobInfo))
 
 
 def list_jobs(subject: str | None) -> Call[JobList]:
@@ -187,14 +189,14 @@ def cancel_job(job_id: str) -> Call[None]:
 
 def job_file(job_id: str, name: str) -> Call[bytes]:
     path = f"/v1/jobs/{segment(job_id)}/files/{segment(name)}"
-    return Call(Request("GET", path, patient=True), lambda reply: reply.content)
+    return Call(Request("GET", path, long_timeout=True), lambda reply: reply.content)
 
 
 # --- assets -----------------------------------------------------------------------------------
 
 
 def list_assets() -> Call[AssetList]:
-    return Call(Request("GET", "/v1/assets", patient=True), model_of(AssetList))
+    return Call(Request("GET", "/v1/assets", long_timeout=True), model_of(AssetList))
 
 
 def get_asset(asset_id: str) -> Call[AssetInfo]:
@@ -202,7 +204,7 @@ def get_asset(asset_id: str) -> Call[AssetInfo]:
 
 
 def cut_asset(body: AssetCut) -> Call[AssetInfo]:
-    return Call(post("/v1/assets", body, patient=True), model_of(AssetInfo))
+    return Call(post("/v1/assets", body, long_timeout=True), model_of(AssetInfo))
 
 
 def upload_asset(path: Path, asked: AssetUpload) -> Call[AssetInfo]:
@@ -216,7 +218,7 @@ def delete_asset(asset_id: str) -> Call[None]:
 
 def asset_thumbnail(asset_id: str, width: int) -> Call[Image]:
     path = f"/v1/assets/{segment(asset_id)}/thumbnail"
-    request = Request("GET", path, {"width": str(width)}, patient=True)
+    request = Request("GET", path, {"width": str(width)}, long_timeout=True)
     return Call(request, lambda reply: parse_image(reply, "rgb"))
 
 
@@ -232,7 +234,7 @@ def create_session(
             "name exactly one of them"
         )
     params = {"scene": scene} if scene is not None else {"scenario": str(scenario)}
-    request = post("/v1/sessions", body, params=params, patient=True)
+    request = post("/v1/sessions", body, params=params, long_timeout=True)
     return Call(request, model_of(SessionInfo))
 
 
@@ -257,7 +259,7 @@ def step_session(session_id: str, token: str | None, body: StepRequest) -> Call[
         headers=bearer(token) | {"Content-Type": "application/json"},
         body=json_of(body),
         idempotent=False,
-        patient=True,
+        long_timeout=True,
     )
     return Call(request, model_of(SessionState))
 
@@ -274,7 +276,7 @@ def record_session(session_id: str, token: str | None, frames: bool) -> Call[byt
         f"{_session(session_id)}/recording",
         params={"frames": "true"} if frames else {},
         headers=bearer(token),
-        patient=True,
+        long_timeout=True,
     )
     return Call(request, lambda reply: reply.content)
 
@@ -287,7 +289,7 @@ def render_session(session_id: str, token: str | None, sensors: Sequence[SensorS
         f"{_session(session_id)}/render",
         headers=bearer(token) | {"Content-Type": "application/json", "Accept": MSGPACK},
         body=json_of(body),
-        patient=True,
+        long_timeout=True,
     )
     return Call(request, parse_view)
 

@@ -1,4 +1,4 @@
-"""What both twins of a scenario handle know and build."""
+"""What a handle of a scenario knows, whoever waits for the worker."""
 
 from __future__ import annotations
 
@@ -26,10 +26,12 @@ class ScenarioState:
 
     @property
     def scenario_id(self) -> str:
+        """Id of the scenario on its worker."""
         return self._info.scenario_id
 
     @property
     def scene(self) -> str:
+        """Name of the scene that is edited."""
         return self._info.scene
 
     @property
@@ -43,10 +45,10 @@ class ScenarioState:
             f"revision={self.revision})"
         )
 
-    def _saw(self, info: ScenarioInfo) -> None:
+    def _update(self, info: ScenarioInfo) -> None:
         self._info, self._etag, self._revision = info, info.etag, info.revision
 
-    def _made(self, result: OperationResult) -> None:
+    def _record(self, result: OperationResult) -> None:
         if not result.dry_run:
             self._etag, self._revision = result.etag, result.revision
 
@@ -62,7 +64,7 @@ class Objects(Mapping[str, H], Generic[H]):
             return self._handles[object_id]
         except KeyError:
             close = difflib.get_close_matches(object_id, self._handles, n=3)
-            instead = f"; did you mean {', '.join(close)}?" if close else ""
+            instead = f"; did you mean {', '.join(close)}?" if close else ";"
             raise KeyError(
                 f"the scenario has no object {object_id!r} among {len(self)}{instead}"
                 " refresh() shows what other clients have added"

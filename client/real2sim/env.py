@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from real2sim_proto.plans import Control
 
+from ._references import ScenarioRef, SceneRef
 from ._sensors import Sensor
-from .client import DEFAULT_URL, connect
+from ._sync.client import connect
 from .observation import Observation
 
 Obs = dict[str, NDArray[Any]]
@@ -49,8 +50,8 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     whole observation.
 
     Args:
-        url, token: of the worker.
-        scene, scenario: exactly one of them.
+        url, token: of the worker; defaults as of :func:`real2sim.connect`.
+        scene, scenario: exactly one of them, or its name or id.
         sensors: camera names or specs; all rgb.
         options: of ``DriveSession.reset``; ``seed`` and ``action`` are the environment's.
     """
@@ -60,10 +61,10 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     def __init__(
         self,
         *,
-        url: str = DEFAULT_URL,
+        url: str | None = None,
         token: str | None = None,
-        scene: str | None = None,
-        scenario: str | None = None,
+        scene: SceneRef | None = None,
+        scenario: ScenarioRef | None = None,
         sensors: Sequence[Sensor] = (),
         render_mode: str | None = None,
         options: Mapping[str, Any] | None = None,

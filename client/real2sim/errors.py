@@ -40,11 +40,18 @@ if TYPE_CHECKING:
 
 
 class Real2SimError(Exception):
-    """Base of all errors of the SDK."""
+    """Base of all errors of the SDK.
+
+    Attributes:
+        hint: what to do about it; None where nothing is known. A traceback shows it.
+    """
 
     def __init__(self, message: str, *, hint: str | None = None) -> None:
         super().__init__(message)
         self.hint = hint
+        if hint is not None:
+            # A traceback shows notes, so that a script says what to do too.
+            self.add_note(f"hint: {hint}")
 
 
 class UnreachableError(Real2SimError, ConnectionError):
@@ -89,7 +96,7 @@ class InvalidValue:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class ErrorDetails:
     """What a worker says about a request that it refuses."""
 
     status: int
@@ -117,19 +124,19 @@ class StatusError(Real2SimError):
         step: step that the drive session is at, where the worker says so.
     """
 
-    def __init__(self, refusal: Refusal) -> None:
+    def __init__(self, details: ErrorDetails) -> None:
         # Many workers say the first of the errors in the detail already.
-        told = [e for e in refusal.errors if e.message not in refusal.detail]
-        places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in told)
-        message = f"{refusal.detail} ({places})" if places else refusal.detail
-        super().__init__(f"{message} [{refusal.code}]", hint=refusal.hint)
-        self.status = refusal.status
-        self.code = refusal.code
-        self.detail = refusal.detail
-        self.request_id = refusal.request_id
-        self.errors = tuple(refusal.errors)
-        self.retry_after = refusal.retry_after
-        self.step = refusal.step
+        unsaid = [e for e in details.errors if e.message not in details.detail]
+        places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in unsaid)
+        message = f"{details.detail} ({places})" if places else details.detail
+        super().__init__(f"{message} [{details.code}]", hint=details.hint)
+        self.status = details.status
+        self.code = details.code
+        self.detail = details.detail
+        self.request_id = details.request_id
+        self.errors = tuple(details.errors)
+        self.retry_after = details.retry_after
+        self.step = details.step
 
 
 class InvalidRequestError(StatusError):
@@ -164,10 +171,10 @@ class StaleRevisionError(ConflictError):
         missed: history entries that this client had not seen, oldest first.
     """
 
-    def __init__(self, refusal: Refusal) -> None:
-        super().__init__(refusal)
-        self.revision = refusal.revision
-        self.missed = tuple(refusal.missed)
+    def __init__(self, details: ErrorDetails) -> None:
+        super().__init__(details)
+        self.revision = details.revision
+        self.missed = tuple(details.missed)
 
 
 class StepConflictError(ConflictError):
@@ -241,11 +248,11 @@ _BY_STATUS: dict[int, type[StatusError]] = {
 }
 
 
-def error_for(refusal: Refusal) -> Real2SimError:
-    """The exception of a refusal: by code where it is known, else by status."""
-    if refusal.code == "UNSUPPORTED_PROTOCOL" or refusal.status == 426:
-        return ProtocolMismatchError(refusal.detail, hint=refusal.hint)
+def error_for(details: ErrorDetails) -> Real2SimError:
+    """The exception for what a worker says: by code where it is known, else by status."""
+    if details.code == "UNSUPPORTED_PROTOCOL" or details.status == 426:
+        return ProtocolMismatchError(details.detail, hint=details.hint)
     by_status = _BY_STATUS.get(
-        refusal.status, WorkerFailedError if refusal.status >= 500 else StatusError
+        details.status, WorkerFailedError if details.status >= 500 else StatusError
     )
-    return _BY_CODE.get(refusal.code, by_status)(refusal)
+    return _BY_CODE.get(details.code, by_status)(details)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from .errors import ImageDecodeError, MalformedReplyError
 
@@ -62,6 +62,10 @@ class Image:
         if self.modality == "depth" and array.dtype == np.uint16:
             return array * np.float32(DEPTH_PNG_UNIT)
         return array
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """For NumPy: ``np.asarray(image)`` is :attr:`array`."""
+        return np.array(self.array, dtype=dtype, copy=copy)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the image atomically and return its path.

@@ -54,6 +54,7 @@ class FakeWorker:
                 Route("/v1/scenes/street/render", self.render),
                 Route("/v1/scenarios", self.create_scenario, methods=["POST"]),
                 Route("/v1/scenarios/{id}", self.scenario),
+                Route("/v1/scenarios/{id}", self.delete_scenario, methods=["DELETE"]),
                 Route("/v1/scenarios/{id}/operations", self.edit, methods=["POST"]),
                 Route("/v1/sessions", self.create_session, methods=["POST"]),
                 Route("/v1/sessions/{id}", self.delete_session, methods=["DELETE"]),
@@ -146,12 +147,20 @@ class FakeWorker:
     async def scenario(self, request: Request) -> Response:
         return JSONResponse(self._scenario_info())
 
+    async def delete_scenario(self, request: Request) -> Response:
+        self.deleted.append(request.path_params["id"])
+        return Response(status_code=204)
+
     async def edit(self, request: Request) -> Response:
         self._note(request)
         revision = len(self.log)
         if request.headers["if-match"] != f'"r{revision}"':
             return self._stale(request)
         batch = OperationBatch.model_validate_json(await request.body())
+        if self.mischief == "refuses edits":
+            return _problem(422, "INVALID_OPERATION", "refused by the test")
+        if batch.dry_run:
+            return JSONResponse({"revision": revision, "etag": f'"r{revision}"', "dry_run": True})
         created = []
         for op in batch.operations:
             if isinstance(op, Duplicate):
@@ -333,3 +342,8 @@ class FakeWorker:
                 answer = {"type": "error", "code": code, "detail": "refused by the test", "step": 7}
         await socket.send_bytes(encode(envelope | answer))
         return True
+
+
+def _problem(status: int, code: str, detail: str) -> Response:
+    content = {"title": code, "status": status, "code": code, "detail": detail}
+    return JSONResponse(content, status, media_type="application/problem+json")

@@ -81,6 +81,50 @@ def test_edit_applies_a_file_of_operations(run: Run, worker: FakeWorker, tmp_pat
     assert "car_3_copy1" in worker.objects
 
 
+@pytest.fixture
+def operations(tmp_path: Path) -> Path:
+    file = tmp_path / "edit.json"
+    file.write_text(json.dumps([{"op": "translate", "object_id": "car_3", "y": 3.2}]))
+    return file
+
+
+@pytest.mark.network
+def test_a_new_scenario_is_not_kept_where_its_edit_is_refused(
+    run: Run, worker: FakeWorker, operations: Path
+) -> None:
+    worker.mischief = "refuses edits"
+    done = run("edit", str(operations), "--scene", "street", "--url", worker.url)
+    assert done.returncode == 1
+    assert "error: refused by the test" in done.stderr
+    assert worker.deleted == ["sc_1"]
+
+
+@pytest.mark.network
+def test_a_dry_run_keeps_no_new_scenario(run: Run, worker: FakeWorker, operations: Path) -> None:
+    options = ("--scene", "street", "--dry-run", "--url", worker.url)
+    done = run("edit", str(operations), *options)
+    assert done.returncode == 0, done.stderr
+    assert "would apply 1 operations to a new scenario on street" in done.stdout
+    assert worker.deleted == ["sc_1"]
+
+
+@pytest.mark.network
+def test_an_old_scenario_stays_where_its_edit_is_refused(
+    run: Run, worker: FakeWorker, operations: Path
+) -> None:
+    worker.mischief = "refuses edits"
+    assert run("edit", str(operations), "--scenario", "sc_1", "--url", worker.url).returncode == 1
+    assert worker.deleted == []
+
+
+@pytest.mark.network
+def test_an_edit_that_applies_keeps_its_new_scenario(
+    run: Run, worker: FakeWorker, operations: Path
+) -> None:
+    assert run("edit", str(operations), "--scene", "street", "--url", worker.url).returncode == 0
+    assert worker.deleted == []
+
+
 @pytest.mark.network
 def test_drive_reports_rates_and_saves_frames(run: Run, worker: FakeWorker, tmp_path: Path) -> None:
     figures, out = tmp_path / "figures.json", tmp_path / "out"

@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import httpx2
 import numpy as np
 import pytest
 
 import real2sim
-from real2sim import _transport
 from real2sim.errors import CapacityError
 from real2sim_proto import encode
 
@@ -52,7 +50,7 @@ def problem(status: int, code: str, **members: object) -> httpx2.Response:
 @pytest.fixture
 def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     delays: list[float] = []
-    monkeypatch.setattr(_transport, "time", SimpleNamespace(sleep=delays.append))
+    monkeypatch.setattr("real2sim._sync.transport.sleep", delays.append)
     return delays
 
 
@@ -211,7 +209,7 @@ def test_the_async_client_retries_alike(monkeypatch):
     async def no_sleep(seconds: float) -> None:
         delays.append(seconds)
 
-    monkeypatch.setattr(_transport, "asyncio", SimpleNamespace(sleep=no_sleep))
+    monkeypatch.setattr("real2sim._async.transport.sleep", no_sleep)
     busy = problem(503, "QUEUE_FULL")
     busy.headers["Retry-After"] = "2"
     script = Script(busy, httpx2.Response(200, json=SCENES))
@@ -307,6 +305,55 @@ def test_a_session_runs_on_exactly_one_world(names):
     with client_of(script) as client, pytest.raises(ValueError, match="name exactly one"):
         client.session(**names).open()
     assert script.requests == []
+
+
+SCENARIO = {
+    "scenario_id": "sc_1",
+    "name": "",
+    "scene": "street",
+    "scene_hash": "00",
+    "revision": 0,
+    "etag": '"r0"',
+    "created_at": "2026-01-01T00:00:00Z",
+    "can_undo": False,
+    "can_redo": False,
+}
+
+
+def test_a_session_takes_a_scenario_or_its_id():
+    script = Script(httpx2.Response(200, json=SCENARIO), problem(404, "UNKNOWN_SCENARIO"))
+    with client_of(script) as client:
+        scenario = client.scenarios.get("sc_1")
+        for given in (scenario, scenario.info, scenario.scenario_id):
+            with pytest.raises(real2sim.NotFoundError):
+                client.session(scenario=given).open()
+    sent = [dict(request.url.params) for request in script.requests[1:]]
+    assert sent == [{"scenario": "sc_1"}] * 3
+
+
+def test_a_session_takes_a_scene_or_its_name():
+    script = Script(httpx2.Response(200, json=SCENES), problem(404, "UNKNOWN_SCENE"))
+    with client_of(script) as client:
+        (street,) = client.scenes.list()
+        for given in (street, "street"):
+            with pytest.raises(real2sim.NotFoundError):
+                client.session(scene=given).open()
+    assert [dict(r.url.params) for r in script.requests[1:]] == [{"scene": "street"}] * 2
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [
+        ({"scenario": object()}, "scenario is a object; give an id or a scenario's handle"),
+        ({"scene": 3}, "scene is a int; give a name or a SceneInfo"),
+    ],
+)
+def test_what_is_neither_a_scene_nor_a_scenario_is_refused_at_once(names, sentence):
+    with (
+        client_of(Script(problem(500, "INTERNAL"))) as client,
+        pytest.raises(TypeError, match=sentence),
+    ):
+        client.session(**names)
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ def test_refusals_on_the_socket_are_told_apart_and_leave_it_open(
     assert (caught.value.code, caught.value.step) == (code, 7)
 
 
-def test_the_async_twin_drives_the_same_episode(worker: FakeWorker) -> None:
+def test_the_async_session_drives_the_same_episode(worker: FakeWorker) -> None:
     async def drive() -> list[float]:
         async with (
             real2sim.connect_async(worker.url) as client,
@@ -227,7 +227,7 @@ def test_the_async_twin_drives_the_same_episode(worker: FakeWorker) -> None:
     assert asyncio.run(drive()) == [o.ego.position[0] for o in sync]
 
 
-def test_the_async_twin_does_not_wait_for_ever(worker: FakeWorker) -> None:
+def test_the_async_session_does_not_wait_for_ever(worker: FakeWorker) -> None:
     async def drive() -> None:
         async with (
             real2sim.connect_async(worker.url, timeout=0.3) as client,

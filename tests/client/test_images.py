@@ -142,3 +142,17 @@ def test_frames_with_broken_matrices_are_malformed(member, value):
     wire = WireFrame.model_validate(frame("raw") | {member: value})
     with pytest.raises(MalformedReplyError, match=member):
         frame_from_wire(wire)
+
+
+def test_numpy_takes_an_image_for_its_array():
+    image = raw_image(IMAGE, "rgb", "uint8")
+    np.testing.assert_array_equal(np.asarray(image), IMAGE)
+    assert np.asarray(image, dtype=np.float32).dtype == np.float32
+    assert np.asarray(image) is image.array
+
+
+def test_numpy_copies_an_image_when_asked():
+    image = raw_image(IMAGE, "rgb", "uint8")
+    copy = np.array(image, copy=True)
+    copy[:] = 0
+    np.testing.assert_array_equal(image.array, IMAGE)

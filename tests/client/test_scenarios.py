@@ -30,7 +30,7 @@ def test_each_method_sends_its_operation(worker: FakeWorker) -> None:
         car.rotate(angle=0.5, axis=(1.0, 0.0, 0.0))
         car.scale(z=2.0, anchor="centre")
         car.set_pose(position=(1.0, 2.0, 3.0))
-        car.duplicate(new_id="twin", y=4.0)
+        car.duplicate(new_id="second", y=4.0)
         car.delete()
     sent = [entry["operations"][0] for entry in worker.log]
     assert [op["op"] for op in sent] == [
@@ -45,7 +45,7 @@ def test_each_method_sends_its_operation(worker: FakeWorker) -> None:
     assert (sent[1]["angle"], sent[1]["axis"]) == (0.5, [1.0, 0.0, 0.0])
     assert (sent[2]["z"], sent[2]["anchor"]) == (2.0, "centre")
     assert sent[3]["pose"]["position"] == [1.0, 2.0, 3.0]
-    assert (sent[4]["new_id"], sent[4]["y"]) == ("twin", 4.0)
+    assert (sent[4]["new_id"], sent[4]["y"]) == ("second", 4.0)
 
 
 def test_a_duplicate_is_a_handle_of_its_own(worker: FakeWorker) -> None:
@@ -94,7 +94,7 @@ def test_operations_that_cannot_be_are_refused_before_they_are_sent(
     assert worker.log == []
 
 
-def test_the_async_twin_edits_alike(worker: FakeWorker) -> None:
+def test_the_async_client_edits_alike(worker: FakeWorker) -> None:
     async def edit() -> None:
         async with real2sim.connect_async(worker.url) as client:
             scenario = await client.scenarios.create(scene="street")

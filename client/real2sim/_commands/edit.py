@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .options import DEFAULT_URL, JsonFile, Timeout, Token, Url, connected, write_json
+
+if TYPE_CHECKING:
+    from real2sim import Client
+    from real2sim_proto.scenarios import OperationResult
 
 app = typer.Typer()
 
@@ -33,25 +38,47 @@ def edit(
     timeout: Timeout = 30.0,
     json_file: JsonFile = None,
 ) -> None:
-    """Apply operations to a scenario; all of them, or none."""
+    """Apply operations to a scenario; all of them, or none.
+
+    A new scenario is only kept where they apply, and never after --dry-run.
+    """
     if (scene is None) == (scenario is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")
     batch = _read(operations)
     with connected(url, token, timeout) as client:
         if scene is not None:
-            handle = client.scenarios.create(scene=scene, name=name)
+            scenario_id, result = _edit_new(client, scene, name, batch, dry_run=dry_run)
         else:
-            handle = client.scenarios.get(str(scenario))
-        result = handle.apply(batch, dry_run=dry_run)
+            scenario_id = scenario
+            result = client.scenarios.get(str(scenario)).apply(batch, dry_run=dry_run)
     if json_file is not None:
-        answer = result.model_dump(mode="json") | {"scenario_id": handle.scenario_id}
-        write_json(json_file, answer)
+        write_json(json_file, result.model_dump(mode="json") | {"scenario_id": scenario_id})
         return
     done = "would apply" if dry_run else "applied"
-    typer.echo(f"{done} {len(batch)} operations to scenario {handle.scenario_id}")
+    where = f"scenario {scenario_id}" if scenario_id else f"a new scenario on {scene}"
+    typer.echo(f"{done} {len(batch)} operations to {where}")
     typer.echo(f"revision {result.revision}; new objects: {', '.join(result.created) or 'none'}")
     for warning in result.warnings:
         typer.echo(f"warning: {warning.message}", err=True)
+
+
+def _edit_new(
+    client: Client, scene: str, name: str, batch: list[Any], *, dry_run: bool
+) -> tuple[str | None, OperationResult]:
+    """Id of a new scenario, None where it was not kept, and what the edit gave."""
+    from real2sim import Real2SimError
+
+    handle = client.scenarios.create(scene=scene, name=name)
+    kept = False
+    try:
+        result = handle.apply(batch, dry_run=dry_run)
+        kept = not dry_run
+    finally:
+        if not kept:
+            # What went wrong with the edit matters more than a scenario that stays behind.
+            with contextlib.suppress(Real2SimError):
+                client.scenarios.delete(handle)
+    return handle.scenario_id if kept else None, result
 
 
 def _read(path: Path) -> list[Any]:

@@ -30,6 +30,7 @@ JsonFile = Annotated[
 ]
 
 DEFAULT_URL = "http://127.0.0.1:8600"
+"""As of ``real2sim.connect``, which would cost a command its quick start to import."""
 
 
 def connected(url: str, token: str | None, timeout: float = 30.0) -> Client:

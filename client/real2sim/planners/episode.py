@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from real2sim_proto.drive import Event
 
     from .._sensors import ResetOptions, Sensor
-    from ..drive_session import DriveSession
+    from .._sync.drive_session import DriveSession
     from ..observation import Observation
     from .planner import Planner
 

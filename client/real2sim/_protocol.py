@@ -1,6 +1,6 @@
 """The client's side of the drive socket, without the socket.
 
-Both twins of the drive session talk through a :class:`ProtocolState`: it numbers messages, says
+A drive session, sync or async, talks through a :class:`ProtocolState`: it numbers messages, says
 which answer is awaited, and turns bytes into answers or exceptions.
 """
 
@@ -54,19 +54,19 @@ from real2sim_proto.plans import PLAN, Plan
 from ._call import checked
 from ._replies import describe
 from .errors import (
+    ErrorDetails,
     MalformedReplyError,
     NotResetError,
     ProtocolMismatchError,
-    Refusal,
     error_for,
 )
 
 A = TypeVar("A", bound=Envelope)
 
-KEPT_UNASKED = 16
-"""Unasked observations that are kept until somebody looks; older ones are dropped."""
+MAX_UNSOLICITED = 16
+"""Unsolicited observations kept until they are taken; older ones are dropped."""
 
-_OVERTAKEN = {ErrorCode.STALE_STEP.value, ErrorCode.EPISODE_OVER.value}
+_SUPERSEDED = {ErrorCode.STALE_STEP.value, ErrorCode.EPISODE_OVER.value}
 
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 _STATUS = {code.value: status for code, status in HTTP_STATUS.items()}
@@ -77,19 +77,19 @@ class PendingRequest(Generic[A]):
     """A message that goes out, and the answer that it waits for.
 
     Attributes:
-        patient: whether the answer may take as long as loading a scene.
-        repeatable: whether it may be sent again after the connection was lost; the worker moves
+        long_timeout: whether the answer may take as long as loading a scene.
+        idempotent: whether it may be sent again after the connection was lost; the worker moves
             only once.
-        only_at: revision at which alone it may be sent again.
+        only_at_revision: revision at which alone it may be sent again.
     """
 
     id: int
     data: bytes
     answer: type[A]
     awaited: str
-    patient: bool = False
-    repeatable: bool = True
-    only_at: int | None = None
+    long_timeout: bool = False
+    idempotent: bool = True
+    only_at_revision: int | None = None
 
 
 class ProtocolState:
@@ -99,7 +99,7 @@ class ProtocolState:
         self._ids = 0
         self._step: int | None = None
         self._revision: int | None = None
-        self._unasked: deque[Obs] = deque(maxlen=KEPT_UNASKED)
+        self._unsolicited: deque[Obs] = deque(maxlen=MAX_UNSOLICITED)
 
     @property
     def step(self) -> int | None:
@@ -122,14 +122,14 @@ class ProtocolState:
             token=token,
             resume=resume,
         )
-        return self._question(
-            message, Welcome, "welcome (scene loading, first render)", patient=True
+        return self._request_for(
+            message, Welcome, "welcome (scene loading, first render)", long_timeout=True
         )
 
     def reset(self, spec: ResetSpec) -> PendingRequest[Obs]:
         """Starts an episode."""
         message = Reset(id=self._next_id(), spec=spec)
-        return self._question(message, Obs, "observation 0 after reset", patient=True)
+        return self._request_for(message, Obs, "observation 0 after reset", long_timeout=True)
 
     def action(self, plan: Plan | Mapping[str, Any]) -> PendingRequest[Obs]:
         """Answers the newest observation.
@@ -140,22 +140,24 @@ class ProtocolState:
         """
         if self._step is None:
             raise NotResetError(
-                Refusal(409, ErrorCode.NOT_RESET, "no episode runs", hint="call reset() first")
+                ErrorDetails(409, ErrorCode.NOT_RESET, "no episode runs", hint="call reset() first")
             )
         message = Action(id=self._next_id(), step=self._step, plan=valid_plan(plan))
-        return self._question(message, Obs, f"observation {self._step + 1}")
+        return self._request_for(message, Obs, f"observation {self._step + 1}")
 
     def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> PendingRequest[Edited]:
         """Changes the session's world, on the revision seen last."""
         message = checked(
             Edit, id=self._next_id(), base_rev=self._revision, operations=list(operations)
         )
-        return self._question(message, Edited, "confirmation of the edit", only_at=self._revision)
+        return self._request_for(
+            message, Edited, "confirmation of the edit", only_at_revision=self._revision
+        )
 
     def render(self, sensors: Sequence[SensorSpec]) -> PendingRequest[View]:
         """Asks for images of the current instant."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors))
-        return self._question(message, View, "images")
+        return self._request_for(message, View, "images")
 
     def agent(
         self,
@@ -171,30 +173,32 @@ class ProtocolState:
             times_us=list(times_us),
             poses=list(poses),
         )
-        return self._question(message, Driven, "confirmation of the object's plan")
+        return self._request_for(message, Driven, "confirmation of the object's plan")
 
     def snapshot(self, name: str) -> PendingRequest[Kept]:
         """Keeps the present instant."""
         message = checked(Snapshot, id=self._next_id(), name=name)
-        return self._question(message, Kept, "confirmation of the snapshot")
+        return self._request_for(message, Kept, "confirmation of the snapshot")
 
     def restore(self, name: str) -> PendingRequest[Obs]:
         """Goes back to a snapshot."""
         message = checked(Restore, id=self._next_id(), name=name)
-        return self._question(message, Obs, f"observation of snapshot {name!r}", patient=True)
+        return self._request_for(
+            message, Obs, f"observation of snapshot {name!r}", long_timeout=True
+        )
 
     def fork(self) -> PendingRequest[Forked]:
         """Makes another session at the same instant."""
-        return self._question(Fork(id=self._next_id()), Forked, "a fork", repeatable=False)
+        return self._request_for(Fork(id=self._next_id()), Forked, "a fork", idempotent=False)
 
     def bye(self) -> PendingRequest[Result]:
         """Ends the session."""
-        return self._question(
-            Bye(id=self._next_id()), Result, "result of the session", repeatable=False
+        return self._request_for(
+            Bye(id=self._next_id()), Result, "result of the session", idempotent=False
         )
 
-    def read(self, data: bytes | str, question: PendingRequest[A]) -> A | None:
-        """The answer in ``data``; None where it is progress, or late for an older question.
+    def read(self, data: bytes | str, request: PendingRequest[A]) -> A | None:
+        """The answer in ``data``; None where it is progress, or late for an older request.
 
         Raises:
             StatusError: the worker refuses the message.
@@ -203,37 +207,37 @@ class ProtocolState:
         """
         message = _server_message(data)
         if isinstance(message, Error):
-            if message.id not in {0, question.id} and not message.fatal:
+            if message.id not in {0, request.id} and not message.fatal:
                 return None
-            overtaken = message.code in _OVERTAKEN and question.answer is Obs
-            if overtaken and (newest := self.unasked(newest=True)) is not None:
+            superseded = message.code in _SUPERSEDED and request.answer is Obs
+            if superseded and (newest := self.take_unsolicited(newest=True)) is not None:
                 # The planner was late and the worker went on without it.
                 return newest  # type: ignore[return-value]
-            raise _refused(message)
+            raise _error_of(message)
         if isinstance(message, Obs) and message.id == 0:
-            self._unasked.append(message)
+            self._unsolicited.append(message)
             return None
-        if isinstance(message, Progress) or 0 < message.id < question.id:
+        if isinstance(message, Progress) or 0 < message.id < request.id:
             return None
-        if not isinstance(message, question.answer) or message.id != question.id:
+        if not isinstance(message, request.answer) or message.id != request.id:
             raise MalformedReplyError(
                 f"{type(message).__name__.lower()} with id {message.id} came where "
-                f"{question.awaited} with id {question.id} was awaited"
+                f"{request.awaited} with id {request.id} was awaited"
             )
-        self._note(message)
+        self._track(message)
         return message
 
-    def unasked(self, *, newest: bool = False) -> Obs | None:
-        """An observation that came unasked: the oldest, or the newest and forget all others."""
-        if not self._unasked:
+    def take_unsolicited(self, *, newest: bool = False) -> Obs | None:
+        """An observation that came unsolicited: the oldest, or the newest and forget all others."""
+        if not self._unsolicited:
             return None
-        message = self._unasked.pop() if newest else self._unasked.popleft()
+        message = self._unsolicited.pop() if newest else self._unsolicited.popleft()
         if newest:
-            self._unasked.clear()
-        self._note(message)
+            self._unsolicited.clear()
+        self._track(message)
         return message
 
-    def hear(self, data: bytes | str) -> None:
+    def handle_unsolicited(self, data: bytes | str) -> None:
         """Take in a message while nothing is awaited.
 
         Raises:
@@ -241,11 +245,11 @@ class ProtocolState:
         """
         message = _server_message(data)
         if isinstance(message, Error):
-            raise _refused(message)
+            raise _error_of(message)
         if isinstance(message, Obs):
-            self._unasked.append(message)
+            self._unsolicited.append(message)
 
-    def _note(self, message: Envelope) -> None:
+    def _track(self, message: Envelope) -> None:
         if isinstance(message, Obs):
             self._step, self._revision = message.step, message.revision
         elif isinstance(message, Edited | View):
@@ -258,7 +262,7 @@ class ProtocolState:
         return self._ids
 
     @staticmethod
-    def _question(
+    def _request_for(
         message: Envelope, answer: type[A], awaited: str, **how: Any
     ) -> PendingRequest[A]:
         fields = message.model_dump(mode="python", exclude_none=True)
@@ -299,9 +303,9 @@ def _server_message(data: bytes | str) -> Any:
         ) from error
 
 
-def _refused(message: Error) -> Exception:
+def _error_of(message: Error) -> Exception:
     return error_for(
-        Refusal(
+        ErrorDetails(
             status=_STATUS.get(message.code, 500),
             code=message.code,
             detail=message.detail,

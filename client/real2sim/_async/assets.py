@@ -1,0 +1,130 @@
+"""The worker's asset library."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetUpload
+
+from .. import _requests
+from .._call import checked
+from .._references import SceneRef, scene_name
+from ..images import Image
+from .transport import AsyncTransport
+
+
+class AsyncAssets:
+    """``client.assets``: things to insert into scenarios.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> asset = await client.assets.cut(scene="street", object_id="car_red", asset_id="hatch")
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    async def list(self) -> Sequence[AssetInfo]:
+        """The whole library.
+
+        Examples:
+            >>> [asset.asset_id for asset in await client.assets.list()]
+            ['hatch']
+        """
+        found = await self._transport.send(_requests.list_assets())
+        return found.assets
+
+    async def get(self, asset_id: str) -> AssetInfo:
+        """One asset.
+
+        Raises:
+            NotFoundError: no such asset.
+
+        Examples:
+            >>> (await client.assets.get("hatch")).size
+            (4.0, 1.8, 1.5)
+        """
+        return await self._transport.send(_requests.get_asset(asset_id))
+
+    async def cut(
+        self,
+        *,
+        scene: SceneRef,
+        object_id: str,
+        asset_id: str | None = None,
+        category: str | None = None,
+    ) -> AssetInfo:
+        """Cut an object out of a scene; default: under its own id and category.
+
+        Examples:
+            >>> (await client.assets.cut(scene="street", object_id="post")).category
+            'pole'
+            >>> await client.assets.delete("post")
+        """
+        cut = checked(
+            AssetCut,
+            scene=scene_name(scene),
+            object_id=object_id,
+            asset_id=asset_id,
+            category=category,
+        )
+        return await self._transport.send(_requests.cut_asset(cut))
+
+    async def upload(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        asset_id: str | None = None,
+        category: str = "car",
+        up_axis: str = "-y",
+        yaw: float = 0.0,
+        length: float | None = None,
+    ) -> AssetInfo:
+        """Send a splat file (.ply, .compressed.ply, .spz, .splat) to the library.
+
+        Args:
+            path: the file.
+            asset_id: default: the file's name.
+            category: for example ``car``, ``truck``, ``pedestrian``.
+            up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``.
+            yaw: turn about z after that [rad], to bring the front to x.
+            length: real length [m]; default: usual for the category.
+
+        Examples:
+            >>> path = folder / "corner.ply"
+            >>> asset = await client.assets.upload(path, up_axis="z", length=4.2)
+            >>> asset.asset_id, round(asset.size[0], 3)
+            ('corner', 4.2)
+            >>> await client.assets.delete("corner")
+        """
+        fields = {
+            "asset_id": asset_id,
+            "category": category,
+            "up_axis": up_axis,
+            "yaw": yaw,
+            "length": length,
+        }
+        upload = checked(AssetUpload, **fields)
+        return await self._transport.send(_requests.upload_asset(Path(path), upload))
+
+    async def delete(self, asset_id: str) -> None:
+        """Remove one that no scenario has in its history.
+
+        Raises:
+            ConflictError: a scenario has it in its history.
+
+        Examples:
+            >>> await client.assets.delete("hatch")
+        """
+        await self._transport.send(_requests.delete_asset(asset_id))
+
+    async def thumbnail(self, asset_id: str, *, width: int = 256) -> Image:
+        """A picture of it (png).
+
+        Examples:
+            >>> (await client.assets.thumbnail("hatch", width=64)).codec
+            'png'
+        """
+        return await self._transport.send(_requests.asset_thumbnail(asset_id, width))

@@ -1,0 +1,31 @@
+"""How the async client waits. Its counterpart in ``_sync`` is written by hand too."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+from websockets.asyncio.client import ClientConnection as AsyncSocket
+from websockets.asyncio.client import connect as connect_socket
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+__all__ = ["AsyncSocket", "connect_socket", "receive", "run_blocking", "sleep"]
+
+
+async def sleep(seconds: float) -> None:
+    """Wait."""
+    await asyncio.sleep(seconds)
+
+
+async def receive(socket: AsyncSocket, timeout: float) -> bytes | str:
+    """The next message of a socket. Raises TimeoutError where none comes in ``timeout`` seconds."""
+    async with asyncio.timeout(timeout):
+        return await socket.recv()
+
+
+async def run_blocking(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """The result of a function that blocks on files, called where it holds nobody up."""
+    return await asyncio.to_thread(function, *args, **kwargs)

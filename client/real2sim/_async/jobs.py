@@ -1,0 +1,172 @@
+"""Jobs: long work on the worker, followed from here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from real2sim_proto.jobs import ExportRequest, JobInfo
+
+from .. import _requests
+from .._call import checked
+from .._job_state import JobBase, OnProgress, poll_delays, require_success
+from .._references import ScenarioRef, SceneRef, job_id_of, optional_scenario_id
+from .._references import optional_scene_name as name_of
+from ..images import write_atomically
+from .concurrency import run_blocking, sleep
+from .transport import AsyncTransport
+
+
+class AsyncJobs:
+    """``client.jobs``.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> job = await client.jobs.export_video(scene="street", camera="front", end_us=200_000)
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    async def get(self, job_id: str) -> AsyncJob:
+        """A handle of an existing job.
+
+        Raises:
+            NotFoundError: no such job.
+
+        Examples:
+            >>> (await client.jobs.get(job.job_id)).info.kind
+            'export'
+        """
+        return AsyncJob(self._transport, await self._transport.send(_requests.get_job(job_id)))
+
+    async def list(self, *, subject: str | None = None) -> Sequence[JobInfo]:
+        """Jobs of the worker, newest first; those of one scene or scenario on request.
+
+        Examples:
+            >>> newest = (await client.jobs.list(subject="street"))[0]
+            >>> newest.job_id == job.job_id
+            True
+        """
+        found = await self._transport.send(_requests.list_jobs(subject))
+        return found.jobs
+
+    async def export_video(
+        self,
+        *,
+        camera: str,
+        scenario: ScenarioRef | None = None,
+        scene: SceneRef | None = None,
+        simulation: str | AsyncJob | None = None,
+        width: int | None = None,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        fps: float = 10.0,
+    ) -> AsyncJob:
+        """Start making a video.
+
+        Args:
+            camera: recorded camera that it is seen from.
+            scenario, scene, simulation: exactly one of them, or its id.
+            width: pixels; default: as recorded.
+            start_us, end_us: default: as long as there is something.
+            fps: frames a second.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> job = await client.jobs.export_video(scene="street", camera="left", end_us=200_000)
+            >>> job = await job.wait(timeout=60.0)
+            >>> path = await job.download("video.webm", folder / "street.webm")
+            >>> path.stat().st_size > 0
+            True
+        """
+        fields = {
+            "camera": camera,
+            "scenario": optional_scenario_id(scenario),
+            "scene": name_of(scene),
+            "simulation": None if simulation is None else job_id_of(simulation),
+            "width": width,
+            "start_us": start_us,
+            "end_us": end_us,
+            "fps": fps,
+        }
+        call = _requests.create_export(checked(ExportRequest, **fields))
+        return AsyncJob(self._transport, await self._transport.send(call))
+
+
+class AsyncJob(JobBase):
+    """One job as this client last saw it.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> job = await client.jobs.export_video(scene="street", camera="front", end_us=200_000)
+    """
+
+    def __init__(self, transport: AsyncTransport, info: JobInfo) -> None:
+        super().__init__(info)
+        self._transport = transport
+
+    async def refresh(self) -> AsyncJob:
+        """See how far it is; returns itself.
+
+        Examples:
+            >>> job = await job.refresh()
+            >>> 0.0 <= job.info.progress <= 1.0
+            True
+        """
+        self.info = await self._transport.send(_requests.get_job(self.job_id))
+        return self
+
+    async def wait(
+        self, *, timeout: float | None = None, on_progress: OnProgress | None = None
+    ) -> AsyncJob:
+        """Wait until it has succeeded; returns itself.
+
+        Args:
+            timeout: seconds; default: without limit.
+            on_progress: called with every change that is seen.
+
+        Raises:
+            ReplyTimeoutError: it goes on for longer.
+            Real2SimError: it failed, was cancelled or interrupted; of the kind of its problem.
+
+        Examples:
+            >>> stages = []
+            >>> job = await job.wait(timeout=60.0, on_progress=lambda i: stages.append(i.stage))
+            >>> job.info.state.value, [file.name for file in job.info.files]
+            ('succeeded', ['video.webm'])
+        """
+        for delay in poll_delays(self.job_id, timeout):
+            seen = self.info.event
+            await self.refresh()
+            if on_progress is not None and self.info.event != seen:
+                on_progress(self.info)
+            if self.info.over:
+                break
+            await sleep(delay)
+        require_success(self.info)
+        return self
+
+    async def cancel(self) -> AsyncJob:
+        """Ask it to end; returns itself.
+
+        Examples:
+            >>> job = await job.cancel()
+        """
+        await self._transport.send(_requests.cancel_job(self.job_id))
+        return await self.refresh()
+
+    async def download(self, name: str, path: str | os.PathLike[str]) -> Path:
+        """Fetch a file that it left, and write it to ``path``.
+
+        Examples:
+            >>> job = await job.wait(timeout=60.0)
+            >>> (await job.download("video.webm", folder / "street.webm")).name
+            'street.webm'
+        """
+        content = await self._transport.send(_requests.job_file(self.job_id, name))
+        await run_blocking(write_atomically, Path(path), content)
+        return Path(path)

@@ -1,0 +1,384 @@
+"""Scenarios: a scene and the edits made to it.
+
+A handle sends the revision it knows with every edit. When somebody else has edited in between,
+the edit is refused with :class:`~real2sim.errors.StaleRevisionError`, which names what was
+missed; ``refresh()`` and decide again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Mapping, Sequence
+from typing import Any
+
+from real2sim_proto.jobs import SimulateRequest
+from real2sim_proto.operations import Operation
+from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
+from real2sim_proto.scenes import ObjectInfo
+
+from .. import _requests
+from .._call import ViewRequest, checked
+from .._object_edits import (
+    UPRIGHT,
+    ObjectEdits,
+    Quaternion,
+    ScenarioEdits,
+    Vector,
+    insertion,
+)
+from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
+from .._scenario_state import Objects, ScenarioState
+from ..images import Image
+from .jobs import AsyncJob
+from .transport import AsyncTransport
+
+
+class AsyncScenarios:
+    """``client.scenarios``.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> scenario = await client.scenarios.create(scene="street", name="an example")
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    async def create(self, *, scene: SceneRef, name: str = "") -> AsyncScenario:
+        """A new scenario without edits on a scene.
+
+        Raises:
+            NotFoundError: no such scene.
+
+        Examples:
+            >>> scenario = await client.scenarios.create(scene="street", name="car in my lane")
+            >>> scenario.revision, list(scenario.objects)
+            (0, ['car_red', 'car_blue', 'post'])
+        """
+        info = await self._transport.send(_requests.create_scenario(scene_name(scene), name))
+        # The answer to a creation leaves trajectories out; a handle always has them.
+        return await AsyncScenario(self._transport, info).refresh()
+
+    async def import_document(
+        self, document: ScenarioDocument | Mapping[str, Any]
+    ) -> AsyncScenario:
+        """A new scenario from what :meth:`AsyncScenario.export` gave, here or elsewhere.
+
+        Examples:
+            >>> document = await scenario.export()
+            >>> copy = await client.scenarios.import_document(document)
+            >>> copy.info.name, copy.scenario_id != scenario.scenario_id
+            ('an example', True)
+        """
+        valid = ScenarioDocument.model_validate(document)
+        info = await self._transport.send(_requests.import_scenario(valid))
+        return await AsyncScenario(self._transport, info).refresh()
+
+    async def get(self, scenario_id: str) -> AsyncScenario:
+        """A handle of an existing scenario.
+
+        Raises:
+            NotFoundError: no such scenario.
+
+        Examples:
+            >>> (await client.scenarios.get(scenario.scenario_id)).info.name
+            'an example'
+        """
+        info = await self._transport.send(_requests.get_scenario(scenario_id))
+        return AsyncScenario(self._transport, info)
+
+    async def list(self) -> Sequence[ScenarioInfo]:
+        """All scenarios of the worker.
+
+        Examples:
+            >>> found = await client.scenarios.list()
+            >>> scenario.scenario_id in [info.scenario_id for info in found]
+            True
+        """
+        found = await self._transport.send(_requests.list_scenarios())
+        return found.scenarios
+
+    async def delete(self, scenario: ScenarioRef) -> None:
+        """Remove a scenario and its history.
+
+        Examples:
+            >>> await client.scenarios.delete(scenario)
+        """
+        await self._transport.send(_requests.delete_scenario(scenario_id_of(scenario)))
+
+
+class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
+    """One scenario as this client last saw it.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> scenario = await client.scenarios.create(scene="street")
+    """
+
+    def __init__(self, transport: AsyncTransport, info: ScenarioInfo) -> None:
+        super().__init__(info)
+        self._transport = transport
+
+    @property
+    def objects(self) -> Objects[AsyncSceneObject]:
+        """Handles of the objects, by id.
+
+        Examples:
+            >>> list(scenario.objects)
+            ['car_red', 'car_blue', 'post']
+            >>> result = await scenario.objects["car_red"].translate(y=3.2)
+        """
+        return Objects({o.object_id: AsyncSceneObject(self, o) for o in self.info.objects})
+
+    async def apply(
+        self, operations: Sequence[Operation | Mapping[str, Any]], *, dry_run: bool = False
+    ) -> OperationResult:
+        """Apply operations, all or none.
+
+        Args:
+            operations: models of ``real2sim_proto.operations``, or their fields.
+            dry_run: check them and change nothing.
+
+        Raises:
+            ValueError: an operation that is not valid.
+            StaleRevisionError: somebody else edited first.
+            InvalidOperationError: an unknown object, or a result that is not allowed.
+
+        Examples:
+            >>> result = await scenario.apply(
+            ...     [
+            ...         {"op": "delete", "object_id": "post"},
+            ...         {"op": "duplicate", "object_id": "car_red", "new_id": "second", "x": 8.0},
+            ...     ]
+            ... )
+            >>> result.revision, result.created
+            (1, ['second'])
+        """
+        call = _requests.apply_operations(self.scenario_id, operations, self._etag, dry_run)
+        return await self._applied(await self._transport.send(call))
+
+    async def insert(
+        self,
+        asset: str,
+        *,
+        position: Vector,
+        quaternion: Quaternion = UPRIGHT,
+        size: Vector | None = None,
+        object_id: str | None = None,
+        snap: bool = True,
+    ) -> AsyncSceneObject:
+        """Add an object from the asset library, and return its handle.
+
+        Args:
+            asset: id in the library.
+            position, quaternion: where its box is, for the whole time range.
+            size: box to fit [m]; default: the asset's own.
+            object_id: default: the asset's id with a number.
+            snap: put it onto the ground, whatever z is.
+
+        Raises:
+            InvalidOperationError: no such asset.
+
+        Examples:
+            >>> asset = await client.assets.cut(scene="street", object_id="car_red")
+            >>> parked = await scenario.insert("car_red", position=(20.0, 3.0, 0.0))
+            >>> parked.object_id, parked.info.category
+            ('car_red_1', 'car')
+            >>> await client.scenarios.delete(scenario)
+            >>> await client.assets.delete("car_red")
+        """
+        operation = insertion(
+            asset,
+            position=position,
+            quaternion=quaternion,
+            size=size,
+            object_id=object_id,
+            snap=snap,
+        )
+        result = await self.apply([operation])
+        return self.objects[result.created[0]]
+
+    async def simulate(
+        self,
+        *,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        frame_us: int = 50_000,
+        objects: Sequence[str] | None = None,
+        preset: str = "vehicle",
+        backend: str = "auto",
+    ) -> AsyncJob:
+        """Start a physics rollout of the scenario as it is now.
+
+        Args:
+            start_us, end_us: default: the scenario's span.
+            frame_us: from one kept frame to the next.
+            objects: what the physics moves; default: what has a velocity or physics of its own.
+            preset: how objects become bodies: ``vehicle`` or ``paper``.
+            backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> post = scenario.objects["post"]
+            >>> result = await post.translate(z=0.3)
+            >>> result = await post.set_physics(material="rigid", mass=30.0)
+            >>> job = await scenario.simulate(end_us=200_000, objects=["post"])
+            >>> job = await job.wait(timeout=240.0)
+            >>> job.info.kind, "post" in job.result["objects"]
+            ('simulate', True)
+        """
+        body = checked(
+            SimulateRequest,
+            start_us=start_us,
+            end_us=end_us,
+            frame_us=frame_us,
+            objects=None if objects is None else list(objects),
+            preset=preset,
+            backend=backend,
+        )
+        info = await self._transport.send(_requests.simulate(self.scenario_id, body))
+        return AsyncJob(self._transport, info)
+
+    async def fork(self, *, name: str | None = None, revision: int | None = None) -> AsyncScenario:
+        """A new scenario with the same history, up to a revision.
+
+        Examples:
+            >>> result = await scenario.remove("post")
+            >>> before = await scenario.fork(name="with the post", revision=0)
+            >>> "post" in before.objects, "post" in scenario.objects
+            (True, False)
+        """
+        call = _requests.fork_scenario(self.scenario_id, name, revision)
+        return await AsyncScenario(self._transport, await self._transport.send(call)).refresh()
+
+    async def export(self) -> ScenarioDocument:
+        """The whole scenario as one document; ``model_dump_json()`` makes a file of it.
+
+        Examples:
+            >>> result = await scenario.remove("post")
+            >>> document = await scenario.export()
+            >>> [operation.op for operation in document.entries[0].operations]
+            ['delete']
+        """
+        return await self._transport.send(_requests.export_scenario(self.scenario_id))
+
+    async def undo(self) -> OperationResult:
+        """Take the newest edit back.
+
+        Raises:
+            ConflictError: there is nothing to take back.
+
+        Examples:
+            >>> result = await scenario.remove("post")
+            >>> result = await scenario.undo()
+            >>> "post" in scenario.objects, scenario.info.can_redo
+            (True, True)
+        """
+        result = await self._transport.send(_requests.undo(self.scenario_id, self._etag))
+        return await self._applied(result)
+
+    async def redo(self) -> OperationResult:
+        """Make the edit again that was taken back last.
+
+        Raises:
+            ConflictError: nothing was taken back.
+
+        Examples:
+            >>> result = await scenario.remove("post")
+            >>> result = await scenario.undo()
+            >>> result = await scenario.redo()
+            >>> "post" in scenario.objects
+            False
+        """
+        result = await self._transport.send(_requests.redo(self.scenario_id, self._etag))
+        return await self._applied(result)
+
+    async def history(self, *, after: int | None = None) -> History:
+        """Edits, undos and redos after a revision, oldest first; default: all.
+
+        Examples:
+            >>> result = await scenario.remove("post")
+            >>> result = await scenario.undo()
+            >>> [(entry.revision, entry.kind) for entry in (await scenario.history()).entries]
+            [(1, 'edit'), (2, 'undo')]
+        """
+        return await self._transport.send(_requests.history(self.scenario_id, after))
+
+    async def refresh(self) -> AsyncScenario:
+        """See what the scenario is now; returns itself.
+
+        Examples:
+            >>> theirs = await client.scenarios.get(scenario.scenario_id)
+            >>> result = await theirs.remove("post")
+            >>> list((await scenario.refresh()).objects)
+            ['car_red', 'car_blue']
+        """
+        self._update(await self._transport.send(_requests.get_scenario(self.scenario_id)))
+        return self
+
+    async def preview(
+        self,
+        *,
+        camera: str,
+        t_us: int | None = None,
+        width: int | None = None,
+        modality: str = "rgb",
+        codec: str = "auto",
+    ) -> Image:
+        """What a recorded camera would see now; arguments as of :meth:`AsyncScenes.render`.
+
+        Examples:
+            >>> image = await scenario.preview(camera="front", codec="jpeg")
+            >>> image.save(folder / "after.jpg").name
+            'after.jpg'
+        """
+        codec = self._transport.target.image_codec(codec, modality)
+        view = ViewRequest(camera, t_us, width, modality, codec)
+        return await self._transport.send(_requests.preview(self.scenario_id, view))
+
+    def _edit(self, operation: Operation) -> Awaitable[OperationResult]:
+        return self.apply([operation])
+
+    async def _applied(self, result: OperationResult) -> OperationResult:
+        self._record(result)
+        if not result.dry_run:
+            await self.refresh()
+        return result
+
+
+class AsyncSceneObject(ObjectEdits[Awaitable[OperationResult]]):
+    """An object of a scenario; each method is one edit. Metres, radians, wxyz.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> scenario = await client.scenarios.create(scene="street")
+        >>> car = scenario.objects["car_red"]
+    """
+
+    def __init__(self, scenario: AsyncScenario, info: ObjectInfo) -> None:
+        super().__init__(info)
+        self._scenario = scenario
+
+    async def duplicate(
+        self,
+        *,
+        new_id: str | None = None,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        frame: str = "world",
+        snap: bool = False,
+    ) -> AsyncSceneObject:
+        """Add a copy, shifted [m], and return its handle; ``snap`` puts it onto the ground.
+
+        Examples:
+            >>> copy = await car.duplicate(x=9.0)
+            >>> copy.object_id
+            'car_red_copy1'
+        """
+        result = await self._scenario.apply([self._duplicate(new_id, (x, y, z), frame, snap)])
+        return self._scenario.objects[result.created[0]]
+
+    def _edit(self, operation: Operation) -> Awaitable[OperationResult]:
+        return self._scenario.apply([operation])

@@ -1,0 +1,150 @@
+"""Scenes of a worker."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from real2sim_proto.scenes import SceneInfo, SceneState
+
+from .. import _requests
+from .._call import ViewRequest
+from .._references import SceneRef, scene_name
+from ..errors import Real2SimError, ReplyTimeoutError
+from ..images import Image
+from .concurrency import sleep
+from .transport import AsyncTransport
+
+POLL_SECONDS = 0.2
+
+
+class AsyncScenes:
+    """``client.scenes``. Where a scene is asked for, its name or its ``SceneInfo`` will do.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    async def list(self) -> Sequence[SceneInfo]:
+        """Every available scene, in memory or not.
+
+        Examples:
+            >>> [scene.scene for scene in await client.scenes.list()]
+            ['street']
+        """
+        found = await self._transport.send(_requests.list_scenes())
+        return found.scenes
+
+    async def get(self, scene: SceneRef) -> SceneInfo:
+        """One scene: cameras, objects, time range, extent.
+
+        Raises:
+            NotFoundError: no such scene.
+
+        Examples:
+            >>> street = await client.scenes.get("street")
+            >>> [camera.name for camera in street.cameras], street.end_us
+            (['front', 'left'], 2000000)
+        """
+        return await self._transport.send(_requests.get_scene(scene_name(scene)))
+
+    async def load(self, scene: SceneRef, *, timeout: float | None = None) -> SceneInfo:
+        """Bring a scene into the worker's memory and wait until it is there.
+
+        Raises:
+            ReplyTimeoutError: it takes longer than ``timeout`` seconds.
+            Real2SimError: the scene is broken.
+
+        Examples:
+            >>> (await client.scenes.load("street")).state.value
+            'resident'
+        """
+        name = scene_name(scene)
+        await self._transport.send(_requests.load_scene(name))
+        seconds = self._transport.target.long_timeout if timeout is None else timeout
+        deadline = time.monotonic() + seconds
+        while not _is_resident(info := await self.get(name)):
+            if time.monotonic() > deadline:
+                raise ReplyTimeoutError(f"scene {name!r} in the worker's memory", seconds)
+            await sleep(POLL_SECONDS)
+        return info
+
+    async def unload(self, scene: SceneRef) -> None:
+        """Free the memory of a scene that no session uses.
+
+        Raises:
+            ConflictError: a session uses it.
+
+        Examples:
+            >>> await client.scenes.unload("street")
+        """
+        await self._transport.send(_requests.unload_scene(scene_name(scene)))
+
+    async def import_path(self, path: str, *, scene: str | None = None) -> SceneInfo:
+        """Import a bundle or splat file that lies below the worker's import folder.
+
+        Args:
+            path: relative to that folder.
+            scene: name to give it; default: the file's name.
+
+        Examples:
+            >>> (await client.scenes.import_path("corner.ply", scene="corner")).gaussians
+            300
+        """
+        return await self._transport.send(_requests.import_scene(path, scene))
+
+    async def upload(self, path: str | os.PathLike[str], *, scene: str | None = None) -> SceneInfo:
+        """Send a bundle or splat file of this machine to the worker and import it there.
+
+        Examples:
+            >>> (await client.scenes.upload(folder / "corner.ply", scene="mine")).gaussians
+            300
+        """
+        return await self._transport.send(_requests.upload_scene(Path(path), scene))
+
+    async def render(
+        self,
+        scene: SceneRef,
+        *,
+        camera: str,
+        t_us: int | None = None,
+        width: int | None = None,
+        modality: str = "rgb",
+        codec: str = "auto",
+    ) -> Image:
+        """One image of a recorded camera at an instant of the recording.
+
+        Args:
+            scene: a scene or its name.
+            camera: name of one of its cameras.
+            t_us: instant; default: the start of the recording.
+            width: pixels; default: as recorded.
+            modality: ``rgb``, ``depth`` or ``instance``.
+            codec: ``raw``, ``jpeg``, ``png``, or ``auto``: raw on this machine, else jpeg.
+
+        Raises:
+            NotFoundError: no such scene or camera.
+            ValueError: an unknown codec.
+
+        Examples:
+            >>> image = await client.scenes.render("street", camera="front", t_us=1_000_000)
+            >>> image.array.shape, image.array.dtype
+            ((64, 96, 3), dtype('uint8'))
+        """
+        codec = self._transport.target.image_codec(codec, modality)
+        view = ViewRequest(camera, t_us, width, modality, codec)
+        return await self._transport.send(_requests.render_scene(scene_name(scene), view))
+
+
+def _is_resident(info: SceneInfo) -> bool:
+    if info.state is SceneState.BROKEN:
+        raise Real2SimError(
+            f"scene {info.scene!r} is broken: {info.reason or 'no reason given'}",
+            hint="import it again, or look at the worker's log",
+        )
+    return info.state is SceneState.RESIDENT

@@ -1,0 +1,161 @@
+"""What a drive session knows, whoever waits for its socket."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from typing import Any
+
+from real2sim_proto.drive import Result, Welcome
+from real2sim_proto.sessions import SessionInfo
+
+from ._protocol import PendingRequest, ProtocolState
+from ._target import Target
+from .errors import (
+    CapacityError,
+    ConnectionLostError,
+    NotOpenError,
+    ReplyTimeoutError,
+    UnreachableError,
+)
+from .version import SDK
+
+TRANSIENT_ERRORS = (UnreachableError, CapacityError, ReplyTimeoutError)
+"""What connecting to a worker that is being restarted ends in."""
+
+MAX_RECONNECTS = 10_000
+
+
+def backoff(attempt: int) -> float:
+    """Seconds before try number ``attempt`` of a connection that was lost; with jitter."""
+    return min(0.05 * 2.0**attempt, 2.0) * (0.75 + 0.25 * random.random())
+
+
+@dataclass(frozen=True)
+class SessionPlan:
+    """Which session to open and how.
+
+    Attributes:
+        scene, scenario: what a new session runs on; exactly one of them.
+        session_id: joins this session instead of making one.
+        token: of the session that is joined.
+        role: ``controller`` or ``observer``.
+        codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
+        reconnect: seconds for which a lost connection is tried again; 0 gives up at once.
+    """
+
+    scene: str | None = None
+    scenario: str | None = None
+    session_id: str | None = None
+    token: str | None = None
+    role: str = "controller"
+    codec: str = "auto"
+    reconnect: float = 60.0
+
+
+class SessionBase:
+    """State of a drive session, shared by the sync and the async variant."""
+
+    def __init__(self, target: Target, plan: SessionPlan) -> None:
+        self._target = target
+        self._plan = plan
+        self._codec = target.codec(plan.codec)
+        self._protocol = ProtocolState()
+        self._welcome: Welcome | None = None
+        self._result: Result | None = None
+        self._token = plan.token
+        self._info: SessionInfo | None = None
+
+    def __repr__(self) -> str:
+        name = self._welcome.session_id if self._welcome else self._plan.session_id
+        return f"{type(self).__name__}({name!r}, step={self._protocol.step})"
+
+    @property
+    def welcome(self) -> Welcome:
+        """What the worker said at the start: cameras, objects, time range, limits, versions.
+
+        Raises:
+            NotOpenError: the session was not opened yet.
+        """
+        if self._welcome is None:
+            raise not_open()
+        return self._welcome
+
+    @property
+    def session_id(self) -> str:
+        """Id of the session on its worker."""
+        return self.welcome.session_id
+
+    @property
+    def token(self) -> str:
+        """Authorises others to join this session: ``client.join(s.session_id, token=s.token)``."""
+        if self._token is None:
+            raise not_open()
+        return self._token
+
+    @property
+    def cameras(self) -> list[str]:
+        """Names of the cameras that can be sensors."""
+        return [camera.name for camera in self.welcome.cameras]
+
+    @property
+    def result(self) -> Result | None:
+        """Final scores; known after ``close``."""
+        return self._result
+
+    def _hello(self) -> PendingRequest[Welcome]:
+        resume_token = self._welcome.resume_token if self._welcome else None
+        return self._protocol.hello(
+            sdk=SDK, role=self._plan.role, token=self._token, resume_token=resume_token
+        )
+
+    def _may_resend(self, request: PendingRequest[Any]) -> bool:
+        """Whether it is worth connecting again for the sake of a request."""
+        return self._welcome is not None and self._plan.reconnect > 0 and request.idempotent
+
+    def _check_not_applied(self, request: PendingRequest[Any]) -> None:
+        """Raises ConnectionLostError when the request may have taken effect already."""
+        expected, revision = request.only_at_revision, self.welcome.revision
+        if expected is not None and revision != expected:
+            raise ConnectionLostError(
+                f"the connection was lost while {request.awaited} was awaited; the session is at "
+                f"revision {revision}, so it took effect",
+                hint="the session goes on; look at the next observation",
+            )
+
+    def _timeout_of(self, request: PendingRequest[Any]) -> float:
+        return self._target.long_timeout if request.long_timeout else self._target.timeout
+
+    def _reply_timeout(self, request: PendingRequest[Any]) -> ReplyTimeoutError:
+        return ReplyTimeoutError(
+            f"{request.awaited} from {self._target.url}",
+            self._timeout_of(request),
+            hint="the worker may be busy; see `real2sim status`, or give a longer timeout",
+        )
+
+
+def not_open() -> NotOpenError:
+    """The error of a session that is used before it is opened, or after it was closed."""
+    return NotOpenError(
+        "the session is not open",
+        hint="use it as `with client.session(...) as session:`, or `async with` of the async one",
+    )
+
+
+class SessionTokens:
+    """Tokens of the sessions that a client created; the worker gives them only once."""
+
+    def __init__(self, own: str | None) -> None:
+        self._own = own
+        self._tokens: dict[str, str] = {}
+
+    def keep(self, info: SessionInfo) -> SessionInfo:
+        self._tokens[info.session_id] = info.token
+        return info
+
+    def forget(self, session_id: str) -> None:
+        self._tokens.pop(session_id, None)
+
+    def of(self, session_id: str) -> str | None:
+        """The worker's own token goes before a session's; it opens every session."""
+        return self._own or self._tokens.get(session_id)

@@ -1,0 +1,131 @@
+# Made from _async/assets.py by scripts/unasync.py; edit that file, then run the script.
+"""The worker's asset library."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetUpload
+
+from .. import _requests
+from .._call import checked
+from .._references import SceneRef, scene_name
+from ..images import Image
+from .transport import Transport
+
+
+class Assets:
+    """``client.assets``: things to insert into scenarios.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> asset = client.assets.cut(scene="street", object_id="car_red", asset_id="hatch")
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def list(self) -> Sequence[AssetInfo]:
+        """The whole library.
+
+        Examples:
+            >>> [asset.asset_id for asset in client.assets.list()]
+            ['hatch']
+        """
+        found = self._transport.send(_requests.list_assets())
+        return found.assets
+
+    def get(self, asset_id: str) -> AssetInfo:
+        """One asset.
+
+        Raises:
+            NotFoundError: no such asset.
+
+        Examples:
+            >>> (client.assets.get("hatch")).size
+            (4.0, 1.8, 1.5)
+        """
+        return self._transport.send(_requests.get_asset(asset_id))
+
+    def cut(
+        self,
+        *,
+        scene: SceneRef,
+        object_id: str,
+        asset_id: str | None = None,
+        category: str | None = None,
+    ) -> AssetInfo:
+        """Cut an object out of a scene; default: under its own id and category.
+
+        Examples:
+            >>> (client.assets.cut(scene="street", object_id="post")).category
+            'pole'
+            >>> client.assets.delete("post")
+        """
+        cut = checked(
+            AssetCut,
+            scene=scene_name(scene),
+            object_id=object_id,
+            asset_id=asset_id,
+            category=category,
+        )
+        return self._transport.send(_requests.cut_asset(cut))
+
+    def upload(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        asset_id: str | None = None,
+        category: str = "car",
+        up_axis: str = "-y",
+        yaw: float = 0.0,
+        length: float | None = None,
+    ) -> AssetInfo:
+        """Send a splat file (.ply, .compressed.ply, .spz, .splat) to the library.
+
+        Args:
+            path: the file.
+            asset_id: default: the file's name.
+            category: for example ``car``, ``truck``, ``pedestrian``.
+            up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``.
+            yaw: turn about z after that [rad], to bring the front to x.
+            length: real length [m]; default: usual for the category.
+
+        Examples:
+            >>> path = folder / "corner.ply"
+            >>> asset = client.assets.upload(path, up_axis="z", length=4.2)
+            >>> asset.asset_id, round(asset.size[0], 3)
+            ('corner', 4.2)
+            >>> client.assets.delete("corner")
+        """
+        fields = {
+            "asset_id": asset_id,
+            "category": category,
+            "up_axis": up_axis,
+            "yaw": yaw,
+            "length": length,
+        }
+        upload = checked(AssetUpload, **fields)
+        return self._transport.send(_requests.upload_asset(Path(path), upload))
+
+    def delete(self, asset_id: str) -> None:
+        """Remove one that no scenario has in its history.
+
+        Raises:
+            ConflictError: a scenario has it in its history.
+
+        Examples:
+            >>> client.assets.delete("hatch")
+        """
+        self._transport.send(_requests.delete_asset(asset_id))
+
+    def thumbnail(self, asset_id: str, *, width: int = 256) -> Image:
+        """A picture of it (png).
+
+        Examples:
+            >>> (client.assets.thumbnail("hatch", width=64)).codec
+            'png'
+        """
+        return self._transport.send(_requests.asset_thumbnail(asset_id, width))

@@ -1,0 +1,237 @@
+# Made from _async/client.py by scripts/unasync.py; edit that file, then run the script.
+"""Connecting to a worker."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from real2sim_proto import PROTOCOL_VERSION
+from real2sim_proto.scenes import Readiness, ServerInfo
+
+from .. import _requests
+from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
+from .._session_state import SessionPlan
+from .._target import Target, resolve_target
+from ..errors import ProtocolMismatchError, ReplyTimeoutError, UnreachableError
+from .assets import Assets
+from .concurrency import sleep
+from .drive_session import DriveSession
+from .jobs import Jobs
+from .scenarios import Scenarios
+from .scenes import Scenes
+from .sessions import Sessions
+from .transport import Transport
+
+if TYPE_CHECKING:
+    import httpx2
+
+POLL_SECONDS = 0.25
+
+
+def connect(
+    url: str | None = None,
+    *,
+    token: str | None = None,
+    name: str | None = None,
+    timeout: float = 30.0,
+    retries: int = 2,
+    transport: httpx2.BaseTransport | None = None,
+) -> Client:
+    """A client of the worker at ``url``. Nothing is sent yet.
+
+    An argument goes before the environment, and the environment before the default.
+
+    Args:
+        url: ``http://host:port`` or ``https://...``; default: ``$REAL2SIM_URL``, else
+            ``http://127.0.0.1:8600``.
+        token: bearer token of the worker; default: ``$REAL2SIM_TOKEN``, else none. ``""`` sends
+            none whatever the environment says.
+        name: who is calling; the history of scenarios names it.
+        timeout: seconds that a reply may take; calls that may load a scene or
+            compile kernels have at least 300.
+        retries: more tries of requests that may safely be sent again.
+        transport: replaces the network, for tests of programs that use the SDK.
+
+    Raises:
+        ValueError: not such an address.
+
+    Examples:
+        >>> client = real2sim.connect(timeout=10.0, name="anna")
+        >>> [scene.scene for scene in client.scenes.list()]
+        ['street']
+        >>> client.close()
+    """
+    target = resolve_target(url, token, timeout=timeout, name=name, retries=retries)
+    return Client(Transport(target, transport=transport))
+
+
+class Client:
+    """A worker's scenes, scenarios and sessions; made by :func:`connect`.
+
+    Attributes:
+        scenes: :class:`Scenes`.
+        scenarios: :class:`Scenarios`.
+        assets: :class:`Assets`.
+        jobs: :class:`Jobs`.
+        sessions: :class:`Sessions`.
+
+    Examples:
+        >>> client = real2sim.connect()
+
+        Used as ``with real2sim.connect() as client:`` it closes by itself.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+        self.scenes = Scenes(transport)
+        self.scenarios = Scenarios(transport)
+        self.assets = Assets(transport)
+        self.jobs = Jobs(transport)
+        self.sessions = Sessions(transport)
+
+    def server(self) -> ServerInfo:
+        """Versions, device, limits, conventions.
+
+        Raises:
+            UnreachableError: no worker answers.
+            ProtocolMismatchError: the worker speaks another protocol version.
+
+        Examples:
+            >>> info = client.server()
+            >>> info.device.backend, info.conventions["quaternion"]
+            ('cpu', 'wxyz, unit length')
+        """
+        return _same_protocol(self._transport.send(_requests.server_info()))
+
+    def readiness(self) -> Readiness:
+        """Whether the worker takes new sessions now, and if not, why.
+
+        Examples:
+            >>> (client.readiness()).ready
+            True
+        """
+        return self._transport.send(_requests.readiness())
+
+    def wait_ready(self, timeout: float = 120.0) -> ServerInfo:
+        """Wait until the worker is ready; it may still be starting.
+
+        Raises:
+            ReplyTimeoutError: it did not become ready; the hint says what was in the way.
+
+        Examples:
+            >>> info = client.wait_ready(timeout=60.0)
+        """
+        deadline = time.monotonic() + timeout
+        while (obstacle := self._obstacle()) is not None:
+            if time.monotonic() > deadline:
+                raise _not_ready(self._transport.target, timeout, obstacle)
+            sleep(POLL_SECONDS)
+        return self.server()
+
+    def session(
+        self,
+        *,
+        scene: SceneRef | None = None,
+        scenario: ScenarioRef | None = None,
+        codec: str = "auto",
+        reconnect: float = 60.0,
+    ) -> DriveSession:
+        """A new session on a scene or a scenario, to be opened by ``with``.
+
+        Args:
+            scene: a scene or its name; or
+            scenario: a scenario or its id.
+            codec: of cameras that name none: ``auto`` (raw when the worker is on this machine,
+                else jpeg), ``raw``, ``jpeg`` or ``png``.
+            reconnect: seconds for which a lost connection is tried again: the session goes on as
+                if nothing had happened, also after the worker was restarted. 0 gives up.
+
+        Raises:
+            TypeError: something else than a scene or a scenario.
+
+        Examples:
+            >>> scenario = client.scenarios.create(scene="street", name="no red car")
+            >>> deleted = scenario.objects["car_red"].delete()
+            >>> with client.session(scenario=scenario) as session:
+            ...     obs = session.reset(privileged=True)
+            >>> sorted(agent.object_id for agent in obs.agents)
+            ['car_blue', 'post']
+        """
+        plan = SessionPlan(
+            scene=optional_scene_name(scene),
+            scenario=optional_scenario_id(scenario),
+            codec=codec,
+            reconnect=reconnect,
+        )
+        return DriveSession(self._transport, plan)
+
+    def join(
+        self, session_id: str, *, token: str, role: str = "controller", codec: str = "auto"
+    ) -> DriveSession:
+        """A session that exists already; closing leaves it running.
+
+        Args:
+            session_id: of that session.
+            token: of that session.
+            role: ``controller`` or ``observer``, which sees what the controller sees.
+            codec: as of :meth:`session`.
+
+        Examples:
+            >>> with client.session(scene="street") as session:
+            ...     token = session.token
+            ...     with client.join(session.session_id, token=token, role="observer") as o:
+            ...         print(o.welcome.role)
+            observer
+        """
+        plan = SessionPlan(session_id=session_id, token=token, role=role, codec=codec)
+        return DriveSession(self._transport, plan)
+
+    def close(self) -> None:
+        """Close the connections.
+
+        Examples:
+            >>> client.close()
+        """
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._transport.target})"
+
+    def _obstacle(self) -> str | None:
+        try:
+            return _obstacle_in(self.readiness())
+        except (UnreachableError, ReplyTimeoutError) as error:
+            return str(error)
+
+
+def _same_protocol(info: ServerInfo) -> ServerInfo:
+    if info.protocol_version != PROTOCOL_VERSION:
+        raise ProtocolMismatchError(
+            f"the worker (version {info.version}) speaks protocol {info.protocol_version}; this "
+            f"client speaks {PROTOCOL_VERSION}",
+            hint="install a client and a worker of the same major version",
+        )
+    return info
+
+
+def _obstacle_in(readiness: Readiness) -> str | None:
+    if readiness.ready:
+        return None
+    return "; ".join(readiness.reasons) or "the worker gives no reason"
+
+
+def _not_ready(target: Target, seconds: float, obstacle: str) -> ReplyTimeoutError:
+    return ReplyTimeoutError(f"ready worker at {target.url}", seconds, hint=obstacle)

@@ -1,0 +1,383 @@
+# Made from _async/scenarios.py by scripts/unasync.py; edit that file, then run the script.
+"""Scenarios: a scene and the edits made to it.
+
+A handle sends the revision it knows with every edit. When somebody else has edited in between,
+the edit is refused with :class:`~real2sim.errors.StaleRevisionError`, which names what was
+missed; ``refresh()`` and decide again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from real2sim_proto.jobs import SimulateRequest
+from real2sim_proto.operations import Operation
+from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
+from real2sim_proto.scenes import ObjectInfo
+
+from .. import _requests
+from .._call import ViewRequest, checked
+from .._object_edits import (
+    UPRIGHT,
+    ObjectEdits,
+    Quaternion,
+    ScenarioEdits,
+    Vector,
+    insertion,
+)
+from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
+from .._scenario_state import Objects, ScenarioState
+from ..images import Image
+from .jobs import Job
+from .transport import Transport
+
+
+class Scenarios:
+    """``client.scenarios``.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> scenario = client.scenarios.create(scene="street", name="an example")
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def create(self, *, scene: SceneRef, name: str = "") -> Scenario:
+        """A new scenario without edits on a scene.
+
+        Raises:
+            NotFoundError: no such scene.
+
+        Examples:
+            >>> scenario = client.scenarios.create(scene="street", name="car in my lane")
+            >>> scenario.revision, list(scenario.objects)
+            (0, ['car_red', 'car_blue', 'post'])
+        """
+        info = self._transport.send(_requests.create_scenario(scene_name(scene), name))
+        # The answer to a creation leaves trajectories out; a handle always has them.
+        return Scenario(self._transport, info).refresh()
+
+    def import_document(self, document: ScenarioDocument | Mapping[str, Any]) -> Scenario:
+        """A new scenario from what :meth:`Scenario.export` gave, here or elsewhere.
+
+        Examples:
+            >>> document = scenario.export()
+            >>> copy = client.scenarios.import_document(document)
+            >>> copy.info.name, copy.scenario_id != scenario.scenario_id
+            ('an example', True)
+        """
+        valid = ScenarioDocument.model_validate(document)
+        info = self._transport.send(_requests.import_scenario(valid))
+        return Scenario(self._transport, info).refresh()
+
+    def get(self, scenario_id: str) -> Scenario:
+        """A handle of an existing scenario.
+
+        Raises:
+            NotFoundError: no such scenario.
+
+        Examples:
+            >>> (client.scenarios.get(scenario.scenario_id)).info.name
+            'an example'
+        """
+        info = self._transport.send(_requests.get_scenario(scenario_id))
+        return Scenario(self._transport, info)
+
+    def list(self) -> Sequence[ScenarioInfo]:
+        """All scenarios of the worker.
+
+        Examples:
+            >>> found = client.scenarios.list()
+            >>> scenario.scenario_id in [info.scenario_id for info in found]
+            True
+        """
+        found = self._transport.send(_requests.list_scenarios())
+        return found.scenarios
+
+    def delete(self, scenario: ScenarioRef) -> None:
+        """Remove a scenario and its history.
+
+        Examples:
+            >>> client.scenarios.delete(scenario)
+        """
+        self._transport.send(_requests.delete_scenario(scenario_id_of(scenario)))
+
+
+class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
+    """One scenario as this client last saw it.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> scenario = client.scenarios.create(scene="street")
+    """
+
+    def __init__(self, transport: Transport, info: ScenarioInfo) -> None:
+        super().__init__(info)
+        self._transport = transport
+
+    @property
+    def objects(self) -> Objects[SceneObject]:
+        """Handles of the objects, by id.
+
+        Examples:
+            >>> list(scenario.objects)
+            ['car_red', 'car_blue', 'post']
+            >>> result = scenario.objects["car_red"].translate(y=3.2)
+        """
+        return Objects({o.object_id: SceneObject(self, o) for o in self.info.objects})
+
+    def apply(
+        self, operations: Sequence[Operation | Mapping[str, Any]], *, dry_run: bool = False
+    ) -> OperationResult:
+        """Apply operations, all or none.
+
+        Args:
+            operations: models of ``real2sim_proto.operations``, or their fields.
+            dry_run: check them and change nothing.
+
+        Raises:
+            ValueError: an operation that is not valid.
+            StaleRevisionError: somebody else edited first.
+            InvalidOperationError: an unknown object, or a result that is not allowed.
+
+        Examples:
+            >>> result = scenario.apply(
+            ...     [
+            ...         {"op": "delete", "object_id": "post"},
+            ...         {"op": "duplicate", "object_id": "car_red", "new_id": "second", "x": 8.0},
+            ...     ]
+            ... )
+            >>> result.revision, result.created
+            (1, ['second'])
+        """
+        call = _requests.apply_operations(self.scenario_id, operations, self._etag, dry_run)
+        return self._applied(self._transport.send(call))
+
+    def insert(
+        self,
+        asset: str,
+        *,
+        position: Vector,
+        quaternion: Quaternion = UPRIGHT,
+        size: Vector | None = None,
+        object_id: str | None = None,
+        snap: bool = True,
+    ) -> SceneObject:
+        """Add an object from the asset library, and return its handle.
+
+        Args:
+            asset: id in the library.
+            position, quaternion: where its box is, for the whole time range.
+            size: box to fit [m]; default: the asset's own.
+            object_id: default: the asset's id with a number.
+            snap: put it onto the ground, whatever z is.
+
+        Raises:
+            InvalidOperationError: no such asset.
+
+        Examples:
+            >>> asset = client.assets.cut(scene="street", object_id="car_red")
+            >>> parked = scenario.insert("car_red", position=(20.0, 3.0, 0.0))
+            >>> parked.object_id, parked.info.category
+            ('car_red_1', 'car')
+            >>> client.scenarios.delete(scenario)
+            >>> client.assets.delete("car_red")
+        """
+        operation = insertion(
+            asset,
+            position=position,
+            quaternion=quaternion,
+            size=size,
+            object_id=object_id,
+            snap=snap,
+        )
+        result = self.apply([operation])
+        return self.objects[result.created[0]]
+
+    def simulate(
+        self,
+        *,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        frame_us: int = 50_000,
+        objects: Sequence[str] | None = None,
+        preset: str = "vehicle",
+        backend: str = "auto",
+    ) -> Job:
+        """Start a physics rollout of the scenario as it is now.
+
+        Args:
+            start_us, end_us: default: the scenario's span.
+            frame_us: from one kept frame to the next.
+            objects: what the physics moves; default: what has a velocity or physics of its own.
+            preset: how objects become bodies: ``vehicle`` or ``paper``.
+            backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> post = scenario.objects["post"]
+            >>> result = post.translate(z=0.3)
+            >>> result = post.set_physics(material="rigid", mass=30.0)
+            >>> job = scenario.simulate(end_us=200_000, objects=["post"])
+            >>> job = job.wait(timeout=240.0)
+            >>> job.info.kind, "post" in job.result["objects"]
+            ('simulate', True)
+        """
+        body = checked(
+            SimulateRequest,
+            start_us=start_us,
+            end_us=end_us,
+            frame_us=frame_us,
+            objects=None if objects is None else list(objects),
+            preset=preset,
+            backend=backend,
+        )
+        info = self._transport.send(_requests.simulate(self.scenario_id, body))
+        return Job(self._transport, info)
+
+    def fork(self, *, name: str | None = None, revision: int | None = None) -> Scenario:
+        """A new scenario with the same history, up to a revision.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> before = scenario.fork(name="with the post", revision=0)
+            >>> "post" in before.objects, "post" in scenario.objects
+            (True, False)
+        """
+        call = _requests.fork_scenario(self.scenario_id, name, revision)
+        return Scenario(self._transport, self._transport.send(call)).refresh()
+
+    def export(self) -> ScenarioDocument:
+        """The whole scenario as one document; ``model_dump_json()`` makes a file of it.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> document = scenario.export()
+            >>> [operation.op for operation in document.entries[0].operations]
+            ['delete']
+        """
+        return self._transport.send(_requests.export_scenario(self.scenario_id))
+
+    def undo(self) -> OperationResult:
+        """Take the newest edit back.
+
+        Raises:
+            ConflictError: there is nothing to take back.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> result = scenario.undo()
+            >>> "post" in scenario.objects, scenario.info.can_redo
+            (True, True)
+        """
+        result = self._transport.send(_requests.undo(self.scenario_id, self._etag))
+        return self._applied(result)
+
+    def redo(self) -> OperationResult:
+        """Make the edit again that was taken back last.
+
+        Raises:
+            ConflictError: nothing was taken back.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> result = scenario.undo()
+            >>> result = scenario.redo()
+            >>> "post" in scenario.objects
+            False
+        """
+        result = self._transport.send(_requests.redo(self.scenario_id, self._etag))
+        return self._applied(result)
+
+    def history(self, *, after: int | None = None) -> History:
+        """Edits, undos and redos after a revision, oldest first; default: all.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> result = scenario.undo()
+            >>> [(entry.revision, entry.kind) for entry in (scenario.history()).entries]
+            [(1, 'edit'), (2, 'undo')]
+        """
+        return self._transport.send(_requests.history(self.scenario_id, after))
+
+    def refresh(self) -> Scenario:
+        """See what the scenario is now; returns itself.
+
+        Examples:
+            >>> theirs = client.scenarios.get(scenario.scenario_id)
+            >>> result = theirs.remove("post")
+            >>> list((scenario.refresh()).objects)
+            ['car_red', 'car_blue']
+        """
+        self._update(self._transport.send(_requests.get_scenario(self.scenario_id)))
+        return self
+
+    def preview(
+        self,
+        *,
+        camera: str,
+        t_us: int | None = None,
+        width: int | None = None,
+        modality: str = "rgb",
+        codec: str = "auto",
+    ) -> Image:
+        """What a recorded camera would see now; arguments as of :meth:`Scenes.render`.
+
+        Examples:
+            >>> image = scenario.preview(camera="front", codec="jpeg")
+            >>> image.save(folder / "after.jpg").name
+            'after.jpg'
+        """
+        codec = self._transport.target.image_codec(codec, modality)
+        view = ViewRequest(camera, t_us, width, modality, codec)
+        return self._transport.send(_requests.preview(self.scenario_id, view))
+
+    def _edit(self, operation: Operation) -> OperationResult:
+        return self.apply([operation])
+
+    def _applied(self, result: OperationResult) -> OperationResult:
+        self._record(result)
+        if not result.dry_run:
+            self.refresh()
+        return result
+
+
+class SceneObject(ObjectEdits[OperationResult]):
+    """An object of a scenario; each method is one edit. Metres, radians, wxyz.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> scenario = client.scenarios.create(scene="street")
+        >>> car = scenario.objects["car_red"]
+    """
+
+    def __init__(self, scenario: Scenario, info: ObjectInfo) -> None:
+        super().__init__(info)
+        self._scenario = scenario
+
+    def duplicate(
+        self,
+        *,
+        new_id: str | None = None,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        frame: str = "world",
+        snap: bool = False,
+    ) -> SceneObject:
+        """Add a copy, shifted [m], and return its handle; ``snap`` puts it onto the ground.
+
+        Examples:
+            >>> copy = car.duplicate(x=9.0)
+            >>> copy.object_id
+            'car_red_copy1'
+        """
+        result = self._scenario.apply([self._duplicate(new_id, (x, y, z), frame, snap)])
+        return self._scenario.objects[result.created[0]]
+
+    def _edit(self, operation: Operation) -> OperationResult:
+        return self._scenario.apply([operation])

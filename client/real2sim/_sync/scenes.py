@@ -1,0 +1,151 @@
+# Made from _async/scenes.py by scripts/unasync.py; edit that file, then run the script.
+"""Scenes of a worker."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from real2sim_proto.scenes import SceneInfo, SceneState
+
+from .. import _requests
+from .._call import ViewRequest
+from .._references import SceneRef, scene_name
+from ..errors import Real2SimError, ReplyTimeoutError
+from ..images import Image
+from .concurrency import sleep
+from .transport import Transport
+
+POLL_SECONDS = 0.2
+
+
+class Scenes:
+    """``client.scenes``. Where a scene is asked for, its name or its ``SceneInfo`` will do.
+
+    Examples:
+        >>> client = real2sim.connect()
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def list(self) -> Sequence[SceneInfo]:
+        """Every available scene, in memory or not.
+
+        Examples:
+            >>> [scene.scene for scene in client.scenes.list()]
+            ['street']
+        """
+        found = self._transport.send(_requests.list_scenes())
+        return found.scenes
+
+    def get(self, scene: SceneRef) -> SceneInfo:
+        """One scene: cameras, objects, time range, extent.
+
+        Raises:
+            NotFoundError: no such scene.
+
+        Examples:
+            >>> street = client.scenes.get("street")
+            >>> [camera.name for camera in street.cameras], street.end_us
+            (['front', 'left'], 2000000)
+        """
+        return self._transport.send(_requests.get_scene(scene_name(scene)))
+
+    def load(self, scene: SceneRef, *, timeout: float | None = None) -> SceneInfo:
+        """Bring a scene into the worker's memory and wait until it is there.
+
+        Raises:
+            ReplyTimeoutError: it takes longer than ``timeout`` seconds.
+            Real2SimError: the scene is broken.
+
+        Examples:
+            >>> (client.scenes.load("street")).state.value
+            'resident'
+        """
+        name = scene_name(scene)
+        self._transport.send(_requests.load_scene(name))
+        seconds = self._transport.target.long_timeout if timeout is None else timeout
+        deadline = time.monotonic() + seconds
+        while not _is_resident(info := self.get(name)):
+            if time.monotonic() > deadline:
+                raise ReplyTimeoutError(f"scene {name!r} in the worker's memory", seconds)
+            sleep(POLL_SECONDS)
+        return info
+
+    def unload(self, scene: SceneRef) -> None:
+        """Free the memory of a scene that no session uses.
+
+        Raises:
+            ConflictError: a session uses it.
+
+        Examples:
+            >>> client.scenes.unload("street")
+        """
+        self._transport.send(_requests.unload_scene(scene_name(scene)))
+
+    def import_path(self, path: str, *, scene: str | None = None) -> SceneInfo:
+        """Import a bundle or splat file that lies below the worker's import folder.
+
+        Args:
+            path: relative to that folder.
+            scene: name to give it; default: the file's name.
+
+        Examples:
+            >>> (client.scenes.import_path("corner.ply", scene="corner")).gaussians
+            300
+        """
+        return self._transport.send(_requests.import_scene(path, scene))
+
+    def upload(self, path: str | os.PathLike[str], *, scene: str | None = None) -> SceneInfo:
+        """Send a bundle or splat file of this machine to the worker and import it there.
+
+        Examples:
+            >>> (client.scenes.upload(folder / "corner.ply", scene="mine")).gaussians
+            300
+        """
+        return self._transport.send(_requests.upload_scene(Path(path), scene))
+
+    def render(
+        self,
+        scene: SceneRef,
+        *,
+        camera: str,
+        t_us: int | None = None,
+        width: int | None = None,
+        modality: str = "rgb",
+        codec: str = "auto",
+    ) -> Image:
+        """One image of a recorded camera at an instant of the recording.
+
+        Args:
+            scene: a scene or its name.
+            camera: name of one of its cameras.
+            t_us: instant; default: the start of the recording.
+            width: pixels; default: as recorded.
+            modality: ``rgb``, ``depth`` or ``instance``.
+            codec: ``raw``, ``jpeg``, ``png``, or ``auto``: raw on this machine, else jpeg.
+
+        Raises:
+            NotFoundError: no such scene or camera.
+            ValueError: an unknown codec.
+
+        Examples:
+            >>> image = client.scenes.render("street", camera="front", t_us=1_000_000)
+            >>> image.array.shape, image.array.dtype
+            ((64, 96, 3), dtype('uint8'))
+        """
+        codec = self._transport.target.image_codec(codec, modality)
+        view = ViewRequest(camera, t_us, width, modality, codec)
+        return self._transport.send(_requests.render_scene(scene_name(scene), view))
+
+
+def _is_resident(info: SceneInfo) -> bool:
+    if info.state is SceneState.BROKEN:
+        raise Real2SimError(
+            f"scene {info.scene!r} is broken: {info.reason or 'no reason given'}",
+            hint="import it again, or look at the worker's log",
+        )
+    return info.state is SceneState.RESIDENT
