@@ -84,7 +84,7 @@ def _lidar_points(log: DrivingLog) -> Float:
     """Points [N, 3] of some sweeps in the world, without what lies in tracked boxes."""
     import numpy as np
 
-    from ..geometry.rotation import apply_transform, invert_transform
+    from ..geometry.transform import apply_transform, invert_transform
 
     frames = np.unique(np.linspace(0, log.frame_count - 1, SWEEPS_MAX).astype(int))
     kept = []
@@ -122,7 +122,7 @@ def _draw(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from ..geometry.rotation import apply_transform, invert_transform
+    from ..geometry.transform import apply_transform, invert_transform
     from ..simulation.experiments.film import look_at
 
     ahead = T_world_vehicle[:3, 0]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from real2sim_proto.operations import Duplicate, Operation, Translate
 
 from ..geometry.box import box_corners
-from ..geometry.rotation import transform_from
+from ..geometry.transform import transform_from
 
 if TYPE_CHECKING:
     from real2sim_proto.scenes import ObjectInfo, SceneInfo

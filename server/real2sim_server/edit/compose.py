@@ -13,7 +13,8 @@ import torch
 
 from real2sim_proto.operations import EraseRegion
 
-from ..geometry.rotation import Float, invert_transform, transform_from
+from ..geometry.rotation import Float
+from ..geometry.transform import invert_transform, transform_from
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene
 from .ground import RecordedGround

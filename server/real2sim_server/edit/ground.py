@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from ..geometry.box import box_corners
-from ..geometry.rotation import Float, quaternion_to_matrix, transform_from
+from ..geometry.rotation import Float, quaternion_to_matrix
+from ..geometry.transform import transform_from
 from ..scene import Trajectory
 
 SPACING = 1.0

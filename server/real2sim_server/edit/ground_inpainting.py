@@ -14,7 +14,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import invert_transform
+from ..geometry.transform import invert_transform
 from ..scene import GaussianCloud, Scene
 from .state import ObjectState, ScenarioState
 from .tracks import Float

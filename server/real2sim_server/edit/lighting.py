@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..scene import GaussianCloud, Scene
-from ..scene.harmonics import SH_C0
+from ..scene.spherical_harmonics import SH_C0
 
 Colour = tuple[float, float, float]
 

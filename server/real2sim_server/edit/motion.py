@@ -20,7 +20,8 @@ from real2sim_proto.operations import (
     Translate,
 )
 
-from ..geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix, transform_from
+from ..geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix
+from ..geometry.transform import transform_from
 from ..scene import Trajectory
 from .change import Change, changed, refused, trajectory_of, wire_track
 from .ground import RecordedGround, bottoms_of

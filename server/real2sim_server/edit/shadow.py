@@ -11,10 +11,11 @@ from functools import cache
 import numpy as np
 import torch
 
-from ..geometry.rotation import Float, transform_from, yaw_quaternion
+from ..geometry.rotation import Float, yaw_quaternion
+from ..geometry.transform import transform_from
 from ..render.types import Instance
 from ..scene import GaussianCloud
-from ..scene.harmonics import SH_C0
+from ..scene.spherical_harmonics import SH_C0
 from .ground import RecordedGround, bottoms_of
 
 MARGIN = 0.35

@@ -9,7 +9,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import slerp, transform_from
+from ..geometry.rotation import slerp
+from ..geometry.transform import transform_from
 from ..scene import Trajectory
 from .track_kernels import KNOT, poses_at
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, apply_transform
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform
 from .driving_log import DrivingLog, LidarSweep
 from .images import write_image
 from .overlay import draw_frame, points_in_box

@@ -7,7 +7,8 @@ import colorsys
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, apply_transform, invert_transform
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform, invert_transform
 from ..scene import Camera
 from .driving_log import DrivingLog
 

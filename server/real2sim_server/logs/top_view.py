@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, apply_transform
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform
 from .driving_log import DrivingLog, LidarSweep, ObjectTrack
 from .overlay import colour_of
 

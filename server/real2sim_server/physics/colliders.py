@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float, is_rigid
+from ..geometry.rotation import Float
+from ..geometry.transform import is_rigid
 from .errors import ColliderError
 
 PLANE, BOX, HEIGHT_FIELD = range(3)

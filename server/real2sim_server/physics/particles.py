@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float, apply_transform, is_rigid
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform, is_rigid
 from .errors import ParticleError
 
 

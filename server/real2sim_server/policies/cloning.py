@@ -14,7 +14,8 @@ from real2sim.planners.learned import REACH, PolicyShape, network, shrink, state
 
 from .._files import atomic_file
 from ..console import CommandError
-from ..geometry.rotation import quaternion_yaw, transform_from
+from ..geometry.rotation import quaternion_yaw
+from ..geometry.transform import transform_from
 from ..scene import Trajectory
 from ..world.ego.route import command_ahead
 from ..world.path import LoggedPath

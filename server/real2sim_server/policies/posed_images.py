@@ -13,7 +13,7 @@ from real2sim.planners.learned import PolicyShape
 
 from ..edit import ScenarioState
 from ..edit.compose import instances_at
-from ..geometry.rotation import transform_from
+from ..geometry.transform import transform_from
 from ..logs import DrivingLog
 from ..render import render_cameras, select_backend
 from ..scene import Scene

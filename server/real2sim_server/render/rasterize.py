@@ -10,7 +10,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..geometry.rotation import are_rigid, is_rotation
+from ..geometry.rotation import is_rotation
+from ..geometry.transform import are_rigid
 from ..scene import GaussianCloud, TimeColour
 from .backends.base import Backend, RasterRequest
 from .backends.select import select_backend

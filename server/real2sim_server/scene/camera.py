@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, invert_transform, is_rigid
+from ..geometry.rotation import Float
+from ..geometry.transform import invert_transform, is_rigid
 from .errors import SceneError
 
 T_VEHICLE_OPTICAL = np.array(

@@ -9,9 +9,10 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..geometry.rotation import is_rigid, matrix_to_quaternion
+from ..geometry.rotation import matrix_to_quaternion
+from ..geometry.transform import is_rigid
 from .errors import SceneError
-from .harmonics import rotate_sh
+from .spherical_harmonics import rotate_sh
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 
@@ -27,7 +28,7 @@ class GaussianCloud:
         opacities: [N] float32 in [0, 1].
         sh: [N, K, 3] float32, spherical harmonics, K = (degree + 1)^2, degree 0 to 3; RGB is
             ``clamp(sum_k sh_k Y_k(direction) + 0.5, min=0)`` with the direction in the cloud's
-            own frame, the basis of :func:`~.harmonics.sh_basis`.
+            own frame, the basis of :func:`~.spherical_harmonics.sh_basis`.
 
     Raises:
         SceneError: on shapes that do not fit together, a dtype other than float32, or tensors on

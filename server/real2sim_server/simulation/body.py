@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..geometry.box import box_penetration
-from ..geometry.rotation import Float, apply_transform
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform
 from ..physics.body import Body
 from ..physics.colliders import Collider
 from ..physics.materials import Material

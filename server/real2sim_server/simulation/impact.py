@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, apply_transform
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform
 from ..physics.colliders import Box, Collider
 from ..physics.materials import Material
 from ..physics.particles import Particles, box_particles

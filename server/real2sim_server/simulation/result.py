@@ -14,7 +14,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from .._files import atomic_folder
-from ..geometry.rotation import Float, transform_from
+from ..geometry.rotation import Float
+from ..geometry.transform import transform_from
 from ..physics.errors import PhysicsError
 
 FORMAT = "real2sim-simulation"

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..geometry.box import box_penetration
-from ..geometry.rotation import Float, apply_transform, is_rigid
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform, is_rigid
 from ..physics.colliders import Collider
 from ..physics.errors import PhysicsError
 from ..physics.particles import Particles

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.rotation import transform_from, yaw_quaternion
+from ..geometry.rotation import yaw_quaternion
+from ..geometry.transform import transform_from
 from ..scene import Camera, CameraRig
 from ..scene.camera import T_VEHICLE_OPTICAL
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float, apply_transform, invert_transform
+from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.native_writer import write_native_log
 from ..scene import CameraRig

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, slerp, transform_from, yaw_quaternion
+from ..geometry.rotation import Float, slerp, yaw_quaternion
+from ..geometry.transform import transform_from
 from ..scene import Trajectory
 from .config import SyntheticConfig
 from .materials import PARKING_BAY

@@ -10,7 +10,7 @@ from real2sim_proto.operations import Delete, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, vacated
 from real2sim_server.edit.ground_inpainting import uncovered
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.scene.harmonics import SH_C0
+from real2sim_server.scene.spherical_harmonics import SH_C0
 
 PARKED = "post"
 

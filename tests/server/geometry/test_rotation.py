@@ -2,29 +2,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from real2sim_server.geometry.rotation import (
-    apply_transform,
-    invert_transform,
-    is_rigid,
     is_rotation,
     matrix_to_quaternion,
     multiply_quaternions,
     quaternion_to_matrix,
     quaternion_yaw,
     slerp,
-    transform_from,
     yaw_quaternion,
 )
 
-components = st.floats(-1, 1, allow_subnormal=False)
-quaternions = (
-    arrays(np.float64, 4, elements=components)
-    .filter(lambda q: np.linalg.norm(q) > 1e-2)
-    .map(lambda q: q / np.linalg.norm(q))
-)
-vectors = arrays(np.float64, 3, elements=st.floats(-100, 100))
+from .strategies import quaternions
+
 IDENTITY = np.array([1.0, 0, 0, 0])
 
 
@@ -105,15 +95,6 @@ def test_yaw_round_trips(yaw):
     assert quaternion_yaw(yaw_quaternion(yaw)) == pytest.approx(yaw, abs=1e-12)
 
 
-@given(vectors, quaternions, arrays(np.float64, (5, 3), elements=st.floats(-100, 100)))
-def test_a_transform_and_its_inverse_bring_points_back(position, quaternion, points):
-    transform = transform_from(position, quaternion)
-    there = apply_transform(transform, points)
-    np.testing.assert_allclose(
-        apply_transform(invert_transform(transform), there), points, atol=1e-9
-    )
-
-
 def test_batches_are_treated_one_by_one():
     q = np.random.default_rng(0).normal(size=(3, 2, 4))
     matrices = quaternion_to_matrix(q)
@@ -137,11 +118,3 @@ def test_batches_are_treated_one_by_one():
 )
 def test_what_is_no_rotation_is_told_apart(matrix):
     assert not is_rotation(matrix)
-
-
-@pytest.mark.parametrize("place", [(3, 0), (0, 3)])
-def test_a_transform_with_a_bad_entry_is_not_rigid(place):
-    matrix = np.eye(4)
-    assert is_rigid(matrix)
-    matrix[place] = np.inf
-    assert not is_rigid(matrix)

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import feather
 
-from real2sim_server.geometry.rotation import apply_transform, invert_transform
+from real2sim_server.geometry.transform import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, open_log
 from real2sim_server.synthetic import SyntheticLog
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.geometry.rotation import apply_transform, invert_transform
+from real2sim_server.geometry.transform import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
 from real2sim_server.logs.readers.formats.wire_format import (
     Message,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.rotation import transform_from
+from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, rasterize
 from real2sim_server.render.backends.base import RasterRequest, place_instances
 from real2sim_server.render.backends.cpu import backend as cpu

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.rotation import transform_from, yaw_quaternion
+from real2sim_server.geometry.rotation import yaw_quaternion
+from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderError, render_cameras, warm_up
 from real2sim_server.render.quantize import solid_depth, to_uint8
 from real2sim_server.scene import Camera, GaussianCloud, Sky

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.rotation import apply_transform, quaternion_to_matrix, transform_from
+from real2sim_server.geometry.rotation import quaternion_to_matrix
+from real2sim_server.geometry.transform import apply_transform, transform_from
 from real2sim_server.scene import GaussianCloud, SceneError
-from real2sim_server.scene.harmonics import sh_basis
+from real2sim_server.scene.spherical_harmonics import sh_basis
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

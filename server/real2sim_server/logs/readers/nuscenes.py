@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform, invert_transform, transform_from
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform, transform_from
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from .box_tracks import Box, build_tracks

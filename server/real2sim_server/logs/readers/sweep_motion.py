@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
 
 
 def compensate_sweep(

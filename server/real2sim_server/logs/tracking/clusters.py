@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...geometry.rotation import Float, apply_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform
 from ..driving_log import LidarSweep
 from .ground import find_ground
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform, invert_transform, yaw_quaternion
+from ...geometry.rotation import Float, yaw_quaternion
+from ...geometry.transform import apply_transform, invert_transform
 from ...scene import Trajectory
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
 from .association import Track, follow

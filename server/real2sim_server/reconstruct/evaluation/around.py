@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
 from ...logs import ObjectTrack
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene

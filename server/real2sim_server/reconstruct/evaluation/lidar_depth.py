@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform
 from ...logs import DrivingLog
 from ...scene import Camera
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import apply_transform, invert_transform
+from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render import RasterOptions, render_cameras
 from ...scene import Camera, Scene

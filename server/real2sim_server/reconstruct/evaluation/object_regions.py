@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.box import box_corners
-from ...geometry.rotation import Float, apply_transform, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import Camera
 

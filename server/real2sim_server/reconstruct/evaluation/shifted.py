@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform
 from ...scene import Camera, Scene
 from ...synthetic import SyntheticLog
 from .image_metrics import mean_psnr, psnr, ssim

@@ -17,8 +17,8 @@ from ...geometry.rotation import Float
 from ...scene import GaussianCloud, Scene
 from ...scene.cloud import SH_DEGREES
 from ...scene.errors import SceneError
-from ...scene.harmonics import rotate_sh
 from ...scene.io.formats.types import build_cloud
+from ...scene.spherical_harmonics import rotate_sh
 from ..options import ReconstructError
 
 

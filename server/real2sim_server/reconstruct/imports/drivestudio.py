@@ -16,11 +16,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, invert_transform, transform_from
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform, transform_from
 from ...scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ...scene.errors import SceneError
-from ...scene.harmonics import SH_C0
+from ...scene.spherical_harmonics import SH_C0
 from .checkpoint import (
     DIRECTIONS_WARNING,
     CheckpointError,

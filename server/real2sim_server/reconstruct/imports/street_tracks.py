@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform
 from ...scene.trajectory import leads_anywhere
 from .checkpoint import CheckpointError
 from .dataset_files import read_json

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform
 from ...logs import ObjectTrack
 from .pull_push import pull_push
 

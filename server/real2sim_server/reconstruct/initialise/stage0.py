@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import GaussianCloud, Scene, SceneObject, Sky
-from ...scene.harmonics import SH_C0
+from ...scene.spherical_harmonics import SH_C0
 from ..options import InitialiseOptions, ReconstructError
 from ..stages import OnProgress, Stages
 from .accumulate import Accumulation, accumulate, drive_path

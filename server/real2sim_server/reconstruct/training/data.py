@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.rotation import apply_transform
+from ...geometry.transform import apply_transform
 from ...logs import DrivingLog, LidarSweep
 from ...scene import Camera
 from ..options import ReconstructError

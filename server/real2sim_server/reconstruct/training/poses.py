@@ -9,13 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.rotation import (
-    Float,
-    multiply_quaternions,
-    quaternion_to_matrix,
-    transform_from,
-    yaw_quaternion,
-)
+from ...geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix, yaw_quaternion
+from ...geometry.transform import transform_from
 from ...scene import Scene, Trajectory
 from .losses import second_differences
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...logs import DrivingLog
 from ...render.backends import Backend
 from ...scene import Scene
-from ...scene.harmonics import SH_C0
+from ...scene.spherical_harmonics import SH_C0
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint

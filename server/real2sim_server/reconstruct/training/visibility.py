@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Sky
-from ...scene.harmonics import SH_C0
+from ...scene.spherical_harmonics import SH_C0
 from .densify import rearrange, rotations
 from .gaussians import Gaussians, joined
 from .model import SceneModel

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ...scene.spherical_harmonics import evaluate_sh
 from ..types import Instance, RenderOutput
 from .base import (
     ALPHA_MAX,
@@ -26,7 +27,6 @@ from .base import (
     with_colours,
 )
 from .screen import ScreenTracker, ScreenWatch
-from .spherical_harmonics import evaluate_sh
 
 TILE = 32
 

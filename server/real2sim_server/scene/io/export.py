@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..._files import atomic_file, atomic_folder
-from ...geometry.rotation import Float, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
 from ..cloud import GaussianCloud
 from ..errors import SceneError
 from ..scene import Scene, SceneObject

@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, invert_transform, matrix_to_quaternion
+from ...geometry.rotation import Float, matrix_to_quaternion
+from ...geometry.transform import invert_transform
 from ..camera import Camera
 from ..cloud import GaussianCloud
-from ..harmonics import SH_C0
 from ..scene import Scene, SceneObject
+from ..spherical_harmonics import SH_C0
 from ..trajectory import Trajectory
 from .formats.types import host_array
 from .glb import GlbWriter

@@ -17,7 +17,8 @@ from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, Materi
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import background_of, shadows_of
 from ...edit.ground import RecordedGround
-from ...geometry.rotation import Float, quaternion_to_matrix, transform_from
+from ...geometry.rotation import Float, quaternion_to_matrix
+from ...geometry.transform import transform_from
 from ...physics.colliders import Box, Collider, HeightField, Plane
 from ...physics.materials import (
     FixedCorotated,

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from ...edit.ground import RecordedGround
 from ...edit.shadow import shadow_under
-from ...geometry.rotation import Float, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...scene import Asset
 

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, apply_transform, invert_transform
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform
 from ...physics.colliders import Plane
 from ...physics.errors import PhysicsError
 from ...render import Instance, RasterOptions, render_cameras

@@ -18,7 +18,8 @@ import numpy as np
 
 from ...edit import ObjectState
 from ...edit.compose import cloud_of
-from ...geometry.rotation import Float, transform_from, yaw_quaternion
+from ...geometry.rotation import Float, yaw_quaternion
+from ...geometry.transform import transform_from
 from ...physics.colliders import Box
 from ...physics.errors import PhysicsError
 from ...render.types import Instance

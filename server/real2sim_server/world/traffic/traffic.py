@@ -25,7 +25,7 @@ from real2sim_proto.episode import (
 )
 
 from ...edit import ObjectState, ScenarioState
-from ...geometry.rotation import transform_from
+from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
 from ..errors import WorldError
 from ..path import Float

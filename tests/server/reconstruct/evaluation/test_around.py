@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.rotation import invert_transform
+from real2sim_server.geometry.transform import invert_transform
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
 from real2sim_server.reconstruct.evaluation.around import (
     HEIGHT,

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from real2sim_server.geometry.rotation import transform_from
+from real2sim_server.geometry.transform import transform_from
 from real2sim_server.reconstruct.evaluation.object_regions import moving_mask, moving_tracks
 from real2sim_server.reconstruct.evaluation.pictures import depth_image, error_image, object_crops
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.rotation import transform_from
+from real2sim_server.geometry.transform import transform_from
 from real2sim_server.reconstruct.initialise.ground import BoxBottoms, fit_ground, spread_ground
 from real2sim_server.reconstruct.initialise.pull_push import pull_push
 

@@ -18,7 +18,7 @@ from real2sim_server.reconstruct.training import (
 from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
 from real2sim_server.reconstruct.training.threads import one_torch_thread
-from real2sim_server.scene.harmonics import sh_basis
+from real2sim_server.scene.spherical_harmonics import sh_basis
 
 from .conftest import TINY
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from real2sim_proto import decode
 from real2sim_proto.drive import SERVER_MESSAGE, SensorSpec
-from real2sim_server.geometry.rotation import transform_from
+from real2sim_server.geometry.transform import transform_from
 from real2sim_server.scene import Camera
 from real2sim_server.service.rendering.renderer import Image
 from real2sim_server.service.sessions.wire import (

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float, invert_transform
+from ....geometry.rotation import Float
+from ....geometry.transform import invert_transform
 from ...driving_log import LogError
 from ..formats.tables import (
     check_frame_times,

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float, invert_transform
+from ....geometry.rotation import Float
+from ....geometry.transform import invert_transform
 from ....scene import Trajectory
 from ...driving_log import DrivingLog, LogError, ObjectTrack
 from ..box_tracks import Box, build_tracks, upright_pose

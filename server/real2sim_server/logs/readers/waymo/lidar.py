@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float, apply_transform, invert_transform
+from ....geometry.rotation import Float
+from ....geometry.transform import apply_transform, invert_transform
 from ...driving_log import LidarSweep, LogError
 
 TOP = 1

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ....geometry.rotation import Float, invert_transform
+from ....geometry.rotation import Float
+from ....geometry.transform import invert_transform
 from ....scene import Camera, CameraRig, Trajectory
 from ....scene.camera import T_VEHICLE_OPTICAL
 from ...driving_log import DrivingLog, FrameSource, LogError

@@ -12,7 +12,7 @@ import numpy as np
 from ...._files import atomic_file
 from ...cloud import GaussianCloud
 from ...errors import BundleError
-from ...harmonics import SH_C0
+from ...spherical_harmonics import SH_C0
 from .types import build_cloud, host_array
 
 RECORD = np.dtype(

@@ -53,7 +53,7 @@ class InriaPly:
             quats=columns(path, vertex, ROTATION),
             log_scales=columns(path, vertex, SCALE),
             opacities=opacities,
-            sh=_harmonics(path, vertex),
+            sh=_spherical_harmonics(path, vertex),
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
@@ -99,7 +99,7 @@ def _rest_names(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def _harmonics(path: Path, vertex: NDArray[np.void]) -> NDArray[np.float64]:
+def _spherical_harmonics(path: Path, vertex: NDArray[np.void]) -> NDArray[np.float64]:
     """Coefficients [N, K, 3]; the file holds those past the first channel by channel."""
     given = [name for name in vertex.dtype.names or () if name.startswith("f_rest_")]
     names = _rest_names(len(given))

@@ -17,7 +17,7 @@ from ...._files import atomic_file
 from ....geometry.rotation import Float
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
-from ...harmonics import SH_C0
+from ...spherical_harmonics import SH_C0
 from ..ply import read_ply_elements
 from .morton import morton_order
 from .types import build_cloud, columns, host_array, require_properties

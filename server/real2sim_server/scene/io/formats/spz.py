@@ -71,7 +71,7 @@ class Spz:
             quats=_rotations(header, streams),
             log_scales=streams.scales.reshape(-1, 3) / 16.0 - 10,
             opacities=streams.alphas / 255.0,
-            sh=_harmonics(header, streams),
+            sh=_spherical_harmonics(header, streams),
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
@@ -133,7 +133,7 @@ def _other_places(place: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array([[k for k in range(4) if k != p] for p in range(4)])[place]
 
 
-def _harmonics(header: Header, streams: Streams) -> Float:
+def _spherical_harmonics(header: Header, streams: Streams) -> Float:
     first = (streams.colours.reshape(-1, 1, 3) / 255.0 - 0.5) / COLOUR_SCALE
     rest = streams.sh.reshape(header.count, (header.sh_degree + 1) ** 2 - 1, 3)
     return np.concatenate([first, (rest[:, :MAX_REST] - 128.0) / 128], axis=1)
