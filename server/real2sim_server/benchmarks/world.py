@@ -44,7 +44,7 @@ CASES: Mapping[str, Mapping[str, Any]] = {
 }
 """What is reset to; where nothing is said, a kinematic car among 18 objects that repeat the log."""
 
-HALVES = ("move", "judge", "observe")
+HALVES = ("move", "evaluate", "observe")
 EPISODES, EPISODES_UNCOMPILED = 5, 1
 
 
@@ -82,14 +82,14 @@ def _episode(scene: Scene, spec: ResetSpec) -> Iterator[tuple[float, float, floa
     world = World(scene, ScenarioState.of(scene), spec)
     while not world.over:
         plan = TrajectoryPlan.model_validate(straight_on(world.t_us))
-        world = world.light_copy()
+        world = world.fork()
         begun = time.perf_counter()
         world.move(plan)
         moved = time.perf_counter()
-        world.judge()
-        judged = time.perf_counter()
+        world.evaluate()
+        evaluated = time.perf_counter()
         world.observe()
-        yield moved - begun, judged - moved, time.perf_counter() - judged
+        yield moved - begun, evaluated - moved, time.perf_counter() - evaluated
 
 
 def _uncompiled() -> Figures:

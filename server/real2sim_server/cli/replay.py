@@ -94,7 +94,7 @@ def _replay_factory(
 
     def start() -> Replayer:
         try:
-            return recording.fresh(scene, library.find if library else None)
+            return recording.replayer(scene, library.find if library else None)
         except EditError as error:
             hint = "name the folder of the worker's asset library with --assets"
             raise CommandError(f"{error}; {hint}") from error

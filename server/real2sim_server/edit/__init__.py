@@ -1,13 +1,13 @@
 """Edits: typed operations onto objects, and scenarios as append-only logs of them."""
 
-from .apply import EditOutcome, advance, apply_operations
+from .apply import EditOutcome, apply_operations, replay_operations
 from .compose import cloud_of, compose, instances_at
 from .errors import EditError
-from .ground_inpainting import vacated
+from .ground_inpainting import vacated_parking
 from .scenario import LogEntry, Planned, Scenario
 from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
-from .tracks import PackedTracks, Placed
+from .tracks import PackedTracks, PlacedObjects
 from .validation import GroundHeight
 
 __all__ = [
@@ -19,16 +19,16 @@ __all__ = [
     "LogEntry",
     "ObjectState",
     "PackedTracks",
-    "Placed",
+    "PlacedObjects",
     "Planned",
     "Scenario",
     "ScenarioState",
-    "advance",
     "apply_operations",
     "cloud_of",
     "compose",
     "instances_at",
     "pack_state",
+    "replay_operations",
     "unpack_state",
-    "vacated",
+    "vacated_parking",
 ]

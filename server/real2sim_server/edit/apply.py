@@ -32,10 +32,10 @@ from real2sim_proto.scenarios import EditWarning
 from ..scene import SceneError
 from . import lifecycle as presence
 from . import motion, properties
-from .change import Change, existing
+from .change import AppliedOperation, require_object
 from .errors import EditError
 from .state import ScenarioState
-from .validation import GroundHeight, review
+from .validation import GroundHeight, validate_edit
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def apply_operations(
         EditError: UNKNOWN_OBJECT, UNKNOWN_ASSET or INVALID_OPERATION, naming the place in the
             batch.
     """
-    changes: list[Change] = []
+    changes: list[AppliedOperation] = []
     after = state
     for index, operation in enumerate(operations):
         change = _apply_one(after, operation, index)
@@ -81,18 +81,18 @@ def apply_operations(
         state=after,
         created=tuple(c.created for c in changes if c.created is not None),
         inverse=tuple(c.inverse for c in reversed(changes)),
-        warnings=tuple(review(after, tuple(touched), ground=ground or after.ground)),
+        warnings=tuple(validate_edit(after, tuple(touched), ground=ground or after.ground)),
     )
 
 
-def advance(state: ScenarioState, operations: Sequence[Operation]) -> ScenarioState:
+def replay_operations(state: ScenarioState, operations: Sequence[Operation]) -> ScenarioState:
     """The state of :func:`apply_operations` alone, for replaying a log. Raises like it."""
     for index, operation in enumerate(operations):
         state = _apply_one(state, operation, index).state
     return state
 
 
-def _apply_one(state: ScenarioState, operation: Operation, index: int) -> Change:
+def _apply_one(state: ScenarioState, operation: Operation, index: int) -> AppliedOperation:
     try:
         return _change(state, operation)
     except EditError as error:
@@ -110,7 +110,7 @@ def _named(operation: Operation) -> str:
 
 def _change(  # noqa: PLR0911, one per kind
     state: ScenarioState, operation: Operation
-) -> Change:
+) -> AppliedOperation:
     match operation:
         case Insert():
             return presence.insert(state, operation)
@@ -144,8 +144,8 @@ ObjectOperation = (
 
 def _change_object(  # noqa: PLR0911, one per kind
     state: ScenarioState, operation: ObjectOperation
-) -> Change:
-    subject = existing(state, operation.object_id)
+) -> AppliedOperation:
+    subject = require_object(state, operation.object_id)
     match operation:
         case Translate():
             return motion.translate(state, subject, operation)
@@ -162,7 +162,7 @@ def _change_object(  # noqa: PLR0911, one per kind
         case Duplicate():
             return presence.duplicate(state, subject, operation)
         case Replace():
-            return presence.replace_look(state, subject, operation)
+            return presence.replace_appearance(state, subject, operation)
         case SetPhysics():
             return properties.set_physics(state, subject, operation)
         case SetVelocity():

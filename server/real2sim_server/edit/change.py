@@ -18,7 +18,7 @@ MAX_ID_LENGTH = 80
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class AppliedOperation:
     """One operation's doing.
 
     Attributes:
@@ -34,17 +34,19 @@ class Change:
     created: str | None = None
 
 
-def changed(state: ScenarioState, subject: ObjectState, inverse: Operation) -> Change:
+def object_changed(
+    state: ScenarioState, subject: ObjectState, inverse: Operation
+) -> AppliedOperation:
     """The change that puts ``subject`` in the place of the object of its id."""
-    return Change(state.with_object(subject), inverse, touched=subject.object_id)
+    return AppliedOperation(state.with_object(subject), inverse, touched=subject.object_id)
 
 
-def refused(message: str, *, hint: str | None = None) -> EditError:
+def invalid_operation(message: str, *, hint: str | None = None) -> EditError:
     """An INVALID_OPERATION."""
     return EditError(ErrorCode.INVALID_OPERATION, message, hint=hint)
 
 
-def existing(state: ScenarioState, object_id: str) -> ObjectState:
+def require_object(state: ScenarioState, object_id: str) -> ObjectState:
     """The object of that id. Raises EditError: UNKNOWN_OBJECT, or INVALID_OPERATION if deleted."""
     found = state.objects.get(object_id)
     if found is None:
@@ -55,7 +57,7 @@ def existing(state: ScenarioState, object_id: str) -> ObjectState:
             hint=f"objects of this scenario: {known}",
         )
     if found.deleted:
-        raise refused(
+        raise invalid_operation(
             f"object {object_id!r} is deleted",
             hint=f"bring it back with restore of {object_id!r} first",
         )
@@ -74,7 +76,7 @@ def new_id(state: ScenarioState, wanted: str | None, stem: str) -> str:
                 wanted in state.objects and state.objects[wanted].deleted
             )
             deleted = " (deleted; its id stays reserved)" if gone else ""
-            raise refused(
+            raise invalid_operation(
                 f"the id {wanted!r} is taken{deleted}",
                 hint="give another id, or none to get the next free one",
             )
@@ -83,7 +85,7 @@ def new_id(state: ScenarioState, wanted: str | None, stem: str) -> str:
     while state.knows(free := f"{stem}{n}"):
         n += 1
     if len(free) > MAX_ID_LENGTH:
-        raise refused(
+        raise invalid_operation(
             f"the new id {free!r} would be longer than {MAX_ID_LENGTH} characters",
             hint="give a shorter new_id",
         )

@@ -18,10 +18,10 @@ from ..geometry.transform import invert_transform, transform_from
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene
 from .ground import RecordedGround
-from .ground_inpainting import uncovered, vacated
-from .shadow import shadow_under
+from .ground_inpainting import inpaint_ground, vacated_parking
+from .shadow import contact_shadow
 from .state import ObjectState, ScenarioState
-from .tracks import Placed
+from .tracks import PlacedObjects
 
 T = TypeVar("T")
 
@@ -48,19 +48,19 @@ def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance
 def compose(
     scene: Scene,
     state: ScenarioState,
-    placed: Placed[ObjectState],
+    placed: PlacedObjects[ObjectState],
     t_us: int,
 ) -> list[Instance]:
     """The same for objects that are ``placed`` already, wherever. Raises like
     :func:`instances_at`."""
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
-    instances = [Instance(background_of(scene, state, poses))]
+    instances = [Instance(composed_background(scene, state, poses))]
     edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         instances.append(_standing(scene, subject, transform, t_us))
         if subject.placed:
             edited.append((subject, transform))
-    return instances + shadows_of(scene, edited, t_us)
+    return instances + contact_shadows(scene, edited, t_us)
 
 
 def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> Instance:
@@ -71,14 +71,14 @@ def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -
     return Instance(source.cloud, *placement, colour=source.colour, t_us=t_us)
 
 
-def shadows_of(
+def contact_shadows(
     scene: Scene, placed: Iterable[tuple[ObjectState, Float]], t_us: int
 ) -> list[Instance]:
     """Soft shadows under the objects (each with its ``T_world_object``) that are not where the
     recording, and so their shadow in the background, has them at ``t_us``."""
     ground = _kept(scene, "ground", lambda: _ground(scene))
     shadows = [
-        shadow_under(transform, subject.scaled_size, ground, device=scene.background.device)
+        contact_shadow(transform, subject.scaled_size, ground, device=scene.background.device)
         for subject, transform in placed
         if not _as_recorded(scene, subject, transform, t_us)
     ]
@@ -96,16 +96,18 @@ def cloud_of(scene: Scene, subject: ObjectState, t_us: int) -> GaussianCloud:
     return scene.object(subject.source_id).cloud_at(t_us)
 
 
-def background_of(scene: Scene, state: ScenarioState, poses: Mapping[str, Float]) -> GaussianCloud:
+def composed_background(
+    scene: Scene, state: ScenarioState, poses: Mapping[str, Float]
+) -> GaussianCloud:
     """The background with all Gaussians in erased regions made invisible, and with plain ground
     where parked objects stood that ``poses`` (``T_world_object`` [4, 4] by id) have elsewhere; the
     rest is shared."""
-    erased, left = state.erased, vacated(state, poses)
+    erased, left = state.erased, vacated_parking(state, poses)
     if not erased and not left:
         return scene.background
 
     def make() -> GaussianCloud:
-        background = uncovered(scene, scene.background, left) if left else scene.background
+        background = inpaint_ground(scene, scene.background, left) if left else scene.background
         return _hidden(background, erased) if erased else background
 
     return _kept(scene, (erased, left), make)

@@ -38,7 +38,7 @@ LOW = 0.25
 NEIGHBOURS = 6
 
 
-def vacated(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
+def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
     """Ids of recorded objects that were parked and are not at their places.
 
     Args:
@@ -59,7 +59,7 @@ def vacated(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]
     )
 
 
-def uncovered(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
+def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
     """The background with the ground coloured like that around it where objects ``left`` stood.
 
     Gaussians inside a box and above its ground become invisible: they belonged to the object.

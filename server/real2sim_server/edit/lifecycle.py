@@ -10,19 +10,26 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Delete, Duplicate, Insert, Replace, Restore
 
 from ..scene.scene import MAX_OBJECTS
-from .change import Change, changed, existing, new_id, refused, trajectory_of
+from .change import (
+    AppliedOperation,
+    invalid_operation,
+    new_id,
+    object_changed,
+    require_object,
+    trajectory_of,
+)
 from .errors import EditError
-from .motion import rescaled, shifted, snapped, standing
+from .motion import rescaled, shifted, snap_to_ground, stationary_track
 from .state import AssetSource, ObjectState, ScenarioState
 
 
-def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) -> Change:
+def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) -> AppliedOperation:
     """Add a copy, shifted."""
     _require_room(state)
     shift = (operation.x, operation.y, operation.z)
     trajectory = shifted(subject.trajectory, shift, operation.frame)
     if operation.snap:
-        trajectory = snapped(trajectory, subject.scaled_size, state.ground)
+        trajectory = snap_to_ground(trajectory, subject.scaled_size, state.ground)
     copy = replace(
         subject,
         object_id=new_id(state, operation.new_id, f"{subject.object_id}_copy"),
@@ -33,7 +40,7 @@ def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) 
     return _added(state, copy)
 
 
-def insert(state: ScenarioState, operation: Insert) -> Change:
+def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
     """Add an object that shows an asset."""
     _require_room(state)
     asset = _asset(state, operation.asset_id)
@@ -41,7 +48,7 @@ def insert(state: ScenarioState, operation: Insert) -> Change:
         track = operation.trajectory
     else:
         assert operation.pose is not None  # the model has one of the two
-        track = standing(operation.pose, state.time_range)
+        track = stationary_track(operation.pose, state.time_range)
     added = ObjectState(
         object_id=new_id(state, operation.object_id, f"{operation.asset_id}_"),
         source_id="",
@@ -56,12 +63,14 @@ def insert(state: ScenarioState, operation: Insert) -> Change:
     if operation.size is not None:
         added = rescaled(added, _fitting(operation.size, asset.size), keep_bottom=False)
     if operation.snap:
-        on_ground = snapped(added.trajectory, added.scaled_size, state.ground)
+        on_ground = snap_to_ground(added.trajectory, added.scaled_size, state.ground)
         added = replace(added, trajectory=on_ground)
     return _added(state, added)
 
 
-def replace_look(state: ScenarioState, subject: ObjectState, operation: Replace) -> Change:
+def replace_appearance(
+    state: ScenarioState, subject: ObjectState, operation: Replace
+) -> AppliedOperation:
     """Show something else in the box; the centre of its bottom stays where it is."""
     look = _look(state, operation)
     box = operation.size or subject.scaled_size
@@ -85,34 +94,34 @@ def replace_look(state: ScenarioState, subject: ObjectState, operation: Replace)
         recorded_id=None if subject.asset else subject.source_id,
         size=old_size,
     )
-    return changed(state, dressed, inverse)
+    return object_changed(state, dressed, inverse)
 
 
-def delete(state: ScenarioState, operation: Delete) -> Change:
+def delete(state: ScenarioState, operation: Delete) -> AppliedOperation:
     """Leave a tombstone."""
     thing, inverse = operation.object_id, Restore(object_id=operation.object_id)
     if thing in state.regions or thing in state.colliders:
         if thing in state.gone:
-            raise refused(f"{thing!r} is deleted already", hint="leave the delete out")
-        return Change(replace(state, gone=state.gone | {thing}), inverse)
-    return changed(state, replace(existing(state, thing), deleted=True), inverse)
+            raise invalid_operation(f"{thing!r} is deleted already", hint="leave the delete out")
+        return AppliedOperation(replace(state, gone=state.gone | {thing}), inverse)
+    return object_changed(state, replace(require_object(state, thing), deleted=True), inverse)
 
 
-def restore(state: ScenarioState, operation: Restore) -> Change:
+def restore(state: ScenarioState, operation: Restore) -> AppliedOperation:
     """Take a tombstone away."""
     thing, inverse = operation.object_id, Delete(object_id=operation.object_id)
     if thing in state.gone:
-        return Change(replace(state, gone=state.gone - {thing}), inverse)
+        return AppliedOperation(replace(state, gone=state.gone - {thing}), inverse)
     found = state.objects.get(thing)
     if found is None and not state.knows(thing):
-        existing(state, thing)
+        require_object(state, thing)
     if found is None or not found.deleted:
-        raise refused(f"{thing!r} is not deleted", hint="leave the restore out")
-    return changed(state, replace(found, deleted=False), inverse)
+        raise invalid_operation(f"{thing!r} is not deleted", hint="leave the restore out")
+    return object_changed(state, replace(found, deleted=False), inverse)
 
 
-def _added(state: ScenarioState, added: ObjectState) -> Change:
-    return Change(
+def _added(state: ScenarioState, added: ObjectState) -> AppliedOperation:
+    return AppliedOperation(
         state.with_object(added),
         Delete(object_id=added.object_id),
         touched=added.object_id,
@@ -122,7 +131,7 @@ def _added(state: ScenarioState, added: ObjectState) -> Change:
 
 def _require_room(state: ScenarioState) -> None:
     if state.next_instance_id > MAX_OBJECTS:
-        raise refused(
+        raise invalid_operation(
             f"the scenario has {len(state.objects)} objects, deleted ones included, the most "
             "that instance images can tell apart",
             hint="start from a new scenario",

@@ -25,7 +25,7 @@ GAIN_RANGE = (0.5, 2.0)
 LUMA = (0.2126, 0.7152, 0.0722)
 
 
-def ambient_of(scene: Scene) -> Colour:
+def ambient_colour(scene: Scene) -> Colour:
     """Mean colour of the street around the ego's path, each Gaussian by the area it shows."""
     cloud = scene.background
     path = torch.from_numpy(scene.ego.positions).to(cloud.means)
@@ -51,7 +51,7 @@ def mean_colour(cloud: GaussianCloud) -> Colour | None:
     return (red, green, blue)
 
 
-def gain_into(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
+def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
     """Factors on the colours of an asset that bring it into the light of ``scene``.
 
     Where the light is known that the asset was seen in, they are the ratio of the two ambient
@@ -60,10 +60,10 @@ def gain_into(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Col
     Args:
         scene: where the asset is put.
         cloud: of the asset.
-        ambient: see :func:`ambient_of`, of where the asset was cut out.
+        ambient: see :func:`ambient_colour`, of where the asset was cut out.
     """
     if ambient is not None:
-        here = ambient_of(scene)
+        here = ambient_colour(scene)
         red, green, blue = (_bounded(h / max(a, 1e-3)) for h, a in zip(here, ambient, strict=True))
         return (red, green, blue)
     own = mean_colour(cloud)
@@ -75,7 +75,7 @@ def gain_into(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Col
     return (factor, factor, factor)
 
 
-def lit(cloud: GaussianCloud, gain: Colour) -> GaussianCloud:
+def relit(cloud: GaussianCloud, gain: Colour) -> GaussianCloud:
     """The cloud with its colours multiplied by ``gain``; itself where that is 1."""
     if gain == (1.0, 1.0, 1.0):
         return cloud

@@ -23,7 +23,7 @@ from real2sim_proto.operations import (
 from ..geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix
 from ..geometry.transform import transform_from
 from ..scene import Trajectory
-from .change import Change, changed, refused, trajectory_of, wire_track
+from .change import AppliedOperation, invalid_operation, object_changed, trajectory_of, wire_track
 from .ground import RecordedGround, bottoms_of
 from .state import ObjectState, ScenarioState
 from .tracks import sample_poses
@@ -40,7 +40,7 @@ BLEND_STEP_US = 50_000
 """Spacing of the poses in which an edit grows or fades."""
 
 
-def translate(state: ScenarioState, subject: ObjectState, operation: Translate) -> Change:
+def translate(state: ScenarioState, subject: ObjectState, operation: Translate) -> AppliedOperation:
     """Shift it, at all times or in a time range."""
     shift = (operation.x, operation.y, operation.z)
     track, weights = _weighted(subject.trajectory, operation.time_range)
@@ -51,7 +51,7 @@ def translate(state: ScenarioState, subject: ObjectState, operation: Translate) 
     return _follow(state, subject, moved, snap=operation.snap)
 
 
-def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> Change:
+def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> AppliedOperation:
     """Turn it about its own centre, at all times or in a time range."""
     axis = np.array(operation.axis) / np.linalg.norm(operation.axis)
     track, weights = _weighted(subject.trajectory, operation.time_range)
@@ -68,7 +68,7 @@ def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> Cha
     return _follow(state, subject, turned, snap=operation.snap)
 
 
-def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> Change:
+def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> AppliedOperation:
     """Multiply its size; what the anchor names stays where it is."""
     factors = (operation.x, operation.y, operation.z)
     a, b, c = subject.scale
@@ -78,32 +78,34 @@ def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> Chang
         keep_bottom=operation.anchor == "bottom",
     )
     inverse = operation.model_copy(update={k: 1 / v for k, v in zip("xyz", factors, strict=True)})
-    return changed(state, scaled, inverse)
+    return object_changed(state, scaled, inverse)
 
 
-def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> Change:
+def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> AppliedOperation:
     """Let it stand for the whole time range of the scene."""
-    stood = trajectory_of(standing(operation.pose, state.time_range))
+    stood = trajectory_of(stationary_track(operation.pose, state.time_range))
     return _follow(state, subject, stood, snap=operation.snap)
 
 
-def set_trajectory(state: ScenarioState, subject: ObjectState, operation: SetTrajectory) -> Change:
+def set_trajectory(
+    state: ScenarioState, subject: ObjectState, operation: SetTrajectory
+) -> AppliedOperation:
     """Let it follow a trajectory."""
     return _follow(state, subject, trajectory_of(operation.trajectory), snap=operation.snap)
 
 
-def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> Change:
+def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> AppliedOperation:
     """Let it do the same at other times."""
     old = subject.trajectory
     since = (old.times_us - old.start_us).astype(np.float64) / operation.speed
     times = old.start_us + operation.delay_us + np.rint(since).astype(np.int64)
     if (np.diff(times) <= 0).any():
-        raise refused(
+        raise invalid_operation(
             f"at {operation.speed:g} times the speed, poses would fall on the same microsecond",
             hint="choose a lower speed",
         )
     if max(abs(int(times[0])), abs(int(times[-1]))) > MAX_TIME_US:
-        raise refused(
+        raise invalid_operation(
             f"the object would move from {times[0]} to {times[-1]} us, beyond what can be stored",
             hint="choose a smaller delay_us or a higher speed",
         )
@@ -113,7 +115,7 @@ def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> Cha
 # --- parts that placing and replacing need too -------------------------------------------------
 
 
-def standing(pose: Pose, time_range: tuple[int, int]) -> Track:
+def stationary_track(pose: Pose, time_range: tuple[int, int]) -> Track:
     """The trajectory of what stands for the whole time range."""
     times = sorted(set(time_range))
     return Track(
@@ -123,7 +125,7 @@ def standing(pose: Pose, time_range: tuple[int, int]) -> Track:
     )
 
 
-def snapped(
+def snap_to_ground(
     trajectory: Trajectory, size: tuple[float, float, float], ground: RecordedGround
 ) -> Trajectory:
     """The trajectory with the bottoms of its boxes on the ground."""
@@ -153,7 +155,7 @@ def shifted(
         offset = weights[:, None] * offset
     positions = trajectory.positions + offset
     if np.abs(positions).max() > MAX_COORDINATE:
-        raise refused(
+        raise invalid_operation(
             f"the object would be {np.abs(positions).max():.6g} m away from the origin; "
             f"{MAX_COORDINATE:g} m is allowed",
             hint="shift it by less",
@@ -171,7 +173,7 @@ def rescaled(
     """
     lowest, highest = SCALE_RANGE
     if min(scale) < lowest or max(scale) > highest:
-        raise refused(
+        raise invalid_operation(
             f"scalings together would be {scale}; {lowest:g} to {highest:g} is allowed",
             hint="scale by factors nearer to 1",
         )
@@ -189,17 +191,17 @@ def rescaled(
 
 def _follow(
     state: ScenarioState, subject: ObjectState, trajectory: Trajectory, *, snap: bool = False
-) -> Change:
+) -> AppliedOperation:
     inverse = SetTrajectory(object_id=subject.object_id, trajectory=wire_track(subject.trajectory))
     if snap:
-        trajectory = snapped(trajectory, subject.scaled_size, state.ground)
+        trajectory = snap_to_ground(trajectory, subject.scaled_size, state.ground)
     return _moved(state, subject, trajectory, inverse)
 
 
 def _moved(
     state: ScenarioState, subject: ObjectState, trajectory: Trajectory, inverse: Operation
-) -> Change:
-    return changed(state, replace(subject, trajectory=trajectory, placed=True), inverse)
+) -> AppliedOperation:
+    return object_changed(state, replace(subject, trajectory=trajectory, placed=True), inverse)
 
 
 def _weighted(

@@ -14,55 +14,59 @@ from real2sim_proto.operations import (
     SetVelocity,
 )
 
-from .change import Change, changed, new_id, refused
+from .change import AppliedOperation, invalid_operation, new_id, object_changed
 from .state import ObjectState, ScenarioState
 
 
-def set_physics(state: ScenarioState, subject: ObjectState, operation: SetPhysics) -> Change:
+def set_physics(
+    state: ScenarioState, subject: ObjectState, operation: SetPhysics
+) -> AppliedOperation:
     """Say what an object is; defaults for what is left out."""
     inverse = subject.physics or SetPhysics(object_id=subject.object_id)
-    return changed(
+    return object_changed(
         state,
         replace(subject, physics=operation),
         inverse.model_copy(update={"object_id": subject.object_id}),
     )
 
 
-def set_velocity(state: ScenarioState, subject: ObjectState, operation: SetVelocity) -> Change:
+def set_velocity(
+    state: ScenarioState, subject: ObjectState, operation: SetVelocity
+) -> AppliedOperation:
     """Say how fast an object enters the physics."""
     inverse = subject.velocity or SetVelocity(object_id=subject.object_id)
-    return changed(
+    return object_changed(
         state,
         replace(subject, velocity=operation),
         inverse.model_copy(update={"object_id": subject.object_id}),
     )
 
 
-def erase_region(state: ScenarioState, operation: EraseRegion) -> Change:
+def erase_region(state: ScenarioState, operation: EraseRegion) -> AppliedOperation:
     """Hide what the background shows in a box."""
     region_id = new_id(state, operation.region_id, "region_")
     named = operation.model_copy(update={"region_id": region_id})
     regions = MappingProxyType(dict(state.regions) | {region_id: named})
     after = replace(state, regions=regions)
-    return Change(after, Delete(object_id=region_id), created=region_id)
+    return AppliedOperation(after, Delete(object_id=region_id), created=region_id)
 
 
-def add_collider(state: ScenarioState, operation: AddCollider) -> Change:
+def add_collider(state: ScenarioState, operation: AddCollider) -> AppliedOperation:
     """Add what does not yield."""
     collider_id = new_id(state, operation.collider_id, "collider_")
     named = operation.model_copy(update={"collider_id": collider_id})
     colliders = MappingProxyType(dict(state.colliders) | {collider_id: named})
     after = replace(state, colliders=colliders)
-    return Change(after, Delete(object_id=collider_id), created=collider_id)
+    return AppliedOperation(after, Delete(object_id=collider_id), created=collider_id)
 
 
-def set_time(state: ScenarioState, operation: SetTime) -> Change:
+def set_time(state: ScenarioState, operation: SetTime) -> AppliedOperation:
     """Set the span in which the scenario plays."""
     first, last = state.time_range
     start = first if operation.start_us is None else operation.start_us
     end = last if operation.end_us is None else operation.end_us
     if not first <= start < end <= last and (start, end) != (first, last):
-        raise refused(
+        raise invalid_operation(
             f"the scenario would play from {start} to {end} us; the recording has {first} to "
             f"{last} us",
             hint="choose start_us before end_us, both within the recording",
@@ -70,4 +74,4 @@ def set_time(state: ScenarioState, operation: SetTime) -> Change:
     inverse = SetTime(start_us=state.clock[0], end_us=state.clock[1])
     if state.clock[0] >= state.clock[1]:
         inverse = SetTime()
-    return Change(replace(state, clock=(start, end)), inverse)
+    return AppliedOperation(replace(state, clock=(start, end)), inverse)

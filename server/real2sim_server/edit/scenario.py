@@ -11,7 +11,7 @@ from typing import Literal
 from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation
 
-from .apply import EditOutcome, advance, apply_operations
+from .apply import EditOutcome, apply_operations, replay_operations
 from .errors import EditError
 from .state import ScenarioState
 from .validation import GroundHeight
@@ -259,7 +259,7 @@ class Scenario:
         nearest = max(n for n in self._states if n <= count)
         state = self._states[nearest]
         for n, edit in enumerate(self._done[nearest:count], nearest + 1):
-            state = advance(state, edit.operations)
+            state = replay_operations(state, edit.operations)
             if n > count - KEPT_STATES:
                 self._keep(n, state)
         return state

@@ -37,7 +37,7 @@ CELLS = (20, 12)
 COLOUR = (0.02, 0.02, 0.025)
 
 
-def shadow_under(
+def contact_shadow(
     T_world_object: Float,
     size: tuple[float, float, float],
     ground: RecordedGround,

@@ -17,7 +17,7 @@ from .track_kernels import KNOT, poses_at
 Float = NDArray[np.float64]
 
 
-class Tracked(Protocol):
+class HasTrajectory(Protocol):
     """Anything with a trajectory and a box."""
 
     @property
@@ -26,11 +26,11 @@ class Tracked(Protocol):
     def scaled_size(self) -> tuple[float, float, float]: ...  # noqa: D102
 
 
-T = TypeVar("T", bound=Tracked)
+T = TypeVar("T", bound=HasTrajectory)
 
 
 @dataclass(frozen=True, eq=False)
-class Placed(Generic[T]):
+class PlacedObjects(Generic[T]):
     """The K objects that exist at one instant.
 
     Attributes:
@@ -75,7 +75,7 @@ class PackedTracks(Generic[T]):
         quaternions = self._knots[:, 3:7]
         self._knots[:-1, 10] = (quaternions[1:] != quaternions[:-1]).any(axis=1)
 
-    def at(self, t_us: int) -> Placed[T]:
+    def at(self, t_us: int) -> PlacedObjects[T]:
         """Objects whose trajectory covers ``t_us``; poses and velocities as Trajectory has them."""
         known, positions, quaternions, velocities, transforms = poses_at(
             t_us, self._ends, self._times, self._knots
@@ -83,7 +83,7 @@ class PackedTracks(Generic[T]):
         objects, sizes = self.objects, self.sizes
         if len(known) < len(objects):
             objects, sizes = tuple([objects[i] for i in known.tolist()]), sizes[known]
-        return Placed(
+        return PlacedObjects(
             objects=objects,
             sizes=sizes,
             positions=positions,

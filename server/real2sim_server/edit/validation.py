@@ -34,7 +34,7 @@ REMEMBERED = 512
 """Objects whose sampled trajectories are kept, 26 kB each at most."""
 
 
-def review(
+def validate_edit(
     state: ScenarioState, touched: Sequence[str], *, ground: GroundHeight | None = None
 ) -> Iterator[EditWarning]:
     """Warnings about the objects ``touched``, looked at every 0.1 s of their trajectories.

@@ -212,7 +212,7 @@ class _StillCapture:
 
 
 def _figures(summary: EpisodeSummary | None, recording: Recording) -> dict[str, Any]:
-    instants, last = recording.instants, recording.tallies()[-1]
+    instants, last = recording.instants, recording.accumulators()[-1]
     stages = summary.stages if summary else {}
     return {
         "steps": len(instants) - 1,

@@ -71,7 +71,7 @@ def film_episode(
 
 def _instants(recording: Recording, replayer: Replayer) -> Iterator[World]:
     for entry in recording.entries:
-        world = replayer.tell(entry)
+        world = replayer.apply(entry)
         if entry.kind in {"reset", "action", "restore"}:
             yield world
 

@@ -83,14 +83,14 @@ def plot_paths(results: Sequence[EpisodeResult], policies: Sequence[str]) -> byt
 
 
 def _series(recording: Recording) -> tuple[Array, tuple[Array, Array, Array, Array]]:
-    instants, tallies = recording.instants, recording.tallies()
+    instants, accumulators = recording.instants, recording.accumulators()
     times = np.array([(i.t_us - instants[0].t_us) * 1e-6 for i in instants])
-    ttc = np.array([min(tally.ttc, TTC_SHOWN) for tally in tallies])
+    ttc = np.array([min(accumulator.ttc, TTC_SHOWN) for accumulator in accumulators])
     return times, (
         np.array([i.ego.speed for i in instants]),
         ttc,
         np.array([i.ego.offset for i in instants]),
-        np.array([tally.s - recording.context.start_s for tally in tallies]),
+        np.array([accumulator.s - recording.context.start_s for accumulator in accumulators]),
     )
 
 

@@ -1,8 +1,8 @@
-"""The closed loop: the only room in which time passes."""
+"""The closed loop: the only package in which time passes."""
 
 from .agents import Agents, agent_fields
 from .ego.controller import Plan
-from .ego.vehicle import Motion
+from .ego.motion import Motion
 from .errors import WorldError
 from .events import Event
 from .ground import LoggedGround

@@ -1,12 +1,12 @@
-"""Other road users that repeat what was recorded, or what an edit made of it."""
+"""Poses of all objects at one instant."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from ..edit import ObjectState, Placed
+from ..edit import ObjectState, PlacedObjects
 
-Agents = Placed[ObjectState]
+Agents = PlacedObjects[ObjectState]
 """Where all objects are at one instant."""
 
 

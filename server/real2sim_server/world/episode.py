@@ -12,7 +12,7 @@ from .errors import WorldError
 
 
 @dataclass(frozen=True)
-class Clock:
+class EpisodeClock:
     """Times of an episode.
 
     Attributes:
@@ -30,7 +30,7 @@ class Clock:
         return self.start_us + step * self.dt_us
 
 
-def plan_episode(scene: Scene, spec: ResetSpec) -> Clock:
+def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     """The clock of an episode on ``scene``.
 
     Raises:
@@ -52,7 +52,7 @@ def plan_episode(scene: Scene, spec: ResetSpec) -> Clock:
     return clock
 
 
-def takes_effect_us(spec: ResetSpec, clock: Clock, t_us: int, latency_us: int) -> int:
+def takes_effect_us(spec: ResetSpec, clock: EpisodeClock, t_us: int, latency_us: int) -> int:
     """When a plan that comes at ``t_us`` takes effect [us]: after its latency and the warm-up.
 
     Args:
@@ -70,7 +70,7 @@ def takes_effect_us(spec: ResetSpec, clock: Clock, t_us: int, latency_us: int) -
     return max(t_us + wait_us, clock.start_us + spec.warmup_us)
 
 
-def _clock(scene: Scene, spec: ResetSpec) -> Clock:
+def _clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     start = scene.start_us if spec.start_us is None else spec.start_us
     latest = scene.end_us - spec.dt_us
     if not scene.start_us <= start <= latest:
@@ -97,7 +97,7 @@ def _clock(scene: Scene, spec: ResetSpec) -> Clock:
             f"are left of the log after {start}",
             hint=f"ask for {longest} steps at most, or leave horizon out",
         )
-    return Clock(start, spec.dt_us, spec.horizon or longest)
+    return EpisodeClock(start, spec.dt_us, spec.horizon or longest)
 
 
 def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:

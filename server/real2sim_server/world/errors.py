@@ -1,4 +1,4 @@
-"""Errors of the world room."""
+"""Errors of the world package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the scores are given of a world."""
+"""What the metrics get of a world: the context of an episode, and samples of an instant."""
 
 from __future__ import annotations
 
@@ -11,51 +11,51 @@ from real2sim_proto.episode import ResetSpec
 from ..edit.tracks import sample
 from ..scene import Scene
 from .agents import Agents
-from .collision.contact import REAR_OVERHANG
-from .collision.contact_kernels import headings
+from .broad_phase_kernels import headings
 from .collision.step_contacts import StepContacts
+from .ego.box import REAR_OVERHANG
+from .ego.motion import Motion, logged_motion
 from .ego.reference import PlannedTrajectory
-from .ego.vehicle import Motion, logged_motion
-from .episode import Clock
+from .episode import EpisodeClock
 from .events import Event
 from .path import LoggedPath, PathPoint
-from .scoring import EgoSample, Others, ScoringContext
-from .scoring.comfort import window_of
+from .scoring import EgoSample, ObjectSamples, ScoringContext
+from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES
 
 
 class PendingStep(NamedTuple):
-    """A step that has been made and not judged yet.
+    """A step that has been made and not evaluated yet.
 
     Attributes:
-        course: given to the ego; None where there was no new trajectory.
+        plan: new trajectory of the ego; None where there was none.
         events: that led to it.
-        left: by its impacts; None where bodies pass through each other.
+        contacts: of its impacts; None where bodies pass through each other.
     """
 
-    course: PlannedTrajectory | None
+    plan: PlannedTrajectory | None
     events: tuple[Event, ...]
-    left: StepContacts | None
+    contacts: StepContacts | None
 
 
-LANE_WAY = 5.0
+LANE_LENGTH = 5.0
 """Recorded vehicles that moved less than this show no lane [m]."""
 
 
 def scoring_context(
-    scene: Scene, spec: ResetSpec, clock: Clock, path: LoggedPath, start_s: float
+    scene: Scene, spec: ResetSpec, clock: EpisodeClock, path: LoggedPath, start_s: float
 ) -> ScoringContext:
     """What stays the same over an episode on ``scene``."""
     times = clock.start_us + clock.dt_us * np.arange(clock.horizon + 1)
     transforms, _ = sample(scene.ego, np.minimum(times, scene.end_us))
-    near, expert = start_s, []
+    s, expert = start_s, []
     for x, y in transforms[:, :2, 3].tolist():
-        near = path.nearest(x, y, near_s=near).s
-        expert.append(near)
+        s = path.nearest(x, y, near_s=s).s
+        expert.append(s)
     lanes = tuple(
         o.trajectory.positions[:, :2]
         for o in scene.objects.values()
-        if o.category in VEHICLES and o.trajectory.extent > LANE_WAY
+        if o.category in VEHICLES and o.trajectory.extent > LANE_LENGTH
     )
     return ScoringContext(
         dt=clock.dt_us * 1e-6,
@@ -75,9 +75,9 @@ def scoring_context(
     )
 
 
-def _history(scene: Scene, spec: ResetSpec, clock: Clock) -> tuple[tuple[float, float], ...]:
+def _history(scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> tuple[tuple[float, float], ...]:
     """Speed and yaw of the log at the clock steps before the start, as far as it goes back."""
-    window = window_of(clock.dt_us * 1e-6) - 1
+    window = comfort_window(clock.dt_us * 1e-6) - 1
     times = [clock.start_us - clock.dt_us * k for k in range(window, 0, -1)]
     motions = [logged_motion(scene.ego, t, spec.ego) for t in times if t >= scene.start_us]
     yaws = np.unwrap([m.yaw for m in motions]).tolist() if motions else []
@@ -102,9 +102,9 @@ def ego_sample(motion: Motion, near: PathPoint, z: float) -> EgoSample:
     )
 
 
-def others_of(agents: Agents) -> Others:
+def object_samples(agents: Agents) -> ObjectSamples:
     """Objects for the scores."""
-    return Others(
+    return ObjectSamples(
         ids=tuple([o.object_id for o in agents.objects]),
         categories=tuple([o.category for o in agents.objects]),
         centres=agents.positions,

@@ -23,8 +23,8 @@ class Event:
     """Something that happened; the fields of the wire's Event.
 
     Data of a ``collision``: ``relative_speed`` [m/s] and ``at_fault`` (0 or 1), and where momentum
-    is exchanged what :class:`~.impact.Impact` says; ``object_id`` is None for the background,
-    ``other_id`` the second object where the ego had no part. Of ``left_log`` and
+    is exchanged :meth:`.collision.impact.Impact.event_data`; ``object_id`` is None for the
+    background, ``other_id`` the second object where the ego had no part. Of ``left_log`` and
     ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
     """
 

@@ -1,4 +1,4 @@
-"""What is perceived at one committed instant, apart from images."""
+"""The observation of one committed instant, apart from images."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from .agents import Agents, agent_fields
+from .ego.motion import Motion
 from .ego.route import Command
-from .ego.vehicle import Motion
 from .events import Event
 from .path import Float
 
@@ -26,7 +26,7 @@ class Observation:
         route: [20, 2] float64, the recorded way ahead in the vehicle frame [m].
         agents: all objects, or None where the episode is not privileged.
         events: of the step that led here.
-        metrics: see :func:`~.scoring.running`.
+        metrics: see :func:`~.scoring.running_metrics`.
         terminated, truncated, reason: how the episode ended, if it did.
         warming_up: whether the ego still moves as recorded.
     """

@@ -1,4 +1,4 @@
-"""What a world compiles, made before anybody waits for a step."""
+"""Compiles the kernels of a step and of an edit before the first request."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from real2sim_proto.plans import TrajectoryPlan
 
 from ..edit import ScenarioState
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
-from .ego.reference import PlannedTrajectory, Reference
+from .ego.reference import PlannedTrajectory, ReferenceTrajectory
 from .ego.trackers import make_tracker
 from .world import World
 
 PERIOD_US = 100_000
 STEPS = 20
-"""More than fill the window in which comfort is judged."""
+"""More than fill the window of the comfort metrics."""
 
 
 def warm_up() -> None:
@@ -39,10 +39,10 @@ def warm_up() -> None:
         poses = [(x + 0.1 * k, y, yaw) for k in range(1, 11)]
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
-    # What only perfect tracking and vehicles that were pushed call.
+    # What only perfect tracking and sliding vehicles call.
     ego = EgoSpec(tracker="perfect")
-    course = PlannedTrajectory.of([PERIOD_US], [(1.0, 0.0, 0.0)], (0.0, 0.0, 0.0))
-    ahead = Reference(world.motion, start_us=0, course=course, spec=ego)
+    trajectory = PlannedTrajectory.of([PERIOD_US], [(1.0, 0.0, 0.0)], (0.0, 0.0, 0.0))
+    ahead = ReferenceTrajectory(world.motion, start_us=0, trajectory=trajectory, spec=ego)
     tracker = make_tracker(ahead, ego)
     tracker.command(tracker.advance(world.motion, 0.0, PERIOD_US // 2), 0.0)
     # An edit that brings the cars near each other, for only then their boxes are compared.

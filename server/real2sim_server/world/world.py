@@ -16,26 +16,26 @@ from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
 from .agents import Agents
-from .collision.contacts import Contacts, Moved
-from .collision.deformation import DeformationTracker
-from .collision.model import Deformation, Impact
-from .collision.obstacles import obstacles_of
-from .collision.step_contacts import StepContacts, after_impacts, after_overlaps
-from .ego.controller import EgoController, Plan, braking
+from .collision.contact_state import ContactState, StepMotion
+from .collision.deformation import Deformation, DeformationTracker
+from .collision.impact import Impact
+from .collision.obstacles import obstacle_grid
+from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
+from .ego.controller import EgoController, Plan, emergency_brake
+from .ego.motion import logged_motion
 from .ego.reference import PlannedTrajectory
 from .ego.route import command_ahead, route_ahead
-from .ego.vehicle import logged_motion
-from .episode import plan_episode, takes_effect_us
+from .episode import episode_clock, takes_effect_us
 from .errors import WorldError
-from .evaluation import PendingStep, ego_sample, others_of, scoring_context
+from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
 from .ground import LoggedGround
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
 from .scoring import Instant, MetricAccumulator, Score
-from .traffic import EgoSeen, Surroundings, Traffic
+from .traffic import ObservedEgo, Surroundings, Traffic
 
-LEFT_LOG = 10.0
+OFF_ROUTE_DISTANCE = 10.0
 """Beyond this distance from the recorded path an event says so [m]; images get poor there."""
 
 
@@ -43,7 +43,7 @@ class World:
     """A scene in which time passes, one step at a time.
 
     Same scene, state, spec, operations and plans: the same observations, bit for bit. A step
-    replaces what it changes and never writes into it, so that :meth:`light_copy` is cheap.
+    replaces what it changes and never writes into it, so that :meth:`fork` is cheap.
 
     Attributes:
         scene: shared, immutable.
@@ -53,12 +53,12 @@ class World:
         revision: edits of this session so far.
         motion: planar state of the ego.
         T_world_vehicle: [4, 4] float64, the ego standing on the ground.
-        traffic: who drives the other objects.
+        traffic: drivers and poses of the other objects.
         ground: height of the ground, usable for edits too.
-        tally: what the scores are made of.
-        instant: the last committed one, as the scores see it.
+        accumulator: what the scores are made of.
+        instant: the last committed one, as the scores get it.
         impacts: of the last step.
-        deformation: dents struck objects; None where nothing can be.
+        deformation: of objects after impacts; None where there is none.
         terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
             ``deadline``, ``wall_clock``.
     """
@@ -75,7 +75,7 @@ class World:
         """The world at step 0: the ego as it was recorded at the start time, on the ground.
 
         Raises:
-            WorldError: the episode cannot run as asked; see :func:`~.episode.plan_episode`.
+            WorldError: the episode cannot run as asked; see :func:`~.episode.episode_clock`.
         """
         self.scene = scene
         self.state = state
@@ -86,34 +86,26 @@ class World:
         self.terminated = False
         self.truncated = False
         self.reason: str | None = None
-        self._clock = plan_episode(scene, spec)
+        self._clock = episode_clock(scene, spec)
         self._path = LoggedPath(scene.ego)
         self.ground = LoggedGround(self._path)
         self.motion = logged_motion(scene.ego, self.t_us, spec.ego)
-        self._near: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
-        self.T_world_vehicle: Float = self._standing()
-        self._pilot = EgoController(spec, scene.ego)
-        obstacles = obstacles_of(scene, self._path) if spec.contact.background else None
-        seen = self._seen(state.tracks.at(self.t_us))
-        self.traffic = Traffic.begin(state, spec.agents, seen)
-        self._left_log = self._off_road = False
-        self._contacts = Contacts.begin(
-            spec,
-            scene.ego_size,
-            obstacles=obstacles,
-            T_world_vehicle=self.T_world_vehicle,
-            motion=self.motion,
-            agents=self.agents,
-        )
-        if deformation is None and self._contacts.physical and spec.contact.dents:
+        self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
+        self.T_world_vehicle: Float = self._ego_pose()
+        self._controller = EgoController(spec, scene.ego)
+        surroundings = self._surroundings(state.tracks.at(self.t_us))
+        self.traffic = Traffic.begin(state, spec.agents, surroundings)
+        self._off_route = self._off_road = False
+        self._contacts = self._initial_contacts()
+        if deformation is None and self._contacts.exchanges_momentum and spec.contact.dents:
             self.deformation = DeformationTracker(scene)
         self.impacts: tuple[Impact, ...] = ()
         self._events: tuple[Event, ...] = ()
-        self._edits: tuple[Event, ...] = ()
-        self._moved: PendingStep | None = None
-        self._context = scoring_context(scene, spec, self._clock, self._path, self._near.s)
+        self._edit_events: tuple[Event, ...] = ()
+        self._pending: PendingStep | None = None
+        self._context = scoring_context(scene, spec, self._clock, self._path, self._path_point.s)
         self.instant = self._instant(StepContacts())
-        self.tally: MetricAccumulator = scoring.begin(self.instant, self._context)
+        self.accumulator: MetricAccumulator = scoring.begin_accumulator(self.instant, self._context)
 
     @property
     def t_us(self) -> int:
@@ -132,8 +124,8 @@ class World:
 
     @property
     def agents(self) -> Agents:
-        """Where all objects are now."""
-        return self.traffic.placed
+        """Poses of all objects now."""
+        return self.traffic.agents
 
     @property
     def warming_up(self) -> bool:
@@ -148,13 +140,13 @@ class World:
     def step(
         self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False
     ) -> list[Event]:
-        """Move the clock by one ``dt_us`` as :meth:`move` does; what happened, also part of the
-        next observation."""
+        """Move the clock by one ``dt_us`` and evaluate the step, see :meth:`move` and
+        :meth:`evaluate`; its events, also part of the next observation."""
         self.move(plan, latency_us=latency_us, missed=missed)
-        return self.judge()
+        return self.evaluate()
 
     def move(self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False) -> None:
-        """The first half of a step: all that images show. Let :meth:`judge` follow.
+        """The first half of a step: all that images show. Let :meth:`evaluate` follow.
 
         Order: edits made since the last step are in effect, then ego, objects, contact.
 
@@ -168,33 +160,32 @@ class World:
                 named or with times that are over; the world is as before.
         """
         self._check_running()
-        pilot = self._told(plan, latency_us)
-        given = pilot.coming[-1].course if plan is not None else None
-        late = [Event("deadline_missed", self.t_us)] if missed else []
-        if missed and self.spec.on_timeout == "brake":
-            fallback = braking(pilot, self.motion, self.spec.ego)
-            pilot = replace(pilot, controller=fallback, since_us=self.t_us, coming=())
-        reacted = self._reacted()
+        controller = self._with_plan(plan, latency_us)
+        trajectory = controller.pending[-1].trajectory if plan is not None else None
+        controller, late_events = self._with_fallback(controller, missed=missed)
+        reaction_events = self._let_agents_react()
         before = self.agents
-        impacts = self._move(pilot)
-        self._near = self._path.nearest(self.motion.x, self.motion.y, near_s=self._near.s)
-        self.T_world_vehicle = self._standing()
-        left = None if impacts is None else self._struck(impacts, before)
-        self.impacts = impacts or ()
-        self._moved = PendingStep(given, (*self._edits, *late, *reacted), left)
-        self._edits = ()
+        moved = self._advance(controller)
+        self._commit_motion(moved)
+        contacts = self._apply_impacts(moved.impacts, before)
+        events = (*self._edit_events, *late_events, *reaction_events)
+        self._pending = PendingStep(trajectory, events, contacts)
+        self._edit_events = ()
 
-    def judge(self) -> list[Event]:
-        """The second half, if it is still to come: scores, and what happened. All that images
+    def evaluate(self) -> list[Event]:
+        """The second half, if it is still pending: contacts, scores and events. All that images
         show stays as it is, so they may be drawn meanwhile."""
-        if self._moved is not None:
-            given, events, left = self._moved
-            self._moved = None
-            left = self._overlapped() if left is None else left
-            self._contacts = replace(self._contacts, touching=left.touching)
-            self.instant = self._instant(left, given)
-            self.tally = scoring.after(self.tally, self.instant, self._context)
-            self._events = (*events, *left.events, *self._strayed(), *self._ended())
+        if self._pending is not None:
+            plan, events, contacts = self._pending
+            self._pending = None
+            contacts = self._overlap_contacts() if contacts is None else contacts
+            self._contacts = replace(self._contacts, touching=contacts.touching)
+            self.instant = self._instant(contacts, plan)
+            self.accumulator = scoring.update_accumulator(
+                self.accumulator, self.instant, self._context
+            )
+            departures, end = self._departure_events(), self._horizon_events()
+            self._events = (*events, *contacts.events, *departures, *end)
         return list(self._events)
 
     def stop(self, reason: str) -> None:
@@ -204,7 +195,7 @@ class World:
         self.truncated, self.reason = True, reason
         self._events = (*self._events, Event("stopped", self.t_us))
 
-    def steer(
+    def set_agent_plan(
         self, object_id: str, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
     ) -> None:
         """Give an externally driven object a plan, from the next step on.
@@ -218,7 +209,7 @@ class World:
             WorldError: EPISODE_OVER or INVALID_ACTION; nothing changed.
         """
         self._check_running()
-        self.traffic = self.traffic.told(object_id, self.t_us, times_us, poses)
+        self.traffic = self.traffic.with_plan(object_id, self.t_us, times_us, poses)
 
     def apply(
         self, operations: Sequence[Operation], *, base_revision: int | None = None
@@ -243,15 +234,17 @@ class World:
             )
         outcome = apply_operations(self.state, operations, ground=self.ground)
         self.state = outcome.state
-        self.traffic = self.traffic.edited(self.state, self._seen(self.state.tracks.at(self.t_us)))
+        self.traffic = self.traffic.edited(
+            self.state, self._surroundings(self.state.tracks.at(self.t_us))
+        )
         self.revision += 1
         edited = Event("edited", self.t_us, data={"revision": float(self.revision)})
-        self._edits = (*self._edits, edited)
+        self._edit_events = (*self._edit_events, edited)
         return outcome
 
     def observe(self) -> Observation:
         """What the policy gets at this instant, apart from images."""
-        motion, s = self.motion, self._near.s
+        motion, s = self.motion, self._path_point.s
         return Observation(
             step=self.steps,
             t_us=self.t_us,
@@ -271,12 +264,12 @@ class World:
         )
 
     def metrics(self) -> dict[str, float]:
-        """Scores so far, see :func:`~.scoring.running`."""
-        return scoring.running(self.tally, self._context)
+        """Scores so far, see :func:`~.scoring.running_metrics`."""
+        return scoring.running_metrics(self.accumulator, self._context)
 
     def scores(self) -> list[Score]:
         """All scores so far, with terms and versions."""
-        return scoring.scores_of(self.tally, self._context)
+        return scoring.scores_of(self.accumulator, self._context)
 
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
@@ -284,7 +277,9 @@ class World:
         if self.deformation is not None:
             # Background first, then the objects, then shadows.
             for k, subject in enumerate(self.agents.objects, start=1):
-                drawn[k] = self.deformation.shown(subject.object_id, drawn[k], self.t_us)
+                drawn[k] = self.deformation.deformed_instance(
+                    subject.object_id, drawn[k], self.t_us
+                )
         return drawn
 
     def due_sensors(self) -> list[SensorSpec]:
@@ -292,11 +287,11 @@ class World:
         elapsed = self.steps * self._clock.dt_us
         return [s for s in self.spec.sensors if elapsed % (s.period_us or self._clock.dt_us) == 0]
 
-    def light_copy(self) -> World:
+    def fork(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""
         return copy.copy(self)
 
-    # --- one step ---------------------------------------------------------------------------
+    # --- phases of a step -------------------------------------------------------------------
 
     def _check_running(self) -> None:
         if self.over:
@@ -306,47 +301,25 @@ class World:
                 hint="reset the session to start another",
             )
 
-    def _told(self, plan: Plan | None, latency_us: int) -> EgoController:
+    def _with_plan(self, plan: Plan | None, latency_us: int) -> EgoController:
+        """The controller with a plan of the policy, which takes effect after its latency."""
         if plan is None:
-            return self._pilot
+            return self._controller
         from_us = takes_effect_us(self.spec, self._clock, self.t_us, latency_us)
-        return self._pilot.told(plan, self.motion, self.t_us, from_us)
+        return self._controller.with_plan(plan, self.motion, self.t_us, from_us)
 
-    def _move(self, pilot: EgoController) -> tuple[Impact, ...] | None:
-        """Ego and objects one step on; impacts, or None where bodies pass through each other."""
-        motion, t_us, before = self.motion, self.t_us, self.agents
-        end_us = t_us + self._clock.dt_us
-        traffic = self.traffic.advance(self.state, end_us, lambda: self._seen(before))
-        self.steps += 1
-        if self.t_us <= self._clock.start_us + self.spec.warmup_us:
-            recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
-            moved = Moved(pilot, recorded, traffic, self._contacts, None)
-        else:
-            moved = self._contacts.move(
-                pilot, motion, before, traffic, t_us=t_us, height=self._height
-            )
-        self._pilot, after, self.traffic, self._contacts, impacts = moved
-        acceleration = (after.speed - motion.speed) / (self._clock.dt_us * 1e-6)
-        self.motion = after._replace(acceleration=acceleration)
-        return impacts
+    def _with_fallback(
+        self, controller: EgoController, *, missed: bool
+    ) -> tuple[EgoController, list[Event]]:
+        """The controller of a step whose planner was late."""
+        if not missed:
+            return controller, []
+        if self.spec.on_timeout == "brake":
+            brake = emergency_brake(controller, self.motion, self.spec.ego)
+            controller = replace(controller, controller=brake, since_us=self.t_us, pending=())
+        return controller, [Event("deadline_missed", self.t_us)]
 
-    def _struck(self, impacts: tuple[Impact, ...], before: Agents) -> StepContacts:
-        """What the impacts of the step leave, dents among it."""
-        if self.deformation is not None:
-            subjects = {o.object_id: o for o in self.agents.objects}
-            for impact in impacts:
-                self.deformation = self.deformation.struck(impact, subjects)
-        return after_impacts(impacts, self.t_us, touched=self._contacts.touching, before=before)
-
-    def _overlapped(self) -> StepContacts:
-        """What overlaps leave where bodies pass through each other."""
-        met = self._contacts.met(self.T_world_vehicle, self.motion, self.agents)
-        left = after_overlaps(met, self.t_us)
-        if left.events and self.spec.on_collision == "terminate":
-            self.terminated, self.reason = True, "collision"
-        return left
-
-    def _reacted(self) -> list[Event]:
+    def _let_agents_react(self) -> list[Event]:
         """Objects stop repeating the log once the ego is too far from where it was recorded."""
         agents = self.spec.agents
         if agents.ego_off_log == "replay" or self.traffic.reacting:
@@ -355,21 +328,70 @@ class World:
         distance = math.hypot(self.motion.x - x, self.motion.y - y)
         if distance <= agents.off_log_distance:
             return []
-        self.traffic = self.traffic.react(self.state, self._seen(self.agents))
+        surroundings = self._surroundings(self.agents)
+        self.traffic = self.traffic.with_reacting_agents(self.state, surroundings)
         return [Event("agents_react", self.t_us, data={"distance": distance})]
 
-    def _strayed(self) -> list[Event]:
+    def _advance(self, controller: EgoController) -> StepMotion:
+        """Objects, then the ego, one clock step on from this instant."""
+        t_us, before = self.t_us, self.agents
+        end_us = t_us + self._clock.dt_us
+        traffic = self.traffic.advance(self.state, end_us, lambda: self._surroundings(before))
+        if end_us <= self._clock.start_us + self.spec.warmup_us:
+            recorded = logged_motion(self.scene.ego, end_us, self.spec.ego)
+            return StepMotion(controller, recorded, traffic, self._contacts, None)
+        return self._contacts.advance(
+            controller, self.motion, before, traffic, t_us=t_us, height=self._height
+        )
+
+    def _commit_motion(self, moved: StepMotion) -> None:
+        """The step is made: clock, ego, objects and contacts are those at its end."""
+        seconds = self._clock.dt_us * 1e-6
+        acceleration = (moved.motion.speed - self.motion.speed) / seconds
+        self.steps += 1
+        self._controller, self.traffic = moved.controller, moved.traffic
+        self._contacts, self.impacts = moved.contacts, moved.impacts or ()
+        self.motion = moved.motion._replace(acceleration=acceleration)
+        self._path_point = self._path.nearest(
+            self.motion.x, self.motion.y, near_s=self._path_point.s
+        )
+        self.T_world_vehicle = self._ego_pose()
+
+    def _apply_impacts(
+        self, impacts: tuple[Impact, ...] | None, before: Agents
+    ) -> StepContacts | None:
+        """Contacts of the impacts, which deform objects; None where bodies pass through each
+        other."""
+        if impacts is None:
+            return None
+        if self.deformation is not None and impacts:
+            subjects = {o.object_id: o for o in self.agents.objects}
+            for impact in impacts:
+                self.deformation = self.deformation.with_impact(impact, subjects)
+        touching = self._contacts.touching
+        return contacts_of_impacts(impacts, self.t_us, touching=touching, before=before)
+
+    def _overlap_contacts(self) -> StepContacts:
+        """Contacts where bodies pass through each other; the first may end the episode."""
+        found = self._contacts.ego_contacts(self.T_world_vehicle, self.motion, self.agents)
+        contacts = contacts_of_overlaps(found, self.t_us)
+        if contacts.events and self.spec.on_collision == "terminate":
+            self.terminated, self.reason = True, "collision"
+        return contacts
+
+    def _departure_events(self) -> list[Event]:
+        """The ego leaves the surroundings of the recorded path, or the road."""
         events = []
-        distance = math.dist(self._near.position[:2], (self.motion.x, self.motion.y))
-        was_off, self._left_log = self._left_log, distance > LEFT_LOG
-        if self._left_log and not was_off:
+        distance = math.dist(self._path_point.position[:2], (self.motion.x, self.motion.y))
+        was_off_route, self._off_route = self._off_route, distance > OFF_ROUTE_DISTANCE
+        if self._off_route and not was_off_route:
             events.append(Event("left_log", self.t_us, data={"distance": distance}))
-        if self.tally.off_road and not self._off_road:
+        if self.accumulator.off_road and not self._off_road:
             events.append(Event("off_road", self.t_us, data={"distance": distance}))
-        self._off_road = self.tally.off_road
+        self._off_road = self.accumulator.off_road
         return events
 
-    def _ended(self) -> list[Event]:
+    def _horizon_events(self) -> list[Event]:
         if self.steps < self._clock.horizon:
             return []
         self.truncated = True
@@ -378,24 +400,37 @@ class World:
 
     # --- views of the instant ---------------------------------------------------------------
 
-    def _standing(self) -> Float:
-        return self.ground.stand(self.motion.x, self.motion.y, self.motion.yaw, self._near)
+    def _initial_contacts(self) -> ContactState:
+        background = self.spec.contact.background
+        return ContactState.begin(
+            self.spec,
+            self.scene.ego_size,
+            obstacles=obstacle_grid(self.scene, self._path) if background else None,
+            T_world_vehicle=self.T_world_vehicle,
+            motion=self.motion,
+            agents=self.agents,
+        )
+
+    def _ego_pose(self) -> Float:
+        motion = self.motion
+        return self.ground.stand(motion.x, motion.y, motion.yaw, self._path_point)
 
     def _height(self, x: float, y: float) -> float:
-        return self.ground.height(x, y, self._path.nearest(x, y, near_s=self._near.s))
+        return self.ground.height(x, y, self._path.nearest(x, y, near_s=self._path_point.s))
 
-    def _seen(self, others: Agents) -> Surroundings:
-        ego = EgoSeen.of(self.motion, self._near, self.scene.ego_size)
+    def _surroundings(self, others: Agents) -> Surroundings:
+        ego = ObservedEgo.of(self.motion, self._path_point, self.scene.ego_size)
         clock = self._clock
         return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
 
-    def _instant(self, left: StepContacts, plan: PlannedTrajectory | None = None) -> Instant:
+    def _instant(self, contacts: StepContacts, plan: PlannedTrajectory | None = None) -> Instant:
+        height = float(self.T_world_vehicle[2, 3])
         return Instant(
             step=self.steps,
             t_us=self.t_us,
-            ego=ego_sample(self.motion, self._near, float(self.T_world_vehicle[2, 3])),
-            others=others_of(self.agents),
-            contacts=left.notes,
-            secondary=left.secondary,
+            ego=ego_sample(self.motion, self._path_point, height),
+            others=object_samples(self.agents),
+            contacts=contacts.records,
+            secondary=contacts.secondary,
             plan=plan,
         )

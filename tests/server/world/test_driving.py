@@ -25,20 +25,20 @@ from real2sim_server.world.driving import (
     PURSUIT,
     Command,
     PlanarState,
-    asked_of,
+    advance_vehicle,
     curve_at,
-    driven,
+    driver_command,
     plan_curve,
-    vehicle_of,
+    vehicle_parameters,
 )
-from real2sim_server.world.driving.curve import Curve
+from real2sim_server.world.driving.curve import PlanCurve
 from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS, scheduled
 from real2sim_server.world.driving.lqr import HEADWAY, TIME
 from real2sim_server.world.driving.tyres import integrate
-from real2sim_server.world.ego.vehicle import Motion
+from real2sim_server.world.ego.motion import Motion
 
-VEHICLE = vehicle_of(EgoSpec())
-SLIPPING = vehicle_of(EgoSpec(dynamics="dynamic_bicycle"))
+VEHICLE = vehicle_parameters(EgoSpec())
+SLIPPING = vehicle_parameters(EgoSpec(dynamics="dynamic_bicycle"))
 SECOND = 1_000_000
 NOTHING = np.empty((0, 2))
 seeds = st.integers(0, 10_000)
@@ -180,7 +180,7 @@ def test_the_regulator_has_the_gains_of_the_riccati_equation():
     def response(**change: float) -> np.ndarray:
         at = {"x": speed, "speed": speed}
         moved = state_of(**{**at, **{k: at.get(k, 0.0) + v for k, v in change.items()}})
-        acceleration, steering = asked_of(tuple(moved), driver, tuple(VEHICLE))
+        acceleration, steering = driver_command(tuple(moved), driver, tuple(VEHICLE))
         return np.array([acceleration, math.tan(steering) / VEHICLE.wheelbase]) / off
 
     along = gains(TIME)[0]
@@ -198,7 +198,7 @@ def test_pursuit_steers_the_arc_through_a_place_of_the_plan(offset, ahead):
     knots, turn_rate = straight_plan(speed)
     state = state_of(x=speed * ahead, y=offset, speed=speed)
     driver = (PURSUIT, knots, turn_rate, ahead, (0.0, 0.0))
-    _, steering = asked_of(tuple(state), driver, tuple(VEHICLE))
+    _, steering = driver_command(tuple(state), driver, tuple(VEHICLE))
 
     curvature = math.tan(steering) / VEHICLE.wheelbase
     aim = 0.4 * speed
@@ -225,7 +225,7 @@ def cost_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> float
 def test_ilqr_finds_the_commands_that_a_general_optimiser_finds(y, speed):
     start = state_of(x=3.0, y=y, speed=speed)
     knots, turn_rate = straight_plan(10.0)
-    states, inputs = scheduled(start, Curve(knots, turn_rate), 0.3, VEHICLE)
+    states, inputs = scheduled(start, PlanCurve(knots, turn_rate), 0.3, VEHICLE)
     wanted = np.zeros((STEPS + 1, 5))
     wanted[:, 0], wanted[:, 3] = 10.0 * (0.3 + STEP * np.arange(STEPS + 1)), 10.0
 
@@ -253,12 +253,12 @@ def some_drives() -> list[list[float]]:
         for dynamics in ("kinematic_bicycle", "dynamic_bicycle"):
             for actuators in ({}, delays):
                 spec = EgoSpec(dynamics=dynamics, actuators=actuators)
-                vehicle = tuple(vehicle_of(spec))
+                vehicle = tuple(vehicle_parameters(spec))
                 state, pending = tuple(state_of(speed=8.0, y=0.5)), NOTHING
                 curve = plan_curve(state, *_at_zero(some_plan(rng, 10)), vehicle)
                 for k in range(5):
                     driver = (kind, *curve, 0.1 * k, (0.0, 0.0))
-                    state, pending = driven(state, pending, driver, vehicle, 100_000)
+                    state, pending = advance_vehicle(state, pending, driver, vehicle, 100_000)
                 found.append([*state, *pending.ravel().tolist()])
     return found
 

@@ -11,12 +11,12 @@ import torch
 from real2sim_proto.operations import SetPhysics
 from real2sim_proto.plans import Control
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.world.collision.body import Body, Solid, integrate_sliding
-from real2sim_server.world.collision.manifold import corners, exchange, touch
+from real2sim_server.world.collision.manifold import contact_impulse, contact_manifold, corners
+from real2sim_server.world.collision.rigid_body import BodyProperties, BodyState, integrate_sliding
 
 COAST = Control(acceleration=0.0, steering=0.0)
 GO_ON = {"action": "control", "on_collision": "continue", "privileged": True}
-CAR = Solid(mass=1500.0, inertia=2500.0, length=4.5, width=1.8)
+CAR = BodyProperties(mass=1500.0, inertia=2500.0, length=4.5, width=1.8)
 MASS = 1500.0
 
 
@@ -36,7 +36,7 @@ def drive_until_contact(world, limit: int = 60) -> list:
 # --- the planar impact ------------------------------------------------------------------------
 
 
-def momentum(*pairs: tuple[Body, Solid]) -> np.ndarray:
+def momentum(*pairs: tuple[BodyState, BodyProperties]) -> np.ndarray:
     """Linear [N s] and angular momentum about the origin [N m s]."""
     total = np.zeros(3)
     for body, solid in pairs:
@@ -45,9 +45,9 @@ def momentum(*pairs: tuple[Body, Solid]) -> np.ndarray:
     return total
 
 
-def after_impact(a: Body, b: Body, **options) -> tuple[Body, Body]:
-    where = touch(corners(a, CAR), corners(b, CAR))
-    given = exchange((a, CAR), (b, CAR), where, **options)
+def after_impact(a: BodyState, b: BodyState, **options) -> tuple[BodyState, BodyState]:
+    where = contact_manifold(corners(a, CAR), corners(b, CAR))
+    given = contact_impulse((a, CAR), (b, CAR), where, **options)
     return (
         a.pushed(CAR, where.x, where.y, given.jx, given.jy),
         b.pushed(CAR, where.x, where.y, -given.jx, -given.jy),
@@ -55,10 +55,10 @@ def after_impact(a: Body, b: Body, **options) -> tuple[Body, Body]:
 
 
 PAIRS = [
-    (Body(0, 0, 0, 10, 0, 0), Body(4.4, 0, 0, 0, 0, 0)),
-    (Body(0, 0.6, 0, 10, 0, 0), Body(4.4, 0, 0.1, 2, 0, 0)),
-    (Body(0, 0, 0, 12, 0, 0.2), Body(3.0, 0.5, 1.57, 0, -8, 0)),
-    (Body(0, 0, 0.3, 9, 4, 0), Body(3.9, 0.9, 2.9, -7, 1, 0)),
+    (BodyState(0, 0, 0, 10, 0, 0), BodyState(4.4, 0, 0, 0, 0, 0)),
+    (BodyState(0, 0.6, 0, 10, 0, 0), BodyState(4.4, 0, 0.1, 2, 0, 0)),
+    (BodyState(0, 0, 0, 12, 0, 0.2), BodyState(3.0, 0.5, 1.57, 0, -8, 0)),
+    (BodyState(0, 0, 0.3, 9, 4, 0), BodyState(3.9, 0.9, 2.9, -7, 1, 0)),
 ]
 
 
@@ -88,24 +88,30 @@ def test_an_impact_off_centre_turns_both():
 
 
 def test_bodies_that_part_exchange_nothing():
-    a, b = Body(0, 0, 0, 0, 0, 0), Body(4.4, 0, 0, 5, 0, 0)
-    where = touch(corners(a, CAR), corners(b, CAR))
-    assert exchange((a, CAR), (b, CAR), where, restitution=0.1, friction=0.5) is None
+    a, b = BodyState(0, 0, 0, 0, 0, 0), BodyState(4.4, 0, 0, 5, 0, 0)
+    where = contact_manifold(corners(a, CAR), corners(b, CAR))
+    assert contact_impulse((a, CAR), (b, CAR), where, restitution=0.1, friction=0.5) is None
 
 
 def test_boxes_that_are_apart_do_not_touch():
     assert (
-        touch(corners(Body(0, 0, 0, 0, 0, 0), CAR), corners(Body(4.6, 0, 0, 0, 0, 0), CAR)) is None
+        contact_manifold(
+            corners(BodyState(0, 0, 0, 0, 0, 0), CAR), corners(BodyState(4.6, 0, 0, 0, 0, 0), CAR)
+        )
+        is None
     )
-    turned = Body(0, 2.9, math.pi / 2, 0, 0, 0)
-    assert touch(corners(Body(0, 0, 0, 0, 0, 0), CAR), corners(turned, CAR)) is not None
+    turned = BodyState(0, 2.9, math.pi / 2, 0, 0, 0)
+    assert (
+        contact_manifold(corners(BodyState(0, 0, 0, 0, 0, 0), CAR), corners(turned, CAR))
+        is not None
+    )
 
 
 # --- sliding to rest --------------------------------------------------------------------------
 
 
 def test_a_body_without_wheels_slides_as_far_as_friction_says():
-    body, solid = Body(0, 0, 0, 10, 0, 0), Solid(80.0, 5.0, 0.5, 0.5, friction=0.7)
+    body, solid = BodyState(0, 0, 0, 10, 0, 0), BodyProperties(80.0, 5.0, 0.5, 0.5, friction=0.7)
     for _ in range(400):
         body = integrate_sliding(body, solid, 0.01)
     assert (body.vx, body.vy, body.turn) == (0.0, 0.0, 0.0)
@@ -113,8 +119,8 @@ def test_a_body_without_wheels_slides_as_far_as_friction_says():
 
 
 def test_a_car_slides_sideways_as_far_as_its_tyres_say():
-    solid = Solid(1500.0, 2500.0, 4.5, 1.8, axles=(1.35, 1.35), friction=0.8)
-    body = Body(0, 0, math.pi / 2, 8, 0, 0)
+    solid = BodyProperties(1500.0, 2500.0, 4.5, 1.8, axles=(1.35, 1.35), friction=0.8)
+    body = BodyState(0, 0, math.pi / 2, 8, 0, 0)
     for _ in range(400):
         body = integrate_sliding(body, solid, 0.01)
     assert body.vx == 0.0
@@ -123,8 +129,8 @@ def test_a_car_slides_sideways_as_far_as_its_tyres_say():
 
 
 def test_a_spinning_car_comes_to_rest():
-    solid = Solid(1500.0, 2500.0, 4.5, 1.8, axles=(1.35, 1.35), friction=0.8, drag=0.1)
-    body = Body(0, 0, 0, 8, 2, 3.0)
+    solid = BodyProperties(1500.0, 2500.0, 4.5, 1.8, axles=(1.35, 1.35), friction=0.8, drag=0.1)
+    body = BodyState(0, 0, 0, 8, 2, 3.0)
     energies = []
     for _ in range(2000):
         body = integrate_sliding(body, solid, 0.01)
@@ -273,7 +279,7 @@ def test_a_wall_of_the_background_is_hit(make_scene, on_collision):
     (event,) = events
     assert event.object_id is None
     assert world.motion.x == pytest.approx(25.0 - 3.65, abs=1.0)
-    assert world.tally.at_fault == {"object": 1}
+    assert world.accumulator.at_fault == {"object": 1}
     if on_collision == "continue":
         assert event.data["delta_v"] == pytest.approx(1.2 * event.data["approach_speed"], rel=0.1)
 

@@ -18,8 +18,7 @@ from real2sim_server.geometry import box_kernels
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.world import path_kernels, warm_up
-from real2sim_server.world.collision import contact_kernels
+from real2sim_server.world import broad_phase_kernels, path_kernels, warm_up
 from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.reference import PlannedTrajectory
 from real2sim_server.world.scoring import comfort_kernels, hazard_kernels, road_kernels
@@ -159,7 +158,7 @@ def test_all_boxes_that_overlap_are_within_reach(seed, count):
     transforms = transform_from(positions, rng.normal(size=(count, 4)))
     box = transform_from(rng.normal(size=3), rng.normal(size=4))
 
-    near = contact_kernels.within_reach(box, SIZE, transforms, sizes)
+    near = broad_phase_kernels.within_reach(box, SIZE, transforms, sizes)
     distances = np.linalg.norm(positions - box[:3, 3], axis=1)
     balls = (np.linalg.norm(sizes, axis=1) + np.linalg.norm(SIZE)) / 2
     np.testing.assert_array_equal(near, np.flatnonzero(distances < balls))
@@ -177,7 +176,7 @@ def test_boxes_that_overlap_soon_may_overlap(seed):
     box = transform_from(ahead, yaw_quaternion(ego[2]))
     meets = overlapping(box, transform_from(positions, quaternions), sizes)
 
-    may = contact_kernels.may_overlap(ego, SIZE, 0.1, positions, quaternions, velocities, sizes)
+    may = broad_phase_kernels.may_overlap(ego, SIZE, 0.1, positions, quaternions, velocities, sizes)
     assert may or not meets
 
 
@@ -185,15 +184,15 @@ def test_boxes_far_away_may_not_overlap():
     boxes = some_boxes(np.random.default_rng(0), 20, spread=3.0)
     boxes[0][:, 0] += 60.0
 
-    assert not contact_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *boxes)
+    assert not broad_phase_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *boxes)
     nobody = [b[:0] for b in boxes]
-    assert not contact_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
+    assert not broad_phase_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
 
 
 def test_headings_are_those_of_quaternions():
     quaternions = np.random.default_rng(0).normal(size=(50, 4))
 
-    found = contact_kernels.headings(quaternions)
+    found = broad_phase_kernels.headings(quaternions)
     np.testing.assert_allclose(found, quaternion_yaw(quaternions), atol=1e-12)
 
 
@@ -264,7 +263,7 @@ def test_the_first_meeting_is_that_of_boxes_moved_step_by_step(seed, everywhere)
     ego = (0.3, -0.2, float(rng.uniform(-4, 4)), 6.0, 0.2, -0.8)
 
     nobody = np.zeros(len(sizes), np.bool_)
-    found = hazard_kernels.first_meeting(ego, SIZE, 1.35, everywhere, others, nobody)
+    found = hazard_kernels.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
     assert found == first_meeting_by_sampling(ego, everywhere, others)
 
 
@@ -273,7 +272,7 @@ def test_objects_that_are_ignored_are_not_met():
     ego = (0.0, 0.0, 0.0, 5.0, 0.0, -0.5)
 
     found = [
-        hazard_kernels.first_meeting(ego, SIZE, 1.35, False, others, np.array([ignored]))
+        hazard_kernels.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
         for ignored in (False, True)
     ]
     assert found == [7, -1]
@@ -286,10 +285,10 @@ def test_objects_that_are_ignored_are_not_met():
 @given(seed=seeds, count=st.integers(0, 12), window=st.integers(1, 9))
 def test_windows_keep_the_last_values(seed, count, window):
     values = np.random.default_rng(seed).normal(size=(count, 2))
-    samples = comfort_kernels.slid(values, 3.0, 4.0, window)
+    samples = comfort_kernels.push_sample(values, 3.0, 4.0, window)
     np.testing.assert_array_equal(samples, np.vstack([values, [[3.0, 4.0]]])[-window:])
 
-    kept, total = comfort_kernels.summed(values[:, 0].copy(), 3.0, window)
+    kept, total = comfort_kernels.windowed_sum(values[:, 0].copy(), 3.0, window)
     np.testing.assert_array_equal(kept, np.append(values[:, 0], 3.0)[-window:])
     assert total == pytest.approx(kept.sum())
 
@@ -373,7 +372,7 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         box_kernels,
         track_kernels,
         path_kernels,
-        contact_kernels,
+        broad_phase_kernels,
         road_kernels,
         hazard_kernels,
         comfort_kernels,

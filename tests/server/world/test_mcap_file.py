@@ -85,7 +85,7 @@ def test_plans_contacts_scores_and_images_are_there(recording, messages):
     assert len(messages["/plan"][0][2]["poses"]) == 10
     contacts = [c[2]["object_id"] for c in messages["/contact"]]
     assert contacts == [c.object_id for i in recording.instants for c in i.contacts] != []
-    assert messages["/metrics"][-1][2]["collisions"] == recording.tallies()[-1].collisions > 0
+    assert messages["/metrics"][-1][2]["collisions"] == recording.accumulators()[-1].collisions > 0
     ((schema, log_time, told),) = messages["/camera/front/rgb"]
     assert (schema, told["format"]) == ("foxglove.CompressedImage", "jpeg")
     assert base64.b64decode(told["data"]) == PICTURE

@@ -10,7 +10,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Delete, Translate
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import ScenarioState
-from real2sim_server.edit.apply import advance
+from real2sim_server.edit.apply import replay_operations
 from real2sim_server.world.recording.recording import (
     RecordingError,
     first_difference,
@@ -103,20 +103,20 @@ def test_living_through_it_again_gives_the_same_bits(recording, scene):
 def test_an_episode_of_a_scenario_is_lived_through_from_the_file_alone(scene, tmp_path):
     moved = ScenarioState.of(scene)
     for operation in (Translate(object_id="other", x=3.0), Delete(object_id="parked")):
-        moved = advance(moved, [operation])
+        moved = replay_operations(moved, [operation])
     log = [e for e in entries(8) if e.kind in {"reset", "action"}][:9]
     made = record(
         Replayer.on(scene, moved), log, scene_hash="abc", scenario=("sc_1", 3), state=moved
     )
     loaded = load_recording(save_recording(made, tmp_path / "episode.r2e"))
-    assert first_difference(loaded, loaded.fresh(scene)) is None
+    assert first_difference(loaded, loaded.replayer(scene)) is None
     assert first_difference(loaded, fresh(scene)) == 0
 
 
 def test_old_files_of_scenarios_say_that_they_can_only_be_scored(recording, scene):
     assert recording.state is None
     with pytest.raises(RecordingError, match="'sc_1' at revision 3, which is not in the file"):
-        recording.fresh(scene)
+        recording.replayer(scene)
 
 
 def test_another_street_differs_from_the_first_step_on_that_shows_it(recording, make_scene, moving):

@@ -10,12 +10,18 @@ import pytest
 
 from real2sim_server.world import scoring
 from real2sim_server.world.ego.reference import PlannedTrajectory
-from real2sim_server.world.scoring import ContactNote, EgoSample, Instant, Others, ScoringContext
-from real2sim_server.world.scoring.boxes import side_of_contact
-from real2sim_server.world.scoring.comfort import felt_in, window_of
+from real2sim_server.world.scoring import (
+    ContactRecord,
+    EgoSample,
+    Instant,
+    ObjectSamples,
+    ScoringContext,
+)
+from real2sim_server.world.scoring.comfort import comfort_sample, comfort_window
+from real2sim_server.world.scoring.contact_side import side_of_contact
 
 DT = 0.1
-NOBODY = Others((), (), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 2)))
+NOBODY = ObjectSamples((), (), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 2)))
 
 
 def context(steps: int, **changes) -> ScoringContext:
@@ -43,8 +49,8 @@ def ego(x: float, y: float = 0.0, *, speed: float = 10.0, yaw: float = 0.0) -> E
     return EgoSample(x, y, yaw, speed, 0.0, 0.0, 0.0, 0.0, x, y, 0.0, 0.0)
 
 
-def car(x: float, y: float = 0.0, *, speed: float = 0.0, category: str = "car") -> Others:
-    return Others(
+def car(x: float, y: float = 0.0, *, speed: float = 0.0, category: str = "car") -> ObjectSamples:
+    return ObjectSamples(
         ("car",),
         (category,),
         np.array([[x, y, 0.8]]),
@@ -65,10 +71,10 @@ def drive(speeds: list[float], *, y: float = 0.0, others=None) -> list[Instant]:
 
 
 def scores(instants: list[Instant], given: ScoringContext) -> dict[str, scoring.Score]:
-    tally = scoring.begin(instants[0], given)
+    accumulator = scoring.begin_accumulator(instants[0], given)
     for instant in instants[1:]:
-        tally = scoring.after(tally, instant, given)
-    return {s.name: s for s in scoring.scores_of(tally, given)}
+        accumulator = scoring.update_accumulator(accumulator, instant, given)
+    return {s.name: s for s in scoring.scores_of(accumulator, given)}
 
 
 def hit(instants: list[Instant], step: int, **note) -> list[Instant]:
@@ -80,7 +86,7 @@ def hit(instants: list[Instant], step: int, **note) -> list[Instant]:
         "ego_speed": 10.0,
         "object_speed": 0.0,
     }
-    contact = ContactNote(**fields | note)
+    contact = ContactRecord(**fields | note)
     return [replace(i, contacts=(contact,)) if i.step == step else i for i in instants]
 
 
@@ -214,10 +220,12 @@ def test_sides_of_a_contact_are_those_of_nuplan(box, ego_speed, speed, side):
 # --- time to collision ------------------------------------------------------------------------
 
 
-def ttc_of(others: Others, *, y: float = 0.0, speed: float = 10.0) -> float:
+def ttc_of(others: ObjectSamples, *, y: float = 0.0, speed: float = 10.0) -> float:
     instants = drive([speed] * 2, y=y, others=lambda _k: others)
-    tally = scoring.after(scoring.begin(instants[0], context(2)), instants[1], context(2))
-    return tally.ttc
+    accumulator = scoring.update_accumulator(
+        scoring.begin_accumulator(instants[0], context(2)), instants[1], context(2)
+    )
+    return accumulator.ttc
 
 
 def test_time_to_collision_is_gap_by_closing_speed():
@@ -291,10 +299,10 @@ def test_longitudinal_bounds_hold_for_steady_acceleration(acceleration, comforta
 
 
 def test_derivatives_are_exact_for_cubics():
-    window = window_of(DT)
+    window = comfort_window(DT)
     t = (np.arange(window) - window // 2) * DT
     speed, yaw = 8.0 + 0.5 * t + 0.2 * t**2, 0.3 * t + 0.1 * t**2 + 0.05 * t**3
-    felt = felt_in(np.stack([speed, yaw], axis=1), DT)
+    felt = comfort_sample(np.stack([speed, yaw], axis=1), DT)
     assert felt.lon_acceleration == pytest.approx(0.5)
     assert felt.lon_jerk == pytest.approx(0.4)
     assert felt.yaw_rate == pytest.approx(0.3)

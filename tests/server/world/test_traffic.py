@@ -73,7 +73,7 @@ def test_a_copy_of_the_world_goes_on_alike_and_alone(driven, kind):
     world = driven(kind)
     for _ in range(3):
         world.step(COAST)
-    copied = world.light_copy()
+    copied = world.fork()
     for _ in range(10):
         world.step(COAST)
     for _ in range(10):
@@ -166,7 +166,7 @@ def test_replayed_traffic_runs_into_an_ego_that_stops(make_world, moving):
     while not world.over:
         world.step(Control(acceleration=-5.0, steering=0.0))
     assert world.reason == "collision"
-    assert world.tally.at_fault == {}
+    assert world.accumulator.at_fault == {}
 
 
 def test_replayed_traffic_reacts_once_the_ego_leaves_the_log_where_asked(make_world, moving):
@@ -239,7 +239,7 @@ def test_a_crossing_is_missed_by_an_ego_that_brakes_late_and_hard(driven):
 def test_an_external_agent_follows_its_plan_and_then_goes_straight_on(driven):
     world = driven("external")
     times = [world.t_us + 500_000, world.t_us + 1_000_000]
-    world.steer("car", times, [(33.0, 1.0, 0.0), (37.0, 2.0, 0.0)])
+    world.set_agent_plan("car", times, [(33.0, 1.0, 0.0), (37.0, 2.0, 0.0)])
     for _ in range(10):
         world.step(COAST)
     assert agent_of(world)["position"][:2] == pytest.approx([37.0, 2.0])
@@ -250,14 +250,14 @@ def test_an_external_agent_follows_its_plan_and_then_goes_straight_on(driven):
 def test_only_external_agents_can_be_steered(driven):
     world = driven("idm")
     with pytest.raises(WorldError, match="not driven externally") as refused:
-        world.steer("car", [world.t_us + 1], [(0.0, 0.0, 0.0)])
+        world.set_agent_plan("car", [world.t_us + 1], [(0.0, 0.0, 0.0)])
     assert refused.value.code == ErrorCode.INVALID_ACTION
 
 
 def test_plans_for_the_past_are_refused(driven):
     world = driven("external")
     with pytest.raises(WorldError, match="us already"):
-        world.steer("car", [world.t_us], [(0.0, 0.0, 0.0)])
+        world.set_agent_plan("car", [world.t_us], [(0.0, 0.0, 0.0)])
 
 
 def test_a_pose_driven_ego_is_seen_by_idm(make_world, moving):

@@ -9,11 +9,11 @@ import pytest
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_proto.plans import TrajectoryPlan
-from real2sim_server.world.driving import GRAVITY, Command, vehicle_of
+from real2sim_server.world.driving import GRAVITY, Command, vehicle_parameters
 from real2sim_server.world.driving.tyres import axle_forces, fiala
-from real2sim_server.world.ego.reference import PlannedTrajectory, Reference
+from real2sim_server.world.ego.motion import Motion, advance_motion, constant_law
+from real2sim_server.world.ego.reference import PlannedTrajectory, ReferenceTrajectory
 from real2sim_server.world.ego.trackers import make_tracker
-from real2sim_server.world.ego.vehicle import Motion, drive, holding
 
 DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
 
@@ -23,7 +23,7 @@ def driven(spec: EgoSpec, motion: Motion, seconds: float, driver) -> list[Motion
     motions = []
     for _ in range(round(seconds * 10)):
         for _ in range(10):
-            motion = drive(motion, holding(driver(motion)), spec, 10_000)
+            motion = advance_motion(motion, constant_law(driver(motion)), spec, 10_000)
         motions.append(motion)
     return motions
 
@@ -41,7 +41,7 @@ def cornering(spec: EgoSpec, speed: float, steering: float) -> Motion:
 def test_steady_cornering_needs_ackermann_plus_the_understeer_gradient(speed):
     # delta = L/R + K a_y (Gillespie 1992, eq. 6-15), at 2 m/s^2, where tyres are linear.
     radius = speed**2 / 2.0
-    vehicle = vehicle_of(DYNAMIC)
+    vehicle = vehicle_parameters(DYNAMIC)
     steering = vehicle.wheelbase / radius + vehicle.understeer * 2.0
     motion = cornering(DYNAMIC, speed, steering)
 
@@ -49,7 +49,7 @@ def test_steady_cornering_needs_ackermann_plus_the_understeer_gradient(speed):
 
 
 def test_the_understeer_gradient_is_that_of_a_mid_size_car():
-    degrees_per_g = math.degrees(vehicle_of(DYNAMIC).understeer * GRAVITY)
+    degrees_per_g = math.degrees(vehicle_parameters(DYNAMIC).understeer * GRAVITY)
 
     assert degrees_per_g == pytest.approx(1.16, abs=0.01)
 
@@ -68,7 +68,7 @@ def test_oversteer_loses_the_car_above_its_critical_speed():
     spec = EgoSpec(
         dynamics="dynamic_bicycle", vehicle={"front_cornering": 15.0, "rear_cornering": 9.0}
     )
-    vehicle = vehicle_of(spec)
+    vehicle = vehicle_parameters(spec)
     critical = math.sqrt(-vehicle.wheelbase / vehicle.understeer)
     assert 15 < critical < 40
 
@@ -121,7 +121,7 @@ def test_a_tyre_is_linear_for_small_slip_and_slides_at_its_limit():
 
 
 def test_braking_in_a_bend_takes_cornering_force():
-    vehicle = vehicle_of(DYNAMIC)
+    vehicle = vehicle_parameters(DYNAMIC)
     free, braked = (
         axle_forces(vehicle, (20.0, 0.0, 0.0), steering=0.2, acceleration=a) for a in (0.0, -8.0)
     )
@@ -170,7 +170,7 @@ def worst_offset(spec: EgoSpec, speed: float) -> float:
     motion = Motion(0, 0, 0, speed)
     errors = []
     for k in range(70):
-        reference = Reference(
+        reference = ReferenceTrajectory(
             motion,
             start_us=k * 100_000,
             course=PlannedTrajectory.of(times[k:], poses[k:]),
@@ -209,7 +209,7 @@ def test_every_tracker_drives_an_episode(make_world, tracker):
 def test_trackers_obey_the_limits_of_the_vehicle(tracker):
     spec = EgoSpec(tracker=tracker)
     motion = Motion(0, 0, 0, 10.0)
-    reference = Reference(
+    reference = ReferenceTrajectory(
         motion,
         start_us=0,
         course=PlannedTrajectory.of(

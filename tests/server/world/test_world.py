@@ -219,7 +219,7 @@ def test_whoever_drives_on_past_the_end_of_the_log_keeps_its_lane(make_world):
     assert world.motion.x > world.scene.ego.positions[-1, 0] + 15
     assert events == ["left_log"]
     assert world.metrics()["lateral_offset"] == pytest.approx(0.3)
-    assert not world.tally.left_lane
+    assert not world.accumulator.left_lane
 
 
 def test_an_edit_shows_at_once_and_is_an_event_of_the_next_step(make_world, moving):
@@ -286,18 +286,18 @@ def test_same_actions_give_the_same_bits(make_world, moving):
     assert drive_somewhere(first) == drive_somewhere(second)
 
 
-def test_a_step_can_be_drawn_before_it_is_judged(make_world, moving):
+def test_a_step_can_be_drawn_before_it_is_evaluated(make_world, moving):
     def drawn(world: World) -> bytes:
         poses = [i.T_world_object for i in world.instances()[1:]]
         return encode({"ego": world.T_world_vehicle, "objects": poses, "t_us": world.t_us})
 
     spec = {"privileged": True, "on_collision": "continue"}
     world = make_world(car=moving(30, 0, z=0.8, speed=2.0), spec=spec)
-    stepped = world.light_copy()
+    stepped = world.fork()
     while not world.over:
         world.move()
         before = drawn(world)
-        world.judge()
+        world.evaluate()
         stepped.step()
         assert drawn(world) == before
         assert observed(world) == observed(stepped)
@@ -309,7 +309,7 @@ def test_judging_again_changes_nothing(make_world):
     events = world.step()
     before = observed(world)
 
-    assert world.judge() == events
+    assert world.evaluate() == events
     assert observed(world) == before
 
 
@@ -317,9 +317,9 @@ def test_a_copy_goes_on_alike_and_on_its_own(make_world, moving):
     spec = {"privileged": True, "on_collision": "continue"}
     world = make_world(car=moving(60, 5, speed=2.0), spec=spec)
     world.step(TrajectoryPlan(times_us=[world.t_us + 2_000_000], poses=[(20, 3, 0)]))
-    copied = world.light_copy()
+    copied = world.fork()
     copied.apply([Delete(object_id="car")])
     copied.step()
 
     assert (world.steps, world.revision, len(world.agents.objects)) == (1, 0, 1)
-    assert drive_somewhere(world.light_copy()) == drive_somewhere(world)
+    assert drive_somewhere(world.fork()) == drive_somewhere(world)

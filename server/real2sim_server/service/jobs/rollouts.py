@@ -15,7 +15,7 @@ from real2sim_proto.jobs import SimulateRequest
 from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, MaterialName, PlaneShape
 
 from ...edit import ObjectState, ScenarioState
-from ...edit.compose import background_of, shadows_of
+from ...edit.compose import composed_background, contact_shadows
 from ...edit.ground import RecordedGround
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
@@ -184,14 +184,14 @@ class Show:
             if subject.object_id in self._result.objects or subject.trajectory.covers(t_us)
         ]
         poses = {subject.object_id: pose for subject, pose in standing}
-        background = Instance(background_of(self._scene, self._state, poses))
+        background = Instance(composed_background(self._scene, self._state, poses))
         _, *objects = self._playback.instances(frame)
         placed = [
             (subject, pose)
             for subject, pose in standing
             if subject.placed or subject.object_id in self._result.objects
         ]
-        return [background, *objects, *shadows_of(self._scene, placed, t_us)]
+        return [background, *objects, *contact_shadows(self._scene, placed, t_us)]
 
     def _pose(self, subject: ObjectState, frame: int, t_us: int) -> Float:
         simulated = self._result.objects.get(subject.object_id)

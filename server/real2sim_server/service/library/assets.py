@@ -18,7 +18,7 @@ import structlog
 from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetInfo, AssetUpload
 
-from ...edit.lighting import Colour, ambient_of, gain_into, lit
+from ...edit.lighting import Colour, ambient_colour, relighting_gain, relit
 from ...scene import Asset, BundleError, GaussianCloud, Scene, SceneError
 from ...scene.io import import_splats, load_asset, save_asset
 from ..http.problems import ServiceError
@@ -74,7 +74,7 @@ class LibraryAsset:
         found = self._lit.get(scene)
         if found is None:
             cloud = self.asset.cloud.to(scene.background.device)
-            found = self._lit[scene] = lit(cloud, gain_into(scene, cloud, self.ambient))
+            found = self._lit[scene] = relit(cloud, relighting_gain(scene, cloud, self.ambient))
         return found
 
     def info(self) -> AssetInfo:
@@ -204,7 +204,7 @@ def cut_out(scene: Scene, object_id: str, *, asset_id: str, category: str | None
         "scene": scene.name,
         "scene_hash": scene.content_hash,
         "object_id": object_id,
-        "ambient": list(ambient_of(scene)),
+        "ambient": list(ambient_colour(scene)),
     }
     cloud = found.cloud_at(middle).to("cpu")
     return Asset(asset_id, category or found.category, found.size, cloud, provenance)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...edit.ground import RecordedGround
-from ...edit.shadow import shadow_under
+from ...edit.shadow import contact_shadow
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
@@ -33,7 +33,7 @@ def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.
         spots=np.zeros((0, 2)),
         offsets=np.zeros(0),
     )
-    shadow = shadow_under(np.eye(4), asset.size, floor, device=asset.cloud.device)
+    shadow = contact_shadow(np.eye(4), asset.size, floor, device=asset.cloud.device)
     output = rasterize(
         [Instance(asset.cloud), *([shadow] if shadow else [])],
         invert_transform(_looking_at_origin(eye))[None],

@@ -17,7 +17,7 @@ from real2sim_proto.base import Identifier, Microseconds, Model
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.operations import Operation
 
-from ...edit import EditError, advance, instances_at
+from ...edit import EditError, instances_at, replay_operations
 from ...render import Instance, RenderError
 from ...scene import Scene, SceneError
 from ..http.problems import ServiceError
@@ -136,7 +136,11 @@ class View:
             scene = await self._worker.residency.get(view.row.scene)
 
             def instances() -> Sequence[Instance]:
-                state = advance(view.state, look.operations) if look.operations else view.state
+                state = (
+                    replay_operations(view.state, look.operations)
+                    if look.operations
+                    else view.state
+                )
                 return instances_at(scene, state, look.t_us)
         else:
             film = await self._worker.simulations.film(look.job)

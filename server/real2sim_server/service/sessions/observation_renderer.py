@@ -121,7 +121,7 @@ class ObservationRenderer:
         change: Callable[[], World],
         cameras: Mapping[str, Camera],
         *,
-        settle: Callable[[World], object] = World.judge,
+        settle: Callable[[World], object] = World.evaluate,
         tell: Tell | None = None,
     ) -> EncodedObservation:
         """The world that ``change`` makes, and the observation of it.
@@ -230,7 +230,7 @@ class ObservationRenderer:
         watch: Stopwatch,
     ) -> Sequence[Image]:
         if world.deformation is not None:
-            world.deformation.work_out()
+            world.deformation.solve()
             watch.stage("physics")
         images = self._images(world, sensors, cameras)
         watch.stage("render")

@@ -39,7 +39,7 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
     def made() -> Recording:
         world = session.running_world()
         impact = None
-        if world.tally.first_impact is not None:
+        if world.accumulator.first_impact is not None:
             impact = no_action_impact(Replayer.on(start.scene, start.state), entries)
         scenario = (
             (row.scenario_id, row.scenario_revision)
@@ -64,9 +64,9 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
 async def _frames(
     show: ObservationRenderer, start: Start, entries: Iterable[Entry]
 ) -> Mapping[str, bytes]:
-    retold, kept, total = Replayer.on(start.scene, start.state), dict[str, bytes](), 0
+    replayer, kept, total = Replayer.on(start.scene, start.state), dict[str, bytes](), 0
     for entry in entries:
-        world = await show.on_world_thread(retold.tell, entry)
+        world = await show.on_world_thread(replayer.apply, entry)
         if entry.kind not in {"reset", "action"}:
             continue
         for frame in await _drawn(show, world):

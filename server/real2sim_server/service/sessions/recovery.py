@@ -38,20 +38,20 @@ async def rebuild(
     entries = entries_of(rows)
     if not entries:
         return session
-    retold = Replayer.on(start.scene, start.state)
+    replayer = Replayer.on(start.scene, start.state)
     *before, last = entries
-    await show.on_world_thread(_tell_all, retold, before)
-    session.snapshots = retold.snapshots
+    await show.on_world_thread(_apply_all, replayer, before)
+    session.snapshots = replayer.snapshots
     if last.kind == "action":
-        cameras = show.cameras(start.scene, _world(retold).spec.sensors)
-        shown = await show.observe(lambda: retold.tell(last), cameras)
+        cameras = show.cameras(start.scene, _world(replayer).spec.sensors)
+        shown = await show.observe(lambda: replayer.apply(last), cameras)
         session.begin(shown.world, cameras)
         session.lockstep.reset(shown.world.steps, over=shown.world.over)
         if not decode(last.payload).get("missed"):
             session.lockstep.taken(_content(last), shown.message)
         session.newest = shown.message
         return session
-    world = await show.on_world_thread(retold.tell, last)
+    world = await show.on_world_thread(replayer.apply, last)
     session.begin(world, show.cameras(start.scene, world.spec.sensors))
     session.lockstep.reset(world.steps, over=world.over)
     return session
@@ -94,14 +94,14 @@ def check_scene(row: SessionRow, scene_hash: str) -> None:
         )
 
 
-def _tell_all(retold: Replayer, entries: Sequence[Entry]) -> None:
+def _apply_all(replayer: Replayer, entries: Sequence[Entry]) -> None:
     for entry in entries:
-        retold.tell(entry)
+        replayer.apply(entry)
 
 
-def _world(retold: Replayer) -> World:
-    assert retold.world is not None
-    return retold.world
+def _world(replayer: Replayer) -> World:
+    assert replayer.world is not None
+    return replayer.world
 
 
 def _content(entry: Entry) -> bytes:

@@ -236,10 +236,10 @@ class Sessions:
 
         def score() -> list[Score]:
             context = world.context
-            if world.tally.first_impact is not None:
-                retold = Replayer.on(session.start.scene, session.start.state)
-                context = replace(context, no_action_impact=no_action_impact(retold, entries))
-            return scores_of(world.tally, context)
+            if world.accumulator.first_impact is not None:
+                replayer = Replayer.on(session.start.scene, session.start.state)
+                context = replace(context, no_action_impact=no_action_impact(replayer, entries))
+            return scores_of(world.accumulator, context)
 
         return await self.show.on_world_thread(score)
 

@@ -131,7 +131,7 @@ class Stepper:
         now = session.running_world()
 
         def stopped() -> World:
-            world = now.light_copy()
+            world = now.fork()
             world.stop(reason)
             return world
 
@@ -153,7 +153,7 @@ class Stepper:
         now = session.running_world()
 
         def moved() -> World:
-            world = now.light_copy()
+            world = now.fork()
             move(world)
             return world
 
@@ -190,7 +190,7 @@ class Stepper:
         now = session.running_world()
 
         def edited() -> tuple[World, EditOutcome]:
-            world = now.light_copy()
+            world = now.fork()
             return world, world.apply(operations, base_revision=base_rev)
 
         world, outcome = await self._show.on_world_thread(edited)
@@ -203,8 +203,8 @@ class Stepper:
         now = session.running_world()
 
         def steered() -> World:
-            world = now.light_copy()
-            world.steer(asked.object_id, asked.times_us, asked.poses)
+            world = now.fork()
+            world.set_agent_plan(asked.object_id, asked.times_us, asked.poses)
             return world
 
         world = await self._show.on_world_thread(steered)
@@ -261,7 +261,7 @@ class Stepper:
 
         def settle(world: World) -> None:
             nonlocal recorded
-            world.judge()
+            world.evaluate()
             self._store.record(session.session_id, entries)
             recorded = True
 
@@ -295,7 +295,7 @@ def _beginning(session: Session, spec: ResetSpec) -> Callable[[], World]:
 
 def _moved_on(now: World, count: int, plan: Plan | None) -> Callable[[], tuple[World, list[Event]]]:
     def move() -> tuple[World, list[Event]]:
-        world = now.light_copy()
+        world = now.fork()
         events = world.step(plan)
         while world.steps < now.steps + count and not world.over:
             events += world.step()

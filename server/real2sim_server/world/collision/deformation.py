@@ -1,9 +1,9 @@
-"""Dents in what is drawn: the impacts of rigid bodies, told to deforming matter.
+"""Deformation of objects after impacts: what is drawn of them, solved by the MPM when asked for.
 
-The sudden exchange of momentum stays the authority for motion: it costs microseconds, so an
-episode without cameras never waits for matter, and every device computes the same. What matter
-does is looked up when a picture needs it, from the impact alone, and so is the same after a crash
-of the worker, in a fork, and in a recording.
+The impulse stays the authority for motion: it costs microseconds, so an episode without cameras
+never waits for the MPM, and every device computes the same. The deformation is solved when a
+picture needs it, from the impact alone, and so is the same after a crash of the worker, in a fork,
+and in a recording.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import logging
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -26,18 +26,18 @@ from ...render.types import Instance
 from ...scene import GaussianCloud, Scene
 from ...simulation import impact as crash
 from ...simulation.embedding import Embedding, deform_cloud, stretched
-from .body import Body
-from .model import Impact, Party
+from .impact import Impact, ImpactParticipant
+from .rigid_body import BodyState
 
 _log = logging.getLogger(__name__)
 
-LEAST_APPROACH = 1.1
+MIN_APPROACH_SPEED = 1.1
 """Bumpers take impacts up to this speed without damage (2.5 mph, 49 CFR 581) [m/s]."""
 
-MOST = 4
-"""Impacts that dent one object; further ones move it only."""
+MAX_IMPACTS = 4
+"""Impacts that deform one object; further ones move it only."""
 
-LIVING = frozenset({"pedestrian", "person", "cyclist", "motorcyclist", "animal"})
+NEVER_DEFORMED = frozenset({"pedestrian", "person", "cyclist", "motorcyclist", "animal"})
 """Categories that are never shown deformed."""
 
 FRICTION = 0.4
@@ -47,66 +47,85 @@ WALL = (1.0, 2.0, 2.0)
 """Size of the part of the background that an object runs into: depth, width, height [m]."""
 
 
+class Deformation(Protocol):
+    """Deforms objects after impacts. Immutable: an impact makes a new one, so that worlds can fork.
+
+    The world moves impacted objects as rigid bodies; the deformation gets every impact and gives
+    what is drawn instead of an object's own Gaussians.
+    """
+
+    def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
+        """After an impact; ``subjects``: all objects by id."""
+
+    def solve(self) -> None:
+        """Find the shapes that are not known yet, before they are drawn."""
+
+    def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
+        """What is drawn of an object; the given instance where it is not deformed."""
+
+
 @dataclass(frozen=True, eq=False)
 class DeformationTracker:
-    """The shapes of all objects of a world; see :class:`~.model.Deformation`.
+    """The shapes of all objects of a world, by the MPM.
 
     Attributes:
         scene: holds their Gaussians.
-        dented: objects that were struck, by id.
+        deformed: objects after an impact that may deform them, by id.
     """
 
     scene: Scene
-    dented: Mapping[str, _Dented] = field(default_factory=dict)
+    deformed: Mapping[str, _DeformedObject] = field(default_factory=dict)
 
-    def struck(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
+    def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
         """After an impact; slow ones leave no trace."""
-        if impact.parties is None or impact.approach_speed < LEAST_APPROACH:
+        if impact.participants is None or impact.approach_speed < MIN_APPROACH_SPEED:
             return self
         names = (impact.other_id, impact.object_id)
-        olds = [self._before(name, subjects, impact) for name in names]
-        if not any(olds):
+        before_impact = [self._before_impact(name, subjects, impact) for name in names]
+        if not any(before_impact):
             return self
-        collision = _Collision(impact, (olds[0], olds[1]))
-        dented = dict(self.dented)
-        for role, (name, old) in enumerate(zip(names, olds, strict=True)):
-            if name is not None and old is not None and old.impacts < MOST:
-                dented[name] = _Dented(old.origin, old.impacts + 1, old, collision, role)
-        return replace(self, dented=dented)
+        collision = _ImpactSolution(impact, (before_impact[0], before_impact[1]))
+        deformed = dict(self.deformed)
+        for role, (name, old) in enumerate(zip(names, before_impact, strict=True)):
+            if name is not None and old is not None and old.impacts < MAX_IMPACTS:
+                deformed[name] = _DeformedObject(old.origin, old.impacts + 1, old, collision, role)
+        return replace(self, deformed=deformed)
 
-    def work_out(self) -> None:
-        """Let all impacts that are not worked out yet deform what they struck."""
-        for dented in self.dented.values():
-            dented.outcome()
+    def solve(self) -> None:
+        """Solve the deformations of all impacts that are not solved yet."""
+        for deformed in self.deformed.values():
+            deformed.outcome()
 
-    def shown(self, object_id: str, instance: Instance, t_us: int) -> Instance:
-        """The object as it is at ``t_us``, in the colours that it had when it was struck first."""
-        dented = self.dented.get(object_id)
-        if dented is None or dented.origin.subject.scale != instance.scale:
+    def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
+        """The object as it is at ``t_us``, in the colours that it had before its first impact."""
+        deformed = self.deformed.get(object_id)
+        if deformed is None or deformed.origin.subject.scale != instance.scale:
             return instance
-        cloud = dented.cloud(t_us)
+        cloud = deformed.cloud(t_us)
         if cloud is None:
             return instance
         return replace(instance, cloud=cloud, colour=None, scale=(1.0, 1.0, 1.0))
 
-    def _before(
+    def _before_impact(
         self, name: str | None, subjects: Mapping[str, ObjectState], impact: Impact
-    ) -> _Dented | None:
+    ) -> _DeformedObject | None:
         if name is None or name not in subjects:
             return None
-        if name in self.dented:
-            return self.dented[name]
+        if name in self.deformed:
+            return self.deformed[name]
         subject = subjects[name]
-        if subject.category in LIVING:
+        if subject.category in NEVER_DEFORMED:
             return None
-        assert impact.parties is not None
-        party = impact.parties[0 if name == impact.other_id else 1]
-        assert party is not None
-        return _Dented(_Origin(self.scene, subject, party.solid.mass, impact.began_us))
+        assert impact.participants is not None
+        participant = impact.participants[0 if name == impact.other_id else 1]
+        assert participant is not None
+        return _DeformedObject(
+            _UndeformedObject(self.scene, subject, participant.properties.mass, impact.began_us)
+        )
 
 
-class _Origin:
-    """An object as it was before it was struck for the first time.
+class _UndeformedObject:
+    """An object as it was before its first impact.
 
     Everything is found on demand and kept; a lock lets sessions on several threads share it.
     """
@@ -129,7 +148,7 @@ class _Origin:
 
     @property
     def body(self) -> crash.CrashBody:
-        """Its matter."""
+        """Its particles."""
         if self._body is None:
             self._body = crash.object_body(
                 self.cloud,
@@ -141,7 +160,7 @@ class _Origin:
         return self._body
 
     def deformed(self, displacements: Float, *, last: bool) -> GaussianCloud:
-        """Its Gaussians where the matter around them is; ``last``: nothing is asked soon again."""
+        """Its Gaussians moved with the particles around them; ``last``: the last frame."""
         if self._embedding is None:
             means = self.cloud.means.detach().cpu().numpy().astype(np.float64)
             rest = self.body.rest.positions
@@ -153,7 +172,7 @@ class _Origin:
 
 
 @dataclass(eq=False)
-class _Dented:
+class _DeformedObject:
     """An object after some impacts; without any it is as it was.
 
     Attributes:
@@ -163,16 +182,16 @@ class _Dented:
         collision, role: the latest, and which of its two bodies the object was.
     """
 
-    origin: _Origin
+    origin: _UndeformedObject
     impacts: int = 0
-    before: _Dented | None = None
-    collision: _Collision | None = None
+    before: _DeformedObject | None = None
+    collision: _ImpactSolution | None = None
     role: int = 0
     _shown: tuple[int, GaussianCloud] | None = None
 
     @property
     def body(self) -> crash.CrashBody:
-        """Its matter as it is after all of them."""
+        """Its particles after all of them."""
         outcome = self.outcome()
         if outcome is not None:
             return outcome.body
@@ -181,7 +200,7 @@ class _Dented:
 
     def outcome(self) -> crash.Dent | None:
         """What the latest impact did; None where it left no trace."""
-        return None if self.collision is None else self.collision.dents()[self.role]
+        return None if self.collision is None else self.collision.outcomes()[self.role]
 
     def cloud(self, t_us: int) -> GaussianCloud | None:
         """Its Gaussians at an instant; None while they are as they were."""
@@ -202,56 +221,66 @@ class _Dented:
             return self._shown[1]
 
 
-class _Collision:
-    """An impact, and what matter makes of it once somebody asks."""
+class _ImpactSolution:
+    """An impact, and its deformation of both bodies, solved when first asked for."""
 
-    def __init__(self, impact: Impact, olds: tuple[_Dented | None, _Dented | None]) -> None:
+    def __init__(
+        self, impact: Impact, before_impact: tuple[_DeformedObject | None, _DeformedObject | None]
+    ) -> None:
         self.impact = impact
-        self._olds = olds
+        self._before_impact = before_impact
         self._lock = threading.Lock()
-        self._dents: tuple[crash.Dent | None, crash.Dent | None] | None = None
+        self._outcomes: tuple[crash.Dent | None, crash.Dent | None] | None = None
 
-    def dents(self) -> tuple[crash.Dent | None, crash.Dent | None]:
+    def outcomes(self) -> tuple[crash.Dent | None, crash.Dent | None]:
         """Of the ego or first object, and of the object."""
         with self._lock:
-            if self._dents is None:
-                found = self._crash()
+            if self._outcomes is None:
+                found = self._solve()
                 kept = [
                     dent if old is not None else None
-                    for dent, old in zip(found, self._olds, strict=True)
+                    for dent, old in zip(found, self._before_impact, strict=True)
                 ]
-                self._dents = kept[0], kept[1]
-            return self._dents
+                self._outcomes = kept[0], kept[1]
+            return self._outcomes
 
-    def _crash(self) -> tuple[crash.Dent | None, crash.Dent | None]:
-        assert self.impact.parties is not None
-        first, second = self.impact.parties
+    def _solve(self) -> tuple[crash.Dent | None, crash.Dent | None]:
+        assert self.impact.participants is not None
+        first, second = self.impact.participants
         floor = first.low if second is None else min(first.low, second.low)
         try:
-            one = self._crasher(first, self._olds[0], floor)
-            other = self._wall() if second is None else self._crasher(second, self._olds[1], floor)
+            one = self._impact_body(first, self._before_impact[0], floor)
+            other = (
+                self._wall()
+                if second is None
+                else self._impact_body(second, self._before_impact[1], floor)
+            )
             return crash.crash(one, other) or (None, None)
         except PhysicsError as error:
-            # A picture without a dent serves an episode better than its end.
-            _log.warning("no dents after the impact at %s us: %s", self.impact.began_us, error)
+            # A picture without the deformation serves an episode better than its end.
+            _log.warning(
+                "no deformation after the impact at %s us: %s", self.impact.began_us, error
+            )
             return None, None
 
-    def _crasher(self, party: Party, old: _Dented | None, floor: float) -> crash.ImpactBody:
-        solid, body = party.solid, party.body
-        height = party.high - party.low
+    def _impact_body(
+        self, participant: ImpactParticipant, old: _DeformedObject | None, floor: float
+    ) -> crash.ImpactBody:
+        properties, body = participant.properties, participant.body
+        height = participant.high - participant.low
         if old is not None:
-            matter = old.body
+            rest_shape = old.body
         else:
-            size = (solid.length, solid.width, height)
-            matter = crash.vehicle_body(size, mass=solid.mass, friction=FRICTION)
+            size = (properties.length, properties.width, height)
+            rest_shape = crash.vehicle_body(size, mass=properties.mass, friction=FRICTION)
         return crash.ImpactBody(
-            matter,
-            self._pose(body, solid.box_ahead, party.low - floor + height / 2),
+            rest_shape,
+            self._pose(body, properties.box_ahead, participant.low - floor + height / 2),
             np.array([body.vx, body.vy, 0.0]),
             body.turn,
         )
 
-    def _pose(self, body: Body, ahead: float, height: float) -> Float:
+    def _pose(self, body: BodyState, ahead: float, height: float) -> Float:
         """About the place of the impact, so that numbers stay small wherever a street lies."""
         x, y = self.impact.point
         centre = np.array([body.x - x, body.y - y, height])

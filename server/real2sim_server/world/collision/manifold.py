@@ -1,11 +1,11 @@
-"""Where two boxes on the plane touch, and the impulse that they exchange there."""
+"""Contact manifold of two boxes on the plane, and the impulse that they exchange there."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-from .body import Body, Solid
+from .rigid_body import BodyProperties, BodyState
 
 Corner = tuple[float, float]
 
@@ -13,8 +13,8 @@ SLOW = 0.3
 """Approach below this speed ends without rebound [m/s]."""
 
 
-class Touch(NamedTuple):
-    """Two bodies that overlap.
+class ContactManifold(NamedTuple):
+    """Where two bodies overlap.
 
     Attributes:
         x, y: middle of the overlap [m].
@@ -29,7 +29,7 @@ class Touch(NamedTuple):
     depth: float
 
 
-class Exchange(NamedTuple):
+class ContactImpulse(NamedTuple):
     """An impulse on the first body [N s], and the speed at which the two approached [m/s]."""
 
     jx: float
@@ -37,18 +37,18 @@ class Exchange(NamedTuple):
     approach: float
 
 
-def corners(body: Body, solid: Solid) -> list[Corner]:
+def corners(body: BodyState, properties: BodyProperties) -> list[Corner]:
     """Corners of the body's box, counter-clockwise."""
     cos, sin = math.cos(body.yaw), math.sin(body.yaw)
-    cx, cy = body.x + solid.box_ahead * cos, body.y + solid.box_ahead * sin
-    a, b = solid.length / 2, solid.width / 2
+    cx, cy = body.x + properties.box_ahead * cos, body.y + properties.box_ahead * sin
+    a, b = properties.length / 2, properties.width / 2
     return [
         (cx + u * cos - v * sin, cy + u * sin + v * cos)
         for u, v in ((a, b), (-a, b), (-a, -b), (a, -b))
     ]
 
 
-def touch(first: list[Corner], second: list[Corner]) -> Touch | None:
+def contact_manifold(first: list[Corner], second: list[Corner]) -> ContactManifold | None:
     """Where two convex quadrilaterals overlap; None where they do not.
 
     The normal is that of least penetration among the edges of both (separating axes); the point
@@ -73,7 +73,7 @@ def touch(first: list[Corner], second: list[Corner]) -> Touch | None:
         return None
     x = sum(p[0] for p in overlap) / len(overlap)
     y = sum(p[1] for p in overlap) / len(overlap)
-    return Touch(x, y, nx, ny, depth)
+    return ContactManifold(x, y, nx, ny, depth)
 
 
 def _clipped(subject: list[Corner], clip: list[Corner]) -> list[Corner]:
@@ -96,14 +96,14 @@ def _clipped(subject: list[Corner], clip: list[Corner]) -> list[Corner]:
     return shape
 
 
-def exchange(
-    first: tuple[Body, Solid],
-    second: tuple[Body, Solid] | None,
-    where: Touch,
+def contact_impulse(
+    first: tuple[BodyState, BodyProperties],
+    second: tuple[BodyState, BodyProperties] | None,
+    manifold: ContactManifold,
     *,
     restitution: float,
     friction: float,
-) -> Exchange | None:
+) -> ContactImpulse | None:
     """The impulse of a planar impact; None where the bodies part already.
 
     Newton's restitution along the normal, and along the tangent as much as ends sliding, at most
@@ -112,27 +112,27 @@ def exchange(
 
     Args:
         first, second: bodies before the impact; None for what cannot move.
-        where: point and normal.
+        manifold: point and normal.
         restitution: separation per approach speed; 0 for slow approaches.
         friction: tangential per normal impulse at most.
     """
-    nx, ny, tx, ty = where.nx, where.ny, -where.ny, where.nx
-    vx, vy = first[0].velocity_at(where.x, where.y)
+    nx, ny, tx, ty = manifold.nx, manifold.ny, -manifold.ny, manifold.nx
+    vx, vy = first[0].velocity_at(manifold.x, manifold.y)
     pairs = [first]
     if second is not None:
-        wx, wy = second[0].velocity_at(where.x, where.y)
+        wx, wy = second[0].velocity_at(manifold.x, manifold.y)
         vx, vy = vx - wx, vy - wy
         pairs.append(second)
     normal, tangent = vx * nx + vy * ny, vx * tx + vy * ty
     if normal >= 0.0:
         return None
     knn = knt = ktt = 0.0
-    for body, solid in pairs:
-        rx, ry = where.x - body.x, where.y - body.y
+    for body, properties in pairs:
+        rx, ry = manifold.x - body.x, manifold.y - body.y
         rn, rt = rx * ny - ry * nx, rx * ty - ry * tx
-        knn += 1 / solid.mass + rn * rn / solid.inertia
-        ktt += 1 / solid.mass + rt * rt / solid.inertia
-        knt += rn * rt / solid.inertia
+        knn += 1 / properties.mass + rn * rn / properties.inertia
+        ktt += 1 / properties.mass + rt * rt / properties.inertia
+        knt += rn * rt / properties.inertia
     e = restitution if -normal > SLOW else 0.0
     wanted_n, wanted_t = -(1 + e) * normal, -tangent
     determinant = knn * ktt - knt * knt
@@ -142,4 +142,4 @@ def exchange(
         slide = math.copysign(friction, jt if jn > 0 else -tangent)
         jn = wanted_n / max(knn + slide * knt, 1e-12)
         jt = slide * jn
-    return Exchange(jn * nx + jt * tx, jn * ny + jt * ty, -normal)
+    return ContactImpulse(jn * nx + jt * tx, jn * ny + jt * ty, -normal)

@@ -1,4 +1,4 @@
-"""What of the background stands in the way: cells of a grid that hold walls, poles, parked cars."""
+"""Obstacles of the background: a grid whose occupied cells hold walls, poles, parked cars."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from ...scene import Scene
 from ..path import Float, LoggedPath
-from .body import Body, Solid
-from .manifold import Touch
+from .manifold import ContactManifold
+from .rigid_body import BodyProperties, BodyState
 
 CELL = 0.25
 """Edge of a cell [m]."""
@@ -25,7 +25,7 @@ OPAQUE = 0.5
 """Gaussians fainter than this do not count."""
 
 FEWEST = 3
-"""Gaussians in a cell from which on it is taken; fewer are floaters."""
+"""Gaussians in a cell from which on it is occupied; fewer are floaters."""
 
 REACH = 40.0
 """Distance from the recorded path within which cells are looked at [m]."""
@@ -35,84 +35,86 @@ DRIVEN_HALF_WIDTH = 1.1
 
 
 @dataclass(frozen=True, eq=False)
-class Obstacles:
+class ObstacleGrid:
     """A grid on the plane.
 
     Attributes:
         origin: [2] lowest corner [m].
-        taken: [nx, ny] bool.
+        occupied: [nx, ny] bool.
     """
 
     origin: Float
-    taken: NDArray[np.bool_]
+    occupied: NDArray[np.bool_]
 
-    def touch(self, body: Body, solid: Solid) -> Touch | None:
-        """Where a body overlaps taken cells; the normal points from their middle to its box."""
-        points = footprint(body, solid)
+    def manifold(self, body: BodyState, properties: BodyProperties) -> ContactManifold | None:
+        """Where a body overlaps occupied cells; the normal points from their middle to its box."""
+        points = footprint(body, properties)
         cells = np.floor((points - self.origin) / CELL).astype(np.int64)
-        inside = ((cells >= 0) & (cells < self.taken.shape)).all(axis=1)
+        inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)
         hit = np.zeros(len(points), dtype=bool)
-        hit[inside] = self.taken[cells[inside, 0], cells[inside, 1]]
+        hit[inside] = self.occupied[cells[inside, 0], cells[inside, 1]]
         if not hit.any():
             return None
         x, y = points[hit].mean(axis=0).tolist()
-        return _side(body, solid, x, y)
+        return _nearest_side(body, properties, x, y)
 
-    def count(self, body: Body, solid: Solid) -> int:
-        """Number of taken cells under a body."""
-        points = footprint(body, solid)
+    def count(self, body: BodyState, properties: BodyProperties) -> int:
+        """Number of occupied cells under a body."""
+        points = footprint(body, properties)
         cells = np.floor((points - self.origin) / CELL).astype(np.int64)
-        inside = cells[((cells >= 0) & (cells < self.taken.shape)).all(axis=1)]
-        distinct = np.unique(inside[:, 0] * self.taken.shape[1] + inside[:, 1])
-        return int(self.taken.reshape(-1)[distinct].sum())
+        inside = cells[((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)]
+        distinct = np.unique(inside[:, 0] * self.occupied.shape[1] + inside[:, 1])
+        return int(self.occupied.reshape(-1)[distinct].sum())
 
 
-def _side(body: Body, solid: Solid, x: float, y: float) -> Touch:
-    """The touch at (x, y) on the side of the box that is nearest to it."""
+def _nearest_side(
+    body: BodyState, properties: BodyProperties, x: float, y: float
+) -> ContactManifold:
+    """The manifold at (x, y) on the side of the box that is nearest to it."""
     cos, sin = math.cos(body.yaw), math.sin(body.yaw)
-    dx = x - body.x - solid.box_ahead * cos
-    dy = y - body.y - solid.box_ahead * sin
+    dx = x - body.x - properties.box_ahead * cos
+    dy = y - body.y - properties.box_ahead * sin
     ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-    deep_x, deep_y = solid.length / 2 - abs(ahead), solid.width / 2 - abs(left)
+    deep_x, deep_y = properties.length / 2 - abs(ahead), properties.width / 2 - abs(left)
     if deep_x <= deep_y:
         sign = -math.copysign(1.0, ahead)
-        return Touch(x, y, sign * cos, sign * sin, max(deep_x, 0.0))
+        return ContactManifold(x, y, sign * cos, sign * sin, max(deep_x, 0.0))
     sign = -math.copysign(1.0, left)
-    return Touch(x, y, -sign * sin, sign * cos, max(deep_y, 0.0))
+    return ContactManifold(x, y, -sign * sin, sign * cos, max(deep_y, 0.0))
 
 
-def footprint(body: Body, solid: Solid) -> Float:
+def footprint(body: BodyState, properties: BodyProperties) -> Float:
     """Points [N, 2] [m] all over the body's box, no farther apart than half a cell."""
-    nx = max(math.ceil(solid.length / (CELL / 2)), 1) + 1
-    ny = max(math.ceil(solid.width / (CELL / 2)), 1) + 1
-    u = np.linspace(-solid.length / 2, solid.length / 2, nx) + solid.box_ahead
-    v = np.linspace(-solid.width / 2, solid.width / 2, ny)
+    nx = max(math.ceil(properties.length / (CELL / 2)), 1) + 1
+    ny = max(math.ceil(properties.width / (CELL / 2)), 1) + 1
+    u = np.linspace(-properties.length / 2, properties.length / 2, nx) + properties.box_ahead
+    v = np.linspace(-properties.width / 2, properties.width / 2, ny)
     grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
     cos, sin = math.cos(body.yaw), math.sin(body.yaw)
     points: Float = grid @ np.array([[cos, sin], [-sin, cos]]) + [body.x, body.y]
     return points
 
 
-_known: WeakKeyDictionary[Scene, Obstacles] = WeakKeyDictionary()
+_grids: WeakKeyDictionary[Scene, ObstacleGrid] = WeakKeyDictionary()
 
 
-def obstacles_of(scene: Scene, path: LoggedPath) -> Obstacles:
+def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     """The grid of a scene's background; made once for each scene in memory.
 
-    A cell is taken when at least three Gaussians of more than half opacity have their centres in
+    A cell is occupied when at least three Gaussians of more than half opacity have their centres in
     it between 0.4 and 1.6 m above the ground. Where the recorded vehicle drove it is free.
 
     Args:
         scene: whose background.
         path: recorded way of the ego, with the ground's tilt.
     """
-    found = _known.get(scene)
+    found = _grids.get(scene)
     if found is None:
-        found = _known[scene] = _build(scene, path)
+        found = _grids[scene] = _build(scene, path)
     return found
 
 
-def _build(scene: Scene, path: LoggedPath) -> Obstacles:
+def _build(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     opaque = (scene.background.opacities > OPAQUE).cpu().numpy()
     points = scene.background.means.cpu().numpy().astype(np.float64)[opaque]
     lower = path.positions[:, :2].min(axis=0) - REACH
@@ -130,12 +132,12 @@ def _build(scene: Scene, path: LoggedPath) -> Obstacles:
         standing = points[(height > LOWEST) & (height < HIGHEST)]
         cells = np.floor((standing[:, :2] - lower) / CELL).astype(np.int64)
         np.add.at(counts, (cells[:, 0], cells[:, 1]), 1)
-    taken = counts >= FEWEST
-    _clear_driven(taken, lower, path)
-    return Obstacles(lower, taken)
+    occupied = counts >= FEWEST
+    _clear_driven(occupied, lower, path)
+    return ObstacleGrid(lower, occupied)
 
 
-def _clear_driven(taken: NDArray[np.bool_], lower: Float, path: LoggedPath) -> None:
+def _clear_driven(occupied: NDArray[np.bool_], lower: Float, path: LoggedPath) -> None:
     # From behind the rear axle at the start to the front bumper at the end.
     at = np.arange(-1.0, path.length + 4.0, CELL)
     x = np.interp(at, path.s, path.positions[:, 0])
@@ -146,5 +148,5 @@ def _clear_driven(taken: NDArray[np.bool_], lower: Float, path: LoggedPath) -> N
     for side in np.arange(-DRIVEN_HALF_WIDTH, DRIVEN_HALF_WIDTH + CELL / 2, CELL / 2):
         points = np.stack([x - side * np.sin(yaw), y + side * np.cos(yaw)], axis=1)
         cells = np.floor((points - lower) / CELL).astype(np.int64)
-        inside = ((cells >= 0) & (cells < taken.shape)).all(axis=1)
-        taken[cells[inside, 0], cells[inside, 1]] = False
+        inside = ((cells >= 0) & (cells < occupied.shape)).all(axis=1)
+        occupied[cells[inside, 0], cells[inside, 1]] = False

@@ -5,9 +5,19 @@ other files hold what that is made of.
 """
 
 from .curve import MOVING
-from .entries import HOLD, ILQR, LQR, PURSUIT, asked_of, curve_at, driven, plan_curve, world_poses
+from .entries import (
+    HOLD,
+    ILQR,
+    LQR,
+    PURSUIT,
+    advance_vehicle,
+    curve_at,
+    driver_command,
+    plan_curve,
+    world_poses,
+)
 from .state import Command, PlanarState
-from .vehicle import GRAVITY, Vehicle, vehicle_of
+from .vehicle import GRAVITY, VehicleParameters, vehicle_parameters
 
 __all__ = [
     "GRAVITY",
@@ -18,11 +28,11 @@ __all__ = [
     "PURSUIT",
     "Command",
     "PlanarState",
-    "Vehicle",
-    "asked_of",
+    "VehicleParameters",
+    "advance_vehicle",
     "curve_at",
-    "driven",
+    "driver_command",
     "plan_curve",
-    "vehicle_of",
+    "vehicle_parameters",
     "world_poses",
 ]

@@ -30,7 +30,7 @@ TRUSTED_YAW = 0.5
 """A planned heading that differs more from the planned way is not used as its tangent [rad]."""
 
 
-class Curve(NamedTuple):
+class PlanCurve(NamedTuple):
     """A plan to be followed.
 
     Attributes:
@@ -63,7 +63,7 @@ def curve_through(state, seconds, poses, vehicle):
     for i in range(1, last + 1):
         slope = _slope(knots, i) if last > 1 else _arrival(knots, state.speed, vehicle)
         knots[i, VX], knots[i, VY] = _along_heading(slope, knots[i, YAW])
-    return Curve(knots, _last_turn_rate(knots, state, vehicle))
+    return PlanCurve(knots, _last_turn_rate(knots, state, vehicle))
 
 
 @func

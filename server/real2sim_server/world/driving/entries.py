@@ -9,12 +9,12 @@ import numpy as np
 from ..._numba import func, kernel
 from .actuators import at_wheels, begun, left, sent
 from .bicycle import moved_on
-from .curve import Curve, at, curve_through, end_of, heading
+from .curve import PlanCurve, at, curve_through, end_of, heading
 from .ilqr import played, scheduled
 from .lqr import regulate
 from .pursuit import pursue
 from .state import Command, PlanarState
-from .vehicle import Vehicle
+from .vehicle import VehicleParameters
 
 HOLD, PURSUIT, LQR, ILQR = range(4)
 """Kinds of drivers: one command all the time, or trackers of a plan."""
@@ -58,20 +58,20 @@ def plan_curve(state, times_us, start_us, poses, vehicle):
         Knots [N + 1, 6] float64 and the turn rate at the end [rad/s].
     """
     seconds = (times_us - start_us) * 1e-6
-    curve = curve_through(PlanarState(*state), seconds, poses, Vehicle(*vehicle))
+    curve = curve_through(PlanarState(*state), seconds, poses, VehicleParameters(*vehicle))
     return curve.knots, curve.turn_rate
 
 
 @kernel
 def curve_at(curve, t):
     """x, y [m], velocity x, y [m/s] and planned heading [rad], ``t`` seconds after the start."""
-    named = Curve(*curve)
+    named = PlanCurve(*curve)
     x, y, vx, vy = at(named, t)
     return x, y, vx, vy, heading(named, t)
 
 
 @kernel
-def driven(state, pending, driver, vehicle, dt_us):
+def advance_vehicle(state, pending, driver, vehicle, dt_us):
     """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
 
     Within a substep the steering angle moves at most at its rate limit. The kinematic bicycle
@@ -92,8 +92,8 @@ def driven(state, pending, driver, vehicle, dt_us):
     kind, knots, turn_rate, since, _ = driver
     substeps = -(-dt_us // SUBSTEP_US)
     h = dt_us * 1e-6 / substeps
-    curve = Curve(knots, turn_rate)
-    start, car = PlanarState(*state), Vehicle(*vehicle)
+    curve = PlanCurve(knots, turn_rate)
+    start, car = PlanarState(*state), VehicleParameters(*vehicle)
     line, waiting = begun(pending, car, h)
     planning = kind == ILQR and since < end_of(curve)
     if planning:
@@ -112,10 +112,10 @@ def driven(state, pending, driver, vehicle, dt_us):
 
 
 @kernel
-def asked_of(state, driver, vehicle):
+def driver_command(state, driver, vehicle):
     """What a driver asks for: acceleration [m/s^2] and road-wheel angle [rad]; arguments as in
-    :func:`driven`. Who plans ahead does here what the plain LQR would."""
-    command = _asked(driver, PlanarState(*state), driver[3], Vehicle(*vehicle))
+    :func:`advance_vehicle`. Who plans ahead does here what the plain LQR would."""
+    command = _asked(driver, PlanarState(*state), driver[3], VehicleParameters(*vehicle))
     return command.acceleration, command.steering
 
 
@@ -125,8 +125,8 @@ def _asked(driver, state, t, vehicle):
     if kind == HOLD:
         return Command(acceleration, steering)
     if kind == PURSUIT:
-        return pursue(state, Curve(knots, turn_rate), t, vehicle)
-    return regulate(state, Curve(knots, turn_rate), t, vehicle)
+        return pursue(state, PlanCurve(knots, turn_rate), t, vehicle)
+    return regulate(state, PlanCurve(knots, turn_rate), t, vehicle)
 
 
 @func

@@ -10,7 +10,7 @@ from real2sim_proto.episode import EgoSpec
 GRAVITY = 9.81
 
 
-class Vehicle(NamedTuple):
+class VehicleParameters(NamedTuple):
     """A car as two axles that carry a mass, with the limits of what moves and steers it.
 
     Attributes:
@@ -55,14 +55,14 @@ class Vehicle(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def vehicle_of(spec: EgoSpec) -> Vehicle:
+def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
     """The constants of a spec."""
     figures, actuators = spec.vehicle, spec.actuators
     front = (1 - figures.front_load) * spec.wheelbase
     rear = figures.front_load * spec.wheelbase
     # k^2 / (a b) is close to 1 for passenger cars (Heydinger et al. 1999, SAE 1999-01-1336).
     inertia = figures.yaw_inertia or figures.mass * front * rear
-    return Vehicle(
+    return VehicleParameters(
         slips=spec.dynamics == "dynamic_bicycle",
         wheelbase=spec.wheelbase,
         mass=figures.mass,

@@ -1,4 +1,4 @@
-"""From plans to motion: which plan holds when, and what holds where there is none."""
+"""From plans to motion: the controller of the plan in effect, and of the log before any plan."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ...edit.tracks import sample
 from ...scene import Trajectory
 from ..driving import Command
 from ..errors import WorldError
-from .reference import PlannedTrajectory, Pose, Reference
+from .motion import Motion, advance_motion, constant_law, teleported
+from .reference import PlannedTrajectory, Pose, ReferenceTrajectory
 from .trackers import make_tracker
-from .vehicle import Motion, drive, holding, placed
 
 Plan = TrajectoryPlan | Control | PoseCommand
 Planned = PlannedTrajectory | Control | PoseCommand
@@ -43,16 +43,16 @@ class Controller(Protocol):
 class ConstantCommand:
     """The same command all the time."""
 
-    asked: Command
+    constant: Command
     spec: EgoSpec
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
         """The vehicle ``dt_us`` later."""
-        return drive(motion, holding(self.asked), self.spec, dt_us)
+        return advance_motion(motion, constant_law(self.constant), self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
         """That command."""
-        return self.asked
+        return self.constant
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Teleport:
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
         """The vehicle at its place, with the velocity that brought it there."""
-        return placed(motion, self.pose, self.spec, dt_us)
+        return teleported(motion, self.pose, self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
         """Brakes: whoever is put somewhere has no driver."""
@@ -84,30 +84,30 @@ class PendingPlan:
     plan: Planned
 
     @property
-    def course(self) -> PlannedTrajectory | None:
+    def trajectory(self) -> PlannedTrajectory | None:
         """The plan where it is a trajectory."""
         return self.plan if isinstance(self.plan, PlannedTrajectory) else None
 
 
 @dataclass(frozen=True, eq=False)
 class EgoController:
-    """What moves the ego, and what will. Immutable.
+    """The active controller of the ego and the pending plans. Immutable.
 
     Attributes:
         spec: of the episode.
         ego: as it was recorded; followed while there is no plan.
-        controller: holds now; None before the first plan.
+        controller: active; None before the first plan.
         since_us: when it took over [us].
-        coming: plans on their way, in the order in which they take effect.
+        pending: plans that have not taken effect yet, in the order in which they will.
     """
 
     spec: ResetSpec
     ego: Trajectory
     controller: Controller | None = None
     since_us: int = 0
-    coming: tuple[PendingPlan, ...] = ()
+    pending: tuple[PendingPlan, ...] = ()
 
-    def told(self, plan: Plan, motion: Motion, t_us: int, from_us: int) -> EgoController:
+    def with_plan(self, plan: Plan, motion: Motion, t_us: int, from_us: int) -> EgoController:
         """With one more plan.
 
         Args:
@@ -133,38 +133,39 @@ class EgoController:
                 f"the plan begins at {plan.times_us[0]} us; it is {t_us} us already",
                 hint="times_us are absolute simulation times after t_us of the observation",
             )
-        kept = tuple(c for c in self.coming if c.from_us < from_us)
-        coming = (*kept, PendingPlan(from_us, _in_world(plan, motion)))
-        return EgoController(self.spec, self.ego, self.controller, self.since_us, coming)
+        kept = tuple(p for p in self.pending if p.from_us < from_us)
+        pending = (*kept, PendingPlan(from_us, _in_world(plan, motion)))
+        return EgoController(self.spec, self.ego, self.controller, self.since_us, pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
-        """Pilot and vehicle ``us`` later than ``t_us``."""
-        pilot, end_us = self, t_us + us
+        """Controller and vehicle ``us`` later than ``t_us``."""
+        current, end_us = self, t_us + us
         while t_us < end_us:
-            pilot = pilot._now(motion, t_us)
-            until = min([end_us, *(c.from_us for c in pilot.coming)])
-            since = (t_us - pilot.since_us) * 1e-6
-            assert pilot.controller is not None
-            motion = pilot.controller.advance(motion, since, until - t_us)
+            current = current.activated(motion, t_us)
+            until = min([end_us, *(p.from_us for p in current.pending)])
+            since = (t_us - current.since_us) * 1e-6
+            assert current.controller is not None
+            motion = current.controller.advance(motion, since, until - t_us)
             t_us = until
-        return pilot, motion
+        return current, motion
 
-    def begun(self, motion: Motion, t_us: int) -> EgoController:
-        """With whatever holds from ``t_us`` on."""
-        return self._now(motion, t_us)
+    def command(self, motion: Motion, t_us: int) -> Command:
+        """Of the active controller in a motion at ``t_us``."""
+        assert self.controller is not None
+        return self.controller.command(motion, (t_us - self.since_us) * 1e-6)
 
-    def _now(self, motion: Motion, t_us: int) -> EgoController:
-        """With the newest plan that has taken effect in charge."""
-        pilot = self
-        while pilot.coming and pilot.coming[0].from_us <= t_us:
-            controller = pilot._controller(pilot.coming[0].plan, motion, t_us)
-            pilot = EgoController(self.spec, self.ego, controller, t_us, pilot.coming[1:])
-        if pilot.controller is None:
-            log = pilot._follow_log(motion, t_us)
-            pilot = replace(pilot, controller=log, since_us=t_us)
-        return pilot
+    def activated(self, motion: Motion, t_us: int) -> EgoController:
+        """With the newest plan that has taken effect by ``t_us`` under control."""
+        current = self
+        while current.pending and current.pending[0].from_us <= t_us:
+            controller = current._controller_of(current.pending[0].plan, motion, t_us)
+            current = EgoController(self.spec, self.ego, controller, t_us, current.pending[1:])
+        if current.controller is None:
+            log = current._follow_log(motion, t_us)
+            current = replace(current, controller=log, since_us=t_us)
+        return current
 
-    def _controller(self, plan: Planned, motion: Motion, t_us: int) -> Controller:
+    def _controller_of(self, plan: Planned, motion: Motion, t_us: int) -> Controller:
         match plan:
             case PlannedTrajectory():
                 return self._tracker(motion, t_us, plan.after(t_us))
@@ -185,14 +186,16 @@ class EgoController:
         poses = np.column_stack([transforms[:, :2, 3], yaws])
         return self._tracker(motion, t_us, PlannedTrajectory(times, poses))
 
-    def _tracker(self, motion: Motion, t_us: int, course: PlannedTrajectory) -> Controller:
+    def _tracker(self, motion: Motion, t_us: int, trajectory: PlannedTrajectory) -> Controller:
         spec = self.spec.ego
-        return make_tracker(Reference(motion, start_us=t_us, course=course, spec=spec), spec)
+        return make_tracker(
+            ReferenceTrajectory(motion, start_us=t_us, trajectory=trajectory, spec=spec), spec
+        )
 
 
-def braking(pilot: EgoController, motion: Motion, spec: EgoSpec) -> Controller:
+def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) -> Controller:
     """The fallback of a planner that is late: brake, and keep the wheels as they are."""
-    if pilot.spec.action == "pose":
+    if controller.spec.action == "pose":
         return Teleport((motion.x, motion.y, motion.yaw), spec)
     return ConstantCommand(
         Command(-min(EMERGENCY_BRAKING, spec.max_braking), motion.steering), spec

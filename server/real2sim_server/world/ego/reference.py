@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from real2sim_proto.episode import EgoSpec
 
-from ..driving import curve_at, plan_curve, vehicle_of, world_poses
+from ..driving import curve_at, plan_curve, vehicle_parameters, world_poses
 from ..path import Float
-from .vehicle import Driver, Motion
+from .motion import ControlLaw, Motion
 
 Pose = tuple[float, float, float]
 """x, y [m], yaw [rad] in the world."""
@@ -34,7 +34,7 @@ class PlannedTrajectory:
     def of(
         times_us: Sequence[int], poses: Sequence[Pose], frame: Pose | None = None
     ) -> PlannedTrajectory:
-        """The course through poses of a frame, given by its pose in the world; None: world."""
+        """The trajectory through poses of a frame, given by its pose in the world; None: world."""
         numbers = np.array(poses, np.float64)
         if frame is not None:
             numbers = world_poses(numbers, frame)
@@ -50,15 +50,15 @@ class PlannedTrajectory:
         return PlannedTrajectory(self.times_us[over:], self.poses[over:])
 
 
-class Reference:
-    """A course as a smooth curve over time, see :mod:`.driving.curve`."""
+class ReferenceTrajectory:
+    """A planned trajectory as a smooth curve over time, see :mod:`.driving.curve`."""
 
     def __init__(
         self,
         motion: Motion,
         *,
         start_us: int,
-        course: PlannedTrajectory,
+        trajectory: PlannedTrajectory,
         spec: EgoSpec,
     ) -> None:
         """The curve of a vehicle that is in ``motion`` at ``start_us``.
@@ -66,15 +66,15 @@ class Reference:
         Args:
             motion: of the vehicle.
             start_us: now [us].
-            course: after ``start_us``.
+            trajectory: after ``start_us``.
             spec: of the vehicle.
         """
         self._curve = plan_curve(
             motion.numbers,
-            course.times_us,
+            trajectory.times_us,
             start_us,
-            course.poses,
-            tuple(vehicle_of(spec)),
+            trajectory.poses,
+            tuple(vehicle_parameters(spec)),
         )
 
     @property
@@ -88,9 +88,9 @@ class Reference:
         _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
         return x, y, yaw
 
-    def driver(self, kind: int) -> Driver:
-        """Who follows the plan: PURSUIT, LQR or ILQR."""
-        return Driver(kind, *self._curve)
+    def control_law(self, kind: int) -> ControlLaw:
+        """Follows the plan by PURSUIT, LQR or ILQR."""
+        return ControlLaw(kind, *self._curve)
 
     def at(self, t: float) -> tuple[float, float, float, float, float]:
         """x, y [m], velocity x, y [m/s] and planned heading [rad] in the world, ``t`` >= 0 seconds

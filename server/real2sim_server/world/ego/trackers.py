@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from real2sim_proto.episode import EgoSpec
 
 from ..driving import ILQR, LQR, MOVING, PURSUIT, Command
-from .reference import Reference
-from .vehicle import Motion, asked, drive, placed
+from .motion import Motion, advance_motion, commanded, teleported
+from .reference import ReferenceTrajectory
 
 KINDS = {"pursuit": PURSUIT, "lqr": LQR, "ilqr": ILQR}
 
 
 @dataclass(frozen=True, eq=False)
-class Steered:
+class ControlledTracker:
     """A controller in the vehicle, bound by the vehicle's limits; knows nothing of the past, so
     that a copied world goes on alike.
 
@@ -26,7 +26,7 @@ class Steered:
     """
 
     kind: int
-    reference: Reference
+    reference: ReferenceTrajectory
     spec: EgoSpec
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
@@ -37,15 +37,17 @@ class Steered:
             since: time since the reference began [s].
             dt_us: how far to go [us].
         """
-        return drive(motion, self.reference.driver(self.kind), self.spec, dt_us, since=since)
+        return advance_motion(
+            motion, self.reference.control_law(self.kind), self.spec, dt_us, since=since
+        )
 
     def command(self, motion: Motion, t: float) -> Command:
         """What to do in a motion, ``t`` seconds after the reference began."""
-        return asked(motion, self.reference.driver(self.kind), self.spec, since=t)
+        return commanded(motion, self.reference.control_law(self.kind), self.spec, since=t)
 
 
 @dataclass(frozen=True, eq=False)
-class Perfect:
+class PerfectTracker:
     """No controller at all: the vehicle is put where the plan is. For open-loop comparisons; obeys
     no limit of any vehicle.
 
@@ -54,26 +56,28 @@ class Perfect:
         spec: of the vehicle.
     """
 
-    reference: Reference
+    reference: ReferenceTrajectory
     spec: EgoSpec
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
         """The vehicle ``dt_us`` later: the plan's place, or its last one once it is over."""
         t = since + dt_us * 1e-6
         if t >= self.reference.end:
-            return placed(motion, self.reference.last_pose, self.spec, dt_us)
+            return teleported(motion, self.reference.last_pose, self.spec, dt_us)
         x, y, vx, vy, yaw = self.reference.at(t)
         if math.hypot(vx, vy) > MOVING:
             yaw = math.atan2(vy, vx)
-        return placed(motion, (x, y, yaw), self.spec, dt_us)
+        return teleported(motion, (x, y, yaw), self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
         """What an LQR would do; for vehicles that were pushed."""
-        return asked(motion, self.reference.driver(LQR), self.spec, since=t)
+        return commanded(motion, self.reference.control_law(LQR), self.spec, since=t)
 
 
-def make_tracker(reference: Reference, spec: EgoSpec) -> Steered | Perfect:
+def make_tracker(
+    reference: ReferenceTrajectory, spec: EgoSpec
+) -> ControlledTracker | PerfectTracker:
     """The tracker that the spec names."""
     if spec.tracker == "perfect":
-        return Perfect(reference, spec)
-    return Steered(KINDS[spec.tracker], reference, spec)
+        return PerfectTracker(reference, spec)
+    return ControlledTracker(KINDS[spec.tracker], reference, spec)

@@ -116,7 +116,7 @@ def _mcap(module: str) -> Any:
 def _messages(recording: Recording) -> Iterator[tuple[Topic, int, dict[str, Any]]]:
     """Topic, time and content of every message, by time."""
     frames = _frames_by_step(recording.frames)
-    for instant, tally in zip(recording.instants, recording.tallies(), strict=True):
+    for instant, accumulator in zip(recording.instants, recording.accumulators(), strict=True):
         t_us, stamp = instant.t_us, _stamp(instant.t_us)
         yield TRANSFORM, t_us, _transform(instant, stamp)
         yield SCENE, t_us, _scene(recording, instant, stamp)
@@ -124,9 +124,9 @@ def _messages(recording: Recording) -> Iterator[tuple[Topic, int, dict[str, Any]
         if instant.plan is not None:
             yield PLAN, t_us, _plan(instant, stamp)
         for contact in instant.contacts:
-            noted = asdict(contact) | {"impulse": list(contact.impulse)}
-            yield CONTACT, t_us, {"timestamp": stamp, **noted}
-        metrics = scoring.running(tally, recording.context)
+            fields = asdict(contact) | {"impulse": list(contact.impulse)}
+            yield CONTACT, t_us, {"timestamp": stamp, **fields}
+        metrics = scoring.running_metrics(accumulator, recording.context)
         yield METRICS, t_us, {"timestamp": stamp, **metrics}
         for name, suffix, data in frames.get(instant.step, ()):
             yield (f"/camera/{name}", IMAGE_SCHEMA), t_us, _image(name, suffix, data, stamp)

@@ -1,10 +1,10 @@
-"""An episode as one file: what was asked for, what came of it, and enough to score it again.
+"""An episode as one file: requests, committed states, and enough to score it again.
 
 The file is a zip archive:
 
 - ``episode.json``: format, scene and hash, scenario, seed, versions of scores, scores, cameras;
 - ``log.msgpack``: entries of the session from its reset on (kind, step, payload);
-- ``instants.msgpack``: what the scores saw of every step, and a digest of its observation;
+- ``instants.msgpack``: what the scores need of every step, and a digest of its observation;
 - ``context.msgpack``: what stays the same for the scores;
 - ``state.msgpack``: how the scenario differed from the scene, where it began from one;
 - ``frames/<camera>/<step>.jpg`` and ``.png``: images, where they were asked for.
@@ -35,11 +35,11 @@ from ...scene import Scene
 from .. import scoring
 from ..ego.reference import PlannedTrajectory
 from ..scoring import (
-    ContactNote,
+    ContactRecord,
     EgoSample,
     Instant,
     MetricAccumulator,
-    Others,
+    ObjectSamples,
     Score,
     ScoringContext,
     metrics_version,
@@ -87,7 +87,7 @@ class Recording:
     state: bytes | None = field(default=None, repr=False)
     frames: Mapping[str, bytes] = field(default_factory=dict, repr=False)
 
-    def fresh(self, scene: Scene, assets: AssetLookup | None = None) -> Replayer:
+    def replayer(self, scene: Scene, assets: AssetLookup | None = None) -> Replayer:
         """The session before its first entry.
 
         Args:
@@ -98,28 +98,28 @@ class Recording:
             EditError: UNKNOWN_ASSET.
             RecordingError: it began from a scenario, and an old file does not tell how that was.
         """
-        begun = ScenarioState.of(scene, assets=assets)
+        initial = ScenarioState.of(scene, assets=assets)
         if self.state is not None:
-            begun = unpack_state(begun, self.state)
+            initial = unpack_state(initial, self.state)
         elif self.scenario_id is not None:
             raise RecordingError(
                 f"the episode began from scenario {self.scenario_id!r} at revision "
                 f"{self.scenario_revision}, which is not in the file; it can still be scored"
             )
-        return Replayer.on(scene, begun)
+        return Replayer.on(scene, initial)
 
     def rescore(self) -> list[Score]:
-        """Scores by the formulas of this version, from the recorded instants alone."""
-        return scoring.scores_of(self.tallies()[-1], self.context)
+        """Scores by the metrics of this version, from the recorded instants alone."""
+        return scoring.scores_of(self.accumulators()[-1], self.context)
 
-    def tallies(self) -> list[MetricAccumulator]:
-        """What the episode had come to at every instant."""
-        tally = scoring.begin(self.instants[0], self.context)
-        tallies = [tally]
+    def accumulators(self) -> list[MetricAccumulator]:
+        """The accumulator at every instant."""
+        accumulator = scoring.begin_accumulator(self.instants[0], self.context)
+        accumulators = [accumulator]
         for instant in self.instants[1:]:
-            tally = scoring.after(tally, instant, self.context)
-            tallies.append(tally)
-        return tallies
+            accumulator = scoring.update_accumulator(accumulator, instant, self.context)
+            accumulators.append(accumulator)
+        return accumulators
 
 
 def digest(world: World) -> str:
@@ -135,7 +135,7 @@ def digest(world: World) -> str:
 
 
 def record(
-    retold: Replayer,
+    replayer: Replayer,
     entries: Sequence[Entry],
     *,
     scene_hash: str,
@@ -143,10 +143,10 @@ def record(
     state: ScenarioState | None = None,
     no_action_impact: float | None = None,
 ) -> Recording:
-    """The recording of an episode, by living through it again.
+    """The recording of an episode, by replaying it.
 
     Args:
-        retold: fresh, on the episode's scene.
+        replayer: fresh, on the episode's scene.
         entries: of the episode, its reset first; returns to snapshots cut off what they undo.
         scene_hash: of the scene's bundle.
         scenario: id and revision.
@@ -156,15 +156,15 @@ def record(
     instants: list[Instant] = []
     digests: list[str] = []
     for entry in entries:
-        world = retold.tell(entry)
+        world = replayer.apply(entry)
         if entry.kind == "snapshot":
             continue
         # A step adds an instant; what changes the present one replaces it; a return cuts off.
         del instants[world.steps :], digests[world.steps :]
         instants.append(world.instant)
         digests.append(digest(world))
-    context = _with_impact(world.context, no_action_impact)
-    scores = scoring.scores_of(world.tally, context)
+    context = _with_no_action_impact(world.context, no_action_impact)
+    scores = scoring.scores_of(world.accumulator, context)
     return Recording(
         scene=world.scene.name,
         scene_hash=scene_hash,
@@ -180,7 +180,7 @@ def record(
     )
 
 
-def _with_impact(context: ScoringContext, impact: float | None) -> ScoringContext:
+def _with_no_action_impact(context: ScoringContext, impact: float | None) -> ScoringContext:
     if impact is None:
         return context
     return ScoringContext.from_fields(context.fields() | {"no_action_impact": impact})
@@ -315,7 +315,7 @@ def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
         step=row["step"],
         t_us=row["t_us"],
         ego=EgoSample(*row["ego"]),
-        others=Others(
+        others=ObjectSamples(
             ids=tuple(row["ids"]),
             categories=tuple(row["categories"]),
             # Copies, since kernels are compiled anew for arrays that must not be written to.
@@ -325,7 +325,7 @@ def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
             velocities=np.array(row["velocities"]),
         ),
         contacts=tuple(
-            ContactNote(**c | {"impulse": (c["impulse"][0], c["impulse"][1])})
+            ContactRecord(**c | {"impulse": (c["impulse"][0], c["impulse"][1])})
             for c in row["contacts"]
         ),
         secondary=row["secondary"],
@@ -334,16 +334,16 @@ def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
     return instant, row["digest"]
 
 
-def first_difference(recording: Recording, retold: Replayer) -> int | None:
-    """The first step at which living through it again differs; None where all bits are the same.
+def first_difference(recording: Recording, replayer: Replayer) -> int | None:
+    """The first step at which its replay differs; None where all bits are the same.
 
     Args:
         recording: of the episode.
-        retold: fresh, on the same scene.
+        replayer: fresh, on the same scene.
     """
     digests: list[str] = []
     for entry in recording.entries:
-        world = retold.tell(entry)
+        world = replayer.apply(entry)
         if entry.kind == "snapshot":
             continue
         del digests[world.steps :]

@@ -1,4 +1,4 @@
-"""An episode as the list of what was asked for: enough to live through it again, bit for bit."""
+"""An episode as a log of requests, and its replay, bit for bit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing that happened to a session.
+    """One request that took effect on a session.
 
     Attributes:
         kind: one of ``KINDS``.
@@ -85,11 +85,11 @@ KEPT_PLAN = action_payload(None)
 
 @dataclass(eq=False)
 class Replayer:
-    """A session lived through again.
+    """A session replayed from its entries.
 
     Attributes:
         begin: makes the world of an episode.
-        world: as far as it was told; None before the first reset. Never changed in place.
+        world: after the entries so far; None before the first reset. Never changed in place.
         snapshots: by name.
     """
 
@@ -102,7 +102,7 @@ class Replayer:
         """A session on a scene, with objects as they were at its creation."""
         return cls(lambda spec: World(scene, state, spec))
 
-    def tell(self, entry: Entry) -> World:
+    def apply(self, entry: Entry) -> World:
         """The world after one more entry.
 
         Raises:
@@ -121,12 +121,12 @@ class Replayer:
         if entry.kind == "snapshot":
             self.snapshots[fields["name"]] = self.world
             return self.world
-        self.world = self.world.light_copy()
-        _happen(self.world, entry.kind, fields)
+        self.world = self.world.fork()
+        _apply_entry(self.world, entry.kind, fields)
         return self.world
 
 
-def _happen(world: World, kind: str, fields: dict[str, Any]) -> None:
+def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
     match kind:
         case "action":
             plan = None if fields["plan"] is None else PLAN.validate_python(fields["plan"])
@@ -139,40 +139,40 @@ def _happen(world: World, kind: str, fields: dict[str, Any]) -> None:
             world.apply(_OPERATIONS.validate_python(fields["operations"]))
         case "agent":
             poses = [(x, y, yaw) for x, y, yaw in fields["poses"]]
-            world.steer(fields["object_id"], fields["times_us"], poses)
+            world.set_agent_plan(fields["object_id"], fields["times_us"], poses)
         case "stop":
             world.stop(fields["reason"])
         case _:
             raise ValueError(f"a log entry of kind {kind!r}; known are {', '.join(KINDS)}")
 
 
-def worlds_of(retold: Replayer, entries: Iterable[Entry]) -> Iterator[tuple[Entry, World]]:
+def replayed_worlds(replayer: Replayer, entries: Iterable[Entry]) -> Iterator[tuple[Entry, World]]:
     """Every entry with the world after it."""
     for entry in entries:
-        yield entry, retold.tell(entry)
+        yield entry, replayer.apply(entry)
 
 
-def no_action_impact(retold: Replayer, entries: Sequence[Entry]) -> float:
+def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:
     """Relative speed [m/s] at the first contact of a run in which the ego keeps to the recorded
-    drive whatever happens; 0 where it touches nothing. v_r of NeuroNCAP.
+    drive whatever is in the way; 0 where it touches nothing. v_r of NeuroNCAP.
 
-    Everything but plans happens as in ``entries``: edits, other agents.
+    Everything but plans is as in ``entries``: edits, other agents.
 
     Args:
-        retold: fresh, on the same scene.
+        replayer: fresh, on the same scene.
         entries: of the episode, its reset first.
     """
     first, *rest = entries
     spec = ResetSpec.model_validate(decode(first.payload)["spec"])
     steady = spec.model_copy(update={"on_collision": "terminate", "deadline_ms": None})
-    world = retold.begin(steady)
-    others: dict[int, list[Entry]] = {}
+    world = replayer.begin(steady)
+    requests: dict[int, list[Entry]] = {}
     for entry in rest:
         if entry.kind in {"edit", "agent"}:
-            others.setdefault(entry.step, []).append(entry)
+            requests.setdefault(entry.step, []).append(entry)
     while not world.over:
-        for entry in others.get(world.steps, ()):
-            _happen(world, entry.kind, decode(entry.payload))
+        for entry in requests.get(world.steps, ()):
+            _apply_entry(world, entry.kind, decode(entry.payload))
         for event in world.step():
             if event.type == "collision":
                 return event.data["relative_speed"]

@@ -1,21 +1,21 @@
 """Versioned scores of episodes: the same code for a running episode and for a recording."""
 
-from .accumulator import MetricAccumulator, after, begin
-from .instant import ContactNote, EgoSample, Instant, Others, ScoringContext
-from .metrics import VERSIONS, Score, metrics_version, running, scores_of
+from .accumulator import MetricAccumulator, begin_accumulator, update_accumulator
+from .instant import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
+from .metrics import VERSIONS, Score, metrics_version, running_metrics, scores_of
 
 __all__ = [
     "VERSIONS",
-    "ContactNote",
+    "ContactRecord",
     "EgoSample",
     "Instant",
     "MetricAccumulator",
-    "Others",
+    "ObjectSamples",
     "Score",
     "ScoringContext",
-    "after",
-    "begin",
+    "begin_accumulator",
     "metrics_version",
-    "running",
+    "running_metrics",
     "scores_of",
+    "update_accumulator",
 ]

@@ -12,7 +12,7 @@ from scipy.signal import savgol_coeffs
 
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
-from .comfort_kernels import derivatives, plans_alike, slid
+from .comfort_kernels import derivatives, plans_alike, push_sample
 
 WINDOW_S = 1.5
 ORDER = 3
@@ -26,7 +26,7 @@ YAW_ACCELERATION = 1.93
 """Bounds of nuPlan and NAVSIM [m/s^2], [m/s^3], [rad/s], [rad/s^2]."""
 
 
-class Felt(NamedTuple):
+class ComfortSample(NamedTuple):
     """What passengers feel at one time: SI units, as the bounds."""
 
     lon_acceleration: float
@@ -51,34 +51,34 @@ class Felt(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Ride:
+class ComfortAccumulator:
     """Comfort of a drive so far.
 
     Derivatives are those of cubics through the last 1.5 s (Savitzky & Golay 1964), taken in the
-    middle of that window; so the first and last 0.75 s of a drive are not judged.
+    middle of that window; so the first and last 0.75 s of a drive are not evaluated.
 
     Attributes:
         samples: [n, 2] float64, speed [m/s] and continuous yaw [rad] of the last 1.5 s.
         comfortable: whether all bounds held so far.
-        worst: greatest magnitudes so far, in the order of :class:`Felt`.
+        worst: greatest magnitudes so far, in the order of :class:`ComfortSample`.
     """
 
     samples: Float = field(default_factory=lambda: np.zeros((0, 2)))
     comfortable: bool = True
     worst: tuple[float, ...] = (0.0,) * 6
 
-    def after(self, speed: float, yaw: float, dt: float) -> Ride:
-        """The ride after one more clock step."""
-        window = window_of(dt)
-        samples = slid(self.samples, speed, yaw, window)
+    def updated(self, speed: float, yaw: float, dt: float) -> ComfortAccumulator:
+        """After one more clock step."""
+        window = comfort_window(dt)
+        samples = push_sample(self.samples, speed, yaw, window)
         if len(samples) < window:
-            return Ride(samples, self.comfortable, self.worst)
-        felt = felt_in(samples, dt)
-        worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, felt, strict=True))
-        return Ride(samples, self.comfortable and felt.comfortable, worst)
+            return ComfortAccumulator(samples, self.comfortable, self.worst)
+        sample = comfort_sample(samples, dt)
+        worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, sample, strict=True))
+        return ComfortAccumulator(samples, self.comfortable and sample.comfortable, worst)
 
 
-def window_of(dt: float) -> int:
+def comfort_window(dt: float) -> int:
     """Samples in a window; odd, at least five."""
     return max(2 * round(WINDOW_S / dt / 2) - 1, 5) if dt < WINDOW_S / 4 else 5
 
@@ -91,8 +91,8 @@ def _coefficients(window: int, dt: float) -> Float:
     return np.stack(rows)
 
 
-def felt_in(samples: Float, dt: float) -> Felt:
-    """What is felt in the middle of samples [W, 2] of speed and yaw."""
+def comfort_sample(samples: Float, dt: float) -> ComfortSample:
+    """Comfort in the middle of samples [W, 2] of speed and yaw."""
     speed, acceleration, lon_jerk, rate, yaw_acceleration = derivatives(
         _coefficients(len(samples), dt), samples
     )
@@ -100,7 +100,7 @@ def felt_in(samples: Float, dt: float) -> Felt:
     # d/dt of the lateral acceleration v w, by the product rule.
     lat_jerk = acceleration * rate + speed * yaw_acceleration
     jerk = math.hypot(lon_jerk, lat_jerk)
-    return Felt(acceleration, lateral, jerk, lon_jerk, rate, yaw_acceleration)
+    return ComfortSample(acceleration, lateral, jerk, lon_jerk, rate, yaw_acceleration)
 
 
 def plans_agree(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | None:

@@ -18,7 +18,7 @@ SHORTEST_OVERLAP = 6
 
 
 @kernel
-def slid(samples, speed, yaw, window):
+def push_sample(samples, speed, yaw, window):
     """Samples [n, 2] of speed and yaw with one more at their end, the last ``window`` of them."""
     kept = min(len(samples), window - 1)
     found = np.empty((kept + 1, 2))
@@ -28,7 +28,7 @@ def slid(samples, speed, yaw, window):
 
 
 @kernel
-def summed(values, value, window):
+def windowed_sum(values, value, window):
     """Values [n] with one more at their end, the last ``window`` of them; and their sum."""
     kept = min(len(values), window - 1)
     found = np.empty(kept + 1)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .hazard_kernels import STEP, first_meeting
+from .hazard_kernels import STEP, first_overlap_step
 from .instant import Instant, ScoringContext
 
 STANDSTILL = 5e-3
@@ -32,7 +32,7 @@ def time_to_collision(
     ego, others = instant.ego, instant.others
     if not others.ids or math.hypot(ego.speed, ego.lateral_speed) < STANDSTILL:
         return NEVER
-    step: int = first_meeting(
+    step: int = first_overlap_step(
         (ego.x, ego.y, ego.yaw, ego.speed, ego.lateral_speed, ego.z),
         context.ego_size,
         context.centre_ahead,

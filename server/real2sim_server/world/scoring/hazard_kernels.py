@@ -16,7 +16,7 @@ AHEAD, BEHIND = math.radians(30), math.radians(150)
 
 
 @kernel
-def first_meeting(ego, size, centre_ahead, everywhere, others, ignored):
+def first_overlap_step(ego, size, centre_ahead, everywhere, others, ignored):
     """The first step of 0.1 s up to 3 s at which the ego box overlaps that of an object.
 
     Args:

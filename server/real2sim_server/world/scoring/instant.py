@@ -43,7 +43,7 @@ class EgoSample(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Others:
+class ObjectSamples:
     """Objects at one instant, K of them.
 
     Attributes:
@@ -63,7 +63,7 @@ class Others:
 
 
 @dataclass(frozen=True)
-class ContactNote:
+class ContactRecord:
     """A contact of the ego that began in this step, or went on with momentum.
 
     Attributes:
@@ -101,8 +101,8 @@ class Instant:
     step: int
     t_us: int
     ego: EgoSample
-    others: Others
-    contacts: tuple[ContactNote, ...] = ()
+    others: ObjectSamples
+    contacts: tuple[ContactRecord, ...] = ()
     secondary: int = 0
     plan: PlannedTrajectory | None = None
 

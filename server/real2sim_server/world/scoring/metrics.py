@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from .accumulator import MetricAccumulator, kind_of
+from .accumulator import MetricAccumulator, fault_class
 from .instant import ScoringContext
 
 TTC_BOUND = 0.95
 """nuPlan; NAVSIM's projections at 0, 0.3, 0.6, 0.9 s ask the same on a grid of 0.1 s [s]."""
 
-SHORT_WAY = 5.0
+SHORT_ROUTE = 5.0
 """Ways up to this are no measure of progress (NAVSIM) [m]."""
 
 CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
@@ -41,9 +41,9 @@ class Score(NamedTuple):
         }
 
 
-def scores_of(tally: MetricAccumulator, context: ScoringContext) -> list[Score]:
+def scores_of(accumulator: MetricAccumulator, context: ScoringContext) -> list[Score]:
     """All scores of an episode so far."""
-    return [formula(tally, context) for formula in FORMULAS]
+    return [metric(accumulator, context) for metric in METRICS]
 
 
 def metrics_version() -> str:
@@ -54,183 +54,183 @@ def metrics_version() -> str:
 # --- terms ------------------------------------------------------------------------------------
 
 
-def no_collision(tally: MetricAccumulator) -> float:
+def no_collision(accumulator: MetricAccumulator) -> float:
     """NC of NAVSIM: 0 for an at-fault hit on a vehicle or road user, 0.5 on an object, else 1."""
-    if tally.at_fault.get("vru") or tally.at_fault.get("vehicle"):
+    if accumulator.at_fault.get("vru") or accumulator.at_fault.get("vehicle"):
         return 0.0
-    return 0.5 if tally.at_fault.get("object") else 1.0
+    return 0.5 if accumulator.at_fault.get("object") else 1.0
 
 
-def nuplan_no_collision(tally: MetricAccumulator) -> float:
+def nuplan_no_collision(accumulator: MetricAccumulator) -> float:
     """NC of nuPlan: product of max(0, 1 - n/(m + 1)) with m = 0 for road users and vehicles, 1
     for objects."""
     allowed = {"vru": 0, "vehicle": 0, "object": 1}
     return math.prod(
-        max(0.0, 1 - tally.at_fault.get(kind, 0) / (m + 1)) for kind, m in allowed.items()
+        max(0.0, 1 - accumulator.at_fault.get(kind, 0) / (m + 1)) for kind, m in allowed.items()
     )
 
 
-def direction(tally: MetricAccumulator) -> float:
+def direction(accumulator: MetricAccumulator) -> float:
     """DDC: 1 below 2 m of way against the route within a second, 0.5 below 6 m, else 0."""
-    return 1.0 if tally.oncoming < 2.0 else 0.5 if tally.oncoming < 6.0 else 0.0
+    return 1.0 if accumulator.oncoming < 2.0 else 0.5 if accumulator.oncoming < 6.0 else 0.0
 
 
-def expert_way(tally: MetricAccumulator, context: ScoringContext) -> float:
+def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """Way of the recorded drive along the route in the same time [m]."""
-    step = min(tally.steps, len(context.expert_s) - 1)
+    step = min(accumulator.steps, len(context.expert_s) - 1)
     return context.expert_s[step] - context.start_s
 
 
-def way_of(tally: MetricAccumulator, context: ScoringContext) -> float:
+def progress_along_route(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """Way along the route [m]."""
-    return max(tally.s - context.start_s, 0.0)
+    return max(accumulator.s - context.start_s, 0.0)
 
 
-def navsim_progress(tally: MetricAccumulator, context: ScoringContext) -> float:
+def navsim_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """EP of NAVSIM with the recorded drive in place of PDM-Closed."""
-    way, expert = way_of(tally, context), expert_way(tally, context)
-    clear = no_collision(tally) * float(not tally.off_road)
+    way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
+    clear = no_collision(accumulator) * float(not accumulator.off_road)
     most = max(way * clear, expert)
-    return 1.0 if most <= SHORT_WAY else min(way / most, 1.0)
+    return 1.0 if most <= SHORT_ROUTE else min(way / most, 1.0)
 
 
-def completed(tally: MetricAccumulator, context: ScoringContext) -> float:
-    """Share of the recorded way up to the horizon that was reached."""
+def route_completion(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """Fraction of the recorded way up to the horizon that was reached."""
     whole = context.route_end_s - context.start_s
-    return 1.0 if whole <= 0 else min(max(tally.furthest - context.start_s, 0.0) / whole, 1.0)
+    return 1.0 if whole <= 0 else min(max(accumulator.furthest - context.start_s, 0.0) / whole, 1.0)
 
 
-def safe(tally: MetricAccumulator) -> float:
+def ttc_within_bound(accumulator: MetricAccumulator) -> float:
     """1 while no time to collision was 0.95 s or less."""
-    return float(tally.min_ttc > TTC_BOUND)
+    return float(accumulator.min_ttc > TTC_BOUND)
 
 
 # --- scores -----------------------------------------------------------------------------------
 
 
-def pdms(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven."""
     terms = {
-        "NC": no_collision(tally),
-        "DAC": float(not tally.off_road),
-        "EP": navsim_progress(tally, context),
-        "TTC": safe(tally),
-        "C": float(tally.ride.comfortable),
+        "NC": no_collision(accumulator),
+        "DAC": float(not accumulator.off_road),
+        "EP": navsim_progress(accumulator, context),
+        "TTC": ttc_within_bound(accumulator),
+        "C": float(accumulator.comfort.comfortable),
     }
     weighted = 5 * terms["EP"] + 5 * terms["TTC"] + 2 * terms["C"]
     value = terms["NC"] * terms["DAC"] * weighted / 12
     return _score("pdms", value, terms, assumed=(NO_MAP,))
 
 
-def epdms(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
     without the penalty filter by the human drive."""
-    if not tally.plans_compared:
+    if not accumulator.plans_compared:
         return _score("epdms", None, {}, missing=("successive trajectory plans (EC)",))
     terms = {
-        "NC": no_collision(tally),
-        "DAC": float(not tally.off_road),
-        "DDC": direction(tally),
+        "NC": no_collision(accumulator),
+        "DAC": float(not accumulator.off_road),
+        "DDC": direction(accumulator),
         "TLC": 1.0,
-        "EP": navsim_progress(tally, context),
-        "TTC": safe(tally),
-        "LK": float(not tally.left_lane),
-        "HC": float(tally.ride_with_history.comfortable),
-        "EC": float(not tally.plans_disagree),
+        "EP": navsim_progress(accumulator, context),
+        "TTC": ttc_within_bound(accumulator),
+        "LK": float(not accumulator.left_lane),
+        "HC": float(accumulator.comfort_with_history.comfortable),
+        "EC": float(not accumulator.plans_disagree),
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 2 * (terms["LK"] + terms["HC"] + terms["EC"])
     value = terms["NC"] * terms["DAC"] * terms["DDC"] * terms["TLC"] * weighted / 16
     return _score("epdms", value, terms, assumed=("TLC: no traffic lights", NO_MAP))
 
 
-def nuplan(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
-    way, expert = way_of(tally, context), expert_way(tally, context)
-    limit, seconds = context.speed_limit, max(tally.steps * context.dt, context.dt)
+    way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
+    limit, seconds = context.speed_limit, max(accumulator.steps * context.dt, context.dt)
     terms = {
-        "NC": nuplan_no_collision(tally),
-        "DAC": float(not tally.far_off_road),
-        "DDC": direction(tally),
+        "NC": nuplan_no_collision(accumulator),
+        "DAC": float(not accumulator.far_off_road),
+        "DDC": direction(accumulator),
         "EP": min(1.0, max(way, 0.1) / max(expert, 0.1)),
-        "TTC": safe(tally),
-        "SL": 1.0 if limit is None else max(0.0, 1 - tally.overspeed / (2.23 * seconds)),
-        "C": float(tally.ride.comfortable),
+        "TTC": ttc_within_bound(accumulator),
+        "SL": 1.0 if limit is None else max(0.0, 1 - accumulator.overspeed / (2.23 * seconds)),
+        "C": float(accumulator.comfort.comfortable),
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 4 * terms["SL"] + 2 * terms["C"]
-    making_way = float(terms["EP"] >= 0.2)
-    value = terms["NC"] * terms["DAC"] * terms["DDC"] * making_way * weighted / 16
+    makes_progress = float(terms["EP"] >= 0.2)
+    value = terms["NC"] * terms["DAC"] * terms["DDC"] * makes_progress * weighted / 16
     assumed = (NO_MAP,) if limit is not None else ("SL: no speed limit known", NO_MAP)
     return _score("nuplan_cls", value, terms, assumed=assumed)
 
 
-def hugsim(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
     whole = context.route_end_s - context.start_s
-    reached = max(tally.furthest - context.start_s, 0.0)
+    reached = max(accumulator.furthest - context.start_s, 0.0)
     route = 1.0 if whole <= 0 else min(reached / (0.9 * whole), 1.0)
-    mean = tally.hugsim / tally.steps if tally.steps else 1.0
+    mean = accumulator.hugsim / accumulator.steps if accumulator.steps else 1.0
     return _score("hugsim_hd", route * mean, {"RC": route, "mean": mean}, assumed=(NO_MAP,))
 
 
-def neuroncap(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """5 without collision, else 4 max(0, 1 - v_i/v_r) (Ljungbergh et al. 2024, NeuroNCAP).
 
     v_i is the relative speed at first contact, v_r that of a run in which the ego keeps to the
     recorded drive whatever happens.
     """
-    if tally.first_impact is None:
+    if accumulator.first_impact is None:
         return _score("neuroncap", 5.0, {})
     reference = context.no_action_impact
     if reference is None:
-        return _score("neuroncap", None, {"v_i": tally.first_impact}, missing=("v_r",))
-    ratio = tally.first_impact / reference if reference > 0 else math.inf
-    terms = {"v_i": tally.first_impact, "v_r": reference}
+        return _score("neuroncap", None, {"v_i": accumulator.first_impact}, missing=("v_r",))
+    ratio = accumulator.first_impact / reference if reference > 0 else math.inf
+    terms = {"v_i": accumulator.first_impact, "v_r": reference}
     return _score("neuroncap", 4 * max(0.0, 1 - ratio), terms)
 
 
-def carla(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def carla(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """Route completion in percent times the product of penalties (CARLA leaderboard), with those
     infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65."""
     counts = {"vru": 0, "vehicle": 0, "object": 0}
-    for category, n in tally.contacts.items():
-        counts[kind_of(category)] += n
+    for category, n in accumulator.contacts.items():
+        counts[fault_class(category)] += n
     penalty = math.prod([CARLA_PENALTIES[kind] ** n for kind, n in counts.items()])
-    share = completed(tally, context)
-    terms = {"RC": share, "P": penalty} | {k: float(n) for k, n in counts.items()}
-    if tally.distance > 0:
-        terms["infractions_per_km"] = sum(counts.values()) / (tally.distance * 1e-3)
+    completion = route_completion(accumulator, context)
+    terms = {"RC": completion, "P": penalty} | {k: float(n) for k, n in counts.items()}
+    if accumulator.distance > 0:
+        terms["infractions_per_km"] = sum(counts.values()) / (accumulator.distance * 1e-3)
     assumed = ("no red lights, stop signs, yielding, timeouts",)
-    return _score("carla_ds", 100 * share * penalty, terms, assumed=assumed)
+    return _score("carla_ds", 100 * completion * penalty, terms, assumed=assumed)
 
 
-def alpasim(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """0 if at fault or off the road, else min(progress / 0.8, 1) (AlpaSim scene score)."""
-    way, expert = way_of(tally, context), expert_way(tally, context)
-    progress = 1.0 if expert < SHORT_WAY else min(way / expert, 1.0)
-    clear = not tally.at_fault and not tally.off_road
+    way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
+    progress = 1.0 if expert < SHORT_ROUTE else min(way / expert, 1.0)
+    clear = not accumulator.at_fault and not accumulator.off_road
     value = min(progress / 0.8, 1.0) if clear else 0.0
     return _score("alpasim", value, {"progress": progress}, assumed=(NO_MAP,))
 
 
-def feasible(tally: MetricAccumulator, _context: ScoringContext) -> Score:
+def feasible(accumulator: MetricAccumulator, _context: ScoringContext) -> Score:
     """1 if any step has |a| > 10.4 m/s^2 or |curvature| > 0.3 1/m, else 0 (Waymax)."""
-    return _score("kinematic_infeasibility", float(tally.infeasible), {})
+    return _score("kinematic_infeasibility", float(accumulator.infeasible), {})
 
 
-def crash(tally: MetricAccumulator, context: ScoringContext) -> Score:
+def crash(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     """Greatest change of the ego's velocity by one object [m/s], with what else physics says."""
-    strongest = max((math.hypot(*j) for j in tally.blows.values()), default=0.0)
+    strongest = max((math.hypot(*j) for j in accumulator.impulses.values()), default=0.0)
     terms = {
-        "impulse": sum(math.hypot(*j) for j in tally.blows.values()),
-        "secondary_collisions": float(tally.secondary),
+        "impulse": sum(math.hypot(*j) for j in accumulator.impulses.values()),
+        "secondary_collisions": float(accumulator.secondary),
     }
-    if tally.impact_place is not None and tally.ego is not None:
-        x, y = tally.impact_place
-        terms["post_impact_displacement"] = math.hypot(tally.ego.x - x, tally.ego.y - y)
+    if accumulator.impact_position is not None and accumulator.ego is not None:
+        x, y = accumulator.impact_position
+        terms["post_impact_displacement"] = math.hypot(accumulator.ego.x - x, accumulator.ego.y - y)
     return _score("delta_v", strongest / context.ego_mass, terms)
 
 
-FORMULAS: tuple[Callable[[MetricAccumulator, ScoringContext], Score], ...] = (
+METRICS: tuple[Callable[[MetricAccumulator, ScoringContext], Score], ...] = (
     pdms,
     epdms,
     nuplan,
@@ -253,7 +253,7 @@ VERSIONS = {
     "kinematic_infeasibility": "1",
     "delta_v": "1",
 }
-"""Version of each formula; raised when a value may change for the same episode."""
+"""Version of each metric; raised when a value may change for the same episode."""
 
 
 def _score(
@@ -267,25 +267,25 @@ def _score(
     return Score(name, VERSIONS[name], value, terms, assumed, missing)
 
 
-def running(tally: MetricAccumulator, context: ScoringContext) -> dict[str, float]:
+def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> dict[str, float]:
     """What is streamed with every observation; all finite."""
     found = {
-        "distance": tally.distance,
-        "route_progress": tally.s - context.start_s,
-        "lateral_offset": tally.offset,
-        "collisions": float(tally.collisions),
-        "at_fault_collisions": float(sum(tally.at_fault.values())),
-        "on_road": float(not tally.off_road),
-        "comfortable": float(tally.ride.comfortable),
-        "route_completion": completed(tally, context),
+        "distance": accumulator.distance,
+        "route_progress": accumulator.s - context.start_s,
+        "lateral_offset": accumulator.offset,
+        "collisions": float(accumulator.collisions),
+        "at_fault_collisions": float(sum(accumulator.at_fault.values())),
+        "on_road": float(not accumulator.off_road),
+        "comfortable": float(accumulator.comfort.comfortable),
+        "route_completion": route_completion(accumulator, context),
     }
-    if math.isfinite(tally.ttc):
-        found["ttc"] = tally.ttc
-    for formula in (pdms, nuplan, hugsim, carla):
-        score = formula(tally, context)
+    if math.isfinite(accumulator.ttc):
+        found["ttc"] = accumulator.ttc
+    for metric in (pdms, nuplan, hugsim, carla):
+        score = metric(accumulator, context)
         if score.value is not None:
             found[score.name] = score.value
     return found
 
 
-__all__ = ["FORMULAS", "VERSIONS", "Score", "metrics_version", "running", "scores_of"]
+__all__ = ["METRICS", "VERSIONS", "Score", "metrics_version", "running_metrics", "scores_of"]

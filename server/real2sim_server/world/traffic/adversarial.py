@@ -15,7 +15,7 @@ from real2sim_proto.episode import CutInDriver, HardBrakeDriver, JunctionCrossin
 from ...edit import ObjectState
 from ..path import LoggedPath
 from .driver import AgentPose, Surroundings, level_quaternion, pose_on_path
-from .idm import ahead
+from .idm import advance_along
 from .replay import recorded_pose
 
 PACE = 1.0
@@ -46,31 +46,36 @@ class CutIn:
     present: bool = True
 
     @classmethod
-    def begin(cls, subject: ObjectState, spec: CutInDriver, seen: Surroundings) -> CutIn:
+    def begin(cls, subject: ObjectState, spec: CutInDriver, surroundings: Surroundings) -> CutIn:
         """Beside the ego, ``gap`` ahead of it and as fast."""
-        s = seen.ego.s + seen.ego.front + spec.gap + subject.scaled_size[0] / 2
-        speed = seen.ego.speed
-        pose = _on_route(seen, subject, (s, spec.offset), (speed, 0.0))
+        s = surroundings.ego.s + surroundings.ego.front + spec.gap + subject.scaled_size[0] / 2
+        speed = surroundings.ego.speed
+        pose = _on_route(surroundings, subject, (s, spec.offset), (speed, 0.0))
         return cls(subject, spec, s, spec.offset, speed, pose)
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
         began = self.began
-        place = seen.ego.s + seen.ego.front + self.spec.gap + self.subject.scaled_size[0] / 2
-        if began is None and seen.elapsed >= self.spec.delay and abs(place - self.s) < 2.0:
-            began = (self.offset, max(seen.ego.speed + self.spec.speed_change, 0.0), 0.0)
+        place = (
+            surroundings.ego.s
+            + surroundings.ego.front
+            + self.spec.gap
+            + self.subject.scaled_size[0] / 2
+        )
+        if began is None and surroundings.elapsed >= self.spec.delay and abs(place - self.s) < 2.0:
+            began = (self.offset, max(surroundings.ego.speed + self.spec.speed_change, 0.0), 0.0)
         if began is None:
-            wanted = seen.ego.speed + (place - self.s) / PACE
-            rate = _towards(self.speed, wanted, PACE_ACCELERATION, seen.dt)
+            wanted = surroundings.ego.speed + (place - self.s) / PACE
+            rate = _towards(self.speed, wanted, PACE_ACCELERATION, surroundings.dt)
             offset = self.offset
         else:
             start, after, since = began
-            began = (start, after, since + seen.dt)
+            began = (start, after, since + surroundings.dt)
             offset = start * (1.0 - _smooth(began[2] / self.spec.duration))
-            rate = _towards(self.speed, after, CUT_BRAKING, seen.dt)
-        s, speed = ahead(self.s, self.speed, rate, seen.dt)
-        drift = (offset - self.offset) / seen.dt
-        pose = _on_route(seen, self.subject, (s, offset), (speed, drift))
+            rate = _towards(self.speed, after, CUT_BRAKING, surroundings.dt)
+        s, speed = advance_along(self.s, self.speed, rate, surroundings.dt)
+        drift = (offset - self.offset) / surroundings.dt
+        pose = _on_route(surroundings, self.subject, (s, offset), (speed, drift))
         return replace(self, s=s, speed=speed, offset=offset, began=began, pose=pose)
 
 
@@ -103,22 +108,26 @@ class HardBrake:
         speed = math.hypot(now.velocity[0], now.velocity[1])
         return cls(subject, spec, path, near.s, speed, now)
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
-        braking = self.braking or (seen.elapsed >= self.spec.delay and self._near(seen))
-        t_us, trajectory = seen.t_us + seen.dt_us, self.subject.trajectory
+        braking = self.braking or (
+            surroundings.elapsed >= self.spec.delay and self._near(surroundings)
+        )
+        t_us, trajectory = surroundings.t_us + surroundings.dt_us, self.subject.trajectory
         if not braking and t_us <= trajectory.end_us:
             now = recorded_pose(self.subject, t_us)
             near = self.path.nearest(now.position[0], now.position[1], near_s=self.s)
             speed = math.hypot(now.velocity[0], now.velocity[1])
             return replace(self, s=near.s, speed=speed, pose=now)
-        s, speed = ahead(self.s, self.speed, -self.spec.braking if braking else 0.0, seen.dt)
+        s, speed = advance_along(
+            self.s, self.speed, -self.spec.braking if braking else 0.0, surroundings.dt
+        )
         pose = pose_on_path(self.path, s, speed)
         return replace(self, s=s, speed=speed, pose=pose, braking=braking)
 
-    def _near(self, seen: Surroundings) -> bool:
+    def _near(self, surroundings: Surroundings) -> bool:
         """Whether the ego is behind, in the same lane, within the distance that triggers."""
-        ego, (x, y, _), yaw = seen.ego, self.pose.position, self.pose.yaw
+        ego, (x, y, _), yaw = surroundings.ego, self.pose.position, self.pose.yaw
         dx, dy = x - ego.x, y - ego.y
         ahead_of = dx * math.cos(yaw) + dy * math.sin(yaw)
         # The path may begin here; then the line straight back from it counts.
@@ -133,7 +142,7 @@ class JunctionCrossing:
 
     Attributes:
         subject, spec: the object and its parameters.
-        meeting_s: of the crossing point along the route [m].
+        crossing_s: of the crossing point along the route [m].
         crossing: the point x, y and the height of its box centre [m].
         heading: of its line [rad].
         left: way to the crossing point, negative beyond it [m].
@@ -143,7 +152,7 @@ class JunctionCrossing:
 
     subject: ObjectState
     spec: JunctionCrossingDriver
-    meeting_s: float
+    crossing_s: float
     crossing: tuple[float, float, float]
     heading: float
     left: float
@@ -153,16 +162,16 @@ class JunctionCrossing:
 
     @classmethod
     def begin(
-        cls, subject: ObjectState, spec: JunctionCrossingDriver, seen: Surroundings
+        cls, subject: ObjectState, spec: JunctionCrossingDriver, surroundings: Surroundings
     ) -> JunctionCrossing:
         """As far from the crossing as it goes at its speed in the time the ego needs."""
-        meeting = seen.ego.s + spec.ahead
-        x, y, z, yaw = seen.route.at(meeting)
-        eta = (spec.ahead - seen.ego.front) / max(seen.ego.speed, 1.0)
+        crossing_s = surroundings.ego.s + spec.ahead
+        x, y, z, yaw = surroundings.route.at(crossing_s)
+        eta = (spec.ahead - surroundings.ego.front) / max(surroundings.ego.speed, 1.0)
         made = cls(
             subject=subject,
             spec=spec,
-            meeting_s=meeting,
+            crossing_s=crossing_s,
             crossing=(x, y, z + subject.scaled_size[2] / 2),
             heading=yaw + spec.angle,
             left=max(eta, 0.0) * spec.speed,
@@ -171,14 +180,16 @@ class JunctionCrossing:
         )
         return replace(made, pose=made._placed(made.left, made.speed))
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
-        eta = (self.meeting_s - seen.ego.s - seen.ego.front) / max(seen.ego.speed, 0.5)
+        eta = (self.crossing_s - surroundings.ego.s - surroundings.ego.front) / max(
+            surroundings.ego.speed, 0.5
+        )
         rate = 0.0
         if self.left > 0.0 and eta > self.spec.commit:
             wanted = min(self.left / eta, self.spec.max_speed)
-            rate = _towards(self.speed, wanted, self.spec.acceleration, seen.dt)
-        way, speed = ahead(0.0, self.speed, rate, seen.dt)
+            rate = _towards(self.speed, wanted, self.spec.acceleration, surroundings.dt)
+        way, speed = advance_along(0.0, self.speed, rate, surroundings.dt)
         left = self.left - way
         return replace(self, left=left, speed=speed, pose=self._placed(left, speed))
 
@@ -193,7 +204,7 @@ class JunctionCrossing:
 
 
 def _on_route(
-    seen: Surroundings,
+    surroundings: Surroundings,
     subject: ObjectState,
     place: tuple[float, float],
     moving: tuple[float, float],
@@ -201,13 +212,13 @@ def _on_route(
     """An object beside the ego's route, standing on its ground.
 
     Args:
-        seen: has the route.
+        surroundings: has the route.
         subject: the object.
         place: along the route and to its left [m].
         moving: speed along it and to its left [m/s].
     """
     s, offset = place
-    pose = pose_on_path(seen.route, s, moving[0], offset=offset, drift=moving[1])
+    pose = pose_on_path(surroundings.route, s, moving[0], offset=offset, drift=moving[1])
     x, y, z = pose.position
     return pose._replace(position=(x, y, z + subject.scaled_size[2] / 2))
 
@@ -217,7 +228,7 @@ def _towards(speed: float, wanted: float, most: float, dt: float) -> float:
     return min(max((wanted - speed) / dt, -most), most)
 
 
-def _smooth(share: float) -> float:
+def _smooth(progress: float) -> float:
     """0 to 1 with slopes and curvatures of 0 at both ends: a lane change in unit time."""
-    u = min(max(share, 0.0), 1.0)
+    u = min(max(progress, 0.0), 1.0)
     return u * u * u * (10 - 15 * u + 6 * u * u)

@@ -1,4 +1,4 @@
-"""What drives another road user, and what it may know."""
+"""Drivers of other road users: Protocol, observation and poses."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from ...edit import ObjectState
 from ..agents import Agents, rows_of
-from ..collision.contact import REAR_OVERHANG
-from ..collision.contact_kernels import headings
-from ..ego.vehicle import Motion
+from ..broad_phase_kernels import headings
+from ..ego.box import REAR_OVERHANG
+from ..ego.motion import Motion
 from ..path import Float, LoggedPath, PathPoint
 
 
@@ -34,8 +34,8 @@ class AgentPose(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class EgoSeen:
-    """The controlled vehicle as others see it.
+class ObservedEgo:
+    """The controlled vehicle as other road users observe it.
 
     Attributes:
         x, y: centre of its box [m].
@@ -91,7 +91,7 @@ class Surroundings:
     t_us: int
     start_us: int
     dt_us: int
-    ego: EgoSeen
+    ego: ObservedEgo
     others: Agents
     route: LoggedPath
 
@@ -141,7 +141,7 @@ class AgentDriver(Protocol):
     def present(self) -> bool:
         """Whether it is in the world; False once it has left it."""
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
 
 

@@ -36,7 +36,7 @@ class External:
         """From how the object moves at ``t_us``."""
         return cls(subject, recorded_pose(subject, t_us))
 
-    def told(
+    def with_plan(
         self, t_us: int, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
     ) -> External:
         """The driver with a new plan; it leads there from where the object is at ``t_us``."""
@@ -44,26 +44,26 @@ class External:
         here = (x, y, self.pose.yaw)
         return replace(self, times_us=(t_us, *times_us), poses=(here, *poses))
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
-        t_us, (x, y, z) = seen.t_us + seen.dt_us, self.pose.position
+        t_us, (x, y, z) = surroundings.t_us + surroundings.dt_us, self.pose.position
         if not self.times_us or t_us > self.times_us[-1]:
             vx, vy, _ = self.pose.velocity
-            moved = (x + vx * seen.dt, y + vy * seen.dt, z)
+            moved = (x + vx * surroundings.dt, y + vy * surroundings.dt, z)
             velocity = (vx, vy, 0.0)
             return replace(self, pose=self.pose._replace(position=moved, velocity=velocity))
         nx, ny, yaw = self._planned(t_us)
-        velocity = ((nx - x) / seen.dt, (ny - y) / seen.dt, 0.0)
+        velocity = ((nx - x) / surroundings.dt, (ny - y) / surroundings.dt, 0.0)
         pose = AgentPose((nx, ny, z), level_quaternion(yaw), yaw, velocity)
         return replace(self, pose=pose)
 
     def _planned(self, t_us: int) -> tuple[float, float, float]:
         k = min(int(np.searchsorted(self.times_us, t_us)), len(self.times_us) - 1)
         a, b = self.poses[k - 1], self.poses[k]
-        share = (t_us - self.times_us[k - 1]) / (self.times_us[k] - self.times_us[k - 1])
+        fraction = (t_us - self.times_us[k - 1]) / (self.times_us[k] - self.times_us[k - 1])
         turn = math.remainder(b[2] - a[2], math.tau)
         return (
-            (1 - share) * a[0] + share * b[0],
-            (1 - share) * a[1] + share * b[1],
-            a[2] + share * turn,
+            (1 - fraction) * a[0] + fraction * b[0],
+            (1 - fraction) * a[1] + fraction * b[1],
+            a[2] + fraction * turn,
         )

@@ -13,7 +13,7 @@ from real2sim_proto.episode import IdmDriver
 from ...edit import ObjectState
 from ..path import LoggedPath
 from .driver import AgentPose, Surroundings, pose_on_path
-from .leader import Leader, leader_on
+from .leader import Leader, leading_agent
 from .replay import recorded_pose
 
 HARDEST = 8.0
@@ -73,25 +73,28 @@ class Idm:
             desired = max(highest_speed(subject), SLOWEST_DESIRED)
         return cls(subject, spec, path, desired, near.s, near.offset, speed, now)
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
         length, width, _ = self.subject.scaled_size
-        leader = leader_on(
+        leader = leading_agent(
             self.path,
             self.s,
             offset=self.offset,
             length=length,
             width=width,
             object_id=self.subject.object_id,
-            seen=seen,
+            surroundings=surroundings,
         )
         bend = self.path.sharpest_turn(self.s, 2.0 * self.speed)
         desired = min(self.desired, math.sqrt(self.spec.lateral / max(bend, 1e-4)))
-        s, speed = ahead(
-            self.s, self.speed, acceleration(self.spec, self.speed, desired, leader), seen.dt
+        s, speed = advance_along(
+            self.s,
+            self.speed,
+            acceleration(self.spec, self.speed, desired, leader),
+            surroundings.dt,
         )
-        offset = self.offset * math.exp(-seen.dt / BACK_TO_LANE)
-        drift = (offset - self.offset) / seen.dt
+        offset = self.offset * math.exp(-surroundings.dt / BACK_TO_LANE)
+        drift = (offset - self.offset) / surroundings.dt
         pose = pose_on_path(self.path, s, speed, offset=offset, drift=drift)
         present = s < self.path.length
         return replace(self, s=s, speed=speed, offset=offset, pose=pose, present=present)
@@ -111,7 +114,7 @@ def acceleration(spec: IdmDriver, speed: float, desired: float, leader: Leader |
     return max(spec.acceleration * (free - interaction), -HARDEST)
 
 
-def ahead(s: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
+def advance_along(s: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
     """Place and speed after ``dt`` seconds; braking ends at rest."""
     if acceleration < 0 and speed + acceleration * dt <= 0:
         return s + speed * speed / (-2 * acceleration), 0.0
@@ -119,7 +122,7 @@ def ahead(s: float, speed: float, acceleration: float, dt: float) -> tuple[float
 
 
 def highest_speed(subject: ObjectState) -> float:
-    """Highest recorded speed [m/s], over half a second to be deaf to noise."""
+    """Highest recorded speed [m/s], over half a second against noise."""
     trajectory = subject.trajectory
     times = trajectory.times_us * 1e-6
     if len(times) == 1:

@@ -17,7 +17,7 @@ class Leader(NamedTuple):
     speed: float
 
 
-def leader_on(
+def leading_agent(
     path: LoggedPath,
     s: float,
     *,
@@ -25,7 +25,7 @@ def leader_on(
     length: float,
     width: float,
     object_id: str,
-    seen: Surroundings,
+    surroundings: Surroundings,
 ) -> Leader | None:
     """The body that is next in the strip an object sweeps along a path.
 
@@ -34,8 +34,10 @@ def leader_on(
         s, offset: of its centre along the path, and from it [m].
         length, width: of its box [m].
         object_id: of the object, which is not its own leader.
-        seen: everybody.
+        surroundings: everybody.
     """
     box = (float(offset), float(length), float(width))
-    gap, speed = next_in_strip(path.knots, float(s), box, seen.bodies, seen.rows.get(object_id, -1))
+    gap, speed = next_in_strip(
+        path.knots, float(s), box, surroundings.bodies, surroundings.rows.get(object_id, -1)
+    )
     return None if math.isinf(gap) else Leader(gap, speed)

@@ -23,9 +23,9 @@ class Replay:
         """From where the trajectory is at ``t_us``, which it must cover."""
         return cls(subject, recorded_pose(subject, t_us))
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
-        t_us, trajectory = seen.t_us + seen.dt_us, self.subject.trajectory
+        t_us, trajectory = surroundings.t_us + surroundings.dt_us, self.subject.trajectory
         if not trajectory.start_us <= t_us <= trajectory.end_us:
             return replace(self, present=False)
         return replace(self, pose=recorded_pose(self.subject, t_us), present=True)
@@ -46,10 +46,10 @@ class ConstantVelocity:
         vx, vy, _ = pose.velocity
         return cls(subject, pose._replace(velocity=(vx, vy, 0.0)))
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
         (x, y, z), (vx, vy, _) = self.pose.position, self.pose.velocity
-        moved = (x + vx * seen.dt, y + vy * seen.dt, z)
+        moved = (x + vx * surroundings.dt, y + vy * surroundings.dt, z)
         return replace(self, pose=self.pose._replace(position=moved))
 
 

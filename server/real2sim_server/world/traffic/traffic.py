@@ -1,4 +1,4 @@
-"""All road users but the ego: who drives them, and where they are."""
+"""All road users but the ego: their drivers and their poses."""
 
 from __future__ import annotations
 
@@ -49,23 +49,23 @@ class Traffic:
     Attributes:
         spec: who drives whom.
         drivers: by object id; of objects that have appeared.
-        placed: where all objects are.
+        agents: poses of all objects.
         reacting: whether objects that repeated the log have begun to drive by IDM.
     """
 
     spec: AgentsSpec
     drivers: Mapping[str, AgentDriver]
-    placed: Agents
+    agents: Agents
     reacting: bool = False
 
     @classmethod
-    def begin(cls, state: ScenarioState, spec: AgentsSpec, seen: Surroundings) -> Traffic:
+    def begin(cls, state: ScenarioState, spec: AgentsSpec, surroundings: Surroundings) -> Traffic:
         """Objects at the start of an episode.
 
         Args:
             state: all objects.
             spec: who drives them.
-            seen: the start; its ``others`` are where the log has them.
+            surroundings: the start; its ``others`` are where the log has them.
 
         Raises:
             WorldError: UNKNOWN_OBJECT for a driver of an object that does not exist.
@@ -78,43 +78,51 @@ class Traffic:
                 hint="insert or duplicate it first; GET /v1/scenes/{scene} lists the objects",
             )
         none: Mapping[str, AgentDriver] = MappingProxyType({})
-        return cls(spec, none, seen.others)._joined(state, seen.others, seen)
+        return cls(spec, none, surroundings.others)._with_new_drivers(
+            state, surroundings.others, surroundings
+        )
 
-    def advance(self, state: ScenarioState, t_us: int, seen: Callable[[], Surroundings]) -> Traffic:
+    def advance(
+        self, state: ScenarioState, t_us: int, surroundings: Callable[[], Surroundings]
+    ) -> Traffic:
         """Objects one step later.
 
         Args:
             state: objects after all edits.
             t_us: the instant after the step [us].
-            seen: tells of the instant before, whose ``others`` are those of ``placed``; only asked
-                where somebody drives.
+            surroundings: of the instant before, whose ``others`` are ``agents``; only called
+                where an object has a driver.
         """
         base = state.tracks.at(t_us)
-        if not (self.drivers or self._drives):
+        if not (self.drivers or self._assigns_drivers):
             return Traffic(self.spec, self.drivers, base, self.reacting)
-        before = seen()
+        before = surroundings()
         drivers = {i: d.advance(before) for i, d in self.drivers.items()}
         moved = replace(self, drivers=MappingProxyType(drivers))
-        return moved._joined(state, base, replace(before, t_us=t_us))
+        return moved._with_new_drivers(state, base, replace(before, t_us=t_us))
 
-    def edited(self, state: ScenarioState, seen: Surroundings) -> Traffic:
+    def edited(self, state: ScenarioState, surroundings: Surroundings) -> Traffic:
         """Objects after an edit: drivers of objects whose trajectory was edited begin anew."""
         kept = {
             i: d
             for i, d in self.drivers.items()
-            if (now := state.objects.get(i)) is not None
-            and not now.deleted
-            and now.trajectory is d.subject.trajectory
-            and now.scale == d.subject.scale
+            if (edited := state.objects.get(i)) is not None
+            and not edited.deleted
+            and edited.trajectory is d.subject.trajectory
+            and edited.scale == d.subject.scale
         }
-        base = state.tracks.at(seen.t_us)
-        return replace(self, drivers=MappingProxyType(kept))._joined(state, base, seen)
+        base = state.tracks.at(surroundings.t_us)
+        return replace(self, drivers=MappingProxyType(kept))._with_new_drivers(
+            state, base, surroundings
+        )
 
-    def react(self, state: ScenarioState, seen: Surroundings) -> Traffic:
+    def with_reacting_agents(self, state: ScenarioState, surroundings: Surroundings) -> Traffic:
         """Objects that repeat the log drive by IDM from now on."""
-        return replace(self, reacting=True)._joined(state, state.tracks.at(seen.t_us), seen)
+        return replace(self, reacting=True)._with_new_drivers(
+            state, state.tracks.at(surroundings.t_us), surroundings
+        )
 
-    def told(
+    def with_plan(
         self,
         object_id: str,
         t_us: int,
@@ -141,37 +149,39 @@ class Traffic:
                 f"the plan of {object_id!r} begins at {times_us[0]} us; it is {t_us} us already",
                 hint="times_us are absolute simulation times after the newest observation",
             )
-        return self.with_drivers({object_id: driver.told(t_us, times_us, poses)}, self.placed)
+        return self.with_drivers({object_id: driver.with_plan(t_us, times_us, poses)}, self.agents)
 
     def with_drivers(self, drivers: Mapping[str, AgentDriver], base: Agents) -> Traffic:
         """Objects with other drivers for some of them, placed anew on top of ``base``."""
         merged = MappingProxyType({**self.drivers, **drivers})
-        return replace(self, drivers=merged, placed=_placed(base, merged))
+        return replace(self, drivers=merged, agents=_with_driver_poses(base, merged))
 
-    def _joined(self, state: ScenarioState, base: Agents, seen: Surroundings) -> Traffic:
+    def _with_new_drivers(
+        self, state: ScenarioState, base: Agents, surroundings: Surroundings
+    ) -> Traffic:
         """With drivers for objects that have just appeared."""
         drivers = dict(self.drivers)
-        if self._drives:
+        if self._assigns_drivers:
             for subject in base.objects:
                 if subject.object_id not in drivers:
-                    driver = self._driver_for(subject, seen)
+                    driver = self._driver_for(subject, surroundings)
                     if driver is not None:
                         drivers[subject.object_id] = driver
         frozen = MappingProxyType(drivers)
-        return replace(self, drivers=frozen, placed=_placed(base, frozen))
+        return replace(self, drivers=frozen, agents=_with_driver_poses(base, frozen))
 
     @property
-    def _drives(self) -> bool:
+    def _assigns_drivers(self) -> bool:
         """Whether objects that appear may get a driver."""
         return bool(self.spec.drivers) or self.spec.default != "log" or self.reacting
 
-    def _driver_for(self, subject: ObjectState, seen: Surroundings) -> AgentDriver | None:
+    def _driver_for(self, subject: ObjectState, surroundings: Surroundings) -> AgentDriver | None:
         spec = self.spec.drivers.get(subject.object_id)
         if spec is None:
             spec = self._default_for(subject)
         if spec is None:
             return None
-        return begin_driver(subject, spec, seen)
+        return begin_driver(subject, spec, surroundings)
 
     def _default_for(self, subject: ObjectState) -> DriverSpec | None:
         kind = "idm" if self.reacting else self.spec.default
@@ -180,24 +190,24 @@ class Traffic:
         return IdmDriver() if kind == "idm" else ConstantVelocityDriver()
 
 
-def begin_driver(subject: ObjectState, spec: DriverSpec, seen: Surroundings) -> AgentDriver:
-    """The driver that a spec names, beginning at the instant ``seen``."""
+def begin_driver(subject: ObjectState, spec: DriverSpec, surroundings: Surroundings) -> AgentDriver:
+    """The driver that a spec names, beginning at the instant ``surroundings``."""
     driver: AgentDriver
     match spec:
         case ReplayDriver():
-            driver = Replay.begin(subject, seen.t_us)
+            driver = Replay.begin(subject, surroundings.t_us)
         case ConstantVelocityDriver():
-            driver = ConstantVelocity.begin(subject, seen.t_us)
+            driver = ConstantVelocity.begin(subject, surroundings.t_us)
         case IdmDriver():
-            driver = Idm.begin(subject, seen.t_us, spec)
+            driver = Idm.begin(subject, surroundings.t_us, spec)
         case CutInDriver():
-            driver = CutIn.begin(subject, spec, seen)
+            driver = CutIn.begin(subject, spec, surroundings)
         case HardBrakeDriver():
-            driver = HardBrake.begin(subject, seen.t_us, spec)
+            driver = HardBrake.begin(subject, surroundings.t_us, spec)
         case JunctionCrossingDriver():
-            driver = JunctionCrossing.begin(subject, spec, seen)
+            driver = JunctionCrossing.begin(subject, spec, surroundings)
         case ExternalDriver():
-            driver = External.begin(subject, seen.t_us)
+            driver = External.begin(subject, surroundings.t_us)
         case _:
             assert_never(spec)
     return driver
@@ -207,7 +217,7 @@ def _moves(subject: ObjectState) -> bool:
     return subject.trajectory.extent >= MOVING
 
 
-def _placed(base: Agents, drivers: Mapping[str, AgentDriver]) -> Agents:
+def _with_driver_poses(base: Agents, drivers: Mapping[str, AgentDriver]) -> Agents:
     """``base`` with the objects that have drivers where those have brought them."""
     if not drivers:
         return base
@@ -220,17 +230,17 @@ def _placed(base: Agents, drivers: Mapping[str, AgentDriver]) -> Agents:
     for k, pose in poses.items():
         positions[k], quaternions[k], velocities[k] = pose.position, pose.quaternion, pose.velocity
     objects = [base.objects[k] for k in keep] + [d.subject for d in late]
-    positions = _with(positions[keep], [d.pose.position for d in late])
-    quaternions = _with(quaternions[keep], [d.pose.quaternion for d in late])
+    positions = _stacked(positions[keep], [d.pose.position for d in late])
+    quaternions = _stacked(quaternions[keep], [d.pose.quaternion for d in late])
     return Agents(
         objects=tuple(objects),
-        sizes=_with(base.sizes[keep], [d.subject.scaled_size for d in late]),
+        sizes=_stacked(base.sizes[keep], [d.subject.scaled_size for d in late]),
         positions=positions,
         quaternions=quaternions,
-        velocities=_with(velocities[keep], [d.pose.velocity for d in late]),
+        velocities=_stacked(velocities[keep], [d.pose.velocity for d in late]),
         transforms=transform_from(positions, quaternions),
     )
 
 
-def _with(rows: Float, more: Sequence[Sequence[float]]) -> Float:
+def _stacked(rows: Float, more: Sequence[Sequence[float]]) -> Float:
     return np.vstack([rows, np.asarray(more, dtype=np.float64)]) if more else rows

@@ -9,7 +9,7 @@ import pytest
 
 from real2sim_proto import ErrorCode, decode
 from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
-from real2sim_server.edit import advance
+from real2sim_server.edit import replay_operations
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.storage import snapshots
 from real2sim_server.service.storage.store import StoreError
@@ -279,8 +279,10 @@ def test_a_snapshot_spares_replaying_and_is_never_needed(
             first.portal.call(store.keep_snapshot, replace(kept, state=damage))
     replayed = []
     monkeypatch.setattr(
-        "real2sim_server.edit.scenario.advance",
-        lambda state, operations: replayed.append(operations) or advance(state, operations),
+        "real2sim_server.edit.scenario.replay_operations",
+        lambda state, operations: (
+            replayed.append(operations) or replay_operations(state, operations)
+        ),
     )
     second = start_worker()
 

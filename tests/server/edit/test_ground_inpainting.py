@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from real2sim_proto.operations import Delete, Translate
-from real2sim_server.edit import ScenarioState, apply_operations, vacated
-from real2sim_server.edit.ground_inpainting import uncovered
+from real2sim_server.edit import ScenarioState, apply_operations, vacated_parking
+from real2sim_server.edit.ground_inpainting import inpaint_ground
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.scene.spherical_harmonics import SH_C0
 
@@ -22,7 +22,7 @@ def poses_of(state: ScenarioState, t_us: int) -> dict[str, np.ndarray]:
 
 def at(scene, state: ScenarioState, *operations) -> tuple[str, ...]:
     after = apply_operations(state, operations).state
-    return vacated(after, poses_of(after, scene.start_us))
+    return vacated_parking(after, poses_of(after, scene.start_us))
 
 
 @pytest.fixture
@@ -42,18 +42,18 @@ def test_small_moves_and_moves_of_what_was_driving_leave_no_place(tiny_scene, st
     driving = next(o.object_id for o in state.visible if not o.standing)
     nudged = Translate(object_id=PARKED, y=0.1)
     assert at(tiny_scene, state, nudged, Delete(object_id=driving)) == ()
-    assert vacated(state, poses_of(state, tiny_scene.start_us)) == ()
+    assert vacated_parking(state, poses_of(state, tiny_scene.start_us)) == ()
 
 
 def test_a_blow_that_pushes_a_parked_object_away_uncovers_its_place(tiny_scene, state):
     poses = poses_of(state, tiny_scene.start_us)
     pushed = poses[PARKED].copy()
     pushed[0, 3] += 1.0
-    assert vacated(state, poses | {PARKED: pushed}) == (PARKED,)
+    assert vacated_parking(state, poses | {PARKED: pushed}) == (PARKED,)
 
 
 def test_what_was_not_recorded_at_a_time_has_not_left_its_place(state):
-    assert vacated(state, {}) == ()
+    assert vacated_parking(state, {}) == ()
 
 
 def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(tiny_scene):
@@ -75,7 +75,7 @@ def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(t
         opacities=torch.ones(len(means)),
         sh=((colours - 0.5) / SH_C0)[:, None],
     )
-    clean = uncovered(tiny_scene, smeared, (PARKED,))
+    clean = inpaint_ground(tiny_scene, smeared, (PARKED,))
     seen = clean.sh[:-1, 0] * SH_C0 + 0.5
     assert torch.allclose(seen, torch.full_like(seen, 0.4), atol=1e-5)
     assert float(clean.opacities[-1]) == 0.0

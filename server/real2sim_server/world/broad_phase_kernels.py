@@ -1,4 +1,4 @@
-"""Which boxes the ego box may overlap, now or within a step, in one call."""
+"""Broad phase of the ego box against boxes of objects, and headings, each in one call."""
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ..._numba import kernel
+from .._numba import kernel
 
 
 @kernel
@@ -78,7 +78,7 @@ def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
 
 @kernel
 def headings(quaternions):
-    """Headings [K] [rad] of quaternions [K, 4] wxyz, as ``scene.rotation.quaternion_yaw``."""
+    """Headings [K] [rad] of quaternions [K, 4] wxyz, as ``geometry.rotation.quaternion_yaw``."""
     found = np.empty(len(quaternions))
     for k in range(len(quaternions)):
         found[k] = heading(quaternions[k])

@@ -121,11 +121,11 @@ def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_sce
     entries += [Entry("action", k, action_payload(COAST)) for k in range(25)]
     told = Replayer.on(scene, ScenarioState.of(scene))
     for entry in entries:
-        world = told.tell(entry)
-    fork = world.light_copy()
+        world = told.apply(entry)
+    fork = world.fork()
     again = Replayer.on(scene, ScenarioState.of(scene))
     for entry in entries:
-        other = again.tell(entry)
+        other = again.apply(entry)
         other.instances()
     assert bits(cloud_of(world)) == bits(cloud_of(other))
     fork.step(COAST)

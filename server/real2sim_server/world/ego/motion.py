@@ -11,7 +11,13 @@ from real2sim_proto.episode import EgoSpec
 
 from ...geometry.rotation import quaternion_yaw
 from ...scene import Trajectory
-from ..driving import HOLD, Command, PlanarState, asked_of, driven, vehicle_of
+from ..driving import (
+    HOLD,
+    Command,
+    advance_vehicle,
+    driver_command,
+    vehicle_parameters,
+)
 from ..path import Float
 
 SLOW = 0.1
@@ -22,7 +28,7 @@ NOTHING_PENDING = np.empty((0, 2))
 
 
 class Motion(NamedTuple):
-    """Planar state of the vehicle: a :class:`.driving.PlanarState`, and what is on its way.
+    """Planar state of the vehicle: a :class:`.driving.PlanarState`, and delayed commands.
 
     Attributes:
         pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
@@ -51,16 +57,18 @@ class Motion(NamedTuple):
     @property
     def numbers(self) -> tuple[float, ...]:
         """All but the pending commands, as :mod:`.driving` takes a state."""
-        return tuple(map(float, self[: len(PlanarState._fields)]))
+        x, y, yaw, speed, acceleration, steering, yaw_rate, lateral_speed, drive, _ = self
+        kinematic = (float(x), float(y), float(yaw), float(speed), float(acceleration))
+        return (*kinematic, float(steering), float(yaw_rate), float(lateral_speed), float(drive))
 
 
-class Driver(NamedTuple):
-    """Who drives: see :func:`.driving.driven`.
+class ControlLaw(NamedTuple):
+    """Gives commands to the vehicle, see :func:`.driving.advance_vehicle`.
 
     Attributes:
         kind: HOLD, PURSUIT, LQR or ILQR.
         knots, turn_rate: the plan that trackers follow.
-        hold: the command of who holds one.
+        hold: the command of HOLD.
     """
 
     kind: int
@@ -68,40 +76,45 @@ class Driver(NamedTuple):
     turn_rate: float = 0.0
     hold: tuple[float, float] = (0.0, 0.0)
 
-    def after(self, since: float) -> tuple[int, Float, float, float, tuple[float, float]]:
-        """The driver ``since`` seconds after the plan began, as :mod:`.driving` takes it."""
+    def arguments(self, since: float) -> tuple[int, Float, float, float, tuple[float, float]]:
+        """The law ``since`` seconds after its plan began, as :mod:`.driving` takes it."""
         return self.kind, self.knots, self.turn_rate, since, self.hold
 
 
-def holding(command: Command) -> Driver:
-    """Who gives the same command all the time."""
-    return Driver(HOLD, hold=(float(command.acceleration), float(command.steering)))
+def constant_law(command: Command) -> ControlLaw:
+    """Gives the same command all the time."""
+    return ControlLaw(HOLD, hold=(float(command.acceleration), float(command.steering)))
 
 
-def drive(
-    motion: Motion, driver: Driver, spec: EgoSpec, dt_us: int, *, since: float = 0.0
+def advance_motion(
+    motion: Motion, law: ControlLaw, spec: EgoSpec, dt_us: int, *, since: float = 0.0
 ) -> Motion:
-    """The vehicle ``dt_us`` later, see :func:`.driving.driven`.
+    """The vehicle ``dt_us`` later, see :func:`.driving.advance_vehicle`.
 
     Args:
         motion: now.
-        driver: of it.
+        law: gives its commands.
         spec: of the vehicle.
         dt_us: how far to go [us].
-        since: time since the driver's plan began [s].
+        since: time since the law's plan began [s].
     """
     pending = np.array(motion.pending) if motion.pending else NOTHING_PENDING
-    vehicle = tuple(vehicle_of(spec))
-    state, waiting = driven(motion.numbers, pending, driver.after(since), vehicle, dt_us)
-    return Motion(*state, pending=tuple(Command(*row) for row in waiting.tolist()))
+    vehicle = tuple(vehicle_parameters(spec))
+    state, waiting = advance_vehicle(motion.numbers, pending, law.arguments(since), vehicle, dt_us)
+    delayed = tuple(Command(*row) for row in waiting.tolist())
+    return Motion._make((*state, delayed))
 
 
-def asked(motion: Motion, driver: Driver, spec: EgoSpec, *, since: float = 0.0) -> Command:
-    """What the driver would do, ``since`` seconds after its plan began."""
-    return Command(*asked_of(motion.numbers, driver.after(since), tuple(vehicle_of(spec))))
+def commanded(motion: Motion, law: ControlLaw, spec: EgoSpec, *, since: float = 0.0) -> Command:
+    """The command of the law, ``since`` seconds after its plan began."""
+    return Command(
+        *driver_command(motion.numbers, law.arguments(since), tuple(vehicle_parameters(spec)))
+    )
 
 
-def placed(motion: Motion, pose: tuple[float, float, float], spec: EgoSpec, dt_us: int) -> Motion:
+def teleported(
+    motion: Motion, pose: tuple[float, float, float], spec: EgoSpec, dt_us: int
+) -> Motion:
     """The vehicle put to ``pose`` x, y [m], yaw [rad]; its velocities follow from the way there.
 
     The way is taken as the arc that ends with the new heading, so that a pose sequence along a

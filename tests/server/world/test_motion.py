@@ -9,18 +9,24 @@ from hypothesis import strategies as st
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_server.world.driving import Command
-from real2sim_server.world.ego.vehicle import Motion, drive, holding, logged_motion, placed
+from real2sim_server.world.ego.motion import (
+    Motion,
+    advance_motion,
+    constant_law,
+    logged_motion,
+    teleported,
+)
 
 SPEC = EgoSpec()
 
 
 def hold(acceleration: float = 0.0, steering: float = 0.0):
-    return holding(Command(acceleration, steering))
+    return constant_law(Command(acceleration, steering))
 
 
 def drive_for(motion: Motion, seconds: float, *, dt_us: int = 100_000, **command: float) -> Motion:
     for _ in range(round(seconds * 1e6) // dt_us):
-        motion = drive(motion, hold(**command), SPEC, dt_us)
+        motion = advance_motion(motion, hold(**command), SPEC, dt_us)
     return motion
 
 
@@ -30,7 +36,7 @@ def test_constant_steering_drives_the_circle_of_the_bicycle(steering):
     start = Motion(0.0, 0.0, 0.0, speed=7.0, steering=steering)
     motion = start
     for _ in range(50):
-        motion = drive(motion, hold(steering=steering), SPEC, 100_000)
+        motion = advance_motion(motion, hold(steering=steering), SPEC, 100_000)
         assert math.hypot(motion.x, motion.y - radius) == pytest.approx(abs(radius), abs=1e-9)
     assert motion.yaw == pytest.approx(5 * 7.0 / radius)
     assert motion.yaw_rate == pytest.approx(7.0 / radius)
@@ -108,7 +114,7 @@ def test_a_placed_vehicle_has_the_velocities_of_its_way():
     radius, turn = 20.0, 0.05
     start = Motion(0.0, 0.0, 0.0, speed=5.0)
     pose = (radius * math.sin(turn), radius * (1 - math.cos(turn)), turn + math.tau)
-    motion = placed(start, pose, SPEC, 100_000)
+    motion = teleported(start, pose, SPEC, 100_000)
 
     assert motion.speed == pytest.approx(radius * turn / 0.1)
     assert motion.acceleration == pytest.approx((10.0 - 5.0) / 0.1)

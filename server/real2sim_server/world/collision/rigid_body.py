@@ -1,4 +1,4 @@
-"""Rigid bodies on the plane, and how they slide to rest."""
+"""Rigid bodies on the plane: state, impulses, and sliding to rest."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ AT_REST = 0.05
 
 
 @dataclass(frozen=True)
-class Solid:
-    """What does not change about a body.
+class BodyProperties:
+    """Mass, shape and friction of a body.
 
     Attributes:
         mass: [kg].
@@ -43,7 +43,7 @@ class Solid:
     drag: float = 0.0
 
 
-class Body(NamedTuple):
+class BodyState(NamedTuple):
     """Planar state: centre of mass [m], heading [rad], world velocity [m/s], yaw rate [rad/s]."""
 
     x: float
@@ -57,24 +57,31 @@ class Body(NamedTuple):
         """World velocity [m/s] of the body's point that is at (x, y)."""
         return self.vx - self.turn * (y - self.y), self.vy + self.turn * (x - self.x)
 
-    def pushed(self, solid: Solid, x: float, y: float, jx: float, jy: float) -> Body:
+    def pushed(
+        self, properties: BodyProperties, x: float, y: float, jx: float, jy: float
+    ) -> BodyState:
         """The body after an impulse [N s] at (x, y)."""
         moment = (x - self.x) * jy - (y - self.y) * jx
         return self._replace(
-            vx=self.vx + jx / solid.mass,
-            vy=self.vy + jy / solid.mass,
-            turn=self.turn + moment / solid.inertia,
+            vx=self.vx + jx / properties.mass,
+            vy=self.vy + jy / properties.mass,
+            turn=self.turn + moment / properties.inertia,
         )
 
-    def energy(self, solid: Solid) -> float:
+    def energy(self, properties: BodyProperties) -> float:
         """Kinetic energy [J]."""
-        linear = solid.mass * (self.vx * self.vx + self.vy * self.vy)
-        return (linear + solid.inertia * self.turn * self.turn) / 2
+        linear = properties.mass * (self.vx * self.vx + self.vy * self.vy)
+        return (linear + properties.inertia * self.turn * self.turn) / 2
 
 
 def integrate_sliding(
-    body: Body, solid: Solid, h: float, *, acceleration: float = 0.0, steering: float = 0.0
-) -> Body:
+    body: BodyState,
+    properties: BodyProperties,
+    h: float,
+    *,
+    acceleration: float = 0.0,
+    steering: float = 0.0,
+) -> BodyState:
     """The body ``h`` seconds later, its wheels rolling, slipping or sliding.
 
     A tyre's lateral force grows with the slip angle up to the friction limit, less what drag,
@@ -82,69 +89,73 @@ def integrate_sliding(
     directions of all forces are far less certain than the loads.
 
     Args:
-        body, solid: the body.
+        body, properties: the body.
         h: at most 10 ms.
         acceleration: by engine or brakes, along the front wheels' axle frame [m/s^2].
         steering: road-wheel angle of the front axle [rad].
     """
     n = max(math.ceil(h / 0.005 - 1e-9), 1)
     for _ in range(n):
-        body = _step(body, solid, h / n, acceleration, steering)
+        body = _step(body, properties, h / n, acceleration, steering)
     return body
 
 
-def _step(body: Body, solid: Solid, h: float, acceleration: float, steering: float) -> Body:
-    if solid.axles is None:
-        fx, fy, moment = _dragged(body, solid)
+def _step(
+    body: BodyState, properties: BodyProperties, h: float, acceleration: float, steering: float
+) -> BodyState:
+    if properties.axles is None:
+        fx, fy, moment = _sliding_force(body, properties)
     else:
-        fx, fy, moment = _rolled(body, solid, acceleration, steering)
-    vx, vy = body.vx + h * fx / solid.mass, body.vy + h * fy / solid.mass
-    turn = body.turn + h * moment / solid.inertia
-    resting = math.hypot(vx, vy) < AT_REST and abs(turn) * solid.length / 2 < AT_REST
+        fx, fy, moment = _wheel_forces(body, properties, acceleration, steering)
+    vx, vy = body.vx + h * fx / properties.mass, body.vy + h * fy / properties.mass
+    turn = body.turn + h * moment / properties.inertia
+    resting = math.hypot(vx, vy) < AT_REST and abs(turn) * properties.length / 2 < AT_REST
     if resting and acceleration <= 0.0:
         vx = vy = turn = 0.0
-    return Body(body.x + h * vx, body.y + h * vy, body.yaw + h * turn, vx, vy, turn)
+    return BodyState(body.x + h * vx, body.y + h * vy, body.yaw + h * turn, vx, vy, turn)
 
 
-def _dragged(body: Body, solid: Solid) -> tuple[float, float, float]:
+def _sliding_force(body: BodyState, properties: BodyProperties) -> tuple[float, float, float]:
     """Force [N] and moment [N m] on a body that slides on the ground."""
     speed = math.hypot(body.vx, body.vy)
-    grip = solid.friction * solid.mass * GRAVITY / max(speed, CREEP)
-    reach = max(solid.length, solid.width) / 3
-    spin = solid.friction * solid.mass * GRAVITY * reach / max(abs(body.turn) * reach, CREEP)
+    grip = properties.friction * properties.mass * GRAVITY / max(speed, CREEP)
+    reach = max(properties.length, properties.width) / 3
+    spin = (
+        properties.friction * properties.mass * GRAVITY * reach / max(abs(body.turn) * reach, CREEP)
+    )
     return -grip * body.vx, -grip * body.vy, -spin * reach * body.turn
 
 
-def _rolled(
-    body: Body, solid: Solid, acceleration: float, steering: float
+def _wheel_forces(
+    body: BodyState, properties: BodyProperties, acceleration: float, steering: float
 ) -> tuple[float, float, float]:
     """Force [N] and moment [N m] on a body with a steered front axle and a straight rear axle."""
-    assert solid.axles is not None
-    front, rear = solid.axles
+    assert properties.axles is not None
+    front, rear = properties.axles
     wheelbase = front + rear
     total_x = total_y = moment = 0.0
-    for ahead, load_share, angle in ((front, rear, steering), (-rear, front, 0.0)):
+    for ahead, load_fraction, angle in ((front, rear, steering), (-rear, front, 0.0)):
         cos, sin = math.cos(body.yaw + angle), math.sin(body.yaw + angle)
         x, y = body.x + ahead * math.cos(body.yaw), body.y + ahead * math.sin(body.yaw)
         vx, vy = body.velocity_at(x, y)
         rolling, slipping = vx * cos + vy * sin, vy * cos - vx * sin
-        load = solid.mass * GRAVITY * load_share / wheelbase
-        along, across = _tyre(rolling, slipping, load, solid, acceleration)
+        load = properties.mass * GRAVITY * load_fraction / wheelbase
+        along, across = _tyre_force(rolling, slipping, load, properties, acceleration)
         fx, fy = along * cos - across * sin, along * sin + across * cos
         total_x, total_y = total_x + fx, total_y + fy
         moment += (x - body.x) * fy - (y - body.y) * fx
     return total_x, total_y, moment
 
 
-def _tyre(
-    rolling: float, slipping: float, load: float, solid: Solid, acceleration: float
+def _tyre_force(
+    rolling: float, slipping: float, load: float, properties: BodyProperties, acceleration: float
 ) -> tuple[float, float]:
     """Force [N] along and across a wheel."""
-    limit = solid.friction * load
+    limit = properties.friction * load
     fade = min(max(rolling / CREEP, -1.0), 1.0)
     brakes = acceleration < 0.0
     driven = (-abs(acceleration) * fade if brakes else acceleration) / GRAVITY
-    along = min(max((driven - solid.drag * fade) * load, -limit), limit)
+    along = min(max((driven - properties.drag * fade) * load, -limit), limit)
     left = math.sqrt(max(limit * limit - along * along, 0.0))
     angle = math.atan2(slipping, max(abs(rolling), CREEP))
     return along, -left * min(max(angle / SLIDING_SLIP, -1.0), 1.0)

@@ -1,0 +1,205 @@
+"""Contacts from step to step, and the motion of ego and objects in a step with contact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from real2sim_proto.episode import ResetSpec
+
+from ..agents import Agents
+from ..broad_phase_kernels import may_overlap
+from ..driving import Command
+from ..ego.box import REAR_OVERHANG
+from ..ego.controller import EgoController
+from ..ego.motion import Motion
+from ..path import Float
+from ..traffic import Traffic
+from .bodies import ImpactedObject
+from .impact import Impact
+from .obstacles import ObstacleGrid
+from .overlaps import EgoContacts, ego_contacts
+from .solver import CollisionStep, solve_collisions
+
+HeightAt = Callable[[float, float], float]
+"""Height of the ground [m] at x, y [m]."""
+
+
+class StepMotion(NamedTuple):
+    """Ego and objects after a step.
+
+    Attributes:
+        controller, motion: of the ego.
+        traffic: the objects, impacted ones among them.
+        contacts: to go on with.
+        impacts: of the step; None where bodies pass through each other.
+    """
+
+    controller: EgoController
+    motion: Motion
+    traffic: Traffic
+    contacts: ContactState
+    impacts: tuple[Impact, ...] | None
+
+
+@dataclass(frozen=True, eq=False)
+class ContactState:
+    """Who touches whom at one instant of an episode.
+
+    Attributes:
+        spec: of the episode.
+        ego_size: of the ego's box [m].
+        obstacles: of the background; None where it does not count.
+        touching: names of what is in contact.
+        ignored_pairs: pairs that overlapped when the episode began; they pass through each other
+            until they have parted.
+        sliding: whether the ego has been pushed and no longer rolls as it is steered.
+    """
+
+    spec: ResetSpec
+    ego_size: tuple[float, float, float]
+    obstacles: ObstacleGrid | None
+    touching: frozenset[str] = frozenset()
+    ignored_pairs: frozenset[frozenset[str]] = frozenset()
+    sliding: bool = False
+
+    @classmethod
+    def begin(
+        cls,
+        spec: ResetSpec,
+        ego_size: tuple[float, float, float],
+        *,
+        obstacles: ObstacleGrid | None,
+        T_world_vehicle: Float,
+        motion: Motion,
+        agents: Agents,
+    ) -> ContactState:
+        """At the start of an episode."""
+        contacts = cls(spec, ego_size, obstacles)
+        touching = contacts.ego_contacts(T_world_vehicle, motion, agents).touching
+        ignored = frozenset(frozenset(("", name)) for name in touching)
+        return replace(contacts, touching=touching, ignored_pairs=ignored)
+
+    @property
+    def exchanges_momentum(self) -> bool:
+        """Whether bodies push each other; one that is put somewhere by poses cannot be pushed."""
+        return self.spec.on_collision == "continue" and self.spec.action != "pose"
+
+    def ego_contacts(self, T_world_vehicle: Float, motion: Motion, agents: Agents) -> EgoContacts:
+        """Contacts of the ego that stands so, and which of them were not there before."""
+        return ego_contacts(
+            T_world_vehicle,
+            motion,
+            agents,
+            spec=self.spec,
+            ego_size=self.ego_size,
+            obstacles=self.obstacles,
+            before=self.touching,
+        )
+
+    def advance(
+        self,
+        controller: EgoController,
+        motion: Motion,
+        before: Agents,
+        traffic: Traffic,
+        *,
+        t_us: int,
+        height: HeightAt,
+    ) -> StepMotion:
+        """One step of the ego, with the impacts of it and of the objects.
+
+        Args:
+            controller, motion: of the ego at the start.
+            before: objects at the start.
+            traffic: objects at the end, were nothing in their way.
+            t_us: at the start [us].
+            height: of the ground at x, y [m].
+        """
+        if not self.exchanges_momentum or not self._may_collide(motion, traffic):
+            controller, motion = controller.advance(motion, t_us, self.spec.dt_us)
+            impacts = () if self.exchanges_momentum else None
+            return StepMotion(controller, motion, traffic, self, impacts)
+        steered = _SteppedController(controller, t_us)
+        result = solve_collisions(
+            CollisionStep(
+                t_us=t_us,
+                dt_us=self.spec.dt_us,
+                motion=motion,
+                sliding=self.sliding,
+                advance=steered.advance,
+                command=steered.command,
+                spec=self.spec.ego,
+                ego_size=self.ego_size,
+                contact=self.spec.contact,
+                before=before,
+                after=traffic.agents,
+                impacted=_impacted_objects(traffic),
+                ignored_pairs=self.ignored_pairs,
+                background=self.obstacles.manifold if self.obstacles is not None else None,
+                height=height,
+            )
+        )
+        contacts = replace(self, sliding=result.sliding, ignored_pairs=result.ignored_pairs)
+        collided = traffic.with_drivers(result.impacted, traffic.agents)
+        return StepMotion(steered.controller, result.motion, collided, contacts, result.impacts)
+
+    def _may_collide(self, motion: Motion, traffic: Traffic) -> bool:
+        """Whether anything could touch anything within the step."""
+        if self.sliding or self.obstacles is not None:
+            return True
+        if any(isinstance(driver, ImpactedObject) for driver in traffic.drivers.values()):
+            return True
+        return may_collide(
+            motion, traffic.agents, ego_size=self.ego_size, dt=self.spec.dt_us * 1e-6
+        )
+
+
+def may_collide(
+    motion: Motion, agents: Agents, *, ego_size: tuple[float, float, float], dt: float
+) -> bool:
+    """Whether the ego could touch an object within the step, by boxes along its heading.
+
+    Args:
+        motion: of the ego at the start of the step.
+        agents: at its end.
+        ego_size: of its box [m].
+        dt: the step [s].
+    """
+    if not agents.objects:
+        return False
+    centre_ahead = ego_size[0] / 2 - REAR_OVERHANG
+    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
+    ego = (
+        motion.x + centre_ahead * cos,
+        motion.y + centre_ahead * sin,
+        motion.yaw,
+        motion.speed,
+        motion.lateral_speed,
+        motion.yaw_rate,
+    )
+    boxes = (agents.positions, agents.quaternions, agents.velocities, agents.sizes)
+    return bool(may_overlap(ego, ego_size[:2], dt, *boxes))
+
+
+class _SteppedController:
+    """The controller of the ego through the substeps of a step that begins at ``t_us``."""
+
+    def __init__(self, controller: EgoController, t_us: int) -> None:
+        self.controller = controller
+        self._t_us = t_us
+
+    def advance(self, motion: Motion, since_us: int, us: int) -> Motion:
+        self.controller, moved = self.controller.advance(motion, self._t_us + since_us, us)
+        return moved
+
+    def command(self, motion: Motion, since_us: int) -> Command:
+        t_us = self._t_us + since_us
+        self.controller = self.controller.activated(motion, t_us)
+        return self.controller.command(motion, t_us)
+
+
+def _impacted_objects(traffic: Traffic) -> dict[str, ImpactedObject]:
+    return {i: d for i, d in traffic.drivers.items() if isinstance(d, ImpactedObject)}

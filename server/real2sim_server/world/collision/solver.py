@@ -1,0 +1,423 @@
+"""A step of the clock with collisions: substeps, each with contact impulses."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from real2sim_proto.episode import ContactSpec, EgoSpec
+
+from ...geometry.rotation import multiply_quaternions, quaternion_yaw, yaw_quaternion
+from ..agents import Agents, rows_of
+from ..driving import Command
+from ..ego.motion import Motion
+from ..scoring.contact_side import side_of_contact
+from ..scoring.instant import Side
+from ..traffic.driver import AgentPose
+from .bodies import (
+    ImpactedObject,
+    ego_body,
+    ego_motion,
+    ego_properties,
+    is_rolling,
+    object_properties,
+)
+from .impact import Impact, ImpactParticipant
+from .manifold import ContactManifold, contact_impulse, contact_manifold, corners
+from .rigid_body import BodyProperties, BodyState, integrate_sliding
+
+SUBSTEP_US = 10_000
+EGO = ""
+"""Key of the ego among the bodies; no object has an empty id."""
+BACKGROUND = "\0"
+
+SLOP = 0.01
+"""Overlap that is left between bodies in contact, so that they stay in contact [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionStep:
+    """A step of the clock before its collisions are solved.
+
+    Attributes:
+        t_us, dt_us: the step [us].
+        motion, sliding: the ego, and whether physics moves it rather than its controller.
+        advance: ``advance(motion, since_us, us)`` moves the ego by its controller.
+        command: of the controller, in a motion so many microseconds after the start.
+        spec, ego_size, contact: parameters.
+        before, after: objects as their drivers move them; impacted ones among them.
+        impacted: objects that physics moves, by id.
+        ignored_pairs: bodies that overlapped without an impact; they do not collide.
+        background: manifold of a body and the background; None where that is left out.
+        height: ground height [m] at x, y.
+    """
+
+    t_us: int
+    dt_us: int
+    motion: Motion
+    sliding: bool
+    advance: Callable[[Motion, int, int], Motion]
+    command: Callable[[Motion, int], Command]
+    spec: EgoSpec
+    ego_size: tuple[float, float, float]
+    contact: ContactSpec
+    before: Agents
+    after: Agents
+    impacted: Mapping[str, ImpactedObject]
+    ignored_pairs: frozenset[frozenset[str]]
+    background: Callable[[BodyState, BodyProperties], ContactManifold | None] | None
+    height: Callable[[float, float], float]
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionResult:
+    """A step after its collisions, see :class:`CollisionStep`; ``impacts`` in order."""
+
+    motion: Motion
+    sliding: bool
+    impacted: dict[str, ImpactedObject]
+    impacts: tuple[Impact, ...]
+    ignored_pairs: frozenset[frozenset[str]]
+
+
+@dataclass(eq=False)
+class _PairImpulse:
+    """Impulse and energy that two bodies have exchanged in this step."""
+
+    manifold: ContactManifold
+    approach: float
+    relative: float
+    side: Side
+    speeds: tuple[float, float]
+    began_us: int
+    participants: tuple[ImpactParticipant, ImpactParticipant | None]
+    jx: float = 0.0
+    jy: float = 0.0
+    energy: float = 0.0
+    masses: tuple[float, float] = (math.inf, math.inf)
+
+
+class _PrescribedMotion(NamedTuple):
+    """How its driver moves an object through the step: places at the start and the end [m], yaw at
+    the start and its change [rad], velocity [m/s] and turn rate [rad/s]."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    yaw: float
+    turn: float
+    velocity: tuple[float, float]
+    rate: float
+
+    def after(self, fraction: float) -> BodyState:
+        """The object after a fraction of the step."""
+        (ax, ay), (bx, by), rest = self.start, self.end, 1 - fraction
+        x, y = rest * ax + fraction * bx, rest * ay + fraction * by
+        return BodyState(x, y, self.yaw + fraction * self.turn, *self.velocity, self.rate)
+
+
+@dataclass(eq=False)
+class _SolverState:
+    """Bodies by id while the substeps run; ``heights``: bottom and top of each box [m]."""
+
+    step: CollisionStep
+    properties: dict[str, BodyProperties]
+    bodies: dict[str, BodyState]
+    prescribed: dict[str, _PrescribedMotion]
+    dynamic: set[str]
+    heights: dict[str, tuple[float, float]]
+    reaches: dict[str, float]
+    impulses: dict[tuple[str, str], _PairImpulse] = field(default_factory=dict)
+    ignored_pairs: set[frozenset[str]] = field(default_factory=set)
+    now_us: int = 0
+
+
+def solve_collisions(step: CollisionStep) -> CollisionResult:
+    """Move ego and objects through a step in substeps of 10 ms; bodies in contact exchange
+    impulses.
+
+    An object with an impact is moved by physics from then on; the ego goes by its controller
+    again once its wheels roll. Contacts are handled in the order of ids, so that the outcome is
+    the same whatever else runs.
+    """
+    state = _begin(step)
+    motion, sliding = step.motion, step.sliding
+    substeps = -(-step.dt_us // SUBSTEP_US)
+    for k in range(substeps):
+        begin, end = step.dt_us * k // substeps, step.dt_us * (k + 1) // substeps
+        motion = _move_ego(state, motion, sliding, begin, end)
+        _move_objects(state, begin, end)
+        state.now_us = end
+        if _resolve_contacts(state):
+            sliding = True
+        if sliding:
+            motion = ego_motion(state.bodies[EGO], motion, step.spec)
+            sliding = not is_rolling(motion, step.spec)
+    return CollisionResult(
+        motion, sliding, _impacted(state), _impacts(state), frozenset(state.ignored_pairs)
+    )
+
+
+def _begin(step: CollisionStep) -> _SolverState:
+    properties, bodies, heights = {EGO: ego_properties(step.spec, step.ego_size)}, {}, {}
+    bodies[EGO] = ego_body(step.motion, step.spec)
+    bottom = step.height(step.motion.x, step.motion.y)
+    heights[EGO] = (bottom, bottom + step.ego_size[2])
+    friction = step.spec.vehicle.friction
+    start = rows_of(step.before)
+    prescribed: dict[str, _PrescribedMotion] = {}
+    for k, subject in enumerate(step.after.objects):
+        i, size = subject.object_id, tuple(step.after.sizes[k].tolist())
+        z = float(step.after.positions[k, 2])
+        heights[i] = (z - size[2] / 2, z + size[2] / 2)
+        if i in step.impacted:
+            properties[i], bodies[i] = step.impacted[i].properties, step.impacted[i].body
+            continue
+        properties[i] = object_properties(subject, step.contact, friction=friction, size=size)
+        motion = _prescribed_motion(step, start.get(i), k)
+        bodies[i] = motion.after(0.0)._replace(turn=0.0)
+        if i in start:
+            prescribed[i] = motion
+    reaches = {i: math.hypot(s.length, s.width) / 2 + 1 for i, s in properties.items()}
+    dynamic = {EGO, *step.impacted}
+    return _SolverState(
+        step,
+        properties,
+        bodies,
+        prescribed,
+        dynamic,
+        heights,
+        reaches,
+        ignored_pairs=set(step.ignored_pairs),
+    )
+
+
+def _prescribed_motion(step: CollisionStep, row: int | None, k: int) -> _PrescribedMotion:
+    """Of the object that is in row ``k`` at the end and was in another at the start; an object
+    that has just appeared stands where it is."""
+    source, j = (step.after, k) if row is None else (step.before, row)
+    yaw = float(quaternion_yaw(source.quaternions[j]))
+    turn = math.remainder(float(quaternion_yaw(step.after.quaternions[k])) - yaw, math.tau)
+    (ax, ay, _), (bx, by, _) = source.positions[j].tolist(), step.after.positions[k].tolist()
+    vx, vy, _ = step.after.velocities[k].tolist()
+    return _PrescribedMotion((ax, ay), (bx, by), yaw, turn, (vx, vy), turn / (step.dt_us * 1e-6))
+
+
+def _move_ego(state: _SolverState, motion: Motion, sliding: bool, begin: int, end: int) -> Motion:
+    step = state.step
+    if not sliding:
+        motion = step.advance(motion, begin, end - begin)
+        state.bodies[EGO] = ego_body(motion, step.spec)
+        return motion
+    command = step.command(motion, begin)
+    spec = step.spec
+    acceleration = min(max(command.acceleration, -spec.max_braking), spec.max_acceleration)
+    state.bodies[EGO] = integrate_sliding(
+        state.bodies[EGO],
+        state.properties[EGO],
+        (end - begin) * 1e-6,
+        acceleration=acceleration,
+        steering=motion.steering,
+    )
+    return ego_motion(state.bodies[EGO], motion, spec)
+
+
+def _move_objects(state: _SolverState, begin: int, end: int) -> None:
+    fraction = end / state.step.dt_us
+    for i in state.bodies:
+        if i == EGO:
+            continue
+        if i in state.dynamic:
+            state.bodies[i] = integrate_sliding(
+                state.bodies[i], state.properties[i], (end - begin) * 1e-6
+            )
+        elif i in state.prescribed:
+            state.bodies[i] = state.prescribed[i].after(fraction)
+
+
+def _resolve_contacts(state: _SolverState) -> bool:
+    """Let all bodies in contact exchange impulses; whether the ego was pushed."""
+    ego_pushed = False
+    for a, b in _near_pairs(state):
+        pair = frozenset((a, b))
+        manifold = contact_manifold(
+            corners(state.bodies[a], state.properties[a]),
+            corners(state.bodies[b], state.properties[b]),
+        )
+        if manifold is None:
+            state.ignored_pairs.discard(pair)
+            continue
+        if pair in state.ignored_pairs:
+            continue
+        ego_pushed |= _apply_impulse(state, a, b, manifold) and a == EGO
+    if state.step.background is not None:
+        for i in sorted(state.dynamic):
+            manifold = state.step.background(state.bodies[i], state.properties[i])
+            if manifold is not None:
+                ego_pushed |= _apply_impulse(state, i, BACKGROUND, manifold) and i == EGO
+    return ego_pushed
+
+
+def _near_pairs(state: _SolverState) -> list[tuple[str, str]]:
+    """Pairs of a body that physics moves and another within reach; in the order of ids."""
+    return [
+        (a, b)
+        for a, b in itertools.combinations(sorted(state.bodies), 2)
+        if (a in state.dynamic or b in state.dynamic) and _within_reach(state, a, b)
+    ]
+
+
+def _within_reach(state: _SolverState, a: str, b: str) -> bool:
+    (low_a, high_a), (low_b, high_b) = state.heights[a], state.heights[b]
+    (ax, ay, *_), (bx, by, *_) = state.bodies[a], state.bodies[b]
+    apart = math.hypot(ax - bx, ay - by)
+    return apart < state.reaches[a] + state.reaches[b] and low_a < high_b and low_b < high_a
+
+
+def _apply_impulse(state: _SolverState, a: str, b: str, manifold: ContactManifold) -> bool:
+    """Exchange momentum; whether there was any to exchange."""
+    contact, second = state.step.contact, None
+    first = (state.bodies[a], state.properties[a])
+    if b != BACKGROUND:
+        second = (state.bodies[b], state.properties[b])
+    impulse = contact_impulse(
+        first, second, manifold, restitution=contact.restitution, friction=contact.friction
+    )
+    if impulse is None:
+        _pair_impulse(state, (a, b), manifold, approach=0.0)
+        return False
+    exchanged = _pair_impulse(state, (a, b), manifold, approach=impulse.approach)
+    after = first[0].pushed(first[1], manifold.x, manifold.y, impulse.jx, impulse.jy)
+    dissipated = first[0].energy(first[1]) - after.energy(first[1])
+    state.bodies[a] = _separated(after, manifold, 1.0 if second is None else 0.5)
+    masses = (first[1].mass, math.inf)
+    if second is not None:
+        other = second[0].pushed(second[1], manifold.x, manifold.y, -impulse.jx, -impulse.jy)
+        dissipated += second[0].energy(second[1]) - other.energy(second[1])
+        state.bodies[b] = _separated(other, manifold, -0.5)
+        masses = (first[1].mass, second[1].mass)
+    _make_dynamic(state, {a, b} - {BACKGROUND} - state.dynamic)
+    exchanged.jx, exchanged.jy = exchanged.jx + impulse.jx, exchanged.jy + impulse.jy
+    exchanged.energy, exchanged.masses = exchanged.energy + dissipated, masses
+    return True
+
+
+def _pair_impulse(
+    state: _SolverState, pair: tuple[str, str], manifold: ContactManifold, *, approach: float
+) -> _PairImpulse:
+    """What two bodies have exchanged so far; a new record where their contact begins."""
+    exchanged = state.impulses.get(pair)
+    if exchanged is None:
+        first = (state.bodies[pair[0]], state.properties[pair[0]])
+        vx, vy = first[0].vx, first[0].vy
+        speeds: tuple[float, float] = (math.hypot(vx, vy), 0.0)
+        side: Side = "stopped_track"
+        if pair[1] != BACKGROUND:
+            second = (state.bodies[pair[1]], state.properties[pair[1]])
+            speeds = (speeds[0], math.hypot(second[0].vx, second[0].vy))
+            vx, vy = vx - second[0].vx, vy - second[0].vy
+            side = _side(first, second, speeds)
+        participants = (
+            _participant(state, pair[0]),
+            None if pair[1] == BACKGROUND else _participant(state, pair[1]),
+        )
+        began_us = state.step.t_us + state.now_us
+        relative = math.hypot(vx, vy)
+        exchanged = _PairImpulse(manifold, approach, relative, side, speeds, began_us, participants)
+        state.impulses[pair] = exchanged
+    return exchanged
+
+
+def _participant(state: _SolverState, i: str) -> ImpactParticipant:
+    return ImpactParticipant(state.properties[i], state.bodies[i], *state.heights[i])
+
+
+def _make_dynamic(state: _SolverState, impacted_now: set[str]) -> None:
+    """Let physics move bodies; those that they overlap already, other than in this contact, are
+    ignored until they have parted."""
+    for i in sorted(impacted_now):
+        shape = corners(state.bodies[i], state.properties[i])
+        for j in sorted(state.bodies.keys() - impacted_now - state.dynamic):
+            reach = state.properties[i].length + state.properties[j].length
+            near = math.dist(state.bodies[i][:2], state.bodies[j][:2]) < reach
+            if (
+                near
+                and contact_manifold(shape, corners(state.bodies[j], state.properties[j]))
+                is not None
+            ):
+                state.ignored_pairs.add(frozenset((i, j)))
+    state.dynamic |= impacted_now
+
+
+def _side(
+    first: tuple[BodyState, BodyProperties],
+    second: tuple[BodyState, BodyProperties],
+    speeds: tuple[float, float],
+) -> Side:
+    boxes = []
+    for body, properties in (first, second):
+        x = body.x + properties.box_ahead * math.cos(body.yaw)
+        y = body.y + properties.box_ahead * math.sin(body.yaw)
+        boxes.append((x, y, body.yaw, properties.length, properties.width))
+    return side_of_contact(boxes[0], speeds[0], boxes[1], speeds[1])
+
+
+def _separated(body: BodyState, manifold: ContactManifold, fraction: float) -> BodyState:
+    """The body moved out of the overlap, most of the way."""
+    depth = fraction * max(manifold.depth - SLOP, 0.0) * 0.5
+    return body._replace(x=body.x + depth * manifold.nx, y=body.y + depth * manifold.ny)
+
+
+def _impacted(state: _SolverState) -> dict[str, ImpactedObject]:
+    impacted = {}
+    for k, subject in enumerate(state.step.after.objects):
+        i = subject.object_id
+        if i not in state.dynamic:
+            continue
+        body = state.bodies[i]
+        old = state.step.impacted.get(i)
+        x, y, z = state.step.after.positions[k].tolist()
+        height = old.height if old else z - state.step.height(x, y)
+        quaternion = state.step.after.quaternions[k]
+        turned = body.yaw - float(quaternion_yaw(quaternion))
+        w, qx, qy, qz = multiply_quaternions(yaw_quaternion(turned), quaternion).tolist()
+        pose = AgentPose(
+            (body.x, body.y, state.step.height(body.x, body.y) + height),
+            (w, qx, qy, qz),
+            body.yaw,
+            (body.vx, body.vy, 0.0),
+        )
+        impacted[i] = (
+            old.at(body, pose)
+            if old
+            else ImpactedObject(subject, state.properties[i], body, height, pose)
+        )
+    return impacted
+
+
+def _impacts(state: _SolverState) -> tuple[Impact, ...]:
+    impacts = []
+    for (a, b), exchanged in state.impulses.items():
+        strength = math.hypot(exchanged.jx, exchanged.jy)
+        impacts.append(
+            Impact(
+                object_id=None if b == BACKGROUND else b,
+                other_id=None if a == EGO else a,
+                t_us=state.step.t_us + state.step.dt_us,
+                point=(exchanged.manifold.x, exchanged.manifold.y),
+                normal=(exchanged.manifold.nx, exchanged.manifold.ny),
+                approach_speed=exchanged.approach,
+                relative_speed=exchanged.relative,
+                impulse=(exchanged.jx, exchanged.jy),
+                delta_v=strength / exchanged.masses[0],
+                object_delta_v=strength / exchanged.masses[1],
+                energy=exchanged.energy,
+                side=exchanged.side,
+                speeds=exchanged.speeds,
+                began_us=exchanged.began_us,
+                participants=exchanged.participants,
+            )
+        )
+    return tuple(impacts)
