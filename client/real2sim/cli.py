@@ -37,6 +37,8 @@ def build_app() -> typer.Typer:
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
+        # Rich's own markup would take units in square brackets for styles, and drop them.
+        rich_markup_mode="markdown",
     )
     app.callback(invoke_without_command=True)(_options)
     for module in (status, scenes, edit, drive):

@@ -18,7 +18,7 @@ from .command import command
 
 if TYPE_CHECKING:
     from ..policies.episodes import EpisodeResult
-    from ..policies.suite import Case
+    from ..policies.suite import Case, EpisodeGrid
 
 RECORDINGS, PAGE, FIGURES = "recordings", "report.html", "report.json"
 
@@ -41,9 +41,19 @@ def evaluate_policy(
     ] = None,
     suite: Annotated[
         Path | None,
-        typer.Option(help="JSON file of cases instead. With none: the demo's street, three ways."),
+        typer.Option(
+            help="JSON file of cases instead, or a shipped suite's name. With none: `demo`, the "
+            "demo's street three ways."
+        ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="How many, from 0 on.")] = 3,
+    seeds: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=1000,
+            help="How many, from 0 on, of each case that has jitter; others are driven once.",
+        ),
+    ] = 3,
     url: Annotated[
         str | None, typer.Option(help="Of a running worker; default: one is started.")
     ] = None,
@@ -53,7 +63,11 @@ def evaluate_policy(
     ] = None,
     sessions: Annotated[int, typer.Option(min=1, max=64, help="Episodes at a time.")] = 2,
 ) -> None:
-    """Drive cases with planners; leave scores, recordings and a page that compares them."""
+    """Drive cases with planners; leave scores, recordings and a page that compares them.
+
+    A suite names cases: a scene or a scenario, options of `reset`, edits, and the `jitter` of
+    numbers in them, by which seeds differ. Its format is described in docs/policies.md.
+    """
     from ..policies.episodes import WorkerTarget, run_episodes
     from ..policies.page import render_page
     from ..policies.suite import EpisodeGrid
@@ -81,6 +95,7 @@ def evaluate_policy(
     with atomic_file(out / PAGE) as file:
         file.write(render_page(results, title="Planners compared").encode())
     _print_scores(results)
+    _print_what_ran_once(grid)
     console.print(f"in {out}: {PAGE}, {FIGURES}, {RECORDINGS}/", highlight=False)
 
 
@@ -134,3 +149,15 @@ def _print_scores(results: Sequence[EpisodeResult]) -> None:
         table.add_row(name, *("–" if s is None else f"{s.mean:.3g}" for s in scores))
     table.add_row("collisions at fault", *(str(group.at_fault) for group in groups))
     console.print(table)
+
+
+def _print_what_ran_once(grid: EpisodeGrid) -> None:
+    fixed = [case.name for case in grid.cases if not case.is_random]
+    if fixed and len(grid.seeds) > 1:
+        console.print(
+            f"driven once, not with {len(grid.seeds)} seeds: {', '.join(fixed)}; nothing in an "
+            "episode is random but the jitter of a suite's case",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from real2sim.planners import EpisodeSummary, Planner, run_episode
 
-from .pictures import Image, mosaic, video
+from ..render.video import video_file
+from .pictures import Image, mosaic
 
 if TYPE_CHECKING:
     from real2sim import DriveSession, Observation
@@ -56,7 +57,7 @@ def drive_through(
     path: list[tuple[float, float]] = []
     stills: dict[int, Image] = {}
     wanted = {round(steps * (i + 1) / (STILLS + 1)) for i in range(STILLS)}
-    with session, video(video_path, frames_per_second=1e6 / dt_us) as film:
+    with session, video_file(video_path, frames_per_second=1e6 / dt_us) as film:
 
         def watch(obs: Observation) -> None:
             caption = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..geometry.rotation import quaternion_yaw
 from ..render import RasterOptions, render_cameras, select_backend
+from ..render.video import video_file
 from ..scene import Scene
 from ..world import World
 from ..world.recording.recording import Recording
@@ -22,8 +24,8 @@ Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
 MAP_PIXELS, MAP_METRES = 160, 60.0
-BACKGROUND, ROUTE, OBJECT, EGO = (40, 40, 40), (160, 160, 160), (60, 140, 255), (120, 220, 120)
-"""Colors of the map, BGR."""
+BACKGROUND, ROUTE, OBJECT, EGO = (40, 40, 40), (160, 160, 160), (255, 140, 60), (120, 220, 120)
+"""Colors of the map."""
 
 
 def film_episode(
@@ -46,27 +48,25 @@ def film_episode(
         width: of the film [px].
     """
     chosen = scene.rig[camera or scene.rig.names[0]].resized(width)
-    backend, writer = select_backend("auto"), None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for world in _instants(recording, replayer):
-        (frame,) = render_cameras(
-            world.instances(),
-            [chosen],
-            world.T_world_vehicle,
-            sky=scene.sky,
-            options=RasterOptions(),
-            backend=backend,
-        )
-        image = np.ascontiguousarray(frame.rgb[:, :, ::-1])
-        _draw_caption(image, world)
-        _draw_map(image, world)
-        if writer is None:
-            rate = 1e6 / world.spec.dt_us
-            fourcc = cv2.VideoWriter.fourcc(*"mp4v")
-            writer = cv2.VideoWriter(str(path), fourcc, rate, (chosen.width, chosen.height))
-        writer.write(image)
-    if writer is not None:
-        writer.release()
+    backend = select_backend("auto")
+    with contextlib.ExitStack() as stack:
+        video = None
+        for world in _instants(recording, replayer):
+            (frame,) = render_cameras(
+                world.instances(),
+                [chosen],
+                world.T_world_vehicle,
+                sky=scene.sky,
+                options=RasterOptions(),
+                backend=backend,
+            )
+            image = np.array(frame.rgb)
+            _draw_caption(image, world)
+            _draw_map(image, world)
+            if video is None:
+                rate = 1e6 / world.spec.dt_us
+                video = stack.enter_context(video_file(path, frames_per_second=rate))
+            video.add(image)
 
 
 def _instants(recording: Recording, replayer: Replayer) -> Iterator[World]:

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from real2sim_server.cli.evaluate_policy import evaluate_policy
+from real2sim.cli import build_app
 from real2sim_server.policies.page import render_page
 from real2sim_server.policies.summary import (
     group_scores,
@@ -94,9 +96,35 @@ def test_the_page_holds_everything_and_loads_nothing(results):
         assert name.replace("_", " ") in text
 
 
-def test_the_command_leaves_a_report_of_a_running_worker(site, tmp_path, capsys):
-    evaluate_policy(out=tmp_path / "out", policies=["pid"], scenes=["tiny"], seeds=3, url=site.url)
-    figures = json.loads((tmp_path / "out/report.json").read_text())
-    assert unconfirmed_scores(figures, tmp_path / "out") == []
-    assert (tmp_path / "out/report.html").read_text().startswith("<!doctype html>")
-    assert "pid" in capsys.readouterr().out
+@pytest.fixture(scope="module")
+def evaluated(site, tmp_path_factory) -> tuple[Path, str]:
+    """The folder and output of `evaluate-policy` on a scene with three seeds."""
+    out = tmp_path_factory.mktemp("evaluate") / "out"
+    command = ["evaluate-policy", "--policy", "pid", "--scene", "tiny", "--seeds", "3"]
+    done = CliRunner().invoke(build_app(), [*command, "--url", site.url, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    return out, done.output
+
+
+def test_the_command_leaves_a_report_of_a_running_worker(evaluated):
+    out, output = evaluated
+    figures = json.loads((out / "report.json").read_text())
+    assert unconfirmed_scores(figures, out) == []
+    assert (out / "report.html").read_text().startswith("<!doctype html>")
+    assert "pid" in output
+
+
+def test_a_scene_is_driven_once_whatever_the_seeds_and_the_command_says_so(evaluated):
+    out, output = evaluated
+    figures = json.loads((out / "report.json").read_text())
+    assert [(e["case"], e["seed"]) for e in figures["episodes"]] == [("tiny", 0)]
+    assert "driven once, not with 3 seeds: tiny" in output
+
+
+def test_one_episode_has_no_deviation(evaluated):
+    out, _ = evaluated
+    groups = json.loads((out / "report.json").read_text())["groups"]
+    scores = [score for group in groups for score in group["scores"].values() if score]
+    assert scores
+    assert all(score["count"] == 1 and score["deviation"] is None for score in scores)
+    assert "±" not in (out / "report.html").read_text()

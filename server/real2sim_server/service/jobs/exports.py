@@ -6,17 +6,15 @@ import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Frame, SensorSpec
 from real2sim_proto.jobs import ExportRequest
 
 from ...render import Instance
+from ...render.video import VideoError, VideoFile
 from ...scene import Scene
 from ..http.problems import ServiceError
 from ..rendering.engine import QueueFullError
@@ -57,16 +55,19 @@ async def export_video(
     await asyncio.to_thread(ticket.folder.mkdir, parents=True, exist_ok=True)
     loop = asyncio.get_running_loop()
     with ThreadPoolExecutor(1, thread_name_prefix="video") as encoder:
-        writer = _Writer(ticket.folder / VIDEO, asked.fps)
+        video = VideoFile(ticket.folder / VIDEO, asked.fps)
         try:
             for index, t_us in enumerate(times):
                 ticket.progress(index / len(times), "drawing")
                 shot = await asyncio.to_thread(_shot, film, sensor, t_us)
                 frame = await _drawn(pictures, shot, ticket)
                 pixels = np.frombuffer(frame.data, np.uint8).reshape(frame.shape)
-                await loop.run_in_executor(encoder, writer.add, pixels)
+                await loop.run_in_executor(encoder, video.add, pixels)
+            await loop.run_in_executor(encoder, video.close)
+        except VideoError as error:
+            raise ServiceError(ErrorCode.UNSUPPORTED, str(error)) from error
         finally:
-            await loop.run_in_executor(encoder, writer.close)
+            await loop.run_in_executor(encoder, video.discard)
     values = {"frames": len(times), "fps": asked.fps, "start_us": times[0], "end_us": times[-1]}
     return JobResult(values, {VIDEO: VIDEO_TYPE})
 
@@ -118,31 +119,3 @@ def _shot(film: Film, sensor: SensorSpec, t_us: int) -> RenderRequest:
         t_us=t_us,
         sensors=(sensor,),
     )
-
-
-class _Writer:
-    """A WebM file; VP8 plays in every browser, and the encoder comes with OpenCV."""
-
-    def __init__(self, path: Path, fps: float) -> None:
-        self._path = path
-        self._fps = fps
-        self._writer: Any = None
-
-    def add(self, pixels: NDArray[np.uint8]) -> None:
-        """Append an RGB frame [H, W, 3]; odd sizes lose their last row or column."""
-        import cv2
-
-        height, width = (side // 2 * 2 for side in pixels.shape[:2])
-        if self._writer is None:
-            fourcc = cv2.VideoWriter.fourcc(*"VP80")
-            self._writer = cv2.VideoWriter(str(self._path), fourcc, self._fps, (width, height))
-            if not self._writer.isOpened():
-                raise ServiceError(
-                    ErrorCode.UNSUPPORTED, "this worker's OpenCV has no VP8 encoder for videos"
-                )
-        self._writer.write(np.ascontiguousarray(pixels[:height, :width, ::-1]))
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._writer is not None:
-            self._writer.release()
