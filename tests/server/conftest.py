@@ -95,3 +95,30 @@ def scenes_dir(tmp_path: Path, tiny_scene: Scene) -> Path:
     folder = tmp_path / "scenes"
     save_scene(tiny_scene, folder / "tiny.r2s")
     return folder
+
+
+@pytest.fixture(scope="session")
+def solver_kernels():
+    """Kernels of the physics on the CPU, compiled in both precisions."""
+    from real2sim_server.physics.materials import FixedCorotated
+    from real2sim_server.physics.validation.check import block, solve
+
+    for precision in ("single", "double"):
+        solve([block(FixedCorotated(young=2e5))], precision=precision).step(1e-4)
+
+
+@pytest.fixture
+def one_torch_thread():
+    """Small tensors gain nothing from threads and lose much when others compute."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def pytest_collection_modifyitems(items):
+    """Time limits are for tests: compiling kernels takes minutes where others compute as well."""
+    for item in items:
+        compiles = "solver_kernels" in getattr(item, "fixturenames", ())
+        if compiles and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(300, func_only=True))

@@ -119,11 +119,11 @@ def _film(
     out: Path,
     report: Callable[[str, int, int], None],
 ) -> None:
-    from ..simulation.experiments import leave_film, views, walls
+    from ..simulation.experiments import views, walls, write_film
     from ..simulation.playback import Playback
 
     playback = Playback(scene, state, result)
-    leave_film(
+    write_film(
         playback,
         views(playback, setup),
         out,

@@ -14,7 +14,7 @@ from .errors import (
 from .materials import FixedCorotated, Foam, Material, Metal, NearRigid, NeoHookean, Sand, Snow
 from .particles import Particles, ball_particles, box_particles
 from .restitution import RestitutionFit, fit_restitution
-from .solver import BodyState, Contact, Energies, Solver, SolverOptions, StepReport
+from .solver import BodyState, ContactTotals, Energies, Solver, SolverOptions, StepReport
 
 __all__ = [
     "Body",
@@ -23,7 +23,7 @@ __all__ = [
     "Calibration",
     "Collider",
     "ColliderError",
-    "Contact",
+    "ContactTotals",
     "Energies",
     "FixedCorotated",
     "Foam",

@@ -21,7 +21,7 @@ class Body:
 
     Attributes:
         name: unique among the bodies of a solver.
-        particles: its matter, placed in the world.
+        particles: placed in the world.
         material: one material, or several that ``regions`` chooses from.
         regions: [N] int, which material a particle is of; all of the first when not given.
         velocity: [3] of the centre of mass [m/s].

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ..geometry.rotation import Float
 from .backends.reference.backend import torch_model
-from .backends.reference.step import TorchRules, TorchState, settle, substep
+from .backends.reference.step import TorchParameters, TorchState, substep, with_stress
 from .colliders import Collider
-from .constitutive import stress as laws
+from .constitutive import material_row
 from .errors import SolverError
 from .solver import Solver
 
@@ -179,14 +179,14 @@ def rollout(
     solver: Solver, parameters: Sequence[str], *, dt: float, every: int, observations: int
 ) -> Callable[[Tensor], Tensor]:
     """Positions [T, N, 3] as a function of logarithms of factors [K]; differentiable."""
-    state, rules = torch_model(solver.model)
+    state, params = torch_model(solver.model)
     colliders: tuple[Collider, ...] = solver.colliders
 
     def path(logs: Tensor) -> Tensor:
         one = torch.ones((), dtype=torch.float64)
         factor = dict.fromkeys(PARAMETERS, one)
         factor.update(zip(parameters, logs.exp().unbind(), strict=True))
-        now, changed = _scaled(state, rules, factor)
+        now, changed = _scaled(state, params, factor)
         seen = []
         for count in range(every * observations):
             moved = [c.after(count * dt) for c in colliders]
@@ -199,15 +199,18 @@ def rollout(
 
 
 def _scaled(
-    state: TorchState, rules: TorchRules, factor: dict[str, Tensor]
-) -> tuple[TorchState, TorchRules]:
-    columns = [torch.ones((), dtype=torch.float64)] * laws.ROW
-    columns[laws.MU] = columns[laws.LAMBDA] = factor["stiffness"]
-    columns[laws.A], columns[laws.VISCOSITY] = factor["yield_stress"], factor["viscosity"]
+    state: TorchState, params: TorchParameters, factor: dict[str, Tensor]
+) -> tuple[TorchState, TorchParameters]:
+    columns = [torch.ones((), dtype=torch.float64)] * material_row.MATERIAL_ROW
+    columns[material_row.MU] = columns[material_row.LAMBDA] = factor["stiffness"]
+    columns[material_row.A], columns[material_row.VISCOSITY] = (
+        factor["yield_stress"],
+        factor["viscosity"],
+    )
     changed = replace(
-        rules,
-        rows=rules.rows * torch.stack(columns),
-        friction=rules.friction * factor["friction"],
+        params,
+        rows=params.rows * torch.stack(columns),
+        friction=params.friction * factor["friction"],
     )
     thrown = replace(state, v=state.v * factor["speed"], L=state.L * factor["speed"])
-    return settle(thrown, changed), changed
+    return with_stress(thrown, changed), changed

@@ -17,7 +17,7 @@ PLANE, BOX, HEIGHT_FIELD = range(3)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Collider:
-    """What all colliders share.
+    """What all colliders have in common.
 
     Attributes:
         name: unique among the colliders of a solver.
@@ -116,7 +116,7 @@ class Box(Collider):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeightField(Collider):
-    """Ground given by heights on a regular grid; matter below it is pushed up.
+    """Ground given by heights on a regular grid; particles below it are pushed up.
 
     Outside the grid the nearest rim height holds.
 

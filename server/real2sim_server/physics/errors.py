@@ -1,11 +1,11 @@
-"""Errors of the physics room.
+"""Errors of the physics package.
 
 PhysicsError
-├── MaterialError    a material parameter outside its range
+├── MaterialError    a material parameter outside its range, or an unknown constitutive law
 ├── ParticleError    particles that cannot be simulated: empty, massless, not finite, too many
 ├── ColliderError    a collider that makes no sense
 ├── SolverError      a setting of the solver that is not allowed, or a backend not usable here
-└── UnstableError    the simulation blew up and smaller steps did not help
+└── UnstableError    the simulation diverged and smaller steps did not help
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class PhysicsError(Exception):
 
 
 class MaterialError(PhysicsError, ValueError):
-    """A material parameter is outside its range."""
+    """A material parameter is outside its range, or its constitutive law is unknown."""
 
 
 class ParticleError(PhysicsError, ValueError):
@@ -32,4 +32,4 @@ class SolverError(PhysicsError, ValueError):
 
 
 class UnstableError(PhysicsError, RuntimeError):
-    """The simulation blew up and smaller steps did not help; names body, step and cause."""
+    """The simulation diverged and smaller steps did not help; names body, step and cause."""

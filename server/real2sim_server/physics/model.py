@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .backends.base import Model, ParticleArrays
 from .body import Body
-from .constitutive.contact import STICKS
+from .contact.surface import STICKS
 from .errors import ParticleError, SolverError
 from .materials import Material
 

@@ -1,4 +1,4 @@
-"""Matter as particles: where it is, how much of it."""
+"""Particles: where they are, how much mass and volume they carry."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .errors import ParticleError
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Lumps of matter at rest, in one frame.
+    """Particles at rest, in one frame.
 
     Attributes:
         positions: [N, 3] float64 [m].

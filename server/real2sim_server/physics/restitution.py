@@ -166,9 +166,9 @@ def with_viscosity(body: Body, viscosity: float) -> Body:
     )
 
 
-def _first_guess(body: Body, share: float, normal: ArrayLike) -> float:
-    """Viscosity [Pa s] that lets ``share`` of the rebound through, by the formula above."""
-    drop = -math.log(max(share, 0.02))
+def _first_guess(body: Body, fraction: float, normal: ArrayLike) -> float:
+    """Viscosity [Pa s] that lets ``fraction`` of the rebound through, by the formula above."""
+    drop = -math.log(max(fraction, 0.02))
     zeta = drop / math.hypot(math.pi, drop)
     material = body.materials[0]
     n = np.asarray(normal, dtype=np.float64)

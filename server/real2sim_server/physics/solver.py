@@ -1,4 +1,4 @@
-"""The solver: time, steps that are small enough, and a guard that takes back what went wrong."""
+"""The solver: time, an adaptive time step, and substeps taken back when they diverged."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from .backends import Measure, Model, ParticleArrays, Simulation, select_backend
 from .backends.base import SolverDiverged
 from .body import Body
 from .colliders import Collider
-from .constitutive import stress as laws
+from .constitutive import material_row
 from .errors import PhysicsError, SolverError, UnstableError
 from .model import build_model
 
-CHECK_EVERY = 16
-"""Substeps between two looks of the guard."""
+CHECK_INTERVAL = 16
+"""Substeps between two checks of energy and of finite numbers."""
 VISCOUS_STEP = 0.2
 """dt <= VISCOUS_STEP rho dx^2 / eta keeps explicit viscosity stable."""
 ENERGY_SLACK = 0.01
-"""Energy may rise by this share of what is moving or stored before the guard takes it back."""
-SMALLEST_SHARE = 2.0**-12
-"""The guard gives up when steps have become this much smaller than they should need to be."""
+"""Energy may rise by this fraction of what is moving or stored before substeps are taken back."""
+DT_SCALE_MIN = 2.0**-12
+"""The solver gives up when substeps are this fraction of what should be stable."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class SolverOptions:
     Attributes:
         dx: cell size [m]; None takes twice the spacing of the coarsest body's particles.
         gravity: [3] [m/s^2].
-        backend: ``auto``, ``cpu``, ``reference``.
+        backend: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``.
         precision: ``single`` or ``double`` state on ``cpu``; the reference is always double.
-        cfl: share of a cell that the fastest wave may cross in a substep, in (0, 0.9].
+        cfl: fraction of a cell that the fastest wave may cross in a substep, in (0, 0.9].
         dt_max: longest substep [s].
         substeps_max: a single ``step`` that would need more substeps is refused.
     """
@@ -94,14 +94,14 @@ class BodyState:
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
-    """What one body has got from a collider or another body since the start.
+class ContactTotals:
+    """Sums over what a collider or another body did to one body since the start.
 
     Attributes:
         body, other: names.
         impulse: [3] on ``body`` [N s]; over its mass this is its delta-v.
         moment: [3] of the impulse about the world origin [N m s].
-        heat: energy rubbed away by friction [J]; between bodies each side counts half.
+        friction_work: energy dissipated by friction [J]; between bodies each side counts half.
         work: energy the other gave to ``body`` by pushing it [J]; negative where it was braked.
     """
 
@@ -109,7 +109,7 @@ class Contact:
     other: str
     impulse: Float
     moment: Float
-    heat: float
+    friction_work: float
     work: float
 
 
@@ -119,7 +119,7 @@ class Energies:
 
     Attributes:
         kinetic, elastic, gravity: present energy; gravity is 0 at the world origin.
-        friction_heat: rubbed away since the start.
+        friction_heat: dissipated by friction since the start.
         collider_work: done on bodies by moving colliders since the start.
         dissipated: gone since the start into viscous and plastic flow, inelastic touch and the
             transfers between particles and grid.
@@ -145,7 +145,7 @@ class StepReport:
     Attributes:
         substeps: made and kept.
         dt: last substep [s].
-        rollbacks: times the guard went back.
+        rollbacks: blocks of substeps that were taken back.
         reasons: why, one for each rollback.
     """
 
@@ -182,10 +182,10 @@ class Solver:
         o = self.options
         self.model: Model = build_model(bodies, dx=o.dx, gravity=o.gravity, precision=o.precision)
         backend = select_backend(o.backend)
-        # Public for benches and restorers of single substeps; time and guard are the solver's.
+        # Public for benches and tests of single substeps; time and its step are the solver's.
         self.simulation: Simulation = backend.start(self.model, self._colliders)
         self._viscous_dt = _viscous_limit(self.model)
-        self._share = 1.0
+        self._dt_scale = 1.0
         self.time = 0.0
         self._measure = self.simulation.measure()
         self._start_energy = self._mechanical(self._measure)
@@ -224,17 +224,17 @@ class Solver:
         while remaining > 1e-9 * duration:
             left = math.ceil(remaining / self.time_step() - 1e-9)
             report.dt = remaining / left
-            count = min(left, CHECK_EVERY)
-            if self._try(count, report):
+            count = min(left, CHECK_INTERVAL)
+            if self._attempt(count, report):
                 remaining -= count * report.dt
                 report.substeps += count
         return report
 
     def time_step(self) -> float:
-        """Longest stable substep now [s]: waves, motion, viscosity, and the guard's caution."""
+        """Longest stable substep now [s]: waves, motion, viscosity, and ``dt_scale``."""
         m, o = self._measure, self.options
         speed = m.max_wave_speed + m.max_speed
-        return self._share * min(o.cfl * self.dx / speed, self._viscous_dt, o.dt_max)
+        return self._dt_scale * min(o.cfl * self.dx / speed, self._viscous_dt, o.dt_max)
 
     def state(self, name: str) -> BodyState:
         """The body of that name.
@@ -279,8 +279,8 @@ class Solver:
         return self.simulation.particles()
 
     @property
-    def contacts(self) -> list[Contact]:
-        """Everything that touched since the start, one entry for each body and other."""
+    def contacts(self) -> list[ContactTotals]:
+        """All contacts since the start, one entry for each body and other."""
         by_collider, by_body = self.simulation.contacts()
         names = [b.name for b in self.bodies]
         found = []
@@ -288,11 +288,13 @@ class Solver:
         for totals, labels in ((by_collider, others), (by_body, names)):
             for b, k in zip(*np.nonzero(totals.any(axis=2)), strict=True):
                 row = totals[b, k]
-                found.append(Contact(names[b], labels[k], row[:3], row[3:6], *row[6:].tolist()))
+                found.append(
+                    ContactTotals(names[b], labels[k], row[:3], row[3:6], *row[6:].tolist())
+                )
         return found
 
     def energies(self) -> Energies:
-        """The ledger: what there is, and where the rest went."""
+        """The energy balance: what there is, and where the rest went."""
         m = self._measure
         heat, work = self._contact_energies()
         now = self._mechanical(m)
@@ -307,15 +309,21 @@ class Solver:
 
     def snapshot(self) -> Any:
         """The present state, bit by bit; for :meth:`restore` of this solver only."""
-        return self.simulation.save(), list(self._colliders), self.time, self._share, self._measure
+        return (
+            self.simulation.save(),
+            list(self._colliders),
+            self.time,
+            self._dt_scale,
+            self._measure,
+        )
 
     def restore(self, snapshot: Any) -> None:
         """Go back to a snapshot; from there on everything is as it was, to the bit."""
-        saved, colliders, self.time, self._share, self._measure = snapshot
+        saved, colliders, self.time, self._dt_scale, self._measure = snapshot
         self._colliders = list(colliders)
         self.simulation.restore(saved)
 
-    def _try(self, count: int, report: StepReport) -> bool:
+    def _attempt(self, count: int, report: StepReport) -> bool:
         """Make ``count`` substeps; take them back and halve the step if they went wrong."""
         before, saved = self._measure, self.simulation.save()
         work_before = self._contact_energies()[1]
@@ -326,19 +334,19 @@ class Solver:
             self._measure = before
             raise
         if not reason:
-            reason = self._complaint(before, self._contact_energies()[1] - work_before)
+            reason = self._instability(before, self._contact_energies()[1] - work_before)
         if not reason:
             self._colliders = [c.after(count * report.dt) for c in self._colliders]
             self.time += count * report.dt
-            self._share = min(1.0, self._share * 1.1)
+            self._dt_scale = min(1.0, self._dt_scale * 1.1)
             return True
         self.simulation.restore(saved)
         self._measure = before
-        self._share *= 0.5
+        self._dt_scale *= 0.5
         report.rollbacks += 1
         report.reasons.append(reason)
-        if self._share < SMALLEST_SHARE:
-            self._share = 1.0
+        if self._dt_scale < DT_SCALE_MIN:
+            self._dt_scale = 1.0
             raise UnstableError(
                 f"unstable at {self.time:.6f} s although substeps went down to {report.dt:.3g} s: "
                 f"{reason}"
@@ -353,7 +361,7 @@ class Solver:
             return "particles left the grid"
         return ""
 
-    def _complaint(self, before: Measure, work: float) -> str:
+    def _instability(self, before: Measure, work: float) -> str:
         """What is wrong with the present state, or nothing."""
         m = self._measure
         if not m.finite:
@@ -388,7 +396,7 @@ class Solver:
 
 def _viscous_limit(model: Model) -> float:
     """Longest substep that Kelvin-Voigt damping allows [s]."""
-    eta = model.table[model.material, laws.VISCOSITY]
+    eta = model.table[model.material, material_row.VISCOSITY]
     density = model.masses / model.volumes
     rate = float((eta / density).max()) / model.dx**2
     return VISCOUS_STEP / rate if rate > 0 else math.inf

@@ -1,12 +1,18 @@
-"""One object of a scene as a body: rigid while alone, matter while it deforms, dented after."""
+"""One object of a scene as a body: rigid while alone, deforming in contact, asleep at rest.
+
+The body owns its state: what it is now, for how long it has been so, and how it changes over.
+A simulator gives orders (activate, rigidify, put to sleep) and reads.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
@@ -18,15 +24,34 @@ from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .rigid import RigidMotion, best_rotation, cross_matrix, inertia_about
 from .surroundings import nearest
-from .tyres import Tyres
+from .tyres import TyreReaction, Tyres
 
-SLEEPING, RIGID, DEFORMING = range(3)
-MODES = ("resting", "rigid", "deforming")
 SURFACE_POINTS = 600
+RIGID_STEP = 0.0025
+"""Longest step of rigid motion [s]."""
+SETTLED_SPEED = 0.06
+"""A body has settled at a residual speed below this, or SETTLED_FRACTION of its speed [m/s]."""
+SETTLED_FRACTION = 0.03
+SETTLE_TIME = 0.05
+"""It may become rigid again once it has been settled for this long [s]."""
+SLEEP_SPEED = 0.06
+"""A body that moves and turns by less, [m/s] and [rad/s] together, may be put to sleep."""
+SLEEP_TIME = 0.08
+"""Once it has been that slow for this long [s]: at the top of a bounce it is so for a moment."""
+WHEELS_SLEEP_TIME = 0.2
+"""The same for a rigid body on its wheels, at half that speed [s]."""
+
+
+class BodyMode(IntEnum):
+    """How a body moves."""
+
+    SLEEPING = 0
+    RIGID = 1
+    DEFORMING = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class DeformedShape:
     """What deformation has left, in the object's frame.
 
     Attributes:
@@ -47,13 +72,14 @@ class DeformableBody:
     Args:
         name: object id.
         particles: at rest, object frame.
-        materials, regions: see :class:`~..body.Body`.
+        materials, regions: see :class:`~..physics.body.Body`.
         friction: of its surface.
         cell: of the solver's grid [m].
         T_world_object: [4, 4] at the start.
         velocity: [3] of the centre of mass [m/s].
         angular_velocity: [3] world axes [rad/s].
         tyres: when it stands on wheels.
+        shape: what earlier deformation has left; None for none.
     """
 
     def __init__(
@@ -61,7 +87,7 @@ class DeformableBody:
         name: str,
         particles: Particles,
         materials: Sequence[Material],
-        regions: Any,
+        regions: NDArray[np.int64],
         *,
         friction: float,
         cell: float,
@@ -69,8 +95,8 @@ class DeformableBody:
         velocity: Float,
         angular_velocity: Float,
         tyres: Tyres | None = None,
+        shape: DeformedShape | None = None,
     ) -> None:
-        n = len(particles)
         self.name = name
         self.rest = particles
         self.materials = tuple(materials)
@@ -78,13 +104,15 @@ class DeformableBody:
         self.friction = friction
         self.cell = cell
         self.tyres = tyres
-        eye = np.tile(np.eye(3), (n, 1, 1))
-        self.shape = Shape(particles.positions, eye, eye, np.zeros(n))
+        self.shape = _undeformed(particles) if shape is None else shape
         self.spacing = float(np.cbrt(np.median(particles.volumes)))
-        self._stiff_pose = np.array(T_world_object, dtype=np.float64)
-        centre = apply_transform(self._stiff_pose, particles.centre_of_mass[None])[0]
+        pose = np.array(T_world_object, dtype=np.float64)
+        if shape is None:
+            centre = apply_transform(pose, particles.centre_of_mass[None])[0]
+        else:
+            centre = particles.masses @ apply_transform(pose, shape.positions) / particles.mass
         self.motion = RigidMotion(
-            rotation=self._stiff_pose[:3, :3],
+            rotation=pose[:3, :3],
             centre=centre,
             velocity=np.array(velocity, dtype=np.float64),
             angular_velocity=np.array(angular_velocity, dtype=np.float64),
@@ -93,17 +121,16 @@ class DeformableBody:
                 particles.centre_of_mass, particles.positions, particles.masses, cell=cell
             ),
         )
-        self._sample = _outer_points(particles.positions)
-        self.mode = RIGID
-        self.deforming_for = 0.0
-        self.calm_for = self.still_for = 0.0
+        self.mode = BodyMode.RIGID
         self.hit = False
         self.state: BodyState | None = None
-        self.stored = 0.0
+        self._surface = _surface_points(particles.positions)
+        self._stored_energy = 0.0
+        self._deforming_time = self._settle_time = self._sleep_time = 0.0
 
     @property
     def T_world_object(self) -> Float:
-        """[4, 4] pose; while deforming, the rigid pose nearest to all its matter."""
+        """[4, 4] pose; while deforming, the rigid pose nearest to all its particles."""
         pose = np.eye(4)
         if self.state is None:
             local_centre = self.rest.masses @ self.shape.positions / self.rest.mass
@@ -122,11 +149,11 @@ class DeformableBody:
         pose = self.T_world_object
         return (self.state.positions - pose[:3, 3]) @ pose[:3, :3]
 
-    def outer_points(self) -> Float:
-        """[K, 3] some particles of the outside, in the world [m]."""
+    def surface_points(self) -> Float:
+        """[K, 3] some particles of its surface, in the world [m]."""
         if self.state is not None:
-            return self.state.positions[self._sample]
-        return apply_transform(self.T_world_object, self.shape.positions[self._sample])
+            return self.state.positions[self._surface]
+        return apply_transform(self.T_world_object, self.shape.positions[self._surface])
 
     def box(self) -> tuple[Float, Float]:
         """Pose [4, 4] and size [3] of the box about its present shape."""
@@ -142,31 +169,37 @@ class DeformableBody:
 
     def gap_to_colliders(self, colliders: Sequence[Collider]) -> tuple[float, float]:
         """Distance [m] to the nearest collider, and the speed of approach there [m/s]."""
-        points = self.outer_points()
+        points = self.surface_points()
         distance, normals = nearest(colliders, points)
         k = int(distance.argmin())
         if not np.isfinite(distance[k]):
             return np.inf, 0.0
         return float(distance[k]), -float(normals[k] @ self.motion.velocity_at(points[k]))
 
-    def body(self) -> Body:
+    def solver_body(self) -> Body:
         """The body as it is now, for a solver; momentum and angular momentum are the motion's."""
         if self.state is not None:
             s = self.state
-            return self._body(s.positions, s.velocities, s.gradients, s)
+            return self._solver_body(s.positions, s.velocities, s.gradients, s)
         pose, rotation = self.T_world_object, self.motion.rotation
         positions = apply_transform(pose, self.shape.positions)
-        turn = cross_matrix(self.motion.angular_velocity)
-        velocities = self.motion.velocity + (positions - self.motion.centre) @ turn.T
+        spin = cross_matrix(self.motion.angular_velocity)
+        velocities = self.motion.velocity + (positions - self.motion.centre) @ spin.T
         shape = replace(
             self.shape,
             F_elastic=rotation @ self.shape.F_elastic,
             F_total=rotation @ self.shape.F_total,
         )
-        return self._body(positions, velocities, np.tile(turn, (len(positions), 1, 1)), shape)
+        return self._solver_body(
+            positions, velocities, np.tile(spin, (len(positions), 1, 1)), shape
+        )
 
-    def _body(
-        self, positions: Float, velocities: Float, gradients: Float, shape: Shape | BodyState
+    def _solver_body(
+        self,
+        positions: Float,
+        velocities: Float,
+        gradients: Float,
+        shape: DeformedShape | BodyState,
     ) -> Body:
         return Body(
             name=self.name,
@@ -181,13 +214,53 @@ class DeformableBody:
             history=shape.history,
         )
 
-    def loosen(self) -> None:
-        """Turn into deforming matter; the next ``body`` goes into a solver."""
-        self.mode, self.deforming_for = DEFORMING, 0.0
-        self.calm_for = self.still_for = 0.0
+    @property
+    def kinetic_energy(self) -> float:
+        """Energy of its motion [J]."""
+        return self.motion.kinetic if self.state is None else self.state.kinetic
 
-    def take(self, state: BodyState) -> None:
-        """The solver's state of this body; the motion becomes its rigid part."""
+    @property
+    def elastic_energy(self) -> float:
+        """Energy stored in its deformation [J]."""
+        return self._stored_energy if self.state is None else self.state.elastic
+
+    def advance_rigid(
+        self, duration: float, gravity: Float, road: Sequence[Collider]
+    ) -> list[TyreReaction]:
+        """Fall, roll, slide for ``duration`` [s]; falls asleep when it has stood long enough.
+
+        Args:
+            duration: [s].
+            gravity: [3] [m/s^2].
+            road: colliders that carry tyres.
+
+        Returns:
+            What the road did, step by step; nothing without tyres.
+        """
+        steps = math.ceil(duration / RIGID_STEP - 1e-6)
+        dt = duration / steps
+        reactions = []
+        for _ in range(steps):
+            m = self.motion.with_gravity(dt, gravity)
+            if self.tyres is not None:
+                m, reaction = self.tyres.apply(m, self.T_world_object, road, dt)
+                reactions.append(reaction)
+            self.motion = m.advanced(dt)
+        m = self.motion
+        slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < SLEEP_SPEED / 2
+        standing = slow and self.tyres is not None
+        self._settle_time = self._settle_time + duration if standing else 0.0
+        if self._settle_time > WHEELS_SLEEP_TIME:
+            self.put_to_sleep()
+        return reactions
+
+    def activate(self) -> None:
+        """Begin to deform; the next ``solver_body`` goes into a solver."""
+        self.mode = BodyMode.DEFORMING
+        self._deforming_time = self._settle_time = self._sleep_time = 0.0
+
+    def update_from_solver(self, state: BodyState) -> None:
+        """Take over the solver's state of this body; the motion becomes its rigid part."""
         self.state = state
         inertia = inertia_about(state.centre, state.positions, self.rest.masses, cell=self.cell)
         # The state's angular momentum is about its centre, spin of particles included.
@@ -200,35 +273,76 @@ class DeformableBody:
             inertia=inertia,
         )
 
-    def kick(self, after: RigidMotion) -> None:
+    def apply_road(self, road: Sequence[Collider], duration: float) -> TyreReaction | None:
+        """Let the road act on the wheels while deforming, as on a rigid body.
+
+        Returns:
+            What the road did, or None when no wheel carries; else a solver must start anew from
+            this body.
+        """
+        if self.tyres is None:
+            return None
+        after, reaction = self.tyres.apply(self.motion, self.T_world_object, road, duration)
+        if not np.any(reaction.impulse):
+            return None
+        self.apply_impulse(after)
+        return reaction
+
+    def apply_impulse(self, after: RigidMotion) -> None:
         """Give all particles the rigid change of velocity from the present motion to ``after``."""
         assert self.state is not None
         s, m = self.state, self.motion
-        turn = cross_matrix(after.angular_velocity - m.angular_velocity)
+        spin = cross_matrix(after.angular_velocity - m.angular_velocity)
         self.state = replace(
             s,
             velocities=s.velocities
             + (after.velocity - m.velocity)
-            + (s.positions - s.centre) @ turn.T,
-            gradients=s.gradients + turn,
+            + (s.positions - s.centre) @ spin.T,
+            gradients=s.gradients + spin,
             momentum=after.momentum,
             angular_momentum=after.angular_momentum,
         )
         self.motion = after
 
-    def unrest(self) -> float:
+    def brake_after_hit(self, fraction: float) -> None:
+        """Lock the wheels, once and for all, as far as ``fraction`` of their grip says."""
+        assert self.tyres is not None
+        self.hit = True
+        self.tyres = self.tyres.braked(fraction)
+
+    def residual_speed(self) -> float:
         """Root mean square speed of particles against the rigid part of their motion [m/s]."""
         assert self.state is not None
         s, m = self.state, self.motion
         rigid = m.velocity + np.cross(m.angular_velocity, s.positions - s.centre)
         return float(np.sqrt(self.rest.masses @ ((s.velocities - rigid) ** 2).sum(axis=1) / m.mass))
 
-    def stiffen(self, mode: int) -> None:
+    def update_timers(self, duration: float) -> None:
+        """Count how long it has been deforming, settled and slow; ``duration`` [s] more."""
+        speed = float(np.linalg.norm(self.motion.velocity))
+        turning = float(np.linalg.norm(self.motion.angular_velocity))
+        settled = self.residual_speed() < max(SETTLED_SPEED, SETTLED_FRACTION * speed)
+        slow = speed + turning < SLEEP_SPEED
+        self._deforming_time += duration
+        self._settle_time = self._settle_time + duration if settled else 0.0
+        self._sleep_time = self._sleep_time + duration if slow else 0.0
+
+    @property
+    def may_rigidify(self) -> bool:
+        """Whether it has deformed and then been settled for long enough."""
+        return self._settle_time >= SETTLE_TIME and self._deforming_time >= 2 * SETTLE_TIME
+
+    @property
+    def may_sleep(self) -> bool:
+        """Whether it has hardly moved for long enough, too."""
+        return self.may_rigidify and self._sleep_time > SLEEP_TIME
+
+    def rigidify(self) -> None:
         """Become rigid as it is: no particle moves; momentum and angular momentum stay."""
         assert self.state is not None
         pose, s = self.T_world_object, self.state
         back = pose[:3, :3].T
-        self.shape = Shape(
+        self.shape = DeformedShape(
             (s.positions - pose[:3, 3]) @ pose[:3, :3],
             back @ s.F_elastic,
             back @ s.F_total,
@@ -238,18 +352,28 @@ class DeformableBody:
         self.motion = replace(
             m, rotation=pose[:3, :3], inertia=back @ m.world_inertia @ pose[:3, :3]
         )
-        self.stored = s.elastic
-        self.state, self.mode, self.calm_for = None, mode, 0.0
-        if mode == SLEEPING:
-            self.lay_down()
+        self._stored_energy = s.elastic
+        self.state, self.mode, self._settle_time = None, BodyMode.RIGID, 0.0
 
-    def lay_down(self) -> None:
-        """Stand still until something comes near."""
-        self.mode, self.calm_for = SLEEPING, 0.0
+    def put_to_sleep(self) -> None:
+        """Stand still until something comes near; a deforming body becomes rigid first."""
+        if self.state is not None:
+            self.rigidify()
+        self.mode, self._settle_time = BodyMode.SLEEPING, 0.0
         self.motion = replace(self.motion, velocity=np.zeros(3), angular_velocity=np.zeros(3))
 
+    def translate(self, by: Float) -> None:
+        """Place a rigid body elsewhere, ``by`` [3] [m]."""
+        self.motion = replace(self.motion, centre=self.motion.centre + by)
 
-def _outer_points(positions: Float) -> Any:
+
+def _undeformed(particles: Particles) -> DeformedShape:
+    n = len(particles)
+    eye = np.tile(np.eye(3), (n, 1, 1))
+    return DeformedShape(particles.positions, eye, eye, np.zeros(n))
+
+
+def _surface_points(positions: Float) -> NDArray[np.int64]:
     """Indices of particles that lie outermost along evenly spread directions."""
     k = np.arange(SURFACE_POINTS) + 0.5
     z = 1 - 2 * k / SURFACE_POINTS

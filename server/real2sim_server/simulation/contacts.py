@@ -1,4 +1,4 @@
-"""Books of a simulation: contacts and energies over stretches of solver and of rigid motion."""
+"""Contacts and energies of a simulation, over stretches of solver and of rigid motion."""
 
 from __future__ import annotations
 
@@ -7,45 +7,54 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..geometry.rotation import Float
-from ..physics.solver import Contact
+from ..physics.solver import ContactTotals
 from .body import DeformableBody
 from .result import ContactRecord
 
-TOUCH = 1e-3
-"""Impulses that change by less than this, per mass, are over [m/s]."""
-
 
 class ContactLog:
-    """What was given and taken since the start."""
+    """Impulses and energies since the start, by body and what touched it.
+
+    Attributes:
+        collider_work: of moving colliders on bodies [J].
+    """
 
     def __init__(self) -> None:
         self._impulses: dict[tuple[str, str], Float] = {}
-        self._heat: dict[tuple[str, str], float] = {}
+        self._friction_work: dict[tuple[str, str], float] = {}
         self._times: dict[tuple[str, str], list[float]] = {}
-        self._seen: dict[tuple[str, str], tuple[Float, float, float]] = {}
+        self._solver_totals: dict[tuple[str, str], tuple[Float, float, float]] = {}
         self.collider_work = 0.0
 
     def start_solver(self) -> None:
         """A new solver counts from zero."""
-        self._seen = {}
+        self._solver_totals = {}
 
-    def add_contacts(self, contacts: Iterable[Contact], time: float, names: set[str]) -> None:
-        """Book what a solver's contacts have grown by since they were last looked at."""
+    def add_solver_contacts(
+        self, contacts: Iterable[ContactTotals], time: float, names: set[str]
+    ) -> None:
+        """Add what a solver's contacts have grown by since the last call.
+
+        Args:
+            contacts: of the present solver, since its start.
+            time: [s].
+            names: of all bodies; others are colliders.
+        """
         for c in contacts:
             key = (c.body, c.other)
-            impulse, heat, work = self._seen.get(key, (np.zeros(3), 0.0, 0.0))
-            self.add(*key, c.impulse - impulse, c.heat - heat, time)
+            impulse, friction_work, work = self._solver_totals.get(key, (np.zeros(3), 0.0, 0.0))
+            self.add(*key, c.impulse - impulse, c.friction_work - friction_work, time)
             if c.other not in names:
                 self.collider_work += c.work - work
-            self._seen[key] = (np.array(c.impulse), c.heat, c.work)
+            self._solver_totals[key] = (np.array(c.impulse), c.friction_work, c.work)
 
-    def add(self, body: str, other: str, impulse: Float, heat: float, time: float) -> None:
-        """Book an impulse [N s] and rubbing [J] at a time [s]."""
+    def add(self, body: str, other: str, impulse: Float, friction_work: float, time: float) -> None:
+        """Add an impulse [3] [N s] and the work of friction [J] at a time [s]."""
         key = (body, other)
         if not np.any(impulse):
             return
         self._impulses[key] = self._impulses.get(key, np.zeros(3)) + impulse
-        self._heat[key] = self._heat.get(key, 0.0) + heat
+        self._friction_work[key] = self._friction_work.get(key, 0.0) + friction_work
         times = self._times.setdefault(key, [time, time])
         times[1] = time
 
@@ -54,9 +63,9 @@ class ContactLog:
         return {key: value.copy() for key, value in self._impulses.items()}
 
     @property
-    def heat(self) -> float:
-        """Rubbed away so far [J]."""
-        return sum(self._heat.values())
+    def friction_work(self) -> float:
+        """Dissipated by friction so far [J]."""
+        return sum(self._friction_work.values())
 
     def records(self, masses: dict[str, float]) -> tuple[ContactRecord, ...]:
         """All contacts, in the order they began."""
@@ -65,22 +74,26 @@ class ContactLog:
             ContactRecord(
                 object_id=key[0],
                 other=key[1],
-                impulse=tuple(self._impulses[key].tolist()),  # type: ignore[arg-type]
+                impulse=_three(self._impulses[key]),
                 delta_v=float(np.linalg.norm(self._impulses[key])) / masses[key[0]],
                 first_s=self._times[key][0],
                 last_s=self._times[key][1],
-                heat=self._heat[key],
+                heat=self._friction_work[key],
             )
             for key in order
         )
 
 
-def energies(actors: Iterable[DeformableBody], gravity: Float) -> tuple[float, float, float]:
+def _three(vector: Float) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, float, float]:
     """Kinetic, elastic and gravity energy of all bodies now [J]."""
     kinetic = elastic = potential = 0.0
-    for actor in actors:
-        m = actor.motion
-        kinetic += m.kinetic if actor.state is None else actor.state.kinetic
-        elastic += actor.stored if actor.state is None else actor.state.elastic
-        potential -= m.mass * float(gravity @ m.centre)
+    for body in bodies:
+        kinetic += body.kinetic_energy
+        elastic += body.elastic_energy
+        potential -= body.motion.mass * float(gravity @ body.motion.centre)
     return kinetic, elastic, potential

@@ -1,4 +1,4 @@
-"""Gaussians in moving matter: each follows the particles around it.
+"""Gaussians in a body of moving particles: each follows the particles around it.
 
 A Gaussian's map is the weighted least-squares affine fit to the motion of its nearest particles
 (moving least squares). The fit is linear in particle displacements, so its coefficients are found
@@ -19,7 +19,7 @@ from ..scene.spherical_harmonics import sh_basis
 
 NEIGHBOURS = 20
 FLAT = 0.05
-"""Second moments below this share of spacing^2 say nothing about the gradient along their axis."""
+"""Second moments below this times spacing^2 say nothing about the gradient along their axis."""
 STRETCH_LIMITS = (0.2, 2.0)
 """Bounds on what a Gaussian is stretched by: across a tear it must not become a sheet."""
 TURNED = 1e-3
@@ -66,7 +66,7 @@ class Embedding:
         self._slopes = np.einsum("gk,gki,gij->gkj", weights, r, inverse)
         self._centre = centre
         self._offset = points - centre
-        # Far from all matter only rotation is trusted.
+        # Far from all particles only rotation is trusted.
         beyond = np.linalg.norm(self._offset, axis=1) / spacing
         self._trust = np.clip(2.5 - beyond, 0, 1)[:, None, None]
 

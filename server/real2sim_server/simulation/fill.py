@@ -22,12 +22,12 @@ from ..scene import GaussianCloud
 from .masses import default_mass
 
 OPACITY_MIN = 0.05
-"""Fainter Gaussians are haze and carry no matter."""
+"""Fainter Gaussians are haze and stand for no particles."""
 BOX_SLACK, BOX_SLACK_MAX = 0.1, 0.15
-"""Gaussians further outside the box than this share of its size, and at most so much [m], are not
-matter of the object."""
-SEEN_SHARE = 0.5
-"""A side is seen when this share of its silhouette shows matter of that side."""
+"""Gaussians further outside the box than this fraction of its size, and at most so much [m], do not
+belong to the object."""
+SEEN_FRACTION = 0.5
+"""A side is seen when this fraction of its silhouette shows a surface of that side."""
 SAMPLES_MAX = 7
 """A Gaussian's extent is sampled by at most this many points along each of its axes."""
 
@@ -57,7 +57,7 @@ class Filling:
         """One particle at the centre of each voxel of the largest connected piece.
 
         Even particles make a smoother solid than Gaussians do, and fewer of them; Gaussians then
-        follow by :class:`~.coupling.Embedding`. Masses sum to those of ``particles``.
+        follow by :class:`~.embedding.Embedding`. Masses sum to those of ``particles``.
 
         Args:
             above: voxels with centres below this height in the object's frame are left out [m].
@@ -67,7 +67,7 @@ class Filling:
         solid = solid & (heights >= above)
         pieces, count = ndimage.label(solid)
         if count == 0:
-            raise ParticleError(f"no matter lies above {above:.2f} m in the object's frame")
+            raise ParticleError(f"nothing of it lies above {above:.2f} m in the object's frame")
         largest = 1 + int(np.bincount(pieces[pieces > 0])[1:].argmax())
         index = np.argwhere(pieces == largest)
         volumes = np.full(len(index), self.spacing**3)
@@ -97,8 +97,8 @@ def fill_object(
         category: class of the object, for the default mass.
 
     Raises:
-        ParticleError: for an object without matter, a spacing that is not positive or too fine
-            for this machine, or a mass that is not positive.
+        ParticleError: for an object without solid Gaussians, a spacing that is not positive or too
+            fine for this machine, or a mass that is not positive.
     """
     edges = np.asarray(size, dtype=np.float64)
     if not (np.isfinite(spacing) and spacing > 0):
@@ -106,19 +106,19 @@ def fill_object(
     counts = np.maximum(np.ceil(edges * (1 + 2 * BOX_SLACK) / spacing).astype(int), 1)
     check_memory(int(counts.prod()), "single")
     origin = -counts * spacing / 2
-    matter = _matter(cloud, edges)
+    index = _solid_gaussians(cloud, edges)
     shell = np.zeros(counts, dtype=bool)
-    covered = np.floor((_covered_points(cloud, matter, spacing) - origin) / spacing).astype(int)
+    covered = np.floor((_covered_points(cloud, index, spacing) - origin) / spacing).astype(int)
     covered = covered[((covered >= 0) & (covered < counts)).all(axis=1)]
     shell[tuple(covered.T)] = True
     inside, sealed = _inside(shell, edges, origin, spacing)
-    particles = _particles(cloud, matter, shell | inside, origin, spacing)
+    particles = _particles(cloud, index, shell | inside, origin, spacing)
     wanted = default_mass(category, size) if mass is None else mass
     return Filling(particles.with_mass(wanted), shell, inside, origin, spacing, sealed)
 
 
-def _matter(cloud: GaussianCloud, size: Float) -> NDArray[np.int64]:
-    """Indices of the Gaussians that are matter of the object."""
+def _solid_gaussians(cloud: GaussianCloud, size: Float) -> NDArray[np.int64]:
+    """Indices of the Gaussians that belong to the object."""
     means = cloud.means.detach().cpu().numpy().astype(np.float64)
     solid = cloud.opacities.detach().cpu().numpy() >= OPACITY_MIN
     slack = np.minimum(size * BOX_SLACK, BOX_SLACK_MAX)
@@ -150,7 +150,7 @@ def _covered_points(cloud: GaussianCloud, index: NDArray[np.int64], spacing: flo
 
 @dataclass(frozen=True)
 class _Side:
-    """A side of the box: how deep below it matter still counts as that side's own."""
+    """A side of the box: how deep below it a surface still counts as that side's own."""
 
     axis: int
     sign: int
@@ -174,7 +174,7 @@ def _inside(
 ) -> tuple[Mask, tuple[str, ...]]:
     """Voxels that cannot be reached straight from outside, and the sides that the box closed.
 
-    From each side everything before the first matter is carved away. Holes in what a side shows
+    From each side everything before the first surface is carved away. Holes in what a side shows
     are closed from around them; a side hardly seen takes the depths of the side across where that
     was seen (things on a street are alike left and right), or the face of the box.
     """
@@ -206,14 +206,14 @@ def len_along(mask: Mask, side: _Side) -> int:
 
 
 def _depth(shell: Mask, side: _Side) -> tuple[NDArray[np.int64], bool]:
-    """Layers [A, B] before the first matter, all of them beside the silhouette; was it seen."""
+    """Layers [A, B] before the first surface, all of them beside the silhouette; was it seen."""
     along = _facing(shell, side)
     hit = along.any(axis=0)
     silhouette = ndimage.binary_closing(np.pad(hit, 4), iterations=4)[4:-4, 4:-4]
     silhouette = ndimage.binary_fill_holes(silhouette)
     first = np.where(hit, along.argmax(axis=0), len(along))
     own = hit & (first <= side.depth * len(along))
-    seen = bool(own.sum() >= SEEN_SHARE * silhouette.sum())
+    seen = bool(own.sum() >= SEEN_FRACTION * silhouette.sum())
     if own.any():
         nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
         first = first[tuple(nearest)]
@@ -222,10 +222,10 @@ def _depth(shell: Mask, side: _Side) -> tuple[NDArray[np.int64], bool]:
 
 
 def _particles(
-    cloud: GaussianCloud, matter: NDArray[np.int64], solid: Mask, origin: Float, spacing: float
+    cloud: GaussianCloud, index: NDArray[np.int64], solid: Mask, origin: Float, spacing: float
 ) -> Particles:
     """Gaussians in solid voxels, and one particle for each solid voxel without any."""
-    means = cloud.means.detach().cpu().numpy()[matter].astype(np.float64)
+    means = cloud.means.detach().cpu().numpy()[index].astype(np.float64)
     voxel = np.floor((means - origin) / spacing).astype(int)
     voxel = np.clip(voxel, 0, np.array(solid.shape) - 1)
     held = np.zeros(solid.shape, dtype=np.int64)
@@ -236,5 +236,5 @@ def _particles(
         positions=np.concatenate([means, origin + (empty + 0.5) * spacing]),
         volumes=volumes,
         masses=volumes,
-        source=np.concatenate([matter, np.full(len(empty), -1)]),
+        source=np.concatenate([index, np.full(len(empty), -1)]),
     )

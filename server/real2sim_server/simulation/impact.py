@@ -1,4 +1,4 @@
-"""Two bodies run into each other once: matter while they touch, dented after.
+"""Two bodies run into each other once: deforming while they touch, dented after.
 
 For a closed loop in which bodies are rigid and their impacts sudden: this says what an impact has
 done to their shapes. The world around (road, gravity, wheels) is left out, since over the tenth of
@@ -21,7 +21,7 @@ from ..physics.materials import Material
 from ..physics.particles import Particles, box_particles
 from ..physics.solver import Solver, SolverOptions
 from ..scene import GaussianCloud
-from .body import RIGID, DeformableBody, Shape
+from .body import DeformableBody, DeformedShape
 from .fill import fill_object
 from .presets import VEHICLES, preset_of
 
@@ -34,28 +34,28 @@ STIFFNESS_SCALE = 0.12
 With it two mean cars together crush as their mutual stiffness of 405 kN/m has it (Bonugli et al.
 2017)."""
 HOOD, UNDER, CABIN = 0.95, 0.2, (0.22, 0.84)
-"""Height of a plain vehicle's hood and of its underside [m]; its cabin from and to, as shares of
+"""Height of a plain vehicle's hood and of its underside [m]; its cabin from and to, as fractions of
 the length from the rear."""
 SAMPLE_DT = 0.005
-FRAME_TICKS = 2
+FRAME_SAMPLES = 2
 LONGEST = 0.25
 """A crash is over by then [s]."""
 SETTLING_TIME = 0.015
-"""After they parted, shapes swing out for so long [s]."""
+"""After they parted, shapes displacement_history out for so long [s]."""
 TOUCHED, ENDED = 0.01, 0.002
-"""Shares of the closing speed whose change tells that a crash has begun, and that it goes on."""
+"""Fractions of the closing speed whose change tells that a crash has begun, and that it goes on."""
 
 
 @dataclass(frozen=True, eq=False)
 class CrashBody:
-    """What does not change about a body in a crash.
+    """A body before or after an impact, in its own frame.
 
     Attributes:
         rest: particles as they were before anything happened, object frame.
         materials, regions: see :class:`~.body.Body`.
         friction: of its surface.
         spacing: of the particles [m].
-        shape: what earlier crashes have left; None for none.
+        shape: what earlier impacts have left; None for none.
     """
 
     rest: Particles
@@ -63,7 +63,7 @@ class CrashBody:
     regions: NDArray[np.int64]
     friction: float
     spacing: float
-    shape: Shape | None = None
+    shape: DeformedShape | None = None
 
     @property
     def positions(self) -> Float:
@@ -73,7 +73,7 @@ class CrashBody:
 
 @dataclass(frozen=True, eq=False)
 class ImpactBody:
-    """A body on its way.
+    """A body about to hit.
 
     Attributes:
         body: what it is.
@@ -94,15 +94,15 @@ class ImpactBody:
 
 
 @dataclass(frozen=True, eq=False)
-class Dent:
-    """What a crash did to one body.
+class ImpactResult:
+    """What an impact did to one body.
 
     Attributes:
         body: as it is afterwards.
         displacements: [F, N, 3] float32 of particles from rest, object frame [m]; every
             ``FRAME_S`` from the first touch on, the last one for good.
         delta_v: [3] change of the velocity of its centre of mass [m/s].
-        depth: how far matter was moved by this crash at most [m].
+        depth: how far particles were moved by this impact at most [m].
     """
 
     body: CrashBody
@@ -111,13 +111,13 @@ class Dent:
     depth: float
 
 
-FRAME_S = SAMPLE_DT * FRAME_TICKS
+FRAME_S = SAMPLE_DT * FRAME_SAMPLES
 
 
 def object_body(
     cloud: GaussianCloud, size: Sequence[float], *, category: str, mass: float, friction: float
 ) -> CrashBody:
-    """An object of a scene, filled with matter.
+    """An object of a scene, filled with particles.
 
     Args:
         cloud: its Gaussians in its own frame, origin at the box centre.
@@ -144,9 +144,9 @@ def vehicle_body(size: Sequence[float], *, mass: float, friction: float) -> Cras
     """
     spacing = _spacing(size)
     block = box_particles(tuple(size), spacing=spacing, density=1.0)
-    share = block.positions[:, 0] / size[0] + 0.5
+    fraction = block.positions[:, 0] / size[0] + 0.5
     height = block.positions[:, 2] + size[2] / 2
-    in_cabin = (share > CABIN[0]) & (share < CABIN[1])
+    in_cabin = (fraction > CABIN[0]) & (fraction < CABIN[1])
     kept = (height > UNDER) & ((height < HOOD) | in_cabin)
     cut = Particles(
         block.positions[kept], block.volumes[kept], block.masses[kept], block.source[kept]
@@ -166,11 +166,13 @@ def _body(
     return CrashBody(rest, softer, regions_of(rest.positions[:, 0]), friction, spacing)
 
 
-def crash(first: ImpactBody, second: ImpactBody | Box) -> tuple[Dent, Dent | None] | None:
+def simulate_impact(
+    first: ImpactBody, second: ImpactBody | Box
+) -> tuple[ImpactResult, ImpactResult | None] | None:
     """Let a body run into another, or into what does not yield.
 
     They are moved back along their ways until they just do not touch. Momentum of both together
-    stays; what they exchange is left to the matter.
+    stays; what they exchange is left to the solver.
 
     Args:
         first, second: about where they meet, with velocities from before they do.
@@ -178,47 +180,50 @@ def crash(first: ImpactBody, second: ImpactBody | Box) -> tuple[Dent, Dent | Non
     Returns:
         What became of both; None for a collider, and None for everything where they miss.
     """
-    crashers = [first, second] if isinstance(second, ImpactBody) else [first]
-    drift = _mean_velocity(crashers) if len(crashers) == 2 else np.zeros(3)
-    closing = first.velocity - (crashers[1].velocity if len(crashers) == 2 else 0.0)
+    impact_bodies = [first, second] if isinstance(second, ImpactBody) else [first]
+    mean_velocity = _mean_velocity(impact_bodies) if len(impact_bodies) == 2 else np.zeros(3)
+    closing = first.velocity - (impact_bodies[1].velocity if len(impact_bodies) == 2 else 0.0)
     speed = float(np.linalg.norm(closing))
-    cell = 2 * max(c.body.spacing for c in crashers)
-    ahead = _way_left(first, second, closing / speed, cell)
-    if ahead is None:
+    cell = 2 * max(c.body.spacing for c in impact_bodies)
+    free_path = _free_path(first, second, closing / speed, cell)
+    if free_path is None:
         return None
-    actors = [_actor(f"body {k}", c, drift, cell) for k, c in enumerate(crashers)]
-    _put(actors[0], ahead * closing / speed)
+    bodies = [_spawn_body(f"body {k}", c, mean_velocity, cell) for k, c in enumerate(impact_bodies)]
+    bodies[0].translate(free_path * closing / speed)
     colliders = [] if isinstance(second, ImpactBody) else [second]
-    swings = _collide(actors, colliders, closing / speed, cell)
-    dents = [_dent(c, a, s, drift) for c, a, s in zip(crashers, actors, swings, strict=True)]
-    return dents[0], dents[1] if len(dents) == 2 else None
+    histories = _collide(bodies, colliders, closing / speed, cell)
+    results = [
+        _impact_result(before, body, history, mean_velocity)
+        for before, body, history in zip(impact_bodies, bodies, histories, strict=True)
+    ]
+    return results[0], results[1] if len(results) == 2 else None
 
 
-def _mean_velocity(crashers: Sequence[ImpactBody]) -> Float:
-    masses = np.array([c.body.rest.mass for c in crashers])
-    return masses @ np.stack([c.velocity for c in crashers]) / masses.sum()
+def _mean_velocity(impact_bodies: Sequence[ImpactBody]) -> Float:
+    masses = np.array([c.body.rest.mass for c in impact_bodies])
+    return masses @ np.stack([c.velocity for c in impact_bodies]) / masses.sum()
 
 
-def _way_left(
+def _free_path(
     first: ImpactBody, second: ImpactBody | Box, along: Float, cell: float
 ) -> float | None:
     """How far ``first`` can go [m] until surfaces are about to touch; None where it misses."""
     side = np.cross([0.0, 0.0, 1.0], along)
     across = np.stack([side / np.linalg.norm(side), np.cross(along, side)])
-    mine = first.positions
+    own = first.positions
     if isinstance(second, ImpactBody):
-        theirs, apart = second.positions, (first.body.spacing + second.body.spacing) / 2
+        other, apart = second.positions, (first.body.spacing + second.body.spacing) / 2
     else:
-        theirs, apart = _surface(second, mine, cell), first.body.spacing / 2
-    if not len(theirs):
+        other, apart = _surface(second, own, cell), first.body.spacing / 2
+    if not len(other):
         return None
-    front = _extreme(mine @ across.T, mine @ along, cell, np.maximum)
-    back = _extreme(theirs @ across.T, theirs @ along, cell, np.minimum)
+    front = _outermost(own @ across.T, own @ along, cell, np.maximum)
+    back = _outermost(other @ across.T, other @ along, cell, np.minimum)
     gaps = [back[key] - front[key] for key in sorted(front.keys() & back.keys())]
     return min(gaps) - apart - 0.1 * cell if gaps else None
 
 
-def _extreme(places: Float, depths: Float, cell: float, choose: Any) -> dict[Any, float]:
+def _outermost(places: Float, depths: Float, cell: float, choose: Any) -> dict[Any, float]:
     """Of all points whose place across falls into one square of the grid, the outermost."""
     found: dict[tuple[int, int], float] = {}
     for (i, j), depth in zip(np.floor(places / cell).astype(int).tolist(), depths, strict=True):
@@ -235,53 +240,47 @@ def _surface(box: Box, like: Float, cell: float) -> Float:
     return points[points[:, 2] < like[:, 2].max() + cell]
 
 
-def _actor(name: str, crasher: ImpactBody, drift: Float, cell: float) -> DeformableBody:
-    body = crasher.body
-    actor = DeformableBody(
+def _spawn_body(
+    name: str, impact_body: ImpactBody, mean_velocity: Float, cell: float
+) -> DeformableBody:
+    crash_body = impact_body.body
+    return DeformableBody(
         name,
-        body.rest,
-        body.materials,
-        body.regions,
-        friction=body.friction,
+        crash_body.rest,
+        crash_body.materials,
+        crash_body.regions,
+        friction=crash_body.friction,
         cell=cell,
-        T_world_object=crasher.T_world_object,
-        velocity=crasher.velocity - drift,
-        angular_velocity=np.array([0.0, 0.0, crasher.yaw_rate]),
+        T_world_object=impact_body.T_world_object,
+        velocity=impact_body.velocity - mean_velocity,
+        angular_velocity=np.array([0.0, 0.0, impact_body.yaw_rate]),
+        shape=crash_body.shape,
     )
-    if body.shape is not None:
-        actor.shape = body.shape
-        centre = body.rest.masses @ crasher.positions / body.rest.mass
-        actor.motion = replace(actor.motion, centre=centre)
-    return actor
-
-
-def _put(actor: DeformableBody, by: Float) -> None:
-    actor.motion = replace(actor.motion, centre=actor.motion.centre + by)
 
 
 def _collide(
-    actors: Sequence[DeformableBody], colliders: Sequence[Collider], along: Float, cell: float
+    bodies: Sequence[DeformableBody], colliders: Sequence[Collider], along: Float, cell: float
 ) -> list[list[Float]]:
     """Step until they have parted; displacements of each body's particles, frame by frame."""
     options = SolverOptions(dx=cell, gravity=(0.0, 0.0, 0.0), backend="cpu")
-    solver = Solver([a.body() for a in actors], colliders, options)
+    solver = Solver([b.solver_body() for b in bodies], colliders, options)
     first = last = _closing(solver, along)
-    swings: list[list[Float]] = [[] for _ in actors]
-    ticks, rings = 0, 0.0
+    histories: list[list[Float]] = [[] for _ in bodies]
+    samples, settling_time = 0, 0.0
     for _ in range(round(LONGEST / SAMPLE_DT)):
         solver.step(SAMPLE_DT)
         speed = _closing(solver, along)
         if first - speed > TOUCHED * first:
-            ticks += 1
-            if ticks % FRAME_TICKS == 0:
-                _look(actors, solver, swings)
-        if ticks and (speed <= 0 or last - speed < ENDED * first):
-            rings += SAMPLE_DT
-        if rings > SETTLING_TIME:
+            samples += 1
+            if samples % FRAME_SAMPLES == 0:
+                _record_displacements(bodies, solver, histories)
+        if samples and (speed <= 0 or last - speed < ENDED * first):
+            settling_time += SAMPLE_DT
+        if settling_time > SETTLING_TIME:
             break
         last = speed
-    _look(actors, solver, swings)
-    return swings
+    _record_displacements(bodies, solver, histories)
+    return histories
 
 
 def _closing(solver: Solver, along: Float) -> float:
@@ -290,19 +289,23 @@ def _closing(solver: Solver, along: Float) -> float:
     return float(velocities[0] - (velocities[1] if len(velocities) == 2 else 0.0))
 
 
-def _look(actors: Sequence[DeformableBody], solver: Solver, swings: list[list[Float]]) -> None:
-    for actor, state, swing in zip(actors, solver.states(), swings, strict=True):
-        actor.take(state)
-        moved = actor.local_positions() - actor.rest.positions
+def _record_displacements(
+    bodies: Sequence[DeformableBody], solver: Solver, histories: list[list[Float]]
+) -> None:
+    for body, state, history in zip(bodies, solver.states(), histories, strict=True):
+        body.update_from_solver(state)
+        moved = body.local_positions() - body.rest.positions
         # Most of a body keeps its shape: that part is what its pose is the pose of.
-        swing.append(moved - np.median(moved, axis=0))
+        history.append(moved - np.median(moved, axis=0))
 
 
-def _dent(crasher: ImpactBody, actor: DeformableBody, swing: Sequence[Float], drift: Float) -> Dent:
-    delta_v = actor.motion.velocity + drift - crasher.velocity
-    actor.stiffen(RIGID)
-    rest = crasher.body.rest
-    shape = replace(actor.shape, positions=rest.positions + swing[-1])
-    moved = np.linalg.norm(shape.positions - crasher.body.positions, axis=1)
-    frames = np.stack(swing).astype(np.float32)
-    return Dent(replace(crasher.body, shape=shape), frames, delta_v, float(moved.max()))
+def _impact_result(
+    before: ImpactBody, body: DeformableBody, history: Sequence[Float], mean_velocity: Float
+) -> ImpactResult:
+    delta_v = body.motion.velocity + mean_velocity - before.velocity
+    body.rigidify()
+    rest = before.body.rest
+    shape = replace(body.shape, positions=rest.positions + history[-1])
+    moved = np.linalg.norm(shape.positions - before.body.positions, axis=1)
+    frames = np.stack(history).astype(np.float32)
+    return ImpactResult(replace(before.body, shape=shape), frames, delta_v, float(moved.max()))

@@ -14,8 +14,8 @@ from ..physics.errors import PhysicsError
 from ..physics.materials import FixedCorotated, Foam, Material, Snow
 
 VEHICLES = ("car", "vehicle", "van", "truck", "bus")
-CRUMPLE_SHARE = 0.26
-"""Share of the length that is crumple zone, at each end."""
+CRUMPLE_FRACTION = 0.26
+"""Fraction of the length that is crumple zone, at each end."""
 BUMPER = 0.35
 """Its outermost part [m]."""
 
@@ -32,7 +32,7 @@ class ObjectPhysics:
         velocity: [3] at the start, world [m/s]; the recorded one when None.
         angular_velocity: [3] at the start, world [rad/s].
         T_world_object: [4, 4] where it starts; where the recording has it when None.
-        brake: share of the wheels' grip that is braked, 0 to 1; when None, standing vehicles are
+        brake: fraction of the wheels' grip that is braked, 0 to 1; when None, standing vehicles are
             braked, moving ones roll until they are hit.
 
     Raises:
@@ -86,9 +86,9 @@ class Preset:
 
 
 def _paper(category: str, length: float) -> tuple[Sequence[Material], Callable[[Float], NDArray]]:
-    """Table II of the paper: E 2e6 Pa, nu 0.4, rho 200 kg/m^3, jelly, all through."""
-    jelly = FixedCorotated(young=2e6, poisson=0.4, density=200.0)
-    return (jelly,), lambda x: np.zeros(len(x), dtype=np.int64)
+    """Table II of the paper: E 2e6 Pa, nu 0.4, rho 200 kg/m^3, fixed corotated, all through."""
+    soft = FixedCorotated(young=2e6, poisson=0.4, density=200.0)
+    return (soft,), lambda x: np.zeros(len(x), dtype=np.int64)
 
 
 def _vehicle(category: str, length: float) -> tuple[Sequence[Material], Callable[[Float], NDArray]]:
@@ -96,7 +96,7 @@ def _vehicle(category: str, length: float) -> tuple[Sequence[Material], Callable
     if category not in VEHICLES:
         foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
         return (foam,), lambda x: np.zeros(len(x), dtype=np.int64)
-    cabin, crumple = (0.5 - CRUMPLE_SHARE) * length, length / 2 - BUMPER
+    cabin, crumple = (0.5 - CRUMPLE_FRACTION) * length, length / 2 - BUMPER
 
     def regions(x: Float) -> NDArray[np.int64]:
         return np.searchsorted([cabin, crumple], np.abs(x))

@@ -34,7 +34,7 @@ class ObjectResult:
         rest: [N, 3] float32, particles at rest, object frame [m].
         positions, quaternions: [F, 3] float64 [m], [F, 4] wxyz: ``T_world_object``.
         velocities, angular_velocities: [F, 3] of the centre of mass, world [m/s], [rad/s].
-        modes: [F] uint8, index into ``coupling.actor.MODES``.
+        modes: [F] uint8, value of ``body.BodyMode``.
         shape_index: [F] int32, row of ``shapes`` that holds at a frame; -1 for undeformed.
         shapes: [S, N, 3] float16, displacements of particles in the object's frame [m].
         wheels: [W, 3] float32 undersides of its wheels, object frame [m]; W is 4 or 0.
@@ -67,14 +67,14 @@ class ObjectResult:
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """What an object had got from another or from a collider, up to the end.
+    """What another object or a collider did to an object, up to the end.
 
     Attributes:
         object_id, other: who, by whom or what.
         impulse: [3] on the object [N s].
         delta_v: length of the impulse over the object's mass [m/s].
         first_s, last_s: when the impulse began and ceased to change [s].
-        heat: rubbed away [J].
+        heat: dissipated by friction [J].
     """
 
     object_id: str

@@ -1,4 +1,4 @@
-"""Rigid motion, and the two handovers between it and deforming matter."""
+"""Rigid motion, and the two handovers between it and deformation."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ class RigidMotion:
         return float(self.mass * self.velocity @ self.velocity + turning) / 2
 
     def velocity_at(self, point: Float) -> Float:
-        """[3] of the body's material at a point of the world [m/s]."""
+        """[3] of the body at a point of the world [m/s]."""
         return self.velocity + np.cross(self.angular_velocity, point - self.centre)
 
-    def pushed(self, impulse: Float, point: Float) -> RigidMotion:
+    def with_impulse(self, impulse: Float, point: Float) -> RigidMotion:
         """After an impulse [3] [N s] at a point [3] of the world."""
         turn = np.cross(point - self.centre, impulse)
         return replace(
@@ -78,14 +78,14 @@ class RigidMotion:
             angular_velocity=self.angular_velocity + np.linalg.solve(self.world_inertia, turn),
         )
 
-    def falling(self, duration: float, gravity: Float) -> RigidMotion:
+    def with_gravity(self, duration: float, gravity: Float) -> RigidMotion:
         """With the velocity that gravity [3] adds in ``duration`` [s], not yet moved."""
         return replace(self, velocity=self.velocity + duration * gravity)
 
-    def moved(self, duration: float) -> RigidMotion:
+    def advanced(self, duration: float) -> RigidMotion:
         """``duration`` [s] later at these velocities; angular momentum stays.
 
-        After :meth:`falling` this is symplectic Euler, like the solver's.
+        After :meth:`with_gravity` this is symplectic Euler, like the solver's.
         """
         momentum = self.angular_momentum
         turned = rotation_of(duration * self.angular_velocity) @ self.rotation

@@ -39,7 +39,7 @@ class SimulateOptions:
         frame_rate: frames kept per second.
         gravity: [3] [m/s^2].
         backend: of the solver.
-        brake_after_hit: share of the wheels' grip that is braked once a vehicle was hit.
+        brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
         max_particles: of all bodies together; where they would be more, all are filled more
             coarsely than the preset has it.
     """
@@ -99,7 +99,7 @@ def simulate(
     gravity = np.array(options.gravity, dtype=np.float64)
     if gravity.shape != (3,) or not np.isfinite(gravity).all():
         raise PhysicsError(f"gravity must be 3 finite numbers [m/s^2], not {options.gravity!r}")
-    actors = spawn_bodies(
+    bodies = spawn_bodies(
         scene,
         state,
         options.objects,
@@ -110,19 +110,19 @@ def simulate(
         gravity=gravity,
         max_particles=options.max_particles,
     )
-    return roll(actors, options, on_progress=on_progress, cancelled=cancelled)
+    return simulate_bodies(bodies, options, on_progress=on_progress, cancelled=cancelled)
 
 
-def roll(
-    actors: Sequence[DeformableBody],
+def simulate_bodies(
+    bodies: Sequence[DeformableBody],
     options: SimulateOptions,
     *,
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """The same for bodies already cast. They are left as they are at the end."""
-    stage = HybridSimulator(
-        actors,
+    """The same for bodies already spawned. They are left as they are at the end."""
+    simulator = HybridSimulator(
+        bodies,
         options.colliders,
         road=options.road,
         gravity=options.gravity,
@@ -130,32 +130,32 @@ def roll(
         brake_after_hit=options.brake_after_hit,
     )
     frames = max(round(options.duration * options.frame_rate), 1)
-    tape = TrajectoryRecorder(stage)
-    tape.keep(0.0)
+    recorder = TrajectoryRecorder(simulator)
+    recorder.record(0.0)
     stopped = "done"
     for frame in range(1, frames + 1):
         end = frame / options.frame_rate
-        while stage.time < end - 1e-9 and stopped == "done":
+        while simulator.time < end - 1e-9 and stopped == "done":
             if cancelled is not None and cancelled():
                 stopped = "cancelled"
                 break
-            left = math.ceil((end - stage.time) / STEP - 1e-6)
-            stage.advance((end - stage.time) / left)
+            left = math.ceil((end - simulator.time) / STEP - 1e-6)
+            simulator.advance((end - simulator.time) / left)
         if stopped == "cancelled":
             break
-        tape.keep(end)
+        recorder.record(end)
         if on_progress is not None:
             on_progress(frame, frames)
-    return tape.result(options.start_us, stopped, _figures(options, stage))
+    return recorder.result(options.start_us, stopped, _figures(options, simulator))
 
 
-def _figures(options: SimulateOptions, stage: HybridSimulator) -> dict[str, Any]:
+def _figures(options: SimulateOptions, simulator: HybridSimulator) -> dict[str, Any]:
     return {
         "preset": options.preset,
         "gravity": list(options.gravity),
         "frame_rate": options.frame_rate,
-        "cell": stage.actors[0].cell,
-        "particles": sum(len(a.rest) for a in stage.actors),
-        "substeps": stage.substeps,
-        "rollbacks": stage.rollbacks,
+        "cell": simulator.bodies[0].cell,
+        "particles": sum(len(b.rest) for b in simulator.bodies),
+        "substeps": simulator.substeps,
+        "rollbacks": simulator.rollbacks,
     }

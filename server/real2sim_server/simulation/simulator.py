@@ -1,48 +1,58 @@
-"""Bodies and colliders in motion: who is rigid, who deforms, who rests."""
+"""Bodies and colliders in motion: the simulator decides who deforms and who is rigid."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..physics.colliders import Collider
 from ..physics.solver import Solver, SolverOptions
-from .body import DEFORMING, RIGID, SLEEPING, DeformableBody
+from .body import BodyMode, DeformableBody
 from .contacts import ContactLog
 from .spawn import STANDS_WITHIN
+from .tyres import TyreReaction
 
 STEP = 0.005
-"""Longest time between two looks at what is near whom [s]."""
-RIGID_STEP = 0.0025
+"""Longest time between two checks of what is near what [s]."""
 NEAR_CELLS = 3.0
-"""Bodies loosen when something comes this near."""
-CALM = 0.06
-"""A body at unrest below this [m/s], or below CALM_SHARE of its speed, may become rigid again."""
-CALM_SHARE = 0.03
-CALM_TIME = 0.05
-STILL_TIME = 0.08
-REST_SPEED = 0.06
-"""And when it hardly moves at all, it is laid to rest [m/s]."""
+"""Bodies are activated when something comes this near."""
+ROAD_CELLS = 0.4
+"""On its wheels a body is near the road all the time; it touches when springs are through."""
+APPROACH_MIN = 1e-3
+"""Bodies approach each other when speed times distance is beyond this [m^2/s]."""
+HIT_DELTA_V = 0.3
+"""A vehicle was hit when something has changed its velocity by more [m/s]."""
+TYRES = "tyres"
+"""What the road does through tyres is booked under this name."""
 
 
 class HybridSimulator:
     """Bodies and colliders in motion.
 
+    Each body is rigid until something comes near, deforms in a solver while it touches, and is
+    rigid again or asleep once it has settled. Bodies keep track of that themselves; the simulator
+    gives the orders.
+
     Args:
-        actors: bodies.
+        bodies: that take part.
         colliders: that do not yield.
         road: names of those that carry tyres.
         gravity: [3] [m/s^2].
         backend: of the solver.
-        brake_after_hit: share of the wheels' grip that is braked once a vehicle was hit.
+        brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
+
+    Attributes:
+        bodies, colliders: as they are now.
+        contact_log: impulses and energies since the start.
+        time: since the start [s].
+        substeps, rollbacks: of all solvers so far.
     """
 
     def __init__(
         self,
-        actors: Sequence[DeformableBody],
+        bodies: Sequence[DeformableBody],
         colliders: Sequence[Collider],
         *,
         road: Sequence[str],
@@ -50,187 +60,160 @@ class HybridSimulator:
         backend: str,
         brake_after_hit: float,
     ) -> None:
-        self.actors = list(actors)
+        self.bodies = list(bodies)
         self.colliders = list(colliders)
         self.gravity = np.array(gravity, dtype=np.float64)
-        self.brake_after_hit = brake_after_hit
-        self._road = frozenset(road)
-        self._backend = backend
-        self.ledger = ContactLog()
+        self.contact_log = ContactLog()
         self.time = 0.0
         self.substeps = self.rollbacks = 0
-        self._names = {a.name for a in actors}
+        self._road = frozenset(road)
+        self._backend = backend
+        self._brake_after_hit = brake_after_hit
+        self._names = {b.name for b in bodies}
         self._solver: Solver | None = None
-        self._inside: list[str] = []
-        for actor in self.actors:
-            if self._stands(actor):
-                actor.lay_down()
+        self._solved: list[str] = []
+        for body in self.bodies:
+            if self._stands(body):
+                body.put_to_sleep()
 
     @property
     def road(self) -> list[Collider]:
         """Colliders that carry tyres."""
         return [c for c in self.colliders if c.name in self._road]
 
-    def _stands(self, actor: DeformableBody) -> bool:
-        """Whether a body that does not move is held by something, or by nothing drawn down."""
-        m = actor.motion
-        if np.any(m.velocity) or np.any(m.angular_velocity):
-            return False
-        return not np.any(self.gravity) or actor.gap_to_colliders(self.colliders)[0] < STANDS_WITHIN
-
     def advance(self, duration: float) -> None:
         """Go on by ``duration`` [s], at most STEP."""
-        self._loosen(duration)
-        deforming = [a for a in self.actors if a.mode == DEFORMING]
+        self._activate(duration)
+        deforming = [b for b in self.bodies if b.mode == BodyMode.DEFORMING]
         if deforming:
-            self._deform(deforming, duration)
-        for actor in self.actors:
-            if actor.mode == RIGID:
-                self._move(actor, duration)
+            self._solve(deforming, duration)
+        for body in self.bodies:
+            if body.mode == BodyMode.RIGID:
+                self._log_tyres(body, body.advance_rigid(duration, self.gravity, self.road))
         if self._solver is None:
             self.colliders = [c.after(duration) for c in self.colliders]
         self.time += duration
-        self._settle(deforming, duration)
+        for body in deforming:
+            self._brake_if_hit(body)
+            self._settle(body, duration)
 
-    def _loosen(self, duration: float) -> None:
-        """Rigid bodies that something comes near to become matter."""
+    def _activate(self, duration: float) -> None:
+        """Let all bodies deform that something comes near to, and those that these come near to."""
         changed = True
         while changed:
             changed = False
-            for actor in self.actors:
-                if actor.mode != DEFORMING and self._is_near_anything(actor, duration):
-                    actor.loosen()
+            for body in self.bodies:
+                if body.mode != BodyMode.DEFORMING and self._is_near_anything(body, duration):
+                    body.activate()
                     self._solver = None
                     changed = True
 
-    def _is_near_anything(self, actor: DeformableBody, duration: float) -> bool:
-        near = NEAR_CELLS * actor.cell
-        for other in self.actors:
-            if other is actor or (actor.mode == SLEEPING and other.mode == SLEEPING):
-                continue
-            if not self._approach(actor, other):
-                continue
-            closing = float(np.linalg.norm(actor.motion.velocity - other.motion.velocity))
-            if actor.gap_to(other) < near + closing * duration:
-                return True
-        if actor.mode == SLEEPING:
-            return False
-        gap, approach = actor.gap_to_colliders(self._walls(actor))
-        if approach > 0 and gap < near + approach * duration:
-            return True
-        if actor.tyres is None:
-            return False
-        # On its wheels a body is near the road all the time; it touches when springs are through.
-        gap, approach = actor.gap_to_colliders(self.road)
-        return gap < 0.4 * actor.cell + max(approach, 0) * duration
-
-    def _walls(self, actor: DeformableBody) -> list[Collider]:
-        return (
-            self.colliders
-            if actor.tyres is None
-            else [c for c in self.colliders if c.name not in self._road]
-        )
-
-    @staticmethod
-    def _approach(a: DeformableBody, b: DeformableBody) -> bool:
-        along = b.motion.centre - a.motion.centre
-        return bool((a.motion.velocity - b.motion.velocity) @ along > 1e-3)
-
-    def _move(self, actor: DeformableBody, duration: float) -> None:
-        """Rigid: fall, roll, slide."""
-        steps = math.ceil(duration / RIGID_STEP - 1e-6)
-        dt = duration / steps
-        for _ in range(steps):
-            m = actor.motion.falling(dt, self.gravity)
-            if actor.tyres is not None:
-                m, impulse, heat = actor.tyres.act(m, actor.T_world_object, self.road, dt)
-                self.ledger.add(actor.name, "tyres", impulse, heat, self.time)
-            actor.motion = m.moved(dt)
-        m = actor.motion
-        slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < REST_SPEED / 2
-        actor.calm_for = actor.calm_for + duration if slow and actor.tyres is not None else 0.0
-        if actor.calm_for > 0.2:
-            actor.lay_down()
-
-    def _deform(self, deforming: list[DeformableBody], duration: float) -> None:
-        names = [a.name for a in deforming]
-        if self._solver is None or self._inside != names:
+    def _solve(self, deforming: list[DeformableBody], duration: float) -> None:
+        names = [b.name for b in deforming]
+        if self._solver is None or self._solved != names:
             self._start_solver(deforming)
         assert self._solver is not None
         report = self._solver.step(duration)
         self.substeps += report.substeps
         self.rollbacks += report.rollbacks
         self.colliders = list(self._solver.colliders)
-        self.ledger.add_contacts(self._solver.contacts, self.time, self._names)
-        for actor, state in zip(deforming, self._solver.states(), strict=True):
-            actor.take(state)
-            actor.deforming_for += duration
-            if actor.tyres is not None:
-                self._roll_on(actor, duration)
+        self.contact_log.add_solver_contacts(self._solver.contacts, self.time, self._names)
+        for body, state in zip(deforming, self._solver.states(), strict=True):
+            body.update_from_solver(state)
+            reaction = body.apply_road(self.road, duration)
+            if reaction is not None:
+                self._log_tyres(body, [reaction])
+                self._solver = None
 
     def _start_solver(self, deforming: list[DeformableBody]) -> None:
         self._solver = Solver(
-            [a.body() for a in deforming],
+            [b.solver_body() for b in deforming],
             self.colliders,
             SolverOptions(dx=deforming[0].cell, gravity=tuple(self.gravity), backend=self._backend),
         )
-        self._inside = [a.name for a in deforming]
-        self.ledger.start_solver()
+        self._solved = [b.name for b in deforming]
+        self.contact_log.start_solver()
 
-    def _roll_on(self, actor: DeformableBody, duration: float) -> None:
-        """The road acts on deforming vehicles' wheels too, as on a rigid body."""
-        assert actor.tyres is not None
-        moved, impulse, heat = actor.tyres.act(
-            actor.motion, actor.T_world_object, self.road, duration
-        )
-        if not np.any(impulse):
+    def _log_tyres(self, body: DeformableBody, reactions: Iterable[TyreReaction]) -> None:
+        for r in reactions:
+            self.contact_log.add(body.name, TYRES, r.impulse, r.friction_work, self.time)
+
+    def _settle(self, body: DeformableBody, duration: float) -> None:
+        """A body that has settled becomes rigid, or falls asleep."""
+        body.update_timers(duration)
+        if body.may_sleep:
+            body.put_to_sleep()
+        elif body.may_rigidify and self._is_free(body):
+            body.rigidify()
+        else:
             return
-        self.ledger.add(actor.name, "tyres", impulse, heat, self.time)
-        actor.kick(moved)
         self._solver = None
 
-    def _settle(self, deforming: list[DeformableBody], duration: float) -> None:
-        """Matter that has calmed down becomes rigid, or is laid to rest."""
-        for actor in deforming:
-            self._note_hit(actor)
-            speed = float(np.linalg.norm(actor.motion.velocity))
-            turning = float(np.linalg.norm(actor.motion.angular_velocity))
-            calm = actor.unrest() < max(CALM, CALM_SHARE * speed)
-            actor.calm_for = actor.calm_for + duration if calm else 0.0
-            # At the top of a bounce everything is slow for a moment, too.
-            still = speed + turning < REST_SPEED
-            actor.still_for = actor.still_for + duration if still else 0.0
-            if actor.calm_for < CALM_TIME or actor.deforming_for < 2 * CALM_TIME:
-                continue
-            if actor.still_for > STILL_TIME:
-                actor.stiffen(SLEEPING)
-            elif self._is_free(actor):
-                actor.stiffen(RIGID)
-            else:
-                continue
-            self._solver = None
-
-    def _is_free(self, actor: DeformableBody) -> bool:
-        for other in self.actors:
-            if other is not actor and self._approach(actor, other):
-                closing = float(np.linalg.norm(actor.motion.velocity - other.motion.velocity))
-                if actor.gap_to(other) < NEAR_CELLS * actor.cell + closing * STEP:
-                    return False
-        gap, approach = actor.gap_to_colliders(self._walls(actor))
-        if gap < NEAR_CELLS * actor.cell and (approach > 0 or actor.tyres is None):
-            return False
-        if actor.tyres is None:
-            return True
-        gap, approach = actor.gap_to_colliders(self.road)
-        return gap > 0.4 * actor.cell + max(approach, 0) * STEP
-
-    def _note_hit(self, actor: DeformableBody) -> None:
+    def _brake_if_hit(self, body: DeformableBody) -> None:
         """Once a vehicle was hit, its wheels lock as far as options say."""
-        if actor.hit or actor.tyres is None:
+        if body.hit or body.tyres is None:
             return
-        for (body, other), impulse in self.ledger.totals().items():
-            hard = float(np.linalg.norm(impulse)) > 0.3 * actor.motion.mass
-            if body == actor.name and other != "tyres" and other not in self._road and hard:
-                actor.hit = True
-                actor.tyres = actor.tyres.braked(self.brake_after_hit)
+        for (name, other), impulse in self.contact_log.totals().items():
+            hard = float(np.linalg.norm(impulse)) > HIT_DELTA_V * body.motion.mass
+            if name == body.name and other != TYRES and other not in self._road and hard:
+                body.brake_after_hit(self._brake_after_hit)
                 return
+
+    def _stands(self, body: DeformableBody) -> bool:
+        """Whether a body that does not move is held by something, or by nothing drawn down."""
+        m = body.motion
+        if np.any(m.velocity) or np.any(m.angular_velocity):
+            return False
+        return not np.any(self.gravity) or body.gap_to_colliders(self.colliders)[0] < STANDS_WITHIN
+
+    def _is_near_anything(self, body: DeformableBody, duration: float) -> bool:
+        """Whether something will be near within ``duration`` [s]."""
+        asleep = body.mode == BodyMode.SLEEPING
+        others = [
+            b for b in self.bodies if not (asleep and b.mode == BodyMode.SLEEPING) and b is not body
+        ]
+        if self._is_near_bodies(body, others, duration):
+            return True
+        if asleep:
+            return False
+        gap, approach = body.gap_to_colliders(self._walls(body))
+        if approach > 0 and gap < NEAR_CELLS * body.cell + approach * duration:
+            return True
+        if body.tyres is None:
+            return False
+        gap, approach = body.gap_to_colliders(self.road)
+        return gap < ROAD_CELLS * body.cell + max(approach, 0) * duration
+
+    def _is_free(self, body: DeformableBody) -> bool:
+        """Whether a deforming body may go its way as a rigid one."""
+        if self._is_near_bodies(body, [b for b in self.bodies if b is not body], STEP):
+            return False
+        gap, approach = body.gap_to_colliders(self._walls(body))
+        if gap < NEAR_CELLS * body.cell and (approach > 0 or body.tyres is None):
+            return False
+        if body.tyres is None:
+            return True
+        gap, approach = body.gap_to_colliders(self.road)
+        return gap > ROAD_CELLS * body.cell + max(approach, 0) * STEP
+
+    def _is_near_bodies(
+        self, body: DeformableBody, others: Iterable[DeformableBody], duration: float
+    ) -> bool:
+        for other in others:
+            if not _approach(body, other):
+                continue
+            closing = float(np.linalg.norm(body.motion.velocity - other.motion.velocity))
+            if body.gap_to(other) < NEAR_CELLS * body.cell + closing * duration:
+                return True
+        return False
+
+    def _walls(self, body: DeformableBody) -> list[Collider]:
+        """Colliders that it touches with its own surface, not by its tyres."""
+        if body.tyres is None:
+            return self.colliders
+        return [c for c in self.colliders if c.name not in self._road]
+
+
+def _approach(a: DeformableBody, b: DeformableBody) -> bool:
+    along = b.motion.centre - a.motion.centre
+    return bool((a.motion.velocity - b.motion.velocity) @ along > APPROACH_MIN)

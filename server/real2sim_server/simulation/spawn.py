@@ -31,10 +31,10 @@ SPIN_MAX = 100.0
 """[rad/s]"""
 COARSEST = 4.0
 """Bodies of fewer particles than this across their shortest side no longer deform."""
-DEEP = 0.3
-"""What is further inside something else than this was put there by mistake [m]."""
-SHARED = 0.01
-"""Bodies overlap when this share of one's particles is among the other's."""
+PENETRATION_MAX = 0.3
+"""Deeper inside something else than this a body was placed by mistake [m]."""
+OVERLAP_FRACTION = 0.01
+"""Bodies overlap when this fraction of one's particles is among the other's."""
 RESTITUTION_SPEED = 2.0
 """Approach at which a wanted restitution is fitted when the object itself stands [m/s]."""
 
@@ -58,15 +58,15 @@ def spawn_bodies(
             one another, and as ``fill_object``.
     """
     subjects = _subjects(state, wanted, start_us)
-    preset = _coarse_enough(preset, subjects, max_particles)
+    preset = _limit_particles(preset, subjects, max_particles)
     carrying = [c for c in colliders if c.name in road]
-    actors = [
-        _actor(scene, subject, physics, preset, start_us, colliders=carrying, gravity=gravity)
+    bodies = [
+        _spawn_body(scene, subject, physics, preset, start_us, colliders=carrying, gravity=gravity)
         for subject, physics in zip(subjects, wanted.values(), strict=True)
     ]
-    boxes = [(a.T_world_object, s.scaled_size) for a, s in zip(actors, subjects, strict=True)]
-    require_apart(actors, boxes, [c for c in colliders if c.name not in road])
-    return actors
+    boxes = [(a.T_world_object, s.scaled_size) for a, s in zip(bodies, subjects, strict=True)]
+    require_separation(bodies, boxes, [c for c in colliders if c.name not in road])
+    return bodies
 
 
 def _subjects(
@@ -87,7 +87,7 @@ def _subjects(
     return subjects
 
 
-def _coarse_enough(preset: Preset, subjects: Sequence[PlacedObject], most: int) -> Preset:
+def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int) -> Preset:
     """The preset with particles so far apart that boxes full of them would hold ``most``."""
     sizes = np.array([s.scaled_size for s in subjects])
     spacing = max(preset.spacing, float(np.cbrt(sizes.prod(axis=1).sum() / most)))
@@ -103,51 +103,51 @@ def _coarse_enough(preset: Preset, subjects: Sequence[PlacedObject], most: int) 
     return replace(preset, spacing=spacing)
 
 
-def require_apart(
-    actors: Sequence[DeformableBody],
+def require_separation(
+    bodies: Sequence[DeformableBody],
     boxes: Sequence[tuple[Float, Sequence[float]]],
     colliders: Sequence[Collider],
 ) -> None:
     """Refuse a start at which bodies are inside one another or inside a collider.
 
-    What overlaps by less than DEEP is left to contact: tracked boxes of parked cars do.
+    What overlaps by less than PENETRATION_MAX is left to contact: tracked boxes of parked cars do.
 
     Args:
-        actors: bodies.
-        boxes: of each, pose [4, 4] and size; matter may reach a little out of them.
+        bodies: bodies.
+        boxes: of each, pose [4, 4] and size; particles may reach a little out of them.
         colliders: that carry no tyres.
 
     Raises:
         PhysicsError: with the names.
     """
-    for k, a in enumerate(actors):
-        for b, box in list(zip(actors, boxes, strict=True))[k + 1 :]:
+    for k, a in enumerate(bodies):
+        for b, box in list(zip(bodies, boxes, strict=True))[k + 1 :]:
             depth = float(box_penetration(*boxes[k], *box))
-            # Corners of boxes may share room in which neither has matter.
-            if depth > DEEP and _share_room(a, b):
+            # Corners of boxes may overlap where neither has particles.
+            if depth > PENETRATION_MAX and _particles_overlap(a, b):
                 raise PhysicsError(
                     f"objects {a.name!r} and {b.name!r} are {depth:.2f} m inside each other at the "
                     "start; move one, or leave one out"
                 )
         for collider in colliders:
             depth = -a.gap_to_colliders([collider])[0]
-            if depth > DEEP:
+            if depth > PENETRATION_MAX:
                 raise PhysicsError(
                     f"object {a.name!r} is {depth:.2f} m inside collider {collider.name!r} at the "
                     "start; move one, or leave one out"
                 )
 
 
-def _share_room(a: DeformableBody, b: DeformableBody) -> bool:
+def _particles_overlap(a: DeformableBody, b: DeformableBody) -> bool:
     from scipy.spatial import cKDTree
 
     mine = apply_transform(a.T_world_object, a.shape.positions)
     theirs = apply_transform(b.T_world_object, b.shape.positions)
     near, _ = cKDTree(theirs).query(mine, distance_upper_bound=a.spacing)
-    return int(np.isfinite(near).sum()) > SHARED * len(mine)
+    return int(np.isfinite(near).sum()) > OVERLAP_FRACTION * len(mine)
 
 
-def _actor(
+def _spawn_body(
     scene: Scene,
     subject: PlacedObject,
     physics: ObjectPhysics,
@@ -159,7 +159,7 @@ def _actor(
 ) -> DeformableBody:
     size = subject.scaled_size
     wheels = preset.wheels and subject.category in VEHICLES
-    particles = matter_of(scene, subject, preset, start_us, mass=physics.mass)
+    particles = object_particles(scene, subject, preset, start_us, mass=physics.mass)
     materials, regions_of = preset.build(subject.category, size[0])
     regions = regions_of(particles.positions[:, 0])
     if physics.material is not None:
@@ -179,7 +179,7 @@ def _actor(
         centre = particles.centre_of_mass
         tyres = Tyres.of(size, centre, max(weight, 1e-6), brake=brake)
         tyres = tyres.standing(pose, colliders, STANDS_WITHIN)
-    actor = DeformableBody(
+    body = DeformableBody(
         subject.object_id,
         particles,
         materials,
@@ -192,14 +192,14 @@ def _actor(
         tyres=tyres,
     )
     if physics.restitution is not None:
-        _fit(actor, physics.restitution)
-    return actor
+        _fit_restitution(body, physics.restitution)
+    return body
 
 
-def matter_of(
+def object_particles(
     scene: Scene, subject: PlacedObject, preset: Preset, start_us: int, *, mass: float | None = None
 ) -> Particles:
-    """What an object is filled with, object frame; without the room between wheels.
+    """What an object is filled with, object frame; without the space between wheels.
 
     Raises:
         ParticleError: as ``fill_object``.
@@ -233,15 +233,15 @@ def _vector(given: object, otherwise: Float | None, name: str, most: float) -> F
     return vector
 
 
-def _fit(actor: DeformableBody, restitution: float) -> None:
+def _fit_restitution(body: DeformableBody, restitution: float) -> None:
     """Add the viscosity that lets the body bounce as wanted, along its own way."""
-    speed = float(np.linalg.norm(actor.motion.velocity))
-    along = actor.motion.velocity / speed if speed > 0.1 else actor.motion.rotation[:, 0]
+    speed = float(np.linalg.norm(body.motion.velocity))
+    along = body.motion.velocity / speed if speed > 0.1 else body.motion.rotation[:, 0]
     fitted = fit_restitution(
-        replace(actor.body(), particle_velocities=None, particle_gradients=None),
+        replace(body.solver_body(), particle_velocities=None, particle_gradients=None),
         restitution,
         speed=speed if speed > 0.1 else RESTITUTION_SPEED,
         normal=-along,
-        options=SolverOptions(dx=actor.cell, gravity=(0.0, 0.0, 0.0)),
+        options=SolverOptions(dx=body.cell, gravity=(0.0, 0.0, 0.0)),
     )
-    actor.materials = fitted.body.materials
+    body.materials = fitted.body.materials

@@ -13,13 +13,26 @@ from .rigid import RigidMotion
 from .surroundings import nearest
 
 ROLLING = 0.015
-"""Rolling resistance of a free wheel, share of its load."""
+"""Rolling resistance of a free wheel, fraction of its load."""
 ROUNDS = 6
 """Sweeps over the four patches in one step; their impulses act on each other."""
 LIFT_MAX = 0.3
 """Wheels never go further into their arches than this [m]."""
 UPRIGHT = 0.5
 """Wheels carry while the body's up axis leans less than 60 degrees from the ground's normal."""
+
+
+@dataclass(frozen=True, eq=False)
+class TyreReaction:
+    """What the road did to a body through its tyres in one step.
+
+    Attributes:
+        impulse: [3] on the body [N s].
+        friction_work: dissipated by slip [J].
+    """
+
+    impulse: Float
+    friction_work: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +43,9 @@ class Tyres:
         patches: [4, 3] undersides of the wheels in the object's frame, as they stand at rest [m].
         static_load: [4] what each carries at rest [N].
         friction: of rubber on the road.
-        brake: share of the wheels' grip that holds against rolling, 0 rolls freely, 1 locks.
+        brake: fraction of the wheels' grip that holds against rolling, 0 rolls freely, 1 locks.
         frequency: of the body on its springs [Hz].
-        damping: share of critical.
+        damping: fraction of critical.
         travel: by which springs give in beyond rest before the body strikes through [m].
         rest: [4] height of the undersides above the road at which they carry ``static_load`` [m].
     """
@@ -64,8 +77,8 @@ class Tyres:
         patches = np.array([[a * x, b * y, -height / 2] for a in (1, -1) for b in (1, -1)])
         front = np.clip((centre[0] + x) / (2 * x), 0.2, 0.8)
         left = np.clip((centre[1] + y) / (2 * y), 0.2, 0.8)
-        shares = np.array([f * s for f in (front, 1 - front) for s in (left, 1 - left)])
-        return cls(patches, weight * shares, **options)
+        fractions = np.array([f * s for f in (front, 1 - front) for s in (left, 1 - left)])
+        return cls(patches, weight * fractions, **options)
 
     def standing(self, T_world_object: Float, road: Sequence[Collider], reach: float) -> Tyres:
         """Tyres whose rest is how the vehicle stands now, where that is within ``reach`` [m].
@@ -76,9 +89,9 @@ class Tyres:
         near = np.abs(heights) < reach
         return replace(self, rest=np.where(near.all(), heights, np.zeros(4)))
 
-    def braked(self, share: float) -> Tyres:
-        """The same with ``share`` of their grip braked, in [0, 1]."""
-        return replace(self, brake=share)
+    def braked(self, fraction: float) -> Tyres:
+        """The same with ``fraction`` of their grip braked, in [0, 1]."""
+        return replace(self, brake=fraction)
 
     def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
         """[4] by how far springs have given in, so that wheels stand on the road, not in it [m]."""
@@ -87,29 +100,29 @@ class Tyres:
         squeeze = np.where(carrying, self.rest - heights, 0.0)
         return np.clip(squeeze, 0.0, LIFT_MAX)
 
-    def act(
+    def apply(
         self,
         motion: RigidMotion,
         T_world_object: Float,
         road: Sequence[Collider],
         duration: float,
-    ) -> tuple[RigidMotion, Float, float]:
+    ) -> tuple[RigidMotion, TyreReaction]:
         """What the road does to the body over ``duration`` [s] through its tyres.
 
         Springs and dampers carry along the normal. Across it each patch stops its slip as far as
         its friction circle lets it: sideways always, along the wheel as far as it is braked.
 
         Returns:
-            The motion after, the whole impulse [3] [N s], and the heat rubbed away [J].
+            The motion after, and what the road did.
         """
         points = self._points(T_world_object)
         up = T_world_object[:3, 2]
         heights, normals = nearest(road, points)
         loads = self._loads(motion, points, heights, normals, duration)
         loads = np.where(normals @ up > UPRIGHT, loads, 0.0)
-        before, total, heat = motion, np.zeros(3), 0.0
+        before, total, friction_work = motion, np.zeros(3), 0.0
         for point, normal, load in zip(points, normals, loads, strict=True):
-            motion = motion.pushed(load * normal, point)
+            motion = motion.with_impulse(load * normal, point)
             total += load * normal
         used = np.zeros((4, 2))
         forward = T_world_object[:3, 0]
@@ -120,8 +133,8 @@ class Tyres:
                 )
                 total += impulse
                 slip = (motion.velocity_at(points[k]) + before.velocity_at(points[k])) / 2
-                heat -= float(impulse @ slip)
-        return motion, total, max(heat, 0.0)
+                friction_work -= float(impulse @ slip)
+        return motion, TyreReaction(total, max(friction_work, 0.0))
 
     def _points(self, T_world_object: Float) -> Float:
         return self.patches @ T_world_object[:3, :3].T + T_world_object[:3, 3]
@@ -165,4 +178,4 @@ class Tyres:
         size = float(np.linalg.norm(wanted))
         wanted *= min(1.0, self.friction * load / max(size, 1e-12))
         impulse = (wanted - used) @ axes
-        return motion.pushed(impulse, point), wanted, impulse
+        return motion.with_impulse(impulse, point), wanted, impulse

@@ -1,4 +1,4 @@
-"""Small bodies in motion, for every test of the room."""
+"""Small bodies in motion, for every test of the solver."""
 
 from __future__ import annotations
 

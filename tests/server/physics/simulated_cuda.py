@@ -38,7 +38,9 @@ from real2sim_server.physics import (
     SolverOptions,
     box_particles,
 )
-from real2sim_server.physics.constitutive import contact, matrices, obstacle, stress
+from real2sim_server.physics.constitutive import stress
+from real2sim_server.physics.contact import collider_distance, node, surface
+from real2sim_server.physics.numerics import matrices
 from real2sim_server.physics.validation import motion
 
 from .scenes import at
@@ -97,7 +99,7 @@ COLLIDERS = (
 def keeping_type(function: Callable[..., float]) -> Callable[..., Any]:
     """A function of ``math`` as devices know it: of the precision of its argument.
 
-    Python's gives a float, which NumPy takes for less precise than the laws' single constants.
+    Python's gives a float, which NumPy takes for less precise than the kernels' single constants.
     """
 
     def typed(x: Any, *more: Any) -> Any:
@@ -115,9 +117,9 @@ DEVICE_MATH = SimpleNamespace(
 
 @contextlib.contextmanager
 def device_math() -> Iterator[None]:
-    """Laws run by Python compute as they do compiled, as long as nothing is compiled meanwhile."""
+    """Kernel functions run by Python compute as compiled; nothing may be compiled meanwhile."""
     with contextlib.ExitStack() as stack:
-        for module in (contact, matrices, obstacle, stress):
+        for module in (collider_distance, matrices, node, stress, surface):
             if hasattr(module, "math"):
                 stack.enter_context(mock.patch.object(module, "math", DEVICE_MATH))
         yield
@@ -125,8 +127,8 @@ def device_math() -> Iterator[None]:
 
 def cube(name: str, position: tuple[float, float, float], material: Any, **options: Any) -> Body:
     """Eight particles."""
-    matter = box_particles([0.1] * 3, spacing=0.05, density=200).moved(at(*position))
-    return Body(name=name, particles=matter, material=material, **options)
+    particles = box_particles([0.1] * 3, spacing=0.05, density=200).moved(at(*position))
+    return Body(name=name, particles=particles, material=material, **options)
 
 
 def strained(material: Any) -> tuple[list[Body], list[Any]]:

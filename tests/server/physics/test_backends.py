@@ -34,7 +34,7 @@ MATERIALS = [
     Sand(young=2e5, density=200),
     Snow(density=200),
 ]
-# Sand comes apart and closes again at a kink of its law, where rounding decides.
+# Sand comes apart and closes again at a kink of its constitutive law, where rounding decides.
 AGREEMENT = {"Sand": 1e-3}
 STATE = ("positions", "velocities", "gradients", "F_elastic", "F_total", "history")
 
@@ -70,7 +70,7 @@ def test_cpu_follows_the_reference_through_a_crash(material):
     for a, b in zip(runs[0].contacts, runs[1].contacts, strict=True):
         np.testing.assert_allclose(b.impulse, a.impulse, atol=1e-4)
         np.testing.assert_allclose(b.moment, a.moment, atol=1e-4)
-        assert b.heat == pytest.approx(a.heat, abs=1e-4)
+        assert b.friction_work == pytest.approx(a.friction_work, abs=1e-4)
 
 
 def test_many_substeps_at_once_are_the_same_substeps():
@@ -109,7 +109,7 @@ def test_single_precision_stays_near_double():
     ],
     ids=lambda c: c.name,
 )
-def test_cpu_meets_colliders_as_the_reference_does(collider):
+def test_cpu_touches_colliders_as_the_reference_does(collider):
     runs = [
         solve(
             [cube(position=(0.02, 0.01, 0.18), edge=0.2, velocity=(0.5, 0, -3))],

@@ -12,7 +12,7 @@ import pytest
 from numba import cuda
 
 from real2sim_server.physics import SolverError
-from real2sim_server.physics.backends.cuda.backend import CudaBackend
+from real2sim_server.physics.backends.cuda.backend import CudaSolverBackend
 
 ROOT = Path(__file__).parents[3]
 MATERIALS = ("FixedCorotated", "NeoHookean", "Metal", "Foam", "Sand", "Snow")
@@ -81,4 +81,4 @@ def test_the_cheap_cases_of_the_table_hold(simulated, case):
 def test_without_a_device_the_reason_is_given(monkeypatch):
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     with pytest.raises(SolverError, match=r"'cuda' is not usable here: .*NVIDIA GPU.*take 'cpu'"):
-        CudaBackend()
+        CudaSolverBackend()

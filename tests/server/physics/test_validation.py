@@ -12,7 +12,7 @@ import typer
 
 from real2sim_server.cli.validate import validate
 from real2sim_server.physics import PhysicsError
-from real2sim_server.physics.validation import CASES, Check, Curve
+from real2sim_server.physics.validation import CASES, Check, ReferenceCurve
 from real2sim_server.physics.validation import table as table_module
 from real2sim_server.physics.validation.page import render_page
 from real2sim_server.physics.validation.table import run_table
@@ -86,7 +86,7 @@ def breaking(backend):
 def fine(backend):
     """A case that holds, with a curve."""
     x = np.linspace(0, 1, 5).tolist()
-    return [Check("held", 1.0, 1.0, 0.1, curve=Curve(x, x, x, "time [s]", "way [m]"))]
+    return [Check("held", 1.0, 1.0, 0.1, curve=ReferenceCurve(x, x, x, "time [s]", "way [m]"))]
 
 
 @pytest.fixture

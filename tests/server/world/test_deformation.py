@@ -175,7 +175,7 @@ def crasher(x: float, y: float, vx: float, *, yaw: float = 0.0, mass: float = MA
 @pytest.mark.parametrize(("mass", "y"), [(1500.0, 0.0), (3000.0, 0.0), (1500.0, 0.7)])
 def test_momentum_of_both_stays_and_delta_v_is_that_of_the_rigid_exchange(mass, y):
     first, second = crasher(-4.15, y, 10.0), crasher(0.0, 0.0, 0.0, mass=mass)
-    struck, hit = crash.crash(first, second)
+    struck, hit = crash.simulate_impact(first, second)
     total = MASS * struck.delta_v + mass * hit.delta_v
     np.testing.assert_allclose(total, 0.0, atol=1e-3 * MASS * 10)
     if y == 0.0:
@@ -185,10 +185,10 @@ def test_momentum_of_both_stays_and_delta_v_is_that_of_the_rigid_exchange(mass, 
 
 def test_both_dents_together_are_as_deep_as_the_mutual_stiffness_says():
     first, second = crasher(-4.15, 0.0, 10.0), crasher(0.0, 0.0, 0.0)
-    depth = sum(dent.depth for dent in crash.crash(first, second))
+    depth = sum(dent.depth for dent in crash.simulate_impact(first, second))
     energy = 0.25 * MASS * 10.0**2
     assert depth == pytest.approx((2 * energy / 405e3) ** 0.5, rel=0.35)
 
 
 def test_bodies_that_pass_each_other_leave_no_dents():
-    assert crash.crash(crasher(-4.0, 2.5, 10.0), crasher(0.0, 0.0, 0.0)) is None
+    assert crash.simulate_impact(crasher(-4.0, 2.5, 10.0), crasher(0.0, 0.0, 0.0)) is None

@@ -1,14 +1,14 @@
 """Ways to solve, one module each, behind one Protocol."""
 
-from .base import Backend, Measure, Model, ParticleArrays, Simulation
+from .base import Measure, Model, ParticleArrays, Simulation, SolverBackend
 from .select import BACKENDS, select_backend
 
 __all__ = [
     "BACKENDS",
-    "Backend",
     "Measure",
     "Model",
     "ParticleArrays",
     "Simulation",
+    "SolverBackend",
     "select_backend",
 ]

@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ..colliders import Box, Collider, HeightField, Plane
-from ..constitutive import obstacle
-from ..constitutive.contact import STICKS
+from ..constitutive import material_row
+from ..constitutive.law import law_of_code
+from ..contact import collider_distance as collider_rows
+from ..contact.surface import STICKS
 
 TOTALS = 8
 """Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
-(3) [N m s], friction heat [J], work of the other's motion [J].
+(3) [N m s], work of friction [J], work of the other's motion [J].
 
-Heat is impulse times slip after the touch, work is impulse times the velocity of the other: both
-are what the impulse did over the substep, whatever the stresses did at the same node.
+Work of friction is impulse times slip after the contact, the other's is impulse times its velocity:
+both are what the impulse did over the substep, whatever the stresses did at the same node.
 """
 
 
@@ -33,7 +35,7 @@ class ParticleArrays:
         gradients: [N, 3, 3] APIC velocity gradient [1/s].
         F_elastic: [N, 3, 3], drives stress.
         F_total: [N, 3, 3], drives what is seen.
-        history: [N] plastic memory, see ``laws.stress``.
+        history: [N] plastic memory, see ``constitutive.stress``.
     """
 
     positions: Float
@@ -53,11 +55,14 @@ class Model:
         masses, volumes: [N] float64 [kg], [m^3].
         material: [N] int64, row of ``table``.
         body: [N] int64, increasing.
-        table: [K, ROW] float64, ``Material.row``.
+        table: [K, MATERIAL_ROW] float64, ``Material.row``.
         friction: [B] float64, of the bodies' surfaces.
         dx: cell size of the grid [m].
         gravity: [3] [m/s^2].
         dtype: float32 or float64, precision of the state where the backend has a choice.
+
+    Raises:
+        MaterialError: for a law in ``table`` that there is not.
     """
 
     start: ParticleArrays
@@ -70,6 +75,15 @@ class Model:
     dx: float
     gravity: Float
     dtype: type[np.floating[Any]]
+
+    def __post_init__(self) -> None:
+        for code in np.unique(self.table[:, material_row.LAW]).tolist():
+            law_of_code(code)
+
+    @property
+    def plastic(self) -> NDArray[np.bool_]:
+        """[N] which particles keep F_total and history of their own."""
+        return self.table[self.material, material_row.PLASTIC] > 0
 
     @property
     def bodies(self) -> int:
@@ -129,7 +143,7 @@ class Simulation(Protocol):
     def contacts(self) -> tuple[Float, Float]:
         """Totals since the start: on bodies by colliders [B, K, TOTALS], by bodies [B, B, TOTALS].
 
-        Between bodies each side counts half of the heat.
+        Between bodies each side counts half of the work of friction.
         """
         ...
 
@@ -142,37 +156,37 @@ class Simulation(Protocol):
         ...
 
 
-class Backend(Protocol):
+class SolverBackend(Protocol):
     """One way to compute; all members agree within the precision they work in."""
 
     name: str
 
     def start(self, model: Model, colliders: Sequence[Collider]) -> Simulation:
-        """Load a model. The number and kind of colliders stay the same."""
+        """Load a model. Number and type of colliders stay the same."""
         ...
 
 
 def pack_colliders(colliders: Sequence[Collider]) -> tuple[Float, Float]:
-    """Rows [K, COLLIDER_ROW] and the heights [H] of all height fields, as the laws read them."""
-    rows = np.zeros((len(colliders), obstacle.COLLIDER_ROW))
+    """Rows [K, COLLIDER_ROW] and the heights [H] of all height fields, as kernels read them."""
+    rows = np.zeros((len(colliders), collider_rows.COLLIDER_ROW))
     heights: list[Float] = []
     stored = 0
     for row, collider in zip(rows, colliders, strict=True):
         own = collider.friction
-        row[obstacle.FRICTION] = -1.0 if own is None else min(own, float(STICKS))
-        row[obstacle.SEPARABLE] = collider.separable
+        row[collider_rows.FRICTION] = -1.0 if own is None else min(own, float(STICKS))
+        row[collider_rows.SEPARABLE] = collider.separable
         if isinstance(collider, Plane):
-            row[obstacle.KIND] = obstacle.PLANE
-            row[obstacle.POINT : obstacle.POINT + 3] = collider.point
-            row[obstacle.AXES : obstacle.AXES + 3] = collider.normal
+            row[collider_rows.KIND] = collider_rows.PLANE
+            row[collider_rows.POINT : collider_rows.POINT + 3] = collider.point
+            row[collider_rows.AXES : collider_rows.AXES + 3] = collider.normal
         elif isinstance(collider, Box):
             _pack_box(row, collider)
         elif isinstance(collider, HeightField):
-            row[obstacle.KIND] = obstacle.HEIGHT_FIELD
-            row[obstacle.POINT : obstacle.POINT + 2] = collider.origin
-            row[obstacle.FIRST_HEIGHT] = stored
-            row[obstacle.COUNT_X], row[obstacle.COUNT_Y] = collider.heights.shape
-            row[obstacle.SPACING] = collider.spacing
+            row[collider_rows.KIND] = collider_rows.HEIGHT_FIELD
+            row[collider_rows.POINT : collider_rows.POINT + 2] = collider.origin
+            row[collider_rows.FIRST_HEIGHT] = stored
+            row[collider_rows.COUNT_X], row[collider_rows.COUNT_Y] = collider.heights.shape
+            row[collider_rows.SPACING] = collider.spacing
             heights.append(collider.heights.ravel())
             stored += collider.heights.size
     return rows, np.concatenate(heights) if heights else np.zeros(0)
@@ -180,12 +194,12 @@ def pack_colliders(colliders: Sequence[Collider]) -> tuple[Float, Float]:
 
 def _pack_box(row: Float, box: Box) -> None:
     pose = np.asarray(box.T_world_box)
-    row[obstacle.KIND] = obstacle.BOX
-    row[obstacle.POINT : obstacle.POINT + 3] = pose[:3, 3]
-    row[obstacle.AXES : obstacle.AXES + 9] = pose[:3, :3].ravel()
-    row[obstacle.HALF_SIZE : obstacle.HALF_SIZE + 3] = np.asarray(box.size) / 2
-    row[obstacle.SPIN : obstacle.SPIN + 3] = box.angular_velocity
-    row[obstacle.SPEED : obstacle.SPEED + 3] = box.velocity
+    row[collider_rows.KIND] = collider_rows.BOX
+    row[collider_rows.POINT : collider_rows.POINT + 3] = pose[:3, 3]
+    row[collider_rows.AXES : collider_rows.AXES + 9] = pose[:3, :3].ravel()
+    row[collider_rows.HALF_SIZE : collider_rows.HALF_SIZE + 3] = np.asarray(box.size) / 2
+    row[collider_rows.SPIN : collider_rows.SPIN + 3] = box.angular_velocity
+    row[collider_rows.SPEED : collider_rows.SPEED + 3] = box.velocity
 
 
 class SolverDiverged(Exception):

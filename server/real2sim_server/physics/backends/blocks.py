@@ -1,4 +1,4 @@
-"""What backends on blocks share: loading, sorting, sums, contact totals, saving.
+"""What backends on blocks have in common: loading, sorting, sums, contact totals, saving.
 
 Arrays live where the backend computes; a backend says how they get there and back.
 """
@@ -13,18 +13,17 @@ import numpy as np
 
 from ...geometry.rotation import Float
 from ..colliders import Box, Collider
-from ..constitutive.stress import KIND, VON_MISES
 from . import particle as columns
 from .base import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from .layout import BLOCK, COLLIDER_MARGIN, Int, Layout, arrange
-from .particle import NODES, TILE, Rules, State, Work
+from .particle import NODES, TILE, ParticleState, StepParameters, Workspace
 
 
 @dataclass(frozen=True, eq=False)
 class _Saved:
     """All that changes, bit by bit; layouts are never written to and may be shared."""
 
-    state: State
+    state: ParticleState
     blocks: Int
     order: Int
     layout: Layout
@@ -33,8 +32,8 @@ class _Saved:
     totals: tuple[Float, Float]
 
 
-class WorkShapes(NamedTuple):
-    """Shapes of :class:`Work` for one layout."""
+class WorkspaceShapes(NamedTuple):
+    """Shapes of :class:`Workspace` for one layout."""
 
     tiles: tuple[int, ...]
     moments: tuple[int, ...]
@@ -45,7 +44,7 @@ class WorkShapes(NamedTuple):
 
 
 class BlockSimulation:
-    """A model in motion. Particles are kept sorted by home block; see ``layout``."""
+    """A model in motion. Particles are kept sorted by block; see ``layout``."""
 
     def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
         self._model = model
@@ -57,31 +56,31 @@ class BlockSimulation:
             np.zeros((bodies, bodies, TOTALS)),
         )
         self._moved = 0.0
-        self._set_rules(colliders)
+        self._set_params(colliders)
         self._load(model.start)
         self._arrange(colliders)
         self._substeps(0, self._dtype(0))
 
     def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
-        """Make up to ``steps`` substeps; how many, and whether a particle strayed in the last.
+        """Make up to ``steps`` substeps; how many, and whether particles must be sorted now.
 
         No steps at all find the stress and energy of the particles as they stand.
         """
         raise NotImplementedError
 
-    def _measure_homes(self) -> tuple[Float, Int]:
-        """Rows of sums [R, COLUMNS], see ``particle``, and the home [R] of each."""
+    def _measure_blocks(self) -> tuple[Float, Int]:
+        """Rows of sums [R, COLUMNS], see ``particle``, and the block [R] of each."""
         raise NotImplementedError
 
-    def _load_state(self, state: State) -> State:
+    def _load_state(self, state: ParticleState) -> ParticleState:
         """The state where the backend computes."""
         raise NotImplementedError
 
-    def _sort_state(self, state: State, xi: Any, order: Int) -> State:
+    def _sort_state(self, state: ParticleState, xi: Any, order: Int) -> ParticleState:
         """The state with other positions from the host, in another order."""
         raise NotImplementedError
 
-    def _copy_state(self, state: State) -> State:
+    def _copy_state(self, state: ParticleState) -> ParticleState:
         """A copy where the backend computes."""
         raise NotImplementedError
 
@@ -89,7 +88,7 @@ class BlockSimulation:
         """An array on the host; not to be written to."""
         raise NotImplementedError
 
-    def _make_work(self, layout: Layout) -> Work:
+    def _make_work(self, layout: Layout) -> Workspace:
         """Work space for a layout, contact totals at zero."""
         raise NotImplementedError
 
@@ -98,7 +97,7 @@ class BlockSimulation:
         raise NotImplementedError
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
-        """Make ``steps`` substeps; sorts particles whenever one has left its home's reach."""
+        """Make ``steps`` substeps; sorts particles whenever one has left its block's reach."""
         if any(c.moving for c in colliders):
             for step in range(steps):
                 self._follow([c.after(step * dt) for c in colliders], dt)
@@ -109,24 +108,24 @@ class BlockSimulation:
     def _run(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
         step = self._dtype(dt)
         while steps > 0:
-            done, strayed = self._substeps(steps, step)
+            done, needs_resort = self._substeps(steps, step)
             steps -= done
-            if strayed:
+            if needs_resort:
                 self._arrange(colliders)
 
     def _follow(self, colliders: Sequence[Collider], dt: float) -> None:
         """Take over new poses; arrange anew before a collider is out of the margin."""
-        self._set_rules(colliders)
+        self._set_params(colliders)
         self._moved += dt * max(_fastest_point(c) for c in colliders)
         if self._moved > COLLIDER_MARGIN / 2 * self._model.dx:
             self._arrange(colliders)
 
     def measure(self) -> Measure:
-        """Sums in float64, added up in the order of homes."""
+        """Sums in float64, added up in the order of blocks."""
         layout, bodies = self._layout, self._model.bodies
-        rows, home = self._measure_homes()
-        # The middle one of the fields around a home is its own.
-        body = layout.field_body[layout.home_fields[home, 13]]
+        rows, block = self._measure_blocks()
+        # The middle one of the fields around a block is its own.
+        body = layout.field_body[layout.block_fields[block, 13]]
         sums = np.zeros((bodies, columns.SUMS))
         np.add.at(sums, body, rows[:, : columns.SUMS])
         mass = sums[:, columns.MASS]
@@ -149,7 +148,7 @@ class BlockSimulation:
         elastic = self._unsorted(s.F).reshape(n, 3, 3)
         total = elastic.copy()
         if len(s.F_total):
-            plastic = self._model.table[self._model.material, KIND] >= VON_MISES
+            plastic = self._model.plastic
             total[plastic] = self._unsorted(s.F_total).reshape(n, 3, 3)[plastic]
         return ParticleArrays(
             positions=self._in_model_order(cells * self._model.dx),
@@ -197,12 +196,11 @@ class BlockSimulation:
         """Particles in the model's order, each in the block of its first node."""
         model, dtype = self._model, self._dtype
         n = len(start.positions)
-        kinds = model.table[model.material, KIND]
-        plastic = bool((kinds >= VON_MISES).any())
+        plastic = bool(model.plastic.any())
         cells = start.positions / model.dx
         self._blocks = _block_of(cells)
         self._order = np.arange(n)
-        state = State(
+        state = ParticleState(
             xi=(cells - self._blocks * BLOCK).astype(dtype),
             v=start.velocities.astype(dtype),
             L=start.gradients.reshape(n, 9).astype(dtype),
@@ -226,7 +224,7 @@ class BlockSimulation:
         if hasattr(self, "_work"):
             self._flush()
         shift = _block_of(at)
-        # More than a few blocks in one go is no motion but an explosion.
+        # More than a few blocks in one go is no motion but a solver that diverges.
         if np.abs(shift).max() > 1 << 10:
             raise SolverDiverged
         xi = (at - (shift * BLOCK).astype(self._dtype)).astype(self._dtype)
@@ -238,15 +236,15 @@ class BlockSimulation:
         self._work = self._make_work(self._layout)
         self._moved = 0.0
 
-    def _shapes(self, layout: Layout) -> WorkShapes:
-        homes, fields = len(layout.home_block), len(layout.field_block)
+    def _shapes(self, layout: Layout) -> WorkspaceShapes:
+        blocks, fields = len(layout.block_coordinates), len(layout.field_coordinates)
         bodies = self._model.bodies
-        return WorkShapes(
-            tiles=(homes, TILE, 4),
-            moments=(int(layout.home_moment.max(initial=-1)) + 1, TILE, 4),
+        return WorkspaceShapes(
+            tiles=(blocks, TILE, 4),
+            moments=(int(layout.block_moment.max(initial=-1)) + 1, TILE, 4),
             velocity=(fields, NODES, 4),
             offset=(fields, NODES, 4),
-            by_collider=(len(layout.touch_collider), TOTALS),
+            by_collider=(len(layout.contact_collider), TOTALS),
             by_body=(fields if bodies > 1 else 0, bodies, TOTALS),
         )
 
@@ -261,10 +259,10 @@ class BlockSimulation:
     def _flush(self) -> None:
         """Move the contact sums of this layout to the totals, in the order of fields."""
         layout, work = self._layout, self._work
-        field = np.repeat(np.arange(len(layout.field_body)), np.diff(layout.touch_start))
+        field = np.repeat(np.arange(len(layout.field_body)), np.diff(layout.contact_start))
         np.add.at(
             self._totals[0],
-            (layout.field_body[field], layout.touch_collider),
+            (layout.field_body[field], layout.contact_collider),
             self._fetch(work.by_collider),
         )
         if work.by_collider.size:
@@ -273,15 +271,15 @@ class BlockSimulation:
             np.add.at(self._totals[1], layout.field_body, self._fetch(work.by_body))
             work.by_body[:] = 0
 
-    def _set_rules(self, colliders: Sequence[Collider]) -> None:
+    def _set_params(self, colliders: Sequence[Collider]) -> None:
         rows, heights = pack_colliders(colliders)
         model, dtype = self._model, self._dtype
-        self._rules = Rules(
+        self._params = StepParameters(
             table=model.table.astype(dtype),
             dx=dtype(model.dx),
             gravity=np.asarray(model.gravity, dtype),
             friction=model.friction,
-            obstacles=rows,
+            collider_rows=rows,
             heights=heights,
         )
 

@@ -6,7 +6,7 @@ import functools
 from typing import Any
 
 from ..._numba import func, kernel
-from ..constitutive.shared import FASTMATH
+from ..numerics.device import FASTMATH
 
 inner: Any = functools.partial(func, fastmath=FASTMATH)
 """Compiles functions that only entry points call; they are kept as part of those."""

@@ -1,24 +1,26 @@
-"""Which blocks of the grid hold matter, and who is whose neighbour.
+"""Which blocks of the grid hold particles, and which are neighbours.
 
-The grid is cut into blocks of 4^3 nodes. Particles are sorted by block and body. A block with
-particles of one body is a *home*: it scatters into its own tile of 8^3 nodes, one block and a
-margin of two nodes below and above, so that no two homes write to the same place and the sums do
-not depend on threads. Particles may leave their home by one cell before they must be sorted again.
-A *field* is a block of one body's velocities: homes and all blocks around them.
+The grid is cut into blocks of 4^3 nodes. Particles are sorted by block and body: what a *block*
+of the kernels holds are the particles of one body there. It scatters into its own tile of 8^3
+nodes, one block and a margin of two nodes below and above, so that no two write to the same place
+and the sums do not depend on threads. Particles may leave their block by one cell before they must
+be sorted again. A *field* is a block of nodes with the velocities of one body: where it has
+particles, and all around.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ..colliders import Collider, HeightField
-from ..constitutive.obstacle import obstacle_distance
+from ..contact.collider_distance import collider_distance
 from ..errors import ParticleError
+from ..numerics.device import device_function
 from .base import pack_colliders
 
 Int = NDArray[np.int64]
@@ -28,7 +30,7 @@ BLOCK = 4
 COORDINATE_BITS, BODY_BITS = 17, 12
 COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)
 CHUNKS = 64
-"""Parts of about equal work that threads share out."""
+"""Parts of about equal work that are divided among threads."""
 BLOCK_REACH = 3.5
 """From the centre of a block to its corners [cells]."""
 COLLIDER_MARGIN = 2.0
@@ -39,35 +41,44 @@ OFFSETS: Int = np.stack(np.meshgrid(_range, _range, _range, indexing="ij"), axis
 
 
 class Layout(NamedTuple):
-    """The blocks of one arrangement; P homes, M fields.
+    """One arrangement: P blocks with particles, M fields.
 
     Attributes:
-        home_start: [P + 1], particles of a home in the sorted arrays.
-        home_block: [P, 3], block coordinates.
-        home_fields: [P, 27], the fields around a home, in the order of OFFSETS.
-        home_moment: [P], slot among homes that contact needs moments of, or -1.
-        chunk_start: [CHUNKS + 1], homes of each chunk.
-        field_block: [M, 3].
+        block_start: [P + 1], particles of a block in the sorted arrays.
+        block_coordinates: [P, 3], in blocks.
+        block_fields: [P, 27], the fields around a block, in the order of OFFSETS.
+        block_moment: [P], slot among blocks that contact needs moments of, or -1.
+        chunk_start: [CHUNKS + 1], blocks of each chunk.
+        field_coordinates: [M, 3], in blocks.
         field_body: [M].
-        field_homes: [M, 27], the homes around a field, or -1.
+        field_blocks: [M, 27], the blocks around a field, or -1.
         group_start: [G + 1], fields of the same block are neighbours and form a group.
-        touch_start: [M + 1], near colliders of each field.
-        touch_collider: [T].
+        contact_start: [M + 1], near colliders of each field.
+        contact_collider: [T].
         near: [M] bool, whether contact is possible in this field.
     """
 
-    home_start: Int
-    home_block: Int
-    home_fields: Int
-    home_moment: Int
+    block_start: Int
+    block_coordinates: Int
+    block_fields: Int
+    block_moment: Int
     chunk_start: Int
-    field_block: Int
+    field_coordinates: Int
     field_body: Int
-    field_homes: Int
+    field_blocks: Int
     group_start: Int
-    touch_start: Int
-    touch_collider: Int
+    contact_start: Int
+    contact_collider: Int
     near: NDArray[np.bool_]
+
+
+@device_function
+def node_position(block: Any, node: Any, dx: Any) -> Any:
+    """World position [m] of a node of a block."""
+    x = (block[0] * BLOCK + node // (BLOCK * BLOCK)) * dx
+    y = (block[1] * BLOCK + node // BLOCK % BLOCK) * dx
+    z = (block[2] * BLOCK + node % BLOCK) * dx
+    return x, y, z
 
 
 def arrange(
@@ -95,38 +106,38 @@ def arrange(
         )
     keys = _pack(blocks, bodies)
     order = np.argsort(keys, kind="stable")
-    home_key, first = np.unique(keys[order], return_index=True)
-    home_start = np.append(first, len(keys))
-    home_block, home_body = _unpack(home_key)
+    found_key, first = np.unique(keys[order], return_index=True)
+    block_start = np.append(first, len(keys))
+    block_coordinates, block_body = _unpack(found_key)
 
-    around = home_block[:, None] + OFFSETS[None]
-    around_key = _pack(around, home_body[:, None])
+    around = block_coordinates[:, None] + OFFSETS[None]
+    around_key = _pack(around, block_body[:, None])
     field_key, inverse = np.unique(around_key, return_inverse=True)
-    home_fields = inverse.reshape(-1, 27)
-    field_block, field_body = _unpack(field_key)
-    field_homes = np.full((len(field_key), 27), -1)
-    # The home at offset o of a field sees that field at offset -o, which is entry 26 - index.
+    block_fields = inverse.reshape(-1, 27)
+    field_coordinates, field_body = _unpack(field_key)
+    field_blocks = np.full((len(field_key), 27), -1)
+    # The block at offset o of a field sees that field at offset -o, which is entry 26 - index.
     for o in range(27):
-        field_homes[home_fields[:, 26 - o], o] = np.arange(len(home_key))
+        field_blocks[block_fields[:, 26 - o], o] = np.arange(len(found_key))
 
     block_key = field_key >> BODY_BITS
     group_start = np.append(np.flatnonzero(np.diff(block_key, prepend=-1)), len(field_key))
-    touch_start, touch_collider = _touches(field_block, dx, colliders)
+    contact_start, contact_collider = _near_colliders(field_coordinates, dx, colliders)
     shared = np.repeat(np.diff(group_start) > 1, np.diff(group_start))
-    near = shared | (np.diff(touch_start) > 0)
-    needed = near[home_fields].any(axis=1)
+    near = shared | (np.diff(contact_start) > 0)
+    needed = near[block_fields].any(axis=1)
     return order, Layout(
-        home_start=home_start,
-        home_block=home_block,
-        home_fields=home_fields,
-        home_moment=np.where(needed, np.cumsum(needed) - 1, -1),
-        chunk_start=_chunks(home_start),
-        field_block=field_block,
+        block_start=block_start,
+        block_coordinates=block_coordinates,
+        block_fields=block_fields,
+        block_moment=np.where(needed, np.cumsum(needed) - 1, -1),
+        chunk_start=_chunks(block_start),
+        field_coordinates=field_coordinates,
         field_body=field_body,
-        field_homes=field_homes,
+        field_blocks=field_blocks,
         group_start=group_start,
-        touch_start=touch_start,
-        touch_collider=touch_collider,
+        contact_start=contact_start,
+        contact_collider=contact_collider,
         near=near,
     )
 
@@ -148,7 +159,7 @@ def _unpack(keys: Int) -> tuple[Int, Int]:
     return blocks - COORDINATE_LIMIT, keys & ((1 << BODY_BITS) - 1)
 
 
-def _touches(blocks: Int, dx: float, colliders: Sequence[Collider]) -> tuple[Int, Int]:
+def _near_colliders(blocks: Int, dx: float, colliders: Sequence[Collider]) -> tuple[Int, Int]:
     """Colliders near each block, as starts [M + 1] and a flat list."""
     centres = (blocks * BLOCK + (BLOCK - 1) / 2) * dx
     rows, heights = pack_colliders(colliders)
@@ -163,14 +174,14 @@ def _touches(blocks: Int, dx: float, colliders: Sequence[Collider]) -> tuple[Int
 
 
 def _distances(row: Float, heights: Float, points: Float) -> Float:
-    return np.array([obstacle_distance(row, heights, *p)[0] for p in points.tolist()])
+    return np.array([collider_distance(row, heights, *p)[0] for p in points.tolist()])
 
 
-def _chunks(home_start: Int) -> Int:
-    """Cut homes into CHUNKS of about equal work: particles, and something for the tile itself."""
-    homes = len(home_start) - 1
-    work = np.append(0, np.cumsum(np.diff(home_start) + 30))
+def _chunks(block_start: Int) -> Int:
+    """Cut blocks into CHUNKS of about equal work: particles, and something for the tile itself."""
+    blocks = len(block_start) - 1
+    work = np.append(0, np.cumsum(np.diff(block_start) + 30))
     wanted = work[-1] * np.arange(CHUNKS + 1) / CHUNKS
     cuts = np.searchsorted(work, wanted)
-    cuts[0], cuts[-1] = 0, homes
+    cuts[0], cuts[-1] = 0, blocks
     return cuts.astype(np.int64)

@@ -11,20 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive.matrices import det
-from ..constitutive.shared import F32, FOUR, HALF, ZERO, law
+from ..constitutive.material_row import LAMBDA, MU, PLASTIC, VISCOSITY
 from ..constitutive.stress import (
-    KIND,
-    LAMBDA,
-    MU,
-    SNOW,
-    VISCOSITY,
-    VON_MISES,
-    C,
     add_viscosity,
     advance_gradient,
     stress_update,
+    wave_hardening,
 )
+from ..numerics.device import F32, FOUR, HALF, ZERO, device_function
+from ..numerics.matrices import det
 from .layout import BLOCK
 
 SIDE = 8
@@ -39,8 +34,8 @@ SUMS, COLUMNS = 12, 15
 """The first SUMS columns of a row of sums are added up, the others are bounds."""
 
 
-class State(NamedTuple):
-    """Particles sorted by home, in one precision.
+class ParticleState(NamedTuple):
+    """Particles sorted by block, in one precision.
 
     Attributes:
         xi: [N, 3] position from the start of the block [cells].
@@ -68,7 +63,7 @@ class State(NamedTuple):
     material: NDArray[Any]
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Space for one layout.
 
     Attributes:
@@ -76,9 +71,9 @@ class Work(NamedTuple):
         moments: [Q, 512, 4] first moment of volume about the nodes [m^3 cells], and volume [m^3].
         velocity: [M, 64, 4] velocity and mass of the fields.
         offset: [M, 64, 4] first moments of the fields.
-        scratch: [CHUNKS, SCRATCH], see ``cpu_deform``; the CPU's only.
-        strayed: [P] bool, whether a particle left its home's reach.
-        by_collider: [T, TOTALS] float64, of each touch.
+        scratch: [CHUNKS, SCRATCH], see ``cpu.deform``; the CPU's only.
+        needs_resort: [P] bool, whether a particle left its block's reach.
+        by_collider: [T, TOTALS] float64, of each near collider of each field.
         by_body: [M, B, TOTALS] float64, on a field from each body; [0, B, TOTALS] for one body.
     """
 
@@ -87,20 +82,20 @@ class Work(NamedTuple):
     velocity: NDArray[Any]
     offset: NDArray[Any]
     scratch: NDArray[Any]
-    strayed: NDArray[np.bool_]
+    needs_resort: NDArray[np.bool_]
     by_collider: NDArray[np.float64]
     by_body: NDArray[np.float64]
 
 
-class Rules(NamedTuple):
+class StepParameters(NamedTuple):
     """What holds for the whole run.
 
     Attributes:
-        table: [K, ROW] materials, in the state's precision.
+        table: [K, MATERIAL_ROW] materials, in the state's precision.
         dx: cell size [m], in the state's precision.
         gravity: [3] [m/s^2], in the state's precision.
         friction: [B] float64.
-        obstacles: [C, COLLIDER_ROW] float64.
+        collider_rows: [C, COLLIDER_ROW] float64.
         heights: [H] float64.
     """
 
@@ -108,11 +103,11 @@ class Rules(NamedTuple):
     dx: Any
     gravity: NDArray[Any]
     friction: NDArray[np.float64]
-    obstacles: NDArray[np.float64]
+    collider_rows: NDArray[np.float64]
     heights: NDArray[np.float64]
 
 
-@law
+@device_function
 def first_node(x: Any) -> Any:
     """First node along one axis that a particle at ``x`` [cells] sees, and its distance from it."""
     # On a device floor gives no whole number.
@@ -120,13 +115,13 @@ def first_node(x: Any) -> Any:
     return node, x - F32(node)
 
 
-@law
+@device_function
 def tile_node(i: Any, j: Any, k: Any) -> Any:
     """Number on the tile of a node of the block; tiles start one cell below the block."""
     return ((i + 1) * SIDE + j + 1) * SIDE + k + 1
 
 
-@law
+@device_function
 def place(p: Any, xi: Any) -> Any:
     """First of a particle's nodes on the tile, and its distance from it (3) [cells]."""
     i, fx = first_node(xi[p, 0])
@@ -135,7 +130,7 @@ def place(p: Any, xi: Any) -> Any:
     return tile_node(i, j, k), (fx, fy, fz)
 
 
-@law
+@device_function
 def momentum(p: Any, dt: Any, dx: Any, f: Any, state: Any) -> Any:
     """What a particle gives to its nodes: start (3) and slopes along x, y and z (3 each) [kg m/s].
 
@@ -157,7 +152,7 @@ def momentum(p: Any, dt: Any, dx: Any, f: Any, state: Any) -> Any:
     return start, qx, qy, qz
 
 
-@law
+@device_function
 def velocity_gradient(g: Any, dx: Any, f: Any) -> Any:
     """Velocity gradient (9) [1/s] from the twelve sums over nodes.
 
@@ -171,9 +166,9 @@ def velocity_gradient(g: Any, dx: Any, f: Any) -> Any:
     )  # fmt: skip
 
 
-@law
+@device_function
 def move(p: Any, dt: Any, dx: Any, v: Any, L: Any, state: Any) -> Any:
-    """Give a particle its new velocity and gradient and move it; whether it left its home's reach.
+    """Give a particle its new velocity and gradient and move it; whether it left its block's reach.
 
     NaN fails both comparisons, so it has left.
     """
@@ -189,7 +184,7 @@ def move(p: Any, dt: Any, dx: Any, v: Any, L: Any, state: Any) -> Any:
     return not stays
 
 
-@law
+@device_function
 def nine(a: Any, p: Any) -> Any:
     """Row p of a [N, 9] array as a tuple."""
     return (
@@ -197,7 +192,7 @@ def nine(a: Any, p: Any) -> Any:
     )  # fmt: skip
 
 
-@law
+@device_function
 def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
     """Advance one particle's deformation by its velocity gradient and find its stress."""
     L = nine(state.L, p)
@@ -210,14 +205,14 @@ def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
     for c in range(6):
         state.tau[p, c] = tau[c]
     state.energy[p] = energy
-    if row[KIND] >= F32(VON_MISES):
+    if row[PLASTIC] > ZERO:
         state.history[p] = history
         F = advance_gradient(nine(state.F_total, p), L, dt)
         for c in range(9):
             state.F_total[p, c] = F[c]
 
 
-@law
+@device_function
 def add_motion(p: Any, block: Any, state: Any, dx: Any, out: Any) -> None:
     """Mass, momentum, angular momentum and kinetic energy, with APIC's affine part."""
     m = float(state.mass[p])
@@ -245,8 +240,8 @@ def add_motion(p: Any, block: Any, state: Any, dx: Any, out: Any) -> None:
     out[SPEED_SQUARE] = max(out[SPEED_SQUARE], square) + (square - square)
 
 
-@law
-def add_matter(p: Any, state: Any, row: Any, out: Any) -> None:
+@device_function
+def add_material(p: Any, state: Any, row: Any, out: Any) -> None:
     """Stored energy, wave speed in the present shape, volume ratio."""
     out[ELASTIC] += float(state.volume[p]) * float(state.energy[p])
     f = state.F[p]
@@ -257,9 +252,7 @@ def add_matter(p: Any, state: Any, row: Any, out: Any) -> None:
     for c in range(9):
         stretch += float(F[c]) * float(F[c])
     stiffening = max(stretch / 3.0, 1.0 / max(ratio, 1e-2))
-    if row[0] == SNOW:
-        hardening = row[C] * (1.0 - math.exp(float(state.history[p])))
-        stiffening *= math.exp(min(max(hardening, -3.0), 3.0))
+    stiffening *= wave_hardening(state.history[p], row)
     modulus = float(row[LAMBDA]) + 2.0 * float(row[MU])
     square = modulus * stiffening * float(state.volume[p]) / float(state.mass[p])
     out[WAVE_SQUARE] = max(out[WAVE_SQUARE], square) + (square - square)

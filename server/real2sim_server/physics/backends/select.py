@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 
 from ..errors import SolverError
-from .base import Backend
+from .base import SolverBackend
 
 BACKENDS = ("cpu", "cuda", "reference")
 
 
 @functools.cache
-def select_backend(name: str = "auto") -> Backend:
+def select_backend(name: str = "auto") -> SolverBackend:
     """The one backend of that name.
 
     Args:
@@ -22,15 +22,15 @@ def select_backend(name: str = "auto") -> Backend:
         SolverError: for an unknown name, or for ``cuda`` where no device is usable.
     """
     if name in ("auto", "cpu"):
-        from .cpu.backend import CpuBackend
+        from .cpu.backend import CpuSolverBackend
 
-        return CpuBackend()
+        return CpuSolverBackend()
     if name == "cuda":
-        from .cuda.backend import CudaBackend
+        from .cuda.backend import CudaSolverBackend
 
-        return CudaBackend()
+        return CudaSolverBackend()
     if name == "reference":
-        from .reference.backend import ReferenceBackend
+        from .reference.backend import ReferenceSolverBackend
 
-        return ReferenceBackend()
+        return ReferenceSolverBackend()
     raise SolverError(f"unknown backend {name!r}; allowed are 'auto' and {list(BACKENDS)}")

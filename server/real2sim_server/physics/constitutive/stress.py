@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .matrices import (
+from ..numerics.device import F32, HALF, ONE, THREE, TWO, ZERO, device_function
+from ..numerics.matrices import (
     det,
     eigen_symmetric,
     gram,
@@ -19,41 +20,48 @@ from .matrices import (
     recompose,
     symmetric_times,
 )
-from .shared import F32, HALF, ONE, THREE, TWO, ZERO, law
-
-COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW = range(6)
-"""Kinds of material, as kernels know them."""
-KIND, MU, LAMBDA, VISCOSITY, A, B, C = range(7)
-"""Columns of a material's row; A, B, C are read by kind, see ``Material.row``."""
-ROW = 7
+from .material_row import (
+    COROTATED,
+    DRUCKER_PRAGER,
+    LAMBDA,
+    LAW,
+    MU,
+    NEO_HOOKEAN,
+    SNOW,
+    VISCOPLASTIC,
+    VON_MISES,
+    A,
+    B,
+    C,
+)
 
 SQRT_TWO_THIRDS = F32(math.sqrt(2 / 3))
 STRETCH_MIN = F32(0.05)
 """Principal stretches are taken as no smaller than this, so that logarithms stay finite."""
 VOLUME_MIN = F32(1e-3)
-"""A particle squeezed below this share of its volume has turned inside out or is about to."""
+"""A particle squeezed below this fraction of its volume has turned inside out or is about to."""
 
 
-@law
+@device_function
 def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
     """(elastic F, tau, energy density, history) of a trial elastic deformation gradient.
 
     Args:
         F: trial deformation gradient, nine numbers.
         history: plastic memory; hardening [Pa], volume correction, or plastic volume ratio.
-        row: material parameters, see the column constants.
+        row: the material, see :mod:`.material_row`.
         dt: time since the last call [s]; 0 leaves rate-dependent flow out.
     """
-    kind = row[KIND]
-    if kind == COROTATED:
+    law = row[LAW]
+    if law == COROTATED:
         tau, energy = corotated(F, row[MU], row[LAMBDA])
         return F, tau, energy, history
-    if kind == NEO_HOOKEAN:
+    if law == NEO_HOOKEAN:
         tau, energy = neo_hookean(F, row[MU], row[LAMBDA])
         return F, tau, energy, history
     squares, vectors = eigen_symmetric(gram(F))
     stretch = (stretch_of(squares[0]), stretch_of(squares[1]), stretch_of(squares[2]))
-    if kind == SNOW:
+    if law == SNOW:
         left, tau, energy, history = snow(stretch, history, row)
     else:
         left, tau, energy, history = hencky(stretch, history, row, dt)
@@ -63,20 +71,20 @@ def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
     return F, recompose(tau, vectors), energy, history
 
 
-@law
+@device_function
 def stretch_of(square: Any) -> Any:
     """Principal stretch of an eigenvalue of F F^T."""
     return max(math.sqrt(max(square, ZERO)), STRETCH_MIN)
 
 
-@law
+@device_function
 def corotated(F: Any, mu: Any, lam: Any) -> Any:
     """Fixed corotated: tau = 2 mu (F - R) F^T + lambda J (J - 1) I (Stomakhin et al. 2012)."""
     volume = max(det(F), VOLUME_MIN)
     return corotated_about(F, polar_rotation(F, volume), volume, mu, lam)
 
 
-@law
+@device_function
 def corotated_about(F: Any, R: Any, volume: Any, mu: Any, lam: Any) -> Any:
     """The same where rotation R and volume ratio are known."""
     d = (
@@ -102,13 +110,13 @@ def corotated_about(F: Any, R: Any, volume: Any, mu: Any, lam: Any) -> Any:
     return tau, mu * shear + HALF * lam * (volume - ONE) * (volume - ONE)
 
 
-@law
+@device_function
 def neo_hookean(F: Any, mu: Any, lam: Any) -> Any:
     """Compressible neo-Hookean: tau = mu (F F^T - I) + lambda ln J I (Bonet and Wood, 6.4)."""
     return neo_hookean_at(F, math.log(max(det(F), VOLUME_MIN)), mu, lam)
 
 
-@law
+@device_function
 def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
     """The same where ln J is known."""
     b = gram(F)
@@ -121,20 +129,23 @@ def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
     return tau, HALF * mu * trace - mu * log_volume + HALF * lam * log_volume * log_volume
 
 
-@law
+@device_function
 def hencky(stretch: Any, history: Any, row: Any, dt: Any) -> Any:
-    """Hencky's law with the flow rule of the row's kind, in principal stretches.
+    """Hencky's law with the flow rule of the row's law, in principal stretches.
 
-    tau = 2 mu e + lambda tr(e), e = ln(stretch).
+    tau = 2 mu e + lambda tr(e), e = ln(stretch). A law that is none of them gives NaN.
     """
     mu, lam = row[MU], row[LAMBDA]
     e = (math.log(stretch[0]), math.log(stretch[1]), math.log(stretch[2]))
-    if row[KIND] == VON_MISES:
+    if row[LAW] == VON_MISES:
         flowed, history = von_mises(e, history, row)
-    elif row[KIND] == VISCOPLASTIC:
+    elif row[LAW] == VISCOPLASTIC:
         flowed = viscoplastic(e, stretch, row, dt)
-    else:
+    elif row[LAW] == DRUCKER_PRAGER:
         flowed, history = drucker_prager(e, history, row)
+    else:
+        nothing = ZERO * mu / ZERO
+        flowed = (nothing, nothing, nothing)
     if flowed[0] != e[0] or flowed[1] != e[1] or flowed[2] != e[2]:
         stretch = (math.exp(flowed[0]), math.exp(flowed[1]), math.exp(flowed[2]))
     trace = flowed[0] + flowed[1] + flowed[2]
@@ -147,7 +158,7 @@ def hencky(stretch: Any, history: Any, row: Any, dt: Any) -> Any:
     return stretch, tau, mu * square + HALF * lam * trace * trace, history
 
 
-@law
+@device_function
 def deviator(e: Any) -> Any:
     """Deviatoric part of principal values, and its norm."""
     mean = (e[0] + e[1] + e[2]) / THREE
@@ -155,13 +166,13 @@ def deviator(e: Any) -> Any:
     return d, math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
 
 
-@law
+@device_function
 def shrink(e: Any, d: Any, factor: Any) -> Any:
     """e with ``factor`` of its deviator ``d`` taken away."""
     return e[0] - factor * d[0], e[1] - factor * d[1], e[2] - factor * d[2]
 
 
-@law
+@device_function
 def von_mises(e: Any, history: Any, row: Any) -> Any:
     """Radial return with linear hardening (Simo and Hughes 1998, box 3.2), in log strain.
 
@@ -176,7 +187,7 @@ def von_mises(e: Any, history: Any, row: Any) -> Any:
     return shrink(e, d, flow / norm), history + SQRT_TWO_THIRDS * row[B] * flow
 
 
-@law
+@device_function
 def viscoplastic(e: Any, stretch: Any, row: Any, dt: Any) -> Any:
     """Von Mises flow that needs time (Yue et al. 2015; as in PhysGaussian's foam).
 
@@ -190,19 +201,19 @@ def viscoplastic(e: Any, stretch: Any, row: Any, dt: Any) -> Any:
     mean_square = (
         stretch[0] * stretch[0] + stretch[1] * stretch[1] + stretch[2] * stretch[2]
     ) / THREE
-    share = dt / (dt + row[B] / (TWO * mu * mean_square))
-    return shrink(e, d, share * excess / (TWO * mu * norm))
+    fraction = dt / (dt + row[B] / (TWO * mu * mean_square))
+    return shrink(e, d, fraction * excess / (TWO * mu * norm))
 
 
-@law
+@device_function
 def drucker_prager(e: Any, history: Any, row: Any) -> Any:
     """Frictional flow without cohesion (Klar et al. 2016), with volume correction (2017).
 
     Column A: alpha of the cone; history: volume gained in tension, to be given back.
     """
     mu, lam = row[MU], row[LAMBDA]
-    share = history / THREE
-    e = (e[0] + share, e[1] + share, e[2] + share)
+    fraction = history / THREE
+    e = (e[0] + fraction, e[1] + fraction, e[2] + fraction)
     trace = e[0] + e[1] + e[2]
     d, norm = deviator(e)
     if trace >= ZERO:
@@ -213,7 +224,7 @@ def drucker_prager(e: Any, history: Any, row: Any) -> Any:
     return shrink(e, d, excess / norm), ZERO * history
 
 
-@law
+@device_function
 def snow(stretch: Any, history: Any, row: Any) -> Any:
     """Clamped stretches and hardening, fixed corotated stress (Stomakhin et al. 2013).
 
@@ -244,7 +255,16 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
     return s, tau, energy, history
 
 
-@law
+@device_function
+def wave_hardening(history: Any, row: Any) -> Any:
+    """By how much plastic flow has stiffened a particle; its waves run so much faster, squared."""
+    if row[LAW] != SNOW:
+        return 1.0
+    hardening = row[C] * (1.0 - math.exp(float(history)))
+    return math.exp(min(max(hardening, -3.0), 3.0))
+
+
+@device_function
 def advance_gradient(F: Any, L: Any, dt: Any) -> Any:
     """(I + dt L) F."""
     one = ONE
@@ -256,7 +276,7 @@ def advance_gradient(F: Any, L: Any, dt: Any) -> Any:
     return multiply(step, F)
 
 
-@law
+@device_function
 def add_viscosity(tau: Any, L: Any, volume: Any, viscosity: Any) -> Any:
     """Kelvin-Voigt: tau + J eta (L + L^T); ``volume`` is J."""
     k = volume * viscosity

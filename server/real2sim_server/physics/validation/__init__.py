@@ -6,7 +6,7 @@ Every case is a function of the backend's name and returns checks: measured, exp
 from collections.abc import Callable
 
 from .bending import cantilever, loaded_beam
-from .check import Check, Curve
+from .check import Check, ReferenceCurve
 from .contact import (
     braking,
     collinear_cars,
@@ -53,4 +53,4 @@ CASES: dict[str, Callable[[str], list[Check]]] = {
 }
 """All cases by name, the cheap ones first."""
 
-__all__ = ["CASES", "Check", "Curve"]
+__all__ = ["CASES", "Check", "ReferenceCurve"]

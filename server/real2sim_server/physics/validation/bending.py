@@ -12,7 +12,7 @@ from ..body import Body
 from ..colliders import Box
 from ..materials import FixedCorotated
 from ..solver import Solver
-from .check import Check, Curve, block, placed, solve
+from .check import Check, ReferenceCurve, block, placed, solve
 
 LENGTH, HEIGHT, DX = 2.0, 0.2, 0.05
 MATERIAL = FixedCorotated(young=1e6, poisson=0.0, density=1000)
@@ -38,10 +38,10 @@ def cantilever(backend: str) -> list[Check]:
     times, heights = _follow_tip(solver, x > LENGTH - 0.1, 0.01 / exact, 0.6 / exact)
     falls = (heights[1:] < 0) & (heights[:-1] >= 0) & (times[1:] > 0.2 / exact)
     i = int(np.flatnonzero(falls)[0])
-    share = heights[i] / (heights[i] - heights[i + 1])
-    half = times[i] + share * (times[i + 1] - times[i])
+    fraction = heights[i] / (heights[i] - heights[i + 1])
+    half = times[i] + fraction * (times[i + 1] - times[i])
     swing = heights.max() * np.sin(2 * np.pi * exact * times)
-    curve = Curve(times.tolist(), heights.tolist(), swing.tolist(), "time [s]", "tip [m]")
+    curve = ReferenceCurve(times.tolist(), heights.tolist(), swing.tolist(), "time [s]", "tip [m]")
     return [Check("cantilever: frequency", 0.5 / half, exact, 0.05 * exact, "Hz", curve)]
 
 
@@ -72,7 +72,7 @@ def loaded_beam(backend: str, *, length: float | None = None) -> list[Check]:
     lowest = int(np.argmin(heights))
     bend = -float(np.trapezoid(heights[: lowest + 1], times[: lowest + 1]) / times[lowest])
     swing = -exact * (1 - np.cos(np.pi * times / times[lowest]))
-    curve = Curve(times.tolist(), heights.tolist(), swing.tolist(), "time [s]", "tip [m]")
+    curve = ReferenceCurve(times.tolist(), heights.tolist(), swing.tolist(), "time [s]", "tip [m]")
     return [Check("cantilever: bend under load", bend, exact, 0.05 * exact, "m", curve)]
 
 

@@ -15,7 +15,7 @@ from ..solver import Solver, SolverOptions
 
 
 @dataclass(frozen=True)
-class Curve:
+class ReferenceCurve:
     """What a case looked like on its way, for the page.
 
     Attributes:
@@ -47,7 +47,7 @@ class Check:
     expected: float
     tolerance: float
     unit: str = ""
-    curve: Curve | None = None
+    curve: ReferenceCurve | None = None
 
     @property
     def passed(self) -> bool:

@@ -12,7 +12,7 @@ from ..materials import FixedCorotated
 from ..particles import ball_particles
 from ..restitution import fit_restitution
 from ..solver import SolverOptions
-from .check import Check, Curve, block, placed, solve
+from .check import Check, ReferenceCurve, block, placed, solve
 
 GRAVITY = 9.81
 RUBBER = FixedCorotated(young=2e5, poisson=0.2, viscosity=200)
@@ -39,7 +39,7 @@ def incline(backend: str, *, duration: float = 5.0) -> list[Check]:
             found.append(float(solver.measure.centre[0, 0] - x - coasted))
         exact = acceleration * times**2 / 2
         tolerance = 1e-3 * exact[-1] if acceleration else 2e-3
-        curve = Curve(times.tolist(), found, exact.tolist(), "time [s]", "way [m]")
+        curve = ReferenceCurve(times.tolist(), found, exact.tolist(), "time [s]", "way [m]")
         checks.append(Check(f"incline: {name}", found[-1], exact[-1], tolerance, "m", curve))
     return checks
 
@@ -60,7 +60,7 @@ def braking(backend: str, *, speed: float = 10.0) -> list[Check]:
     stopped = times[slow[0]] if len(slow) else math.nan
     sliding = np.minimum(times, duration)
     exact = speed * sliding - mu * GRAVITY * sliding**2 / 2
-    curve = Curve(times, ways, exact.tolist(), "time [s]", "way [m]")
+    curve = ReferenceCurve(times, ways, exact.tolist(), "time [s]", "way [m]")
     return [
         Check("braking: distance", ways[-1], distance, 0.03 * distance, "m", curve),
         Check("braking: time", stopped, duration, 0.03 * duration, "s"),

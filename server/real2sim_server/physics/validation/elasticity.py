@@ -7,7 +7,7 @@ import numpy as np
 from ..colliders import Box, Plane
 from ..materials import FixedCorotated, Metal, NeoHookean
 from ..solver import Solver
-from .check import Check, Curve, block, placed, solve
+from .check import Check, ReferenceCurve, block, placed, solve
 
 
 def vibrating_bar(backend: str) -> list[Check]:
@@ -38,7 +38,7 @@ def vibrating_bar(backend: str) -> list[Check]:
         found.append(float(solver.particles().velocities[x > 0, 0].mean()))
     exact = 0.2 / np.pi * np.cos(np.pi * 10 / 50 * np.array(times))
     worst = float(np.abs(found - exact).max()) / (0.2 / np.pi)
-    curve = Curve(times, found, exact.tolist(), "time [s]", "velocity of the centre [m/s]")
+    curve = ReferenceCurve(times, found, exact.tolist(), "time [s]", "velocity of the centre [m/s]")
     return [Check("vibrating bar: v_cm over a period", worst, 0, 0.02, curve=curve)]
 
 
@@ -55,7 +55,7 @@ def bar_on_wall(backend: str) -> list[Check]:
     # Impulse over plateau force is how long the wall was pushed.
     lasted = float(J[-1]) / force
     pushes = np.gradient(J, t) / area
-    curve = Curve(
+    curve = ReferenceCurve(
         t.tolist(),
         pushes.tolist(),
         np.where(t < 2 * length / c, stress, 0.0).tolist(),

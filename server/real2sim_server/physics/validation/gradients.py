@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ..backends.reference.backend import torch_model
-from ..backends.reference.step import TorchRules, TorchState, settle, substep
+from ..backends.reference.step import TorchParameters, TorchState, substep, with_stress
 from ..colliders import Plane
-from ..constitutive import stress as laws
+from ..constitutive import material_row
 from ..materials import Metal
 from .check import Check, block, solve
 
@@ -24,10 +24,10 @@ def gradients(backend: str = "reference") -> list[Check]:
     body = block(
         metal, size=(0.2, 0.2, 0.2), at=(0.013, 0.027, 0.12), velocity=(1, 0.2, -2), friction=0.3
     )
-    state, rules = torch_model(solve([body], backend="reference").model)
+    state, params = torch_model(solve([body], backend="reference").model)
     names = ("stiffness", "yield stress", "viscosity", "friction", "speed")
     knobs = torch.zeros(len(names), dtype=torch.float64, requires_grad=True)
-    outcome = _outcome(state, rules)
+    outcome = _outcome(state, params)
     outcome(knobs).backward()
     assert knobs.grad is not None
     checks = []
@@ -40,24 +40,24 @@ def gradients(backend: str = "reference") -> list[Check]:
     return checks
 
 
-def _outcome(state: TorchState, rules: TorchRules) -> Callable[[Tensor], Tensor]:
+def _outcome(state: TorchState, params: TorchParameters) -> Callable[[Tensor], Tensor]:
     """Final motion as one number, of logarithms of factors on five parameters."""
 
     def run(knobs: Tensor) -> Tensor:
         factor = knobs.exp()
         ones = torch.ones_like(factor[0])
-        columns = [ones] * laws.ROW
-        columns[laws.MU] = columns[laws.LAMBDA] = factor[0]
-        columns[laws.A], columns[laws.VISCOSITY] = factor[1], factor[2]
+        columns = [ones] * material_row.MATERIAL_ROW
+        columns[material_row.MU] = columns[material_row.LAMBDA] = factor[0]
+        columns[material_row.A], columns[material_row.VISCOSITY] = factor[1], factor[2]
         changed = replace(
-            rules,
-            rows=rules.rows * torch.stack(columns),
-            friction=rules.friction * factor[3],
+            params,
+            rows=params.rows * torch.stack(columns),
+            friction=params.friction * factor[3],
         )
-        now = settle(replace(state, v=state.v * factor[4]), changed)
+        now = with_stress(replace(state, v=state.v * factor[4]), changed)
         for _ in range(STEPS):
             now, _ = substep(now, changed, [Plane(name="ground")], DT)
-        momentum = (rules.mass[:, None] * now.v).sum(0)
+        momentum = (params.mass[:, None] * now.v).sum(0)
         return momentum @ torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64)
 
     return run

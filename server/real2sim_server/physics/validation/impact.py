@@ -11,7 +11,7 @@ from ..body import Body
 from ..colliders import Plane
 from ..materials import FixedCorotated
 from ..particles import Particles, ball_particles, box_particles
-from .check import Check, Curve, placed, solve
+from .check import Check, ReferenceCurve, placed, solve
 
 _HERTZ_POWER = 1.5 * 1.07
 """Hertz's indentation is close to sin(pi t)^(1.07), its force to the power 3/2 of that."""
@@ -123,7 +123,7 @@ def hertz(backend: str) -> list[Check]:
     t = np.array(times[1:])
     middle = float(np.interp(0.5, J, times))
     phase = np.clip((t - middle) / exact + 0.5, 0, 1)
-    curve = Curve(
+    curve = ReferenceCurve(
         t.tolist(),
         (np.diff(impulses) / np.diff(times)).tolist(),
         (peak * np.sin(np.pi * phase) ** _HERTZ_POWER).tolist(),

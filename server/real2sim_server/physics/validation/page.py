@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-from .check import Check, Curve
+from .check import Check, ReferenceCurve
 from .table import CaseResult
 
 STYLE = """
@@ -34,7 +34,7 @@ def render_page(results: Sequence[CaseResult], *, backend: str) -> str:
     return (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
         f"<title>Validation of the solver: {escape(verdict)}</title><style>{STYLE}</style></head>"
-        f"<body><h1>Validation of the solver</h1><p>Backend {escape(backend)}: "
+        f"<body><h1>Validation of the solver</h1><p>SolverBackend {escape(backend)}: "
         f"<span class='{kind}'>{escape(verdict)}</span>. Margins show where within its tolerance "
         f"a measured value lies.</p>\n{body}\n</body></html>\n"
     )
@@ -82,7 +82,7 @@ def _margin(check: Check) -> str:
     )
 
 
-def draw_curve(curve: Curve, title: str) -> str:
+def draw_curve(curve: ReferenceCurve, title: str) -> str:
     """A plot of a curve against theory, as inline SVG."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG

@@ -12,7 +12,7 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import SimulateRequest
-from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, MaterialName, PlaneShape
+from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, PlaneShape
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
@@ -20,16 +20,7 @@ from ...edit.ground import RecordedGround
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
 from ...physics.colliders import Box, Collider, HeightField, Plane
-from ...physics.materials import (
-    FixedCorotated,
-    Foam,
-    Material,
-    Metal,
-    NearRigid,
-    NeoHookean,
-    Sand,
-    Snow,
-)
+from ...physics.materials import named_material
 from ...render import Instance
 from ...scene import Scene, SceneObject
 from ...simulation.playback import Playback
@@ -48,17 +39,6 @@ REACH = 25.0
 
 MOST = 12
 PLAYBACK = "playback.json"
-
-MATERIALS: dict[MaterialName, Callable[[], Material]] = {
-    "rigid": NearRigid,
-    "metal": lambda: Metal(young=2e8, density=300.0, yield_stress=4e6, hardening=2e7),
-    "foam": lambda: Foam(young=4e5, density=60.0, yield_stress=3e4, viscosity=400.0),
-    "rubber": lambda: NeoHookean(young=3e6, poisson=0.45, density=1100.0),
-    "jelly": lambda: FixedCorotated(young=2e6, poisson=0.4, density=200.0),
-    "sand": Sand,
-    "snow": Snow,
-}
-"""What the names of operations stand for. Metal is that of a car body smeared over its volume."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +246,7 @@ def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
     angular = velocity.angular if velocity is not None else None
     return ObjectPhysics(
         mass=given.mass if given else None,
-        material=MATERIALS[given.material]() if given and given.material else None,
+        material=named_material(given.material) if given and given.material else None,
         friction=given.friction if given else None,
         restitution=given.restitution if given else None,
         velocity=None if linear is None else turn @ np.array(linear),

@@ -17,7 +17,7 @@ from ...physics.colliders import Plane
 from ...physics.errors import PhysicsError
 from ...render import Instance, RasterOptions, render_cameras
 from ...scene import Camera, GaussianCloud
-from ..body import MODES
+from ..body import BodyMode
 from ..playback import Playback
 from ..result import ENERGIES, SimulationResult
 from .setups import Experiment
@@ -34,7 +34,7 @@ WALL_HALF_WIDTH, WALL_DOWN, WALL_UP = 1.3, 0.7, 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class FilmView:
     """A camera of the film.
 
     Attributes:
@@ -49,7 +49,7 @@ class View:
     clear: float = 0.0
 
 
-def views(playback: Playback, experiment: Experiment) -> list[View]:
+def views(playback: Playback, experiment: Experiment) -> list[FilmView]:
     """The scene's first camera where it stood at the start, and one near the subjects."""
     scene = playback.scene
     recorded = scene.rig.cameras[0]
@@ -62,11 +62,11 @@ def views(playback: Playback, experiment: Experiment) -> list[View]:
     K[0, 0] = K[1, 1] = 0.9 * recorded.width
     K[0, 2], K[1, 2] = recorded.width / 2, recorded.height / 2
     return [
-        View(
+        FilmView(
             Camera("scene", recorded.width, recorded.height, np.array(recorded.K), stood),
             scene.background,
         ),
-        View(
+        FilmView(
             Camera("near", recorded.width, recorded.height, K, near),
             _before(scene.background, viewer, experiment),
             clear=CLEAR * experiment.distance,
@@ -108,7 +108,7 @@ def look_at(viewer: Float, focus: Float) -> Float:
     return pose
 
 
-def draw(playback: Playback, shown: Sequence[View], frame: int, backend: str) -> list[Image]:
+def draw(playback: Playback, shown: Sequence[FilmView], frame: int, backend: str) -> list[Image]:
     """RGB images of a frame, one for each view."""
     images = []
     for view in shown:
@@ -125,7 +125,7 @@ def draw(playback: Playback, shown: Sequence[View], frame: int, backend: str) ->
     return images
 
 
-def _bystanders(playback: Playback, view: View, frame: int) -> set[str]:
+def _bystanders(playback: Playback, view: FilmView, frame: int) -> set[str]:
     """What takes no part and is too near to the view to be shown."""
     t_us, eye = playback.time_us(frame), view.camera.T_vehicle_camera[:3, 3]
     return {
@@ -138,9 +138,9 @@ def _bystanders(playback: Playback, view: View, frame: int) -> set[str]:
     }
 
 
-def leave_film(
+def write_film(
     playback: Playback,
-    shown: Sequence[View],
+    shown: Sequence[FilmView],
     folder: Path,
     *,
     outlines: Sequence[Float] = (),
@@ -153,7 +153,7 @@ def leave_film(
         playback: what is shown.
         shown: as ``views`` gives them.
         folder: for the files.
-        outlines: of things without looks, see ``walls``.
+        outlines: of things without an appearance, see ``walls``.
         backend: of the renderer.
         on_progress: called with (pictures done, pictures).
 
@@ -217,7 +217,7 @@ def draw_curves(result: SimulationResult, path: Path) -> None:
     for name, o in result.objects.items():
         [line] = speed.plot(t, np.linalg.norm(o.velocities, axis=1), label=name)
         height.plot(t, o.positions[:, 2], color=line.get_color())
-        deforming = o.modes == MODES.index("deforming")
+        deforming = o.modes == BodyMode.DEFORMING
         speed.plot(t[deforming], np.zeros(deforming.sum()), ".", ms=3, color=line.get_color())
     for c, contact in enumerate(result.contacts):
         size = np.linalg.norm(result.impulses[:, c], axis=1)
@@ -267,4 +267,13 @@ def _even(image: Image) -> Image:
     return np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
 
 
-__all__ = ["View", "draw", "draw_curves", "leave_film", "look_at", "views", "walls", "write_png"]
+__all__ = [
+    "FilmView",
+    "draw",
+    "draw_curves",
+    "look_at",
+    "views",
+    "walls",
+    "write_film",
+    "write_png",
+]

@@ -18,13 +18,13 @@ from ...physics.particles import box_particles
 from ...physics.validation.check import Check
 from ..body import DeformableBody
 from ..presets import ObjectPhysics, preset_of
-from ..rollout import SimulateOptions, roll
+from ..rollout import SimulateOptions, simulate_bodies
 
 MALIBU_MASS = 1651.0
 MALIBU_SIZE = (4.87, 1.85, 1.35)
 """Length and width of the car, height of its body above the wheels [m]."""
 COLUMN = (0.4, 0.4)
-"""Width and height of the part of it that is simulated, with its share of the mass [m]. Nothing
+"""Width and height of the part of it that is simulated, with its fraction of the mass [m]. Nothing
 differs across a block that meets a wall squarely: the whole section gives the same restitutions and
 the same crush to a millimetre, and takes sixteen times as long."""
 MALIBU_SPEED = 56.5 / 3.6
@@ -65,15 +65,15 @@ def block_car(
 
     Args:
         name: of the body.
-        mass: of the whole car [kg]; the column has its share.
+        mass: of the whole car [kg]; the column has its fraction.
         x: of its middle [m].
         speed: [m/s].
         heading: which way it looks.
     """
     preset = preset_of("vehicle")
-    share = float(np.prod(COLUMN) / np.prod(MALIBU_SIZE[1:]))
+    fraction = float(np.prod(COLUMN) / np.prod(MALIBU_SIZE[1:]))
     block = box_particles((MALIBU_SIZE[0], *COLUMN), spacing=preset.spacing, density=1.0)
-    particles = block.with_mass(mass * share)
+    particles = block.with_mass(mass * fraction)
     materials, regions = preset.build("car", MALIBU_SIZE[0])
     pose = np.diag([heading, heading, 1.0, 1.0])
     pose[0, 3] = x
@@ -102,7 +102,7 @@ def barrier_test(speed: float) -> BarrierTest:
         duration=0.05 / speed + 0.25,
         gravity=(0.0, 0.0, 0.0),
     )
-    result = roll([car], options)
+    result = simulate_bodies([car], options)
     own = result.objects["car"]
     rest = own.rest.astype(np.float64)
     moved = np.zeros_like(rest) if not len(own.shapes) else own.shapes[-1].astype(np.float64)
@@ -156,14 +156,14 @@ def collinear_pair() -> list[Check]:
     """
     heavy, light, speed = 1651.0, 1200.0, 8.0
     gap = MALIBU_SIZE[0] + 0.15
-    actors = [
+    bodies = [
         block_car("striker", mass=heavy, speed=speed),
         block_car("struck", mass=light, x=gap),
     ]
     options = SimulateOptions(
-        objects={a.name: ObjectPhysics() for a in actors}, duration=0.4, gravity=(0.0, 0.0, 0.0)
+        objects={b.name: ObjectPhysics() for b in bodies}, duration=0.4, gravity=(0.0, 0.0, 0.0)
     )
-    result = roll(actors, options)
+    result = simulate_bodies(bodies, options)
     after = {name: float(o.velocities[-1, 0]) for name, o in result.objects.items()}
     e = (after["struck"] - after["striker"]) / speed
     theory = speed * (1 + e) / (heavy + light)

@@ -15,8 +15,8 @@ from ..ground import find_road
 from ..playback import PlacedObject, PlacedObjects
 from ..presets import VEHICLES, ObjectPhysics, preset_of
 from ..rollout import SimulateOptions
-from ..spawn import matter_of
-from .viewing import in_view, seen
+from ..spawn import object_particles
+from .viewing import in_view, visibility_of
 
 WALL_GAP = 0.5
 """Between the vehicle and the wall at the start [m]: contact after 1 s at 0.5 m/s."""
@@ -56,7 +56,7 @@ class Experiment:
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
+class _Request:
     scene: Scene
     state: PlacedObjects
     chosen: tuple[PlacedObject, ...]
@@ -82,7 +82,7 @@ def set_up(
             ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground.
         preset: of the materials.
         speed: [m/s]; the paper's 2.5 and 3.5 by default.
-        objects: ids to take; by default vehicles in view, those that were seen best where it hits.
+        objects: ids to take; by default vehicles in view, those seen best where it hits.
 
     Raises:
         PhysicsError: unknown name or objects, or no vehicles in view.
@@ -99,7 +99,7 @@ def set_up(
     if not chosen:
         raise PhysicsError(f"no vehicles in view at {start_us} us; name some with objects")
     return builders[name](
-        _Asked(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
+        _Request(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
     )
 
 
@@ -132,65 +132,67 @@ def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
     return find_road(means, boxes).field
 
 
-def _wall(asked: _Asked) -> Experiment:
-    start_us = asked.start_us
+def _wall(request: _Request) -> Experiment:
+    start_us = request.start_us
     # What is to be crushed must have been seen.
-    subject = max(asked.chosen, key=lambda s: seen(asked.scene, s).front)
-    speed = 2.5 if asked.speed is None else asked.speed
+    subject = max(request.chosen, key=lambda s: visibility_of(request.scene, s).front)
+    speed = 2.5 if request.speed is None else request.speed
     pose = subject.trajectory.transform(start_us)
     forward, length = _level(pose[:3, 0]), subject.scaled_size[0]
-    front = pose[:3, 3] + _reach(asked, subject)[1][0] * forward
+    front = pose[:3, 3] + _reach(request, subject)[1][0] * forward
     wall = Plane(name="wall", point=front + WALL_GAP * forward, normal=-forward, friction=0.3)
     options = SimulateOptions(
-        preset=asked.preset,
-        objects={subject.object_id: ObjectPhysics(velocity=speed * forward, friction=_ROLLS)},
-        colliders=[_standing_road(asked, subject), wall],
+        preset=request.preset,
+        objects={
+            subject.object_id: ObjectPhysics(velocity=speed * forward, friction=ROLLING_FRICTION)
+        },
+        colliders=[_standing_road(request, subject), wall],
         start_us=start_us,
         duration=WALL_GAP / speed + 1.0,
     )
-    view = _viewer(asked.scene, subject, pose, slant=0.8)
+    view = _viewer(request.scene, subject, pose, slant=0.8)
     return Experiment(
         "wall", options, (subject.object_id,), front - 0.3 * length * forward, view, 6.5
     )
 
 
-_ROLLS = 0.0
+ROLLING_FRICTION = 0.0
 """In the paper's preset a vehicle has no wheels; that it rolls means it slides freely."""
 
 
-def _standing_road(asked: _Asked, subject: PlacedObject) -> Collider:
+def _standing_road(request: _Request, subject: PlacedObject) -> Collider:
     """The road; without wheels it must not reach into the vehicle's underside."""
-    if asked.preset != "paper":
-        return scene_road(asked.scene, asked.state, asked.start_us)
-    pose = subject.trajectory.transform(asked.start_us)
+    if request.preset != "paper":
+        return scene_road(request.scene, request.state, request.start_us)
+    pose = subject.trajectory.transform(request.start_us)
     return Plane(
         name="ground",
-        point=pose[:3, 3] + _reach(asked, subject)[0][2] * pose[:3, 2],
+        point=pose[:3, 3] + _reach(request, subject)[0][2] * pose[:3, 2],
         normal=pose[:3, 2],
         friction=0.0,
     )
 
 
-def _pair(asked: _Asked) -> Experiment:
+def _pair(request: _Request) -> Experiment:
     """Two vehicles start behind standing ones, half a width off centre, as traffic hits."""
-    speed, start_us = 3.5 if asked.speed is None else asked.speed, asked.start_us
-    chosen = asked.chosen
+    speed, start_us = 3.5 if request.speed is None else request.speed, request.start_us
+    chosen = request.chosen
     if len(chosen) < 2:
         raise PhysicsError("two vehicles in view are needed; name four or two with objects")
     count = min(len(chosen) // 2, 2)
-    if asked.named:
+    if request.named:
         runners, standing = chosen[:count], chosen[count : 2 * count]
     else:
-        looks = {s.object_id: seen(asked.scene, s) for s in chosen}
-        runners = sorted(chosen, key=lambda s: -looks[s.object_id].front)[:count]
+        visibilities = {s.object_id: visibility_of(request.scene, s) for s in chosen}
+        runners = sorted(chosen, key=lambda s: -visibilities[s.object_id].front)[:count]
         rest = [s for s in chosen if s not in runners]
-        standing = sorted(rest, key=lambda s: -looks[s.object_id].rear)[:count]
+        standing = sorted(rest, key=lambda s: -visibilities[s.object_id].rear)[:count]
     objects: dict[str, ObjectPhysics] = {}
     meeting = []
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
         own = runner.trajectory.transform(start_us)
         forward = _level(own[:3, 0])
-        away = _reach(asked, runner)[1][0] + PAIR_GAP - _reach(asked, hit)[0][0]
+        away = _reach(request, runner)[1][0] + PAIR_GAP - _reach(request, hit)[0][0]
         target = np.array(own)
         target[:3, 3] += away * forward
         target[:3, 3] += (0.25 - 0.5 * k) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
@@ -199,48 +201,50 @@ def _pair(asked: _Asked) -> Experiment:
         objects[hit.object_id] = ObjectPhysics(velocity=(0, 0, 0), T_world_object=target)
         meeting.append((own[:3, 3] + target[:3, 3]) / 2)
     options = SimulateOptions(
-        preset=asked.preset,
+        preset=request.preset,
         objects=objects,
         start_us=start_us,
         duration=PAIR_GAP / speed + 0.8,
         gravity=(0.0, 0.0, 0.0),
     )
-    view = _viewer(asked.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
+    view = _viewer(request.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
     return Experiment("pair", options, tuple(objects), meeting[0], view, 9.0)
 
 
-def _drop(asked: _Asked) -> Experiment:
-    subjects, start_us = asked.chosen[:3], asked.start_us
+def _drop(request: _Request) -> Experiment:
+    subjects, start_us = request.chosen[:3], request.start_us
     objects = {}
     for subject in subjects:
         pose = subject.trajectory.transform(start_us)
         pose[2, 3] += DROP_HEIGHT
-        down = (0.0, 0.0, -(asked.speed or 0.0))
+        down = (0.0, 0.0, -(request.speed or 0.0))
         objects[subject.object_id] = ObjectPhysics(
-            T_world_object=pose, velocity=down, material=DAMPED if asked.preset == "paper" else None
+            T_world_object=pose,
+            velocity=down,
+            material=DAMPED if request.preset == "paper" else None,
         )
     options = SimulateOptions(
-        preset=asked.preset,
+        preset=request.preset,
         objects=objects,
-        colliders=[scene_road(asked.scene, asked.state, start_us)],
+        colliders=[scene_road(request.scene, request.state, start_us)],
         start_us=start_us,
         duration=2.0,
     )
-    shown = max(subjects, key=lambda s: abs(float(seen(asked.scene, s).direction[1])))
+    shown = max(subjects, key=lambda s: abs(float(visibility_of(request.scene, s).direction[1])))
     pose = shown.trajectory.transform(start_us)
-    view = _viewer(asked.scene, shown, pose, slant=1.0, rise=0.15)
+    view = _viewer(request.scene, shown, pose, slant=1.0, rise=0.15)
     focus = pose[:3, 3] + np.array([0.0, 0.0, DROP_HEIGHT / 3])
     return Experiment("drop", options, tuple(objects), focus, view, 8.0)
 
 
-def _reach(asked: _Asked, subject: PlacedObject) -> tuple[Float, Float]:
-    """How far an object's matter reaches back and forth along its own axes, [3] and [3] [m].
+def _reach(request: _Request, subject: PlacedObject) -> tuple[Float, Float]:
+    """How far an object's particles reaches back and forth along its own axes, [3] and [3] [m].
 
-    Tracked boxes are not that exact: matter reaches up to a voxel out of them.
+    Tracked boxes are not that exact: particles reaches up to a voxel out of them.
     """
-    preset = preset_of(asked.preset)
-    matter = matter_of(asked.scene, subject, preset, asked.start_us).positions
-    return matter.min(axis=0) - preset.spacing / 2, matter.max(axis=0) + preset.spacing / 2
+    preset = preset_of(request.preset)
+    particles = object_particles(request.scene, subject, preset, request.start_us).positions
+    return particles.min(axis=0) - preset.spacing / 2, particles.max(axis=0) + preset.spacing / 2
 
 
 def _level(direction: Float) -> Float:
@@ -251,13 +255,13 @@ def _level(direction: Float) -> Float:
 def _viewer(
     scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
 ) -> Float:
-    """Direction [3] to a viewer on the side and at the end from which the subject was seen.
+    """Direction [3] to a viewer on the side and at the end from which it was seen.
 
     Args:
         slant: how much to the side, against along the subject; less for a side hardly seen.
         rise: how much up.
     """
-    x, y, _ = seen(scene, subject).direction
+    x, y, _ = visibility_of(scene, subject).direction
     slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
     along = (1.0 if x >= 0 else -1.0) * _level(pose[:3, 0])
     side = (1.0 if y >= 0 else -1.0) * slant * _level(np.cross([0, 0, 1], pose[:3, 0]))

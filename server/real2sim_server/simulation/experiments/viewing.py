@@ -1,4 +1,4 @@
-"""From where the recording vehicle saw an object: what nobody saw is no sight to show."""
+"""From where the recording vehicle saw an object: what no camera saw cannot be shown."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from ...geometry.rotation import Float
 from ...scene import Camera, Scene
 from ..playback import PlacedObject
 
-LOOKS_MAX = 24
-"""Recorded frames that are looked at."""
+VIEWS_MAX = 24
+"""Recorded frames that are considered."""
 DEPTH_MIN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Visibility:
     """How an object was seen over the recording.
 
     Attributes:
-        direction: [3] towards the cameras, object frame, each look weighed by the solid angle the
+        direction: [3] towards the cameras, object frame, each view weighed by the solid angle the
             object took up; its length grows with how well it was seen.
-        front, rear: solid angles of looks that came from ahead and from behind, summed up.
+        front, rear: solid angles of views that came from ahead and from behind, summed up.
     """
 
     direction: Float
@@ -31,15 +31,15 @@ class Seen:
 
     @property
     def whole(self) -> float:
-        """All looks together."""
+        """All views together."""
         return self.front + self.rear
 
 
-def seen(scene: Scene, subject: PlacedObject) -> Seen:
+def visibility_of(scene: Scene, subject: PlacedObject) -> Visibility:
     """How ``subject`` was seen by all cameras of the scene."""
     times = [int(t) for t in scene.frame_times_us if subject.trajectory.covers(int(t))]
     total, front, rear = np.zeros(3), 0.0, 0.0
-    for t_us in times[:: max(len(times) // LOOKS_MAX, 1)]:
+    for t_us in times[:: max(len(times) // VIEWS_MAX, 1)]:
         pose, ego = subject.trajectory.transform(t_us), scene.ego.transform(t_us)
         for camera in scene.rig.cameras:
             if not in_view(camera, ego, pose[:3, 3], farthest=np.inf):
@@ -49,9 +49,9 @@ def seen(scene: Scene, subject: PlacedObject) -> Seen:
             distance = float(np.linalg.norm(towards))
             angle = subject.scaled_size[1] * subject.scaled_size[2] / distance**2
             total += angle * towards / distance
-            share = towards[0] / distance
-            front, rear = front + angle * max(share, 0.0), rear + angle * max(-share, 0.0)
-    return Seen(total, front, rear)
+            cosine = towards[0] / distance
+            front, rear = front + angle * max(cosine, 0.0), rear + angle * max(-cosine, 0.0)
+    return Visibility(total, front, rear)
 
 
 def in_view(

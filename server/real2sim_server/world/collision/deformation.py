@@ -198,7 +198,7 @@ class _DeformedObject:
         with self.origin.lock:
             return self.before.body if self.before is not None else self.origin.body
 
-    def outcome(self) -> crash.Dent | None:
+    def outcome(self) -> crash.ImpactResult | None:
         """What the latest impact did; None where it left no trace."""
         return None if self.collision is None else self.collision.outcomes()[self.role]
 
@@ -230,9 +230,9 @@ class _ImpactSolution:
         self.impact = impact
         self._before_impact = before_impact
         self._lock = threading.Lock()
-        self._outcomes: tuple[crash.Dent | None, crash.Dent | None] | None = None
+        self._outcomes: tuple[crash.ImpactResult | None, crash.ImpactResult | None] | None = None
 
-    def outcomes(self) -> tuple[crash.Dent | None, crash.Dent | None]:
+    def outcomes(self) -> tuple[crash.ImpactResult | None, crash.ImpactResult | None]:
         """Of the ego or first object, and of the object."""
         with self._lock:
             if self._outcomes is None:
@@ -244,7 +244,7 @@ class _ImpactSolution:
                 self._outcomes = kept[0], kept[1]
             return self._outcomes
 
-    def _solve(self) -> tuple[crash.Dent | None, crash.Dent | None]:
+    def _solve(self) -> tuple[crash.ImpactResult | None, crash.ImpactResult | None]:
         assert self.impact.participants is not None
         first, second = self.impact.participants
         floor = first.low if second is None else min(first.low, second.low)
@@ -255,7 +255,7 @@ class _ImpactSolution:
                 if second is None
                 else self._impact_body(second, self._before_impact[1], floor)
             )
-            return crash.crash(one, other) or (None, None)
+            return crash.simulate_impact(one, other) or (None, None)
         except PhysicsError as error:
             # A picture without the deformation serves an episode better than its end.
             _log.warning(

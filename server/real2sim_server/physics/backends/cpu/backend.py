@@ -14,16 +14,16 @@ from ...colliders import Collider
 from ..base import Model
 from ..blocks import BlockSimulation
 from ..layout import CHUNKS, Int, Layout
-from ..particle import COLUMNS, State, Work
+from ..particle import COLUMNS, ParticleState, Workspace
 from .deform import SCRATCH
 from .kernels import advance
-from .measure import measure_homes
+from .measure import measure_blocks
 
 PARTICLES_PER_THREAD = 5000
 """With fewer, threads gain little, and wait long for each other where others compute as well."""
 
 
-class CpuBackend:
+class CpuSolverBackend:
     """Solver for any CPU."""
 
     name = "cpu"
@@ -38,8 +38,8 @@ class CpuSimulation(BlockSimulation):
 
     def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
         with self._threads():
-            done = advance(steps, dt, self._state, self._layout, self._work, self._rules)
-        return done, bool(self._work.strayed.any())
+            done = advance(steps, dt, self._state, self._layout, self._work, self._params)
+        return done, bool(self._work.needs_resort.any())
 
     @contextmanager
     def _threads(self) -> Iterator[None]:
@@ -52,35 +52,35 @@ class CpuSimulation(BlockSimulation):
         finally:
             numba.set_num_threads(before)
 
-    def _measure_homes(self) -> tuple[Float, Int]:
-        homes = len(self._layout.home_block)
-        rows = np.empty((homes, COLUMNS))
+    def _measure_blocks(self) -> tuple[Float, Int]:
+        blocks = len(self._layout.block_coordinates)
+        rows = np.empty((blocks, COLUMNS))
         with self._threads():
-            measure_homes(self._state, self._layout, self._rules, rows)
-        return rows, np.arange(homes)
+            measure_blocks(self._state, self._layout, self._params, rows)
+        return rows, np.arange(blocks)
 
-    def _load_state(self, state: State) -> State:
+    def _load_state(self, state: ParticleState) -> ParticleState:
         return state
 
-    def _sort_state(self, state: State, xi: Any, order: Int) -> State:
+    def _sort_state(self, state: ParticleState, xi: Any, order: Int) -> ParticleState:
         moved = state._replace(xi=xi)
-        return State(*(np.take(a, order, axis=0) if len(a) else a for a in moved))
+        return ParticleState(*(np.take(a, order, axis=0) if len(a) else a for a in moved))
 
-    def _copy_state(self, state: State) -> State:
-        return State(*(a.copy() for a in state))
+    def _copy_state(self, state: ParticleState) -> ParticleState:
+        return ParticleState(*(a.copy() for a in state))
 
     def _fetch(self, array: Any) -> Any:
         return array
 
-    def _make_work(self, layout: Layout) -> Work:
+    def _make_work(self, layout: Layout) -> Workspace:
         shapes = self._shapes(layout)
-        return Work(
+        return Workspace(
             tiles=self._array("tiles", shapes.tiles),
             moments=self._array("moments", shapes.moments),
             velocity=self._array("velocity", shapes.velocity),
             offset=self._array("offset", shapes.offset),
             scratch=self._array("scratch", (CHUNKS, SCRATCH)),
-            strayed=np.zeros(len(layout.home_block), np.bool_),
+            needs_resort=np.zeros(len(layout.block_coordinates), np.bool_),
             by_collider=np.zeros(shapes.by_collider),
             by_body=np.zeros(shapes.by_body),
         )

@@ -20,7 +20,7 @@ BATCH = 2 * EIGHT
 I32, I64 = ir.IntType(32), ir.IntType(64)
 
 
-class _Emitter:
+class _ColumnEmitter:
     """Moves vectors between two arrays of the same precision: [N, width] and scratch space."""
 
     def __init__(self, context: Any, builder: ir.IRBuilder, kinds: Any, values: Any) -> None:
@@ -85,7 +85,7 @@ def lay_out(typingctx, rows, first, scratch, plane):  # type: ignore[no-untyped-
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         data, first, space, plane = arguments
         kinds = signature.args[0], signature.args[2]
-        e = _Emitter(context, builder, kinds, (data, space))
+        e = _ColumnEmitter(context, builder, kinds, (data, space))
         for half in range(0, BATCH, EIGHT):
             places = [e.row(first, half + lane, 9) for lane in range(EIGHT)]
             columns = e.turned([e.load(e.rows, place, EIGHT) for place in places])
@@ -139,4 +139,4 @@ def bring_back_six(typingctx, scratch, plane, rows, first):  # type: ignore[no-u
 def _way_back(context: Any, builder: Any, signature: Any, arguments: Any) -> tuple[Any, Any, Any]:
     scratch, plane, rows, first = arguments
     kinds = signature.args[2], signature.args[0]
-    return _Emitter(context, builder, kinds, (rows, scratch)), plane, first
+    return _ColumnEmitter(context, builder, kinds, (rows, scratch)), plane, first

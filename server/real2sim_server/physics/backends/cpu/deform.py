@@ -1,8 +1,9 @@
-"""Deformation and stress of a home's particles, several at a time where they are elastic.
+"""Deformation and stress of a block's particles, several at a time where they are elastic.
 
-The laws are written for one particle. Elastic ones have no branches worth the name, so a batch
-of particles is laid out component by component and the law called in a loop of fixed length, which
-LLVM turns into vector code. What does not converge there, and all that flows, goes one by one.
+Stress is written for one particle. Elastic laws have no branches worth the name, so a batch of
+particles is laid out component by component and the function called in a loop of fixed length,
+which LLVM turns into vector code. What does not converge there, and all that flows, goes one by
+one.
 """
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
@@ -13,21 +14,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ...constitutive.matrices import det, rotation_step
-from ...constitutive.shared import ONE, ZERO
+from ...constitutive.material_row import COROTATED, LAMBDA, LAW, MU, NEO_HOOKEAN, VISCOSITY
 from ...constitutive.stress import (
-    COROTATED,
-    KIND,
-    LAMBDA,
-    MU,
-    NEO_HOOKEAN,
-    VISCOSITY,
     VOLUME_MIN,
     add_viscosity,
     advance_gradient,
     corotated_about,
     neo_hookean_at,
 )
+from ...numerics.device import ONE, ZERO
+from ...numerics.matrices import det, rotation_step
 from ..kernel import inner
 from ..particle import deform
 from .columns import BATCH, bring_back_nine, bring_back_six, lay_out
@@ -42,12 +38,12 @@ def deform_all(begin: Any, end: Any, dt: Any, state: Any, table: Any, scratch: A
     """Advance the deformation of sorted particles by their velocity gradients; find stress."""
     for first in range(begin, end, BATCH):
         count = min(end - first, BATCH)
-        kind = common_kind(first, count, state.material, table)
-        if kind == COROTATED:
+        law = common_law(first, count, state.material, table)
+        if law == COROTATED:
             load(first, count, state, table, scratch)
             corotated_batch(dt, scratch)
             store(first, count, dt, state, table, scratch)
-        elif kind == NEO_HOOKEAN:
+        elif law == NEO_HOOKEAN:
             load(first, count, state, table, scratch)
             neo_hookean_batch(dt, scratch)
             store(first, count, dt, state, table, scratch)
@@ -57,13 +53,13 @@ def deform_all(begin: Any, end: Any, dt: Any, state: Any, table: Any, scratch: A
 
 
 @inner()
-def common_kind(first: Any, count: Any, material: Any, table: Any) -> Any:
-    """The kind that all particles of a batch are of, or -1."""
-    kind = int(table[material[first], KIND])
+def common_law(first: Any, count: Any, material: Any, table: Any) -> Any:
+    """Code of the law that all particles of a batch follow, or -1."""
+    law = int(table[material[first], LAW])
     for p in range(first + 1, first + count):
-        if int(table[material[p], KIND]) != kind:
+        if int(table[material[p], LAW]) != law:
             return -1
-    return kind
+    return law
 
 
 @inner()

@@ -1,4 +1,4 @@
-"""The substep on the CPU: homes scatter to tiles, fields collect and meet, homes gather."""
+"""The substep on the CPU: blocks scatter to tiles, fields collect and touch, blocks gather."""
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
 # ruff: noqa: PLR0917
@@ -9,8 +9,8 @@ from typing import Any
 
 from numba import prange
 
-from ...constitutive.shared import ONE, ZERO
-from ...constitutive.weights import spline_weights
+from ...numerics.device import ONE, ZERO
+from ...numerics.splines import spline_weights
 from ..kernel import entry, inner
 from ..layout import BLOCK, CHUNKS
 from ..particle import NODES, SIDE, momentum, move, place, velocity_gradient
@@ -20,39 +20,39 @@ from .simd import LANES, gather, scatter
 
 
 @entry()
-def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> Any:
+def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> Any:
     """Make up to ``steps`` substeps; returns how many, fewer when particles must be sorted.
 
     No steps at all find the stress and energy of the particles as they stand.
     """
     if steps == 0:
-        gather_homes(dt, state, layout, work, rules, False, False)
+        gather_blocks(dt, state, layout, work, params, False, False)
     else:
-        scatter_homes(dt, state, layout, work, rules)
+        scatter_blocks(dt, state, layout, work, params)
     for done in range(steps):
-        collect_fields(dt, layout, work, rules)
-        gather_homes(dt, state, layout, work, rules, True, done + 1 < steps)
-        if work.strayed.any():
+        collect_fields(dt, layout, work, params)
+        gather_blocks(dt, state, layout, work, params, True, done + 1 < steps)
+        if work.needs_resort.any():
             return done + 1
     return steps
 
 
 @inner(parallel=True)
-def scatter_homes(dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> None:
+def scatter_blocks(dt: Any, state: Any, layout: Any, work: Any, params: Any) -> None:
     """Particles to tiles: momentum with APIC and stress (MLS-MPM, Hu et al. 2018), mass."""
     for chunk in prange(CHUNKS):
-        for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
-            scatter_home(home, dt, state, layout, work, rules)
+        for block in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
+            scatter_block(block, dt, state, layout, work, params)
 
 
 @inner()
-def scatter_home(home: Any, dt: Any, state: Any, layout: Any, work: Any, rules: Any) -> None:
-    """Add the particles of one home to its tile, and their moments where they are asked for."""
-    tile = work.tiles[home]
+def scatter_block(block: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> None:
+    """Add the particles of one block to its tile, and their moments where they are asked for."""
+    tile = work.tiles[block]
     tile[:] = ZERO
-    begin, end = layout.home_start[home], layout.home_start[home + 1]
-    scatter_particles(begin, end, dt, rules.dx, state, tile.reshape(-1))
-    slot = layout.home_moment[home]
+    begin, end = layout.block_start[block], layout.block_start[block + 1]
+    scatter_particles(begin, end, dt, params.dx, state, tile.reshape(-1))
+    slot = layout.block_moment[block]
     if slot >= 0:
         moments = work.moments[slot]
         moments[:] = ZERO
@@ -61,7 +61,7 @@ def scatter_home(home: Any, dt: Any, state: Any, layout: Any, work: Any, rules: 
 
 @inner()
 def scatter_particles(begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any) -> None:
-    """Add the particles of one home to its tile."""
+    """Add the particles of one block to its tile."""
     for p in range(begin, end):
         first, f = place(p, state.xi)
         start, qx, qy, qz = momentum(p, dt, dx, f, state)
@@ -71,7 +71,7 @@ def scatter_particles(begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: 
 
 @inner()
 def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
-    """Add w V (x_p - x_i) and w V of one home's particles to its moments; V at rest."""
+    """Add w V (x_p - x_i) and w V of one block's particles to its moments; V at rest."""
     for p in range(begin, end):
         first, f = place(p, state.xi)
         V = state.volume[p]
@@ -84,21 +84,21 @@ def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
 
 
 @inner(parallel=True)
-def collect_fields(dt: Any, layout: Any, work: Any, rules: Any) -> None:
+def collect_fields(dt: Any, layout: Any, work: Any, params: Any) -> None:
     """Tiles to fields: sums, gravity, contact. One group of fields is one task."""
     groups = len(layout.group_start) - 1
     for group in prange(groups):
         begin, end = layout.group_start[group], layout.group_start[group + 1]
         for field in range(begin, end):
-            collect(field, layout.field_homes, work.tiles, work.velocity[field])
-            to_velocity(work.velocity[field], dt, rules.gravity)
+            collect(field, layout.field_blocks, work.tiles, work.velocity[field])
+            to_velocity(work.velocity[field], dt, params.gravity)
             if layout.near[field]:
                 collect_moments(field, layout, work)
         if end - begin > 1:
-            resolve_body_contact(begin, end, layout, work, rules)
+            resolve_body_contact(begin, end, layout, work, params)
         for field in range(begin, end):
-            if layout.touch_start[field] < layout.touch_start[field + 1]:
-                resolve_collider_contact(field, layout, work, rules)
+            if layout.contact_start[field] < layout.contact_start[field + 1]:
+                resolve_collider_contact(field, layout, work, params)
 
 
 @inner()
@@ -113,18 +113,18 @@ def overlap(offset: Any) -> Any:
 
 
 @inner()
-def collect(field: Any, field_homes: Any, tiles: Any, out: Any) -> None:
-    """Sum a field from the tiles of the homes around it, always in the same order."""
+def collect(field: Any, field_blocks: Any, tiles: Any, out: Any) -> None:
+    """Sum a field from the tiles of the blocks around it, always in the same order."""
     out[:] = ZERO
     for o in range(27):
-        home = field_homes[field, o]
-        if home >= 0:
-            add_tile(tiles[home], o, out)
+        block = field_blocks[field, o]
+        if block >= 0:
+            add_tile(tiles[block], o, out)
 
 
 @inner()
 def add_tile(tile: Any, o: Any, out: Any) -> None:
-    """Add what a tile says of a field; the tile's home lies at offset number ``o``."""
+    """Add a tile to a field; the tile's block lies at offset number ``o``."""
     i0, i1, si = overlap(1 - o // 9)
     j0, j1, sj = overlap(1 - o // 3 % 3)
     k0, k1, sk = overlap(1 - o % 3)
@@ -139,13 +139,13 @@ def add_tile(tile: Any, o: Any, out: Any) -> None:
 
 @inner()
 def collect_moments(field: Any, layout: Any, work: Any) -> None:
-    """Sum the first moments of a field; every home around a near field has some."""
+    """Sum the first moments of a field; every block around a near field has some."""
     out = work.offset[field]
     out[:] = ZERO
     for o in range(27):
-        home = layout.field_homes[field, o]
-        if home >= 0:
-            add_tile(work.moments[layout.home_moment[home]], o, out)
+        block = layout.field_blocks[field, o]
+        if block >= 0:
+            add_tile(work.moments[layout.block_moment[block]], o, out)
 
 
 @inner()
@@ -162,34 +162,37 @@ def to_velocity(field: Any, dt: Any, gravity: Any) -> None:
 
 
 @inner(parallel=True)
-def gather_homes(
-    dt: Any, state: Any, layout: Any, work: Any, rules: Any, moving: Any, going_on: Any
+def gather_blocks(
+    dt: Any, state: Any, layout: Any, work: Any, params: Any, moving: Any, scatter_next: Any
 ) -> None:
-    """Fields to particles when ``moving``, then stress; when ``going_on``, already the scattering
-    of the next substep, while a home's particles are in the cache."""
+    """Fields to particles when ``moving``, then stress.
+
+    When ``scatter_next``, already the scattering of the next substep, while a block's particles
+    are in the cache.
+    """
     for chunk in prange(CHUNKS):
-        for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
-            tile = work.tiles[home]
+        for block in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
+            tile = work.tiles[block]
             for o in range(27):
-                copy_field(work.velocity[layout.home_fields[home, o]], o, tile)
-            begin, end = layout.home_start[home], layout.home_start[home + 1]
-            gone = gather_particles(begin, end, dt, rules.dx, state, tile.reshape(-1), moving)
-            deform_all(begin, end, dt, state, rules.table, work.scratch[chunk])
-            note(work.strayed, home, gone)
-            # What has strayed does not fit the tile; all is sorted and scattered anew then.
-            if going_on and not gone:
-                scatter_home(home, dt, state, layout, work, rules)
+                copy_field(work.velocity[layout.block_fields[block, o]], o, tile)
+            begin, end = layout.block_start[block], layout.block_start[block + 1]
+            left_tile = gather_particles(begin, end, dt, params.dx, state, tile.reshape(-1), moving)
+            deform_all(begin, end, dt, state, params.table, work.scratch[chunk])
+            set_flag(work.needs_resort, block, left_tile)
+            # Particles that left the tile cannot be scattered to it; all are sorted first.
+            if scatter_next and not left_tile:
+                scatter_block(block, dt, state, layout, work, params)
 
 
 @inner()
-def note(flags: Any, index: Any, flag: Any) -> None:
+def set_flag(flags: Any, index: Any, flag: Any) -> None:
     """Store a flag. As a plain assignment in the parallel loop Numba takes it for dead code."""
     flags[index] = flag
 
 
 @inner()
 def copy_field(field: Any, o: Any, tile: Any) -> None:
-    """Copy to a tile the nodes of the field at offset number ``o`` from the home."""
+    """Copy to a tile the nodes of the field at offset number ``o`` from the block."""
     i0, i1, si = overlap(o // 9 - 1)
     j0, j1, sj = overlap(o // 3 % 3 - 1)
     k0, k1, sk = overlap(o % 3 - 1)
@@ -206,8 +209,8 @@ def copy_field(field: Any, o: Any, tile: Any) -> None:
 def gather_particles(
     begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any, moving: Any
 ) -> Any:
-    """Move the particles of one home; returns whether one strayed off its tile."""
-    strayed = False
+    """Move the particles of one block; returns whether one left its tile."""
+    needs_resort = False
     if moving:
         for p in range(begin, end):
             first, f = place(p, state.xi)
@@ -215,5 +218,5 @@ def gather_particles(
             g = gather(tile, first, wx, wy, wz)
             L = velocity_gradient(g, dx, f)
             if move(p, dt, dx, (g[0], g[1], g[2]), L, state):
-                strayed = True
-    return strayed
+                needs_resort = True
+    return needs_resort

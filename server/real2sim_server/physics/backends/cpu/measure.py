@@ -1,4 +1,4 @@
-"""Sums and bounds over the particles of each home."""
+"""Sums and bounds over the particles of each block."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from numba import prange
 
 from ..kernel import entry
 from ..layout import CHUNKS
-from ..particle import VOLUME_RATIO, add_matter, add_motion
+from ..particle import VOLUME_RATIO, add_material, add_motion
 
 
 @entry(parallel=True)
-def measure_homes(state: Any, layout: Any, rules: Any, out: Any) -> None:
-    """Fill ``out`` [P, COLUMNS] float64, one row for each home."""
+def measure_blocks(state: Any, layout: Any, params: Any, out: Any) -> None:
+    """Fill ``out`` [P, COLUMNS] float64, one row for each block."""
     for chunk in prange(CHUNKS):
-        for home in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
-            row = out[home]
+        for block in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
+            row = out[block]
             row[:] = 0.0
             row[VOLUME_RATIO] = math.inf
-            begin, end = layout.home_start[home], layout.home_start[home + 1]
+            begin, end = layout.block_start[block], layout.block_start[block + 1]
             for p in range(begin, end):
-                add_motion(p, layout.home_block[home], state, rules.dx, row)
-                add_matter(p, state, rules.table[state.material[p]], row)
+                add_motion(p, layout.block_coordinates[block], state, params.dx, row)
+                add_material(p, state, params.table[state.material[p]], row)

@@ -23,7 +23,7 @@ LANES = 4
 I32 = ir.IntType(32)
 
 
-class _Emitter:
+class _LaneEmitter:
     """Builds vector arithmetic in the array's precision, on nodes and on lines of three nodes."""
 
     def __init__(self, context: Any, builder: ir.IRBuilder, kind: Any, array: Any) -> None:
@@ -96,7 +96,7 @@ def scatter(typingctx, tiles, first, wx, wy, wz, start, qx, qy, qz):  # type: ig
     """
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        e = _Emitter(context, builder, signature.args[0], arguments[0])
+        e = _LaneEmitter(context, builder, signature.args[0], arguments[0])
         weights = [_unpack(builder, a, 3) for a in arguments[2:5]]
         along_z = e.spread(weights[2])
         x, y, z = (e.repeated(e.pack(_unpack(builder, a, 3))) for a in arguments[6:9])
@@ -125,7 +125,7 @@ def gather(typingctx, tiles, first, wx, wy, wz):  # type: ignore[no-untyped-def]
     """Twelve numbers: sum w v, and sum w v times the offset i, j and k of each node."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        e = _Emitter(context, builder, signature.args[0], arguments[0])
+        e = _LaneEmitter(context, builder, signature.args[0], arguments[0])
         weights = [_unpack(builder, a, 3) for a in arguments[2:5]]
         wx, wy = ([e.splat(w, e.line) for w in axis] for axis in weights[:2])
         wz = [e.splat(w, e.node) for w in weights[2]]
@@ -152,11 +152,11 @@ def gather(typingctx, tiles, first, wx, wy, wz):  # type: ignore[no-untyped-def]
     return types.UniTuple(number, 12)(tiles, types.int64, three, three, three), generate
 
 
-def _total(e: _Emitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
+def _total(e: _LaneEmitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
     """Sum of w v over three neighbours."""
     return e.fused(w[2], v[2], e.fused(w[1], v[1], e.builder.fmul(w[0], v[0])))
 
 
-def _lever(e: _Emitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
+def _lever(e: _LaneEmitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
     """Sum of w v times 0, 1, 2 over three neighbours."""
     return e.fused(e.builder.fadd(w[2], w[2]), v[2], e.builder.fmul(w[1], v[1]))

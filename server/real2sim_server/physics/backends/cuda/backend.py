@@ -1,4 +1,4 @@
-"""The CUDA backend: the blocks and laws of the CPU on an NVIDIA GPU, or in Numba's simulator.
+"""The CUDA backend: the CPU's blocks and functions on an NVIDIA GPU, or in Numba's simulator.
 
 Particles stay on the device; the host sorts them by their positions alone. Sums of floating-point
 numbers are made by atomics, so the last bits differ from run to run.
@@ -18,13 +18,13 @@ from ...errors import SolverError
 from ..base import Model
 from ..blocks import BlockSimulation
 from ..layout import Int, Layout
-from ..particle import COLUMNS, Rules, State, Work
-from .kernels import DONE, HALTED, MEASURE_THREADS, NODE_THREADS, STRAYED, THREADS, kernels_of
+from ..particle import COLUMNS, ParticleState, StepParameters, Workspace
+from .kernels import DONE, HALTED, MEASURE_THREADS, NEEDS_RESORT, NODE_THREADS, THREADS, kernels_of
 
 REORDER_THREADS = 256
 
 
-class CudaBackend:
+class CudaSolverBackend:
     """Solver for NVIDIA GPUs.
 
     Raises:
@@ -59,35 +59,40 @@ class CudaSimulation(BlockSimulation):
         super().__init__(model, colliders)
 
     def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
-        k, layout, work, rules = self._kernels, self._placed, self._work, self._placed_rules
-        homes, groups = len(self._layout.home_block), len(self._layout.group_start) - 1
+        k, layout, work, params = (
+            self._kernels,
+            self._device_layout,
+            self._work,
+            self._device_params,
+        )
+        blocks, groups = len(self._layout.block_coordinates), len(self._layout.group_start) - 1
         progress = self._progress
         progress[:] = np.zeros(3, np.int64)
         if steps == 0:
-            k.gather[homes, THREADS](dt, self._state, layout, work, rules, progress, False)
+            k.gather[blocks, THREADS](dt, self._state, layout, work, params, progress, False)
         for _ in range(steps):
-            k.scatter[homes, THREADS](dt, self._state, layout, work, rules, progress)
-            k.collect[groups, NODE_THREADS](dt, layout, work, rules, progress)
-            k.gather[homes, THREADS](dt, self._state, layout, work, rules, progress, True)
+            k.scatter[blocks, THREADS](dt, self._state, layout, work, params, progress)
+            k.collect[groups, NODE_THREADS](dt, layout, work, params, progress)
+            k.gather[blocks, THREADS](dt, self._state, layout, work, params, progress, True)
             k.finish[1, 1](progress)
-        said = progress.copy_to_host()
-        return int(said[DONE]), bool(said[STRAYED] or said[HALTED])
+        counted = progress.copy_to_host()
+        return int(counted[DONE]), bool(counted[NEEDS_RESORT] or counted[HALTED])
 
-    def _measure_homes(self) -> tuple[Float, Int]:
-        homes = len(self._layout.home_block)
-        rows = cuda.device_array((homes * MEASURE_THREADS, COLUMNS), np.float64)
-        self._kernels.measure[homes, MEASURE_THREADS](
-            self._state, self._placed, self._placed_rules, rows
+    def _measure_blocks(self) -> tuple[Float, Int]:
+        blocks = len(self._layout.block_coordinates)
+        rows = cuda.device_array((blocks * MEASURE_THREADS, COLUMNS), np.float64)
+        self._kernels.measure[blocks, MEASURE_THREADS](
+            self._state, self._device_layout, self._device_params, rows
         )
-        return rows.copy_to_host(), np.repeat(np.arange(homes), MEASURE_THREADS)
+        return rows.copy_to_host(), np.repeat(np.arange(blocks), MEASURE_THREADS)
 
-    def _load_state(self, state: State) -> State:
-        return State(*(cuda.to_device(a) for a in state))
+    def _load_state(self, state: ParticleState) -> ParticleState:
+        return ParticleState(*(cuda.to_device(a) for a in state))
 
-    def _sort_state(self, state: State, xi: Any, order: Int) -> State:
+    def _sort_state(self, state: ParticleState, xi: Any, order: Int) -> ParticleState:
         placed = cuda.to_device(order)
         moved = state._replace(xi=cuda.to_device(xi))
-        return State(*(self._sorted(a, placed) for a in moved))
+        return ParticleState(*(self._sorted(a, placed) for a in moved))
 
     def _sorted(self, array: Any, order: Any) -> Any:
         if not array.size:
@@ -99,22 +104,22 @@ class CudaSimulation(BlockSimulation):
         self._kernels.reorder[groups, threads](array.reshape(rows), order, out.reshape(rows))
         return out
 
-    def _copy_state(self, state: State) -> State:
-        return State(*(_copied(a) for a in state))
+    def _copy_state(self, state: ParticleState) -> ParticleState:
+        return ParticleState(*(_copied(a) for a in state))
 
     def _fetch(self, array: Any) -> Any:
         return array.copy_to_host()
 
-    def _make_work(self, layout: Layout) -> Work:
-        self._placed = Layout(*(cuda.to_device(np.ascontiguousarray(a)) for a in layout))
+    def _make_work(self, layout: Layout) -> Workspace:
+        self._device_layout = Layout(*(cuda.to_device(np.ascontiguousarray(a)) for a in layout))
         host = self._shapes(layout)
-        return Work(
+        return Workspace(
             tiles=self._array("tiles", host.tiles),
             moments=self._array("moments", host.moments),
             velocity=self._array("velocity", host.velocity),
             offset=self._array("offset", host.offset),
             scratch=self._array("scratch", (1, 1)),
-            strayed=self._array("strayed", (1,)),
+            needs_resort=self._array("needs_resort", (1,)),
             by_collider=cuda.to_device(np.zeros(host.by_collider)),
             by_body=cuda.to_device(np.zeros(host.by_body)),
         )
@@ -122,10 +127,12 @@ class CudaSimulation(BlockSimulation):
     def _allocate(self, size: int) -> Any:
         return cuda.device_array(size, self._dtype)
 
-    def _set_rules(self, colliders: Sequence[Collider]) -> None:
-        super()._set_rules(colliders)
-        r = self._rules
-        self._placed_rules = Rules(*(a if np.ndim(a) == 0 else cuda.to_device(a) for a in r))
+    def _set_params(self, colliders: Sequence[Collider]) -> None:
+        super()._set_params(colliders)
+        r = self._params
+        self._device_params = StepParameters(
+            *(a if np.ndim(a) == 0 else cuda.to_device(a) for a in r)
+        )
 
 
 def _copied(array: Any) -> Any:

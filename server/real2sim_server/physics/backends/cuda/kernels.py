@@ -1,7 +1,7 @@
 """The substep on a CUDA device: the CPU's blocks, one group of threads for each.
 
-Homes add up in shared memory with atomics, fields collect from homes without any. Threads of a
-group share out particles or nodes, however many they are, so the simulator may use few.
+Blocks add up in shared memory with atomics, fields collect from blocks without any. Threads of a
+group divide particles or nodes, however many they are, so the simulator may use few.
 """
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
@@ -17,18 +17,18 @@ import numpy as np
 from numba import config, cuda, float64
 from numba.np.numpy_support import from_dtype
 
-from ...constitutive.shared import F32, ONE, ZERO, law
-from ...constitutive.weights import spline_weights
+from ...contact.node import pair_friction, resolve_node_collider, resolve_node_pair
+from ...numerics.device import F32, ONE, ZERO, device_function
+from ...numerics.splines import spline_weights
 from ..base import TOTALS
-from ..layout import BLOCK
-from ..node_contact import meet_node, meet_obstacle, node_position, pair_friction
+from ..layout import BLOCK, node_position
 from ..particle import (
     COLUMNS,
     NODES,
     SIDE,
     TILE,
     VOLUME_RATIO,
-    add_matter,
+    add_material,
     add_motion,
     deform,
     momentum,
@@ -43,9 +43,9 @@ THREADS = 2 if SIMULATED else 128
 """Of a group. The simulator starts a Python thread for each."""
 NODE_THREADS = 2 if SIMULATED else NODES
 MEASURE_THREADS = 1 if SIMULATED else 32
-STRAYED, HALTED, DONE = range(3)
-"""Entries of ``progress``: a particle strayed in this substep; no more steps until particles are
-sorted; substeps made."""
+NEEDS_RESORT, HALTED, DONE = range(3)
+"""Entries of ``progress``: a particle left its tile in this substep; no more steps until particles
+are sorted; substeps made."""
 
 
 class Kernels(NamedTuple):
@@ -59,9 +59,9 @@ class Kernels(NamedTuple):
     reorder: Any
 
 
-@law
+@device_function
 def tile_index(node: Any, o: Any) -> Any:
-    """Index on the tile of a home of a field's node, or -1; the home is at offset number ``o``."""
+    """Index on a block's tile of a field's node, or -1; the block is at offset number ``o``."""
     i = node // (BLOCK * BLOCK) + BLOCK * (1 - o // 9)
     j = node // BLOCK % BLOCK + BLOCK * (1 - o // 3 % 3)
     k = node % BLOCK + BLOCK * (1 - o % 3)
@@ -69,7 +69,7 @@ def tile_index(node: Any, o: Any) -> Any:
     return tile_node(i, j, k) if inside else -1
 
 
-@law
+@device_function
 def field_of(index: Any) -> Any:
     """Where a node of a tile is stored: offset number of its field, and node on that field."""
     i, j, k = index // (SIDE * SIDE) - 1, index // SIDE % SIDE - 1, index % SIDE - 1
@@ -77,46 +77,46 @@ def field_of(index: Any) -> Any:
     return o, (i % BLOCK * BLOCK + j % BLOCK) * BLOCK + k % BLOCK
 
 
-@law
-def collect_node(field: Any, node: Any, dt: Any, layout: Any, work: Any, rules: Any) -> None:
+@device_function
+def collect_node(field: Any, node: Any, dt: Any, layout: Any, work: Any, params: Any) -> None:
     """Sum one node of a field from the tiles around it, always in the same order; to velocity."""
-    zero = ZERO * rules.dx
+    zero = ZERO * params.dx
     px, py, pz, m = zero, zero, zero, zero
     for o in range(27):
-        home = layout.field_homes[field, o]
-        index = tile_index(node, o) if home >= 0 else -1
+        block = layout.field_blocks[field, o]
+        index = tile_index(node, o) if block >= 0 else -1
         if index >= 0:
-            px += work.tiles[home, index, 0]
-            py += work.tiles[home, index, 1]
-            pz += work.tiles[home, index, 2]
-            m += work.tiles[home, index, 3]
+            px += work.tiles[block, index, 0]
+            py += work.tiles[block, index, 1]
+            pz += work.tiles[block, index, 2]
+            m += work.tiles[block, index, 3]
     inverse = ONE / m if m > ZERO else zero
-    work.velocity[field, node, 0] = px * inverse + dt * rules.gravity[0]
-    work.velocity[field, node, 1] = py * inverse + dt * rules.gravity[1]
-    work.velocity[field, node, 2] = pz * inverse + dt * rules.gravity[2]
+    work.velocity[field, node, 0] = px * inverse + dt * params.gravity[0]
+    work.velocity[field, node, 1] = py * inverse + dt * params.gravity[1]
+    work.velocity[field, node, 2] = pz * inverse + dt * params.gravity[2]
     work.velocity[field, node, 3] = m
 
 
-@law
+@device_function
 def collect_moment(field: Any, node: Any, layout: Any, work: Any) -> None:
-    """Sum the first moment of one node; every home around a near field has some."""
+    """Sum the first moment of one node; every block around a near field has some."""
     for c in range(4):
         work.offset[field, node, c] = ZERO
     for o in range(27):
-        home = layout.field_homes[field, o]
-        index = tile_index(node, o) if home >= 0 else -1
+        block = layout.field_blocks[field, o]
+        index = tile_index(node, o) if block >= 0 else -1
         if index >= 0:
-            slot = layout.home_moment[home]
+            slot = layout.block_moment[block]
             for c in range(4):
                 work.offset[field, node, c] += work.moments[slot, index, c]
 
 
 @cuda.jit(device=True)
-def add_particles(home, thread, dt, state, layout, rules, tile):  # type: ignore[no-untyped-def]
-    """Add momentum and mass of one home's particles to its tile."""
-    for p in range(layout.home_start[home] + thread, layout.home_start[home + 1], THREADS):
+def add_particles(block, thread, dt, state, layout, params, tile):  # type: ignore[no-untyped-def]
+    """Add momentum and mass of one block's particles to its tile."""
+    for p in range(layout.block_start[block] + thread, layout.block_start[block + 1], THREADS):
         first, f = place(p, state.xi)
-        start, qx, qy, qz = momentum(p, dt, rules.dx, f, state)
+        start, qx, qy, qz = momentum(p, dt, params.dx, f, state)
         wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
         for a in range(3):
             for b in range(3):
@@ -131,9 +131,9 @@ def add_particles(home, thread, dt, state, layout, rules, tile):  # type: ignore
 
 
 @cuda.jit(device=True)
-def add_volumes(home, thread, state, layout, tile):  # type: ignore[no-untyped-def]
-    """Add w V (x_p - x_i) and w V of one home's particles to its tile; V at rest."""
-    for p in range(layout.home_start[home] + thread, layout.home_start[home + 1], THREADS):
+def add_volumes(block, thread, state, layout, tile):  # type: ignore[no-untyped-def]
+    """Add w V (x_p - x_i) and w V of one block's particles to its tile; V at rest."""
+    for p in range(layout.block_start[block] + thread, layout.block_start[block + 1], THREADS):
         first, f = place(p, state.xi)
         wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
         for a in range(3):
@@ -147,8 +147,8 @@ def add_volumes(home, thread, state, layout, tile):  # type: ignore[no-untyped-d
                     cuda.atomic.add(tile, (node, 3), share)
 
 
-@law
-def pick_up(first: Any, f: Any, tile: Any) -> Any:
+@device_function
+def gather_sums(first: Any, f: Any, tile: Any) -> Any:
     """Twelve sums over a particle's nodes, see ``particle.velocity_gradient``."""
     wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
     zero = ZERO * f[0]
@@ -187,11 +187,11 @@ def store(thread, tile, out):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def look_around(home, thread, layout, work, tile):  # type: ignore[no-untyped-def]
-    """Copy the velocities around a home to its tile."""
+def load_velocities(block, thread, layout, work, tile):  # type: ignore[no-untyped-def]
+    """Copy the velocities around a block to its tile."""
     for index in range(thread, TILE, THREADS):
         o, node = field_of(index)
-        field = layout.home_fields[home, o]
+        field = layout.block_fields[block, o]
         for c in range(3):
             tile[index, c] = work.velocity[field, node, c]
 
@@ -205,51 +205,51 @@ def kernels_of(dtype: type[np.floating[Any]]) -> Kernels:
     number = from_dtype(np.dtype(dtype))
 
     @cuda.jit
-    def scatter(dt, state, layout, work, rules, progress):  # type: ignore[no-untyped-def]
-        """Particles of one home to its tile, then volumes where contact asks for them."""
+    def scatter(dt, state, layout, work, params, progress):  # type: ignore[no-untyped-def]
+        """Particles of one block to its tile, then volumes where contact asks for them."""
         if progress[HALTED] != 0:
             return
-        home, thread = cuda.blockIdx.x, cuda.threadIdx.x
+        block, thread = cuda.blockIdx.x, cuda.threadIdx.x
         tile = cuda.shared.array((TILE, 4), number)
         clear(thread, tile)
         cuda.syncthreads()
-        add_particles(home, thread, dt, state, layout, rules, tile)
+        add_particles(block, thread, dt, state, layout, params, tile)
         cuda.syncthreads()
-        store(thread, tile, work.tiles[home])
-        slot = layout.home_moment[home]
+        store(thread, tile, work.tiles[block])
+        slot = layout.block_moment[block]
         if slot < 0:
             return
         cuda.syncthreads()
         clear(thread, tile)
         cuda.syncthreads()
-        add_volumes(home, thread, state, layout, tile)
+        add_volumes(block, thread, state, layout, tile)
         cuda.syncthreads()
         store(thread, tile, work.moments[slot])
 
     @cuda.jit
-    def gather(dt, state, layout, work, rules, progress, moving):  # type: ignore[no-untyped-def]
-        """Fields to the particles of one home when ``moving``, then stress."""
+    def gather(dt, state, layout, work, params, progress, moving):  # type: ignore[no-untyped-def]
+        """Fields to the particles of one block when ``moving``, then stress."""
         if progress[HALTED] != 0:
             return
-        home, thread = cuda.blockIdx.x, cuda.threadIdx.x
+        block, thread = cuda.blockIdx.x, cuda.threadIdx.x
         tile = cuda.shared.array((TILE, 4), number)
         if moving:
-            look_around(home, thread, layout, work, tile)
+            load_velocities(block, thread, layout, work, tile)
         cuda.syncthreads()
-        for p in range(layout.home_start[home] + thread, layout.home_start[home + 1], THREADS):
+        for p in range(layout.block_start[block] + thread, layout.block_start[block + 1], THREADS):
             if moving:
                 first, f = place(p, state.xi)
-                g = pick_up(first, f, tile)
-                L = velocity_gradient(g, rules.dx, f)
-                if move(p, dt, rules.dx, (g[0], g[1], g[2]), L, state):
-                    progress[STRAYED] = 1
-            deform(p, dt, state, rules.table[state.material[p]])
+                g = gather_sums(first, f, tile)
+                L = velocity_gradient(g, params.dx, f)
+                if move(p, dt, params.dx, (g[0], g[1], g[2]), L, state):
+                    progress[NEEDS_RESORT] = 1
+            deform(p, dt, state, params.table[state.material[p]])
 
     return Kernels(scatter, collect, gather, finish, measure, reorder)
 
 
 @cuda.jit
-def collect(dt, layout, work, rules, progress):  # type: ignore[no-untyped-def]
+def collect(dt, layout, work, params, progress):  # type: ignore[no-untyped-def]
     """Tiles to the fields of one group: sums, gravity, contact. Nodes do not know each other."""
     if progress[HALTED] != 0:
         return
@@ -257,21 +257,21 @@ def collect(dt, layout, work, rules, progress):  # type: ignore[no-untyped-def]
     begin, end = layout.group_start[group], layout.group_start[group + 1]
     for node in range(cuda.threadIdx.x, NODES, NODE_THREADS):
         for field in range(begin, end):
-            collect_node(field, node, dt, layout, work, rules)
+            collect_node(field, node, dt, layout, work, params)
             if layout.near[field]:
                 collect_moment(field, node, layout, work)
-        at = node_position(layout.field_block[begin], node, rules.dx)
+        at = node_position(layout.field_coordinates[begin], node, params.dx)
         for a in range(begin, end):
             for b in range(a + 1, end):
                 if work.velocity[a, node, 3] > ZERO and work.velocity[b, node, 3] > ZERO:
-                    collide(a, b, node, at, layout, work, rules)
+                    collide(a, b, node, at, layout, work, params)
         for field in range(begin, end):
             if work.velocity[field, node, 3] > ZERO:
-                obstruct(field, node, at, layout, work, rules)
+                obstruct(field, node, at, layout, work, params)
 
 
 @cuda.jit(device=True)
-def collide(a, b, node, at, layout, work, rules):  # type: ignore[no-untyped-def]
+def collide(a, b, node, at, layout, work, params):  # type: ignore[no-untyped-def]
     """Contact of two bodies at one node; what it did goes to the totals of both."""
     on_a = cuda.local.array(TOTALS, float64)
     on_b = cuda.local.array(TOTALS, float64)
@@ -279,11 +279,11 @@ def collide(a, b, node, at, layout, work, rules):  # type: ignore[no-untyped-def
         on_a[c] = 0.0
         on_b[c] = 0.0
     body_a, body_b = layout.field_body[a], layout.field_body[b]
-    friction = pair_friction(rules.friction[body_a], rules.friction[body_b])
-    meet_node(
+    friction = pair_friction(params.friction[body_a], params.friction[body_b])
+    resolve_node_pair(
         work.velocity[a, node], work.velocity[b, node],
         work.offset[a, node], work.offset[b, node],
-        friction, rules.dx, at, on_a, on_b,
+        friction, params.dx, at, on_a, on_b,
     )  # fmt: skip
     for c in range(TOTALS):
         if on_a[c] != 0.0:
@@ -293,21 +293,21 @@ def collide(a, b, node, at, layout, work, rules):  # type: ignore[no-untyped-def
 
 
 @cuda.jit(device=True)
-def obstruct(field, node, at, layout, work, rules):  # type: ignore[no-untyped-def]
+def obstruct(field, node, at, layout, work, params):  # type: ignore[no-untyped-def]
     """Contact of one body's node with every collider near its field."""
-    friction = rules.friction[layout.field_body[field]]
-    for touch in range(layout.touch_start[field], layout.touch_start[field + 1]):
+    friction = params.friction[layout.field_body[field]]
+    for contact in range(layout.contact_start[field], layout.contact_start[field + 1]):
         total = cuda.local.array(TOTALS, float64)
         for c in range(TOTALS):
             total[c] = 0.0
-        row = rules.obstacles[layout.touch_collider[touch]]
-        meet_obstacle(
-            row, rules.heights, rules.dx, friction, at,
+        row = params.collider_rows[layout.contact_collider[contact]]
+        resolve_node_collider(
+            row, params.heights, params.dx, friction, at,
             work.velocity[field, node], work.offset[field, node], total,
         )  # fmt: skip
         for c in range(TOTALS):
             if total[c] != 0.0:
-                cuda.atomic.add(work.by_collider, (touch, c), total[c])
+                cuda.atomic.add(work.by_collider, (contact, c), total[c])
 
 
 @cuda.jit
@@ -315,21 +315,21 @@ def finish(progress):  # type: ignore[no-untyped-def]
     """End of a substep, by one thread: count it, and halt when particles must be sorted."""
     if progress[HALTED] == 0:
         progress[DONE] += 1
-        progress[HALTED] = progress[STRAYED]
+        progress[HALTED] = progress[NEEDS_RESORT]
 
 
 @cuda.jit
-def measure(state, layout, rules, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` [P MEASURE_THREADS, COLUMNS] float64, one row for each thread of each home."""
-    home, thread = cuda.blockIdx.x, cuda.threadIdx.x
-    row = out[home * MEASURE_THREADS + thread]
+def measure(state, layout, params, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` [P MEASURE_THREADS, COLUMNS] float64, one row for each thread of each block."""
+    block, thread = cuda.blockIdx.x, cuda.threadIdx.x
+    row = out[block * MEASURE_THREADS + thread]
     for c in range(COLUMNS):
         row[c] = 0.0
     row[VOLUME_RATIO] = math.inf
-    begin, end = layout.home_start[home], layout.home_start[home + 1]
+    begin, end = layout.block_start[block], layout.block_start[block + 1]
     for p in range(begin + thread, end, MEASURE_THREADS):
-        add_motion(p, layout.home_block[home], state, rules.dx, row)
-        add_matter(p, state, rules.table[state.material[p]], row)
+        add_motion(p, layout.block_coordinates[block], state, params.dx, row)
+        add_material(p, state, params.table[state.material[p]], row)
 
 
 @cuda.jit

@@ -10,13 +10,14 @@ import torch
 
 from ....geometry.rotation import Float
 from ...colliders import Collider
-from ...constitutive import stress as laws
+from ...constitutive import material_row
 from ..base import TOTALS, Measure, Model, ParticleArrays, SolverDiverged
-from .step import TorchRules, TorchState, Touch, settle, substep
+from .step import NodeContact, TorchParameters, TorchState, substep, with_stress
+from .stress import wave_hardening
 
 
-class ReferenceBackend:
-    """Solver to compare others with, and to differentiate; see ``reference_step.substep``."""
+class ReferenceSolverBackend:
+    """Solver to compare others with, and to differentiate; see ``step.substep``."""
 
     name = "reference"
 
@@ -25,11 +26,11 @@ class ReferenceBackend:
         return ReferenceSimulation(model, colliders)
 
 
-def torch_model(model: Model) -> tuple[TorchState, TorchRules]:
+def torch_model(model: Model) -> tuple[TorchState, TorchParameters]:
     """A model as tensors: where a differentiable rollout starts."""
     start = model.start
     table = torch.from_numpy(model.table)
-    rules = TorchRules(
+    params = TorchParameters(
         mass=torch.from_numpy(model.masses),
         volume=torch.from_numpy(model.volumes),
         rows=table[torch.from_numpy(model.material)],
@@ -49,7 +50,7 @@ def torch_model(model: Model) -> tuple[TorchState, TorchRules]:
         energy=torch.zeros(n, dtype=torch.float64),
         history=torch.from_numpy(start.history),
     )
-    return settle(state, rules), rules
+    return with_stress(state, params), params
 
 
 class ReferenceSimulation:
@@ -57,7 +58,7 @@ class ReferenceSimulation:
 
     def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
         self._model = model
-        self._state, self._rules = torch_model(model)
+        self._state, self._params = torch_model(model)
         bodies = model.bodies
         self._by_collider = np.zeros((bodies, len(colliders), TOTALS))
         self._by_body = np.zeros((bodies, bodies, TOTALS))
@@ -69,22 +70,22 @@ class ReferenceSimulation:
                 if not torch.isfinite(self._state.x).all():
                     raise SolverDiverged
                 now = [c.after(step * dt) for c in colliders]
-                self._state, touches = substep(self._state, self._rules, now, dt)
-                for touch in touches:
-                    self._record(touch)
+                self._state, contacts = substep(self._state, self._params, now, dt)
+                for contact in contacts:
+                    self._record(contact)
 
-    def _record(self, touch: Touch) -> None:
-        totals = self._by_body if touch.by_body else self._by_collider
-        moment = torch.linalg.cross(touch.at, touch.impulse)
-        share = 0.5 if touch.by_body else 1.0
-        heat = -share * (touch.impulse * touch.slip).sum()
-        work = (touch.impulse * touch.velocity).sum()
-        row = torch.cat([touch.impulse.sum(0), moment.sum(0), torch.stack([heat, work])])
-        totals[touch.body, touch.other] += row.numpy()
+    def _record(self, contact: NodeContact) -> None:
+        totals = self._by_body if contact.by_body else self._by_collider
+        moment = torch.linalg.cross(contact.at, contact.impulse)
+        share = 0.5 if contact.by_body else 1.0
+        heat = -share * (contact.impulse * contact.slip).sum()
+        work = (contact.impulse * contact.velocity).sum()
+        row = torch.cat([contact.impulse.sum(0), moment.sum(0), torch.stack([heat, work])])
+        totals[contact.body, contact.other] += row.numpy()
 
     def measure(self) -> Measure:
         """Sums over each body."""
-        s, r = self._state, self._rules
+        s, r = self._state, self._params
         D = self._model.dx**2 / 4
         axial = torch.stack(
             [
@@ -99,10 +100,8 @@ class ReferenceSimulation:
         mass = self._sum(r.mass)
         J = torch.linalg.det(s.F)
         stiffening = torch.maximum(s.F.square().sum((1, 2)) / 3, 1 / J.clamp(min=1e-2))
-        modulus = (r.rows[:, laws.LAMBDA] + 2 * r.rows[:, laws.MU]) * stiffening
-        snow = r.rows[:, laws.KIND] == laws.SNOW
-        hardening = (r.rows[:, laws.C] * (1 - s.history.exp())).clamp(-3, 3).exp()
-        modulus = torch.where(snow, modulus * hardening, modulus)
+        modulus = (r.rows[:, material_row.LAMBDA] + 2 * r.rows[:, material_row.MU]) * stiffening
+        modulus = modulus * wave_hardening(s.history, r.rows)
         return Measure(
             mass=mass,
             centre=self._sum(m * s.x) / mass[:, None],
@@ -118,7 +117,7 @@ class ReferenceSimulation:
     def _sum(self, values: torch.Tensor) -> Float:
         shape = (self._model.bodies, *values.shape[1:])
         total = torch.zeros(shape, dtype=torch.float64)
-        return total.index_add(0, self._rules.body, values).numpy()
+        return total.index_add(0, self._params.body, values).numpy()
 
     def particles(self) -> ParticleArrays:
         """A copy of the state."""

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ...colliders import Box, Collider, HeightField, Plane
-from ...constitutive import stress as laws
-from ...constitutive.contact import FLAT_MOMENT, OPPOSED, STICKS, SURFACE
+from ...constitutive import material_row
+from ...contact.surface import FLAT_MOMENT, OPPOSED, STICKS, SURFACE
 from ...errors import ColliderError
 from .stress import stress_update
 
@@ -48,12 +48,12 @@ class TorchState:
 
 
 @dataclass(frozen=True, eq=False)
-class TorchRules:
+class TorchParameters:
     """What holds for a run; gradients flow to masses, rows, friction and gravity.
 
     Attributes:
         mass, volume: [N].
-        rows: [N, ROW] material row of each particle.
+        rows: [N, MATERIAL_ROW] material row of each particle.
         body: [N] int64.
         friction: [B].
         dx: [m].
@@ -70,7 +70,7 @@ class TorchRules:
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
+class NodeContact:
     """What contact did to a body's nodes in one substep.
 
     Attributes:
@@ -78,7 +78,7 @@ class Touch:
         other: collider index, or body index when ``by_body``.
         at: [U, 3] nodes [m].
         impulse: [U, 3] [N s].
-        slip: [U, 3] velocity relative to the other, after the touch [m/s].
+        slip: [U, 3] velocity relative to the other, after the contact [m/s].
         velocity: [U, 3] of the other [m/s].
     """
 
@@ -91,36 +91,36 @@ class Touch:
     velocity: Tensor
 
 
-def settle(state: TorchState, rules: TorchRules) -> TorchState:
+def with_stress(state: TorchState, params: TorchParameters) -> TorchState:
     """The state with stress and energy of its deformation."""
-    return _respond(state, rules, state.x, state.v, state.L, state.F, state.F_total, 0.0)
+    return _update_stress(state, params, state.x, state.v, state.L, state.F, state.F_total, 0.0)
 
 
 def substep(
-    state: TorchState, rules: TorchRules, colliders: Sequence[Collider], dt: float
-) -> tuple[TorchState, list[Touch]]:
+    state: TorchState, params: TorchParameters, colliders: Sequence[Collider], dt: float
+) -> tuple[TorchState, list[NodeContact]]:
     """MLS-MPM with APIC (Hu et al. 2018), contact on separate velocity fields."""
-    index, weights, arm, nodes = _stencil(state.x, rules.dx)
-    velocity, mass, moment = _to_grid(state, rules, dt, index, weights, arm, len(nodes))
-    velocity = velocity + dt * rules.gravity
-    touches: list[Touch] = []
-    velocity = _meet_bodies(velocity, mass, moment, nodes, rules, touches)
-    velocity = _meet_colliders(velocity, mass, moment, nodes, rules, colliders, touches)
+    index, weights, arm, nodes = _stencil(state.x, params.dx)
+    velocity, mass, moment = _to_grid(state, params, dt, index, weights, arm, len(nodes))
+    velocity = velocity + dt * params.gravity
+    contacts: list[NodeContact] = []
+    velocity = _resolve_body_contact(velocity, mass, moment, nodes, params, contacts)
+    velocity = _resolve_collider_contact(velocity, mass, moment, nodes, params, colliders, contacts)
 
-    seen = velocity[rules.body[:, None], index]
+    seen = velocity[params.body[:, None], index]
     v = (weights[:, :, None] * seen).sum(1)
-    L = 4 / rules.dx**2 * torch.einsum("nk,nki,nkj->nij", weights, seen, arm)
+    L = 4 / params.dx**2 * torch.einsum("nk,nki,nkj->nij", weights, seen, arm)
     step = torch.eye(3, dtype=state.x.dtype) + dt * L
     moved = state.x + dt * v
     return (
-        _respond(state, rules, moved, v, L, step @ state.F, step @ state.F_total, dt),
-        touches,
+        _update_stress(state, params, moved, v, L, step @ state.F, step @ state.F_total, dt),
+        contacts,
     )
 
 
-def _respond(
+def _update_stress(
     state: TorchState,
-    rules: TorchRules,
+    params: TorchParameters,
     x: Tensor,
     v: Tensor,
     L: Tensor,
@@ -128,8 +128,8 @@ def _respond(
     F_total: Tensor,
     dt: float,
 ) -> TorchState:
-    F, tau, energy, history = stress_update(F, state.history, rules.rows, dt)
-    eta = rules.rows[:, laws.VISCOSITY] * torch.linalg.det(F)
+    F, tau, energy, history = stress_update(F, state.history, params.rows, dt)
+    eta = params.rows[:, material_row.VISCOSITY] * torch.linalg.det(F)
     tau = tau + eta[:, None, None] * (L + L.mT)
     return TorchState(x, v, L, F, F_total, tau, energy, history)
 
@@ -158,7 +158,7 @@ def _stencil(x: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def _to_grid(
     state: TorchState,
-    rules: TorchRules,
+    params: TorchParameters,
     dt: float,
     index: Tensor,
     weights: Tensor,
@@ -166,14 +166,14 @@ def _to_grid(
     nodes: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity [B, U, 3], mass [B, U], volume and its first moment [B, U, 4] of each body."""
-    scale = (-dt * 4 / rules.dx**2 * rules.volume)[:, None, None]
-    Q = scale * state.tau + rules.mass[:, None, None] * state.L
-    momentum = (rules.mass[:, None] * state.v)[:, None] + torch.einsum("nij,nkj->nki", Q, arm)
-    m = weights * rules.mass[:, None]
-    V = (weights * rules.volume[:, None])[..., None]
-    values = torch.cat([weights[..., None] * momentum, m[..., None], -V * arm / rules.dx, V], -1)
-    bodies = len(rules.friction)
-    flat = (rules.body[:, None] * nodes + index).reshape(-1)
+    scale = (-dt * 4 / params.dx**2 * params.volume)[:, None, None]
+    Q = scale * state.tau + params.mass[:, None, None] * state.L
+    momentum = (params.mass[:, None] * state.v)[:, None] + torch.einsum("nij,nkj->nki", Q, arm)
+    m = weights * params.mass[:, None]
+    V = (weights * params.volume[:, None])[..., None]
+    values = torch.cat([weights[..., None] * momentum, m[..., None], -V * arm / params.dx, V], -1)
+    bodies = len(params.friction)
+    flat = (params.body[:, None] * nodes + index).reshape(-1)
     grid = torch.zeros(bodies * nodes, 8, dtype=state.x.dtype)
     grid = grid.index_add(0, flat, values.reshape(-1, 8)).reshape(bodies, nodes, 8)
     mass = grid[..., 3]
@@ -182,7 +182,7 @@ def _to_grid(
 
 
 def surface_offset(centroid: Tensor) -> Tensor:
-    """Where surfaces lie, from centroid offsets [cells]; see ``laws.contact``."""
+    """Where surfaces lie, from centroid offsets [cells]; see ``contact.surface``."""
     return _look_up(SURFACE_TABLE, centroid / 1.5)
 
 
@@ -203,7 +203,7 @@ def _depth(moment: Tensor, n: Tensor) -> Tensor:
 
 
 def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
-    """Relative velocities [U, 3] after a touch; see ``laws.contact``."""
+    """Relative velocities [U, 3] after a contact; see ``contact.surface``."""
     approach = (v * n).sum(-1, keepdim=True)
     t = v - approach * n
     square = t.square().sum(-1, keepdim=True)
@@ -214,33 +214,33 @@ def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
     return torch.where((approach >= 0) & separable, v, slid)
 
 
-def _meet_bodies(
+def _resolve_body_contact(
     velocity: Tensor,
     mass: Tensor,
     moment: Tensor,
     nodes: Tensor,
-    rules: TorchRules,
-    touches: list[Touch],
+    params: TorchParameters,
+    contacts: list[NodeContact],
 ) -> Tensor:
     """Contact of every two bodies, pair after pair."""
     fields = list(velocity)
     for a in range(len(fields)):
         for b in range(a + 1, len(fields)):
             ma, mb = mass[a], mass[b]
-            n, opposed = _normal(moment[a] / rules.dx**3, moment[b] / rules.dx**3)
+            n, opposed = _normal(moment[a] / params.dx**3, moment[b] / params.dx**3)
             gap = surface_offset(_depth(moment[a], -n)) + surface_offset(_depth(moment[b], n))
-            meet = (ma > 0) & (mb > 0) & opposed & (gap <= 0)
+            closed = (ma > 0) & (mb > 0) & opposed & (gap <= 0)
             relative = fields[b] - fields[a]
-            friction = (rules.friction[a] * rules.friction[b]).sqrt()
+            friction = (params.friction[a] * params.friction[b]).sqrt()
             change = coulomb(relative, n, friction, separable=True) - relative
-            change = torch.where(meet[:, None], change, torch.zeros_like(change))
-            total = torch.where(meet, ma + mb, torch.ones_like(ma))
+            change = torch.where(closed[:, None], change, torch.zeros_like(change))
+            total = torch.where(closed, ma + mb, torch.ones_like(ma))
             new_a = fields[a] - (mb / total)[:, None] * change
             new_b = fields[b] + (ma / total)[:, None] * change
             slip = new_b - new_a
             on_a, on_b = ma[:, None] * (new_a - fields[a]), mb[:, None] * (new_b - fields[b])
-            touches.append(Touch(a, b, True, nodes, on_a, -slip, new_b))
-            touches.append(Touch(b, a, True, nodes, on_b, slip, new_a))
+            contacts.append(NodeContact(a, b, True, nodes, on_a, -slip, new_b))
+            contacts.append(NodeContact(b, a, True, nodes, on_b, slip, new_a))
             fields[a], fields[b] = new_a, new_b
     return torch.stack(fields)
 
@@ -256,37 +256,37 @@ def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _face_score(size: Tensor, share: Tensor) -> Tensor:
-    """How well first moments tell normals; see ``laws.contact``."""
+    """How well first moments tell normals; see ``contact.surface``."""
     flat = _look_up(FLAT_TABLE, share).clamp(min=1e-3)
     return (size / flat) ** 2 * size
 
 
-def _meet_colliders(
+def _resolve_collider_contact(
     velocity: Tensor,
     mass: Tensor,
     moment: Tensor,
     nodes: Tensor,
-    rules: TorchRules,
+    params: TorchParameters,
     colliders: Sequence[Collider],
-    touches: list[Touch],
+    contacts: list[NodeContact],
 ) -> Tensor:
     fields = list(velocity)
     for b in range(len(fields)):
         for k, collider in enumerate(colliders):
             distance, n = _distance(collider, nodes)
-            gap = distance / rules.dx + surface_offset(_depth(moment[b], n))
-            meet = (mass[b] > 0) & (distance <= 0) & (gap <= 0)
+            gap = distance / params.dx + surface_offset(_depth(moment[b], n))
+            closed = (mass[b] > 0) & (distance <= 0) & (gap <= 0)
             own = collider.friction is None
             friction = (
-                rules.friction[b]
+                params.friction[b]
                 if own
-                else rules.friction.new_tensor(min(collider.friction, float(STICKS)))
+                else params.friction.new_tensor(min(collider.friction, float(STICKS)))
             )
             u = _material_velocity(collider, nodes)
             after = u + coulomb(fields[b] - u, n, friction, collider.separable)
-            new = torch.where(meet[:, None], after, fields[b])
+            new = torch.where(closed[:, None], after, fields[b])
             impulse = mass[b][:, None] * (new - fields[b])
-            touches.append(Touch(b, k, False, nodes, impulse, new - u, u))
+            contacts.append(NodeContact(b, k, False, nodes, impulse, new - u, u))
             fields[b] = new
     return torch.stack(fields)
 

@@ -1,8 +1,9 @@
 """Stress in plain torch, batched over particles: the oracle, and the differentiable path.
 
-Written in matrix form where ``laws.stress`` works with scalars and principal values: logarithms by
-repeated square roots, flow by matrix exponentials. Nothing here divides by differences of
-principal values, so gradients are right at rest, too. Only snow needs singular values.
+Written in matrix form where ``constitutive.stress`` works with scalars and principal values:
+logarithms by repeated square roots, flow by matrix exponentials. Nothing here divides by
+differences of principal values, so gradients are right at rest, too. Only snow needs singular
+values.
 """
 
 from __future__ import annotations
@@ -10,7 +11,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...constitutive import stress as laws
+from ...constitutive import material_row
+from ...constitutive.law import law_of_code
+from ...constitutive.stress import STRETCH_MIN, VOLUME_MIN
+from ...errors import MaterialError
 
 NEWTON_STEPS = 8
 SQUARE_ROOTS = 3
@@ -24,15 +28,15 @@ def stress_update(
 
     Args:
         F: [N, 3, 3] trial F_elastic.
-        history: [N], see ``laws.stress``.
-        rows: [N, ROW] material rows; gradients flow to all columns but the kind.
+        history: [N], see ``constitutive.stress``.
+        rows: [N, MATERIAL_ROW]; gradients flow to all columns but those of the law.
         dt: time since the last call [s].
     """
-    kinds = rows[:, laws.KIND].detach().round().long()
+    codes = rows[:, material_row.LAW].detach().round().long()
     parts = []
-    for kind in kinds.unique().tolist():
-        index = torch.nonzero(kinds == kind)[:, 0]
-        answer = _respond_kind(kind, F[index], history[index], rows[index], dt)
+    for code in codes.unique().tolist():
+        index = torch.nonzero(codes == code)[:, 0]
+        answer = _stress_of_law(code, F[index], history[index], rows[index], dt)
         parts.append((index, answer))
     order = torch.argsort(torch.cat([index for index, _ in parts]))
     columns = zip(*(answer for _, answer in parts), strict=True)
@@ -40,21 +44,21 @@ def stress_update(
     return elastic, tau, energy, memory
 
 
-def _respond_kind(
-    kind: int, F: Tensor, history: Tensor, rows: Tensor, dt: float
+def _stress_of_law(
+    code: int, F: Tensor, history: Tensor, rows: Tensor, dt: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    if kind == laws.COROTATED:
+    if code == material_row.COROTATED:
         return F, *_corotated(F, rows), history
-    if kind == laws.NEO_HOOKEAN:
+    if code == material_row.NEO_HOOKEAN:
         return F, *_neo_hookean(F, rows), history
-    if kind == laws.SNOW:
+    if code == material_row.SNOW:
         return _snow(F, history, rows)
-    return _hencky(kind, F, history, rows, dt)
+    return _hencky(code, F, history, rows, dt)
 
 
 def _corotated(F: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    mu, lam = rows[:, laws.MU], rows[:, laws.LAMBDA]
-    J = torch.linalg.det(F).clamp(min=float(laws.VOLUME_MIN))
+    mu, lam = rows[:, material_row.MU], rows[:, material_row.LAMBDA]
+    J = torch.linalg.det(F).clamp(min=float(VOLUME_MIN))
     d = F - polar_rotation(F)
     eye = torch.eye(3, dtype=F.dtype)
     tau = 2 * mu[:, None, None] * d @ F.mT + (lam * J * (J - 1))[:, None, None] * eye
@@ -78,8 +82,8 @@ def inverse(a: Tensor) -> Tensor:
 
 
 def _neo_hookean(F: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    mu, lam = rows[:, laws.MU], rows[:, laws.LAMBDA]
-    log_J = torch.linalg.det(F).clamp(min=float(laws.VOLUME_MIN)).log()
+    mu, lam = rows[:, material_row.MU], rows[:, material_row.LAMBDA]
+    log_J = torch.linalg.det(F).clamp(min=float(VOLUME_MIN)).log()
     b = F @ F.mT
     eye = torch.eye(3, dtype=F.dtype)
     tau = mu[:, None, None] * (b - eye) + (lam * log_J)[:, None, None] * eye
@@ -88,18 +92,20 @@ def _neo_hookean(F: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _hencky(
-    kind: int, F: Tensor, history: Tensor, rows: Tensor, dt: float
+    code: int, F: Tensor, history: Tensor, rows: Tensor, dt: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    mu, lam = rows[:, laws.MU], rows[:, laws.LAMBDA]
+    mu, lam = rows[:, material_row.MU], rows[:, material_row.LAMBDA]
     eye = torch.eye(3, dtype=F.dtype)
     b = F @ F.mT
     e = log_symmetric(b) / 2
-    if kind == laws.VON_MISES:
+    if code == material_row.VON_MISES:
         taken, history = _von_mises(e, history, rows)
-    elif kind == laws.VISCOPLASTIC:
+    elif code == material_row.VISCOPLASTIC:
         taken = _viscoplastic(e, b, rows, dt)
-    else:
+    elif code == material_row.DRUCKER_PRAGER:
         taken, history = _drucker_prager(e, history, rows)
+    else:
+        raise MaterialError(f"the reference has no flow rule for {law_of_code(code).name!r}")
     left = e - taken
     trace = _trace(left)
     tau = 2 * mu[:, None, None] * left + (lam * trace)[:, None, None] * eye
@@ -138,50 +144,60 @@ def _deviator(e: Tensor) -> tuple[Tensor, Tensor]:
 
 def _von_mises(e: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     d, norm = _deviator(e)
-    two_mu, hardening = 2 * rows[:, laws.MU], rows[:, laws.B]
+    two_mu, hardening = 2 * rows[:, material_row.MU], rows[:, material_row.B]
     root = (2 / 3) ** 0.5
-    excess = (two_mu * norm - root * (rows[:, laws.A] + history)).clamp(min=0)
+    excess = (two_mu * norm - root * (rows[:, material_row.A] + history)).clamp(min=0)
     flow = excess / (two_mu + 2 / 3 * hardening)
-    share = torch.where(excess > 0, flow / norm.clamp(min=1e-300), torch.zeros_like(flow))
-    return share[:, None, None] * d, history + root * hardening * flow
+    fraction = torch.where(excess > 0, flow / norm.clamp(min=1e-300), torch.zeros_like(flow))
+    return fraction[:, None, None] * d, history + root * hardening * flow
 
 
 def _viscoplastic(e: Tensor, b: Tensor, rows: Tensor, dt: float) -> Tensor:
     d, norm = _deviator(e)
-    mu = rows[:, laws.MU]
-    excess = (2 * mu * norm - (2 / 3) ** 0.5 * rows[:, laws.A]).clamp(min=0)
+    mu = rows[:, material_row.MU]
+    excess = (2 * mu * norm - (2 / 3) ** 0.5 * rows[:, material_row.A]).clamp(min=0)
     if dt <= 0:
         return torch.zeros_like(e)
-    rate = dt / (dt + rows[:, laws.B] / (2 * mu * _trace(b) / 3))
+    rate = dt / (dt + rows[:, material_row.B] / (2 * mu * _trace(b) / 3))
     part = torch.where(excess > 0, rate * excess / (2 * mu * norm.clamp(min=1e-300)), 0 * norm)
     return part[:, None, None] * d
 
 
 def _drucker_prager(e: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    mu, lam, alpha = rows[:, laws.MU], rows[:, laws.LAMBDA], rows[:, laws.A]
+    mu, lam, alpha = rows[:, material_row.MU], rows[:, material_row.LAMBDA], rows[:, material_row.A]
     given_back = (history / 3)[:, None, None] * torch.eye(3, dtype=e.dtype)
     shifted = e + given_back
     trace = _trace(shifted)
     d, norm = _deviator(shifted)
     excess = (norm + (3 * lam + 2 * mu) / (2 * mu) * trace * alpha).clamp(min=0)
-    share = torch.where(excess > 0, excess / norm.clamp(min=1e-300), torch.zeros_like(norm))
+    fraction = torch.where(excess > 0, excess / norm.clamp(min=1e-300), torch.zeros_like(norm))
     apart = (trace >= 0)[:, None, None]
-    left = torch.where(apart, torch.zeros_like(e), shifted - share[:, None, None] * d)
+    left = torch.where(apart, torch.zeros_like(e), shifted - fraction[:, None, None] * d)
     return e - left, torch.where(trace >= 0, trace, torch.zeros_like(trace))
 
 
 def _snow(F: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     U, S, Vh = torch.linalg.svd(F)
-    S = S.clamp(min=float(laws.STRETCH_MIN))
-    low, high = 1 - rows[:, laws.A : laws.A + 1], 1 + rows[:, laws.B : laws.B + 1]
+    S = S.clamp(min=float(STRETCH_MIN))
+    low, high = (
+        1 - rows[:, material_row.A : material_row.A + 1],
+        1 + rows[:, material_row.B : material_row.B + 1],
+    )
     s = torch.minimum(torch.maximum(S, low), high)
     history = history + (S.prod(1) / s.prod(1)).log()
-    hard = (rows[:, laws.C] * (1 - history.exp())).clamp(-3, 3).exp()
-    mu, lam, J = rows[:, laws.MU] * hard, rows[:, laws.LAMBDA] * hard, s.prod(1)
+    hard = (rows[:, material_row.C] * (1 - history.exp())).clamp(-3, 3).exp()
+    mu, lam, J = rows[:, material_row.MU] * hard, rows[:, material_row.LAMBDA] * hard, s.prod(1)
     principal = 2 * mu[:, None] * (s - 1) * s + (lam * J * (J - 1))[:, None]
     tau = U @ torch.diag_embed(principal) @ U.mT
     energy = mu * (s - 1).square().sum(1) + lam / 2 * (J - 1) ** 2
     return U @ torch.diag_embed(s) @ Vh, tau, energy, history
+
+
+def wave_hardening(history: Tensor, rows: Tensor) -> Tensor:
+    """[N] by how much plastic flow has stiffened particles; see ``constitutive.stress``."""
+    snow = rows[:, material_row.LAW] == material_row.SNOW
+    hardening = (rows[:, material_row.C] * (1 - history.exp())).clamp(-3, 3).exp()
+    return torch.where(snow, hardening, torch.ones_like(hardening))
 
 
 def _trace(a: Tensor) -> Tensor:

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from real2sim_server.physics import FixedCorotated, PhysicsError, Plane, box_particles
-from real2sim_server.simulation.body import DEFORMING, RIGID, SLEEPING, DeformableBody
+from real2sim_server.physics.validation.check import placed as at
+from real2sim_server.simulation.body import BodyMode, DeformableBody
 from real2sim_server.simulation.presets import ObjectPhysics
 from real2sim_server.simulation.result import SimulationResult
-from real2sim_server.simulation.rollout import SimulateOptions, roll
-
-from .scenes import at
+from real2sim_server.simulation.rollout import SimulateOptions, simulate_bodies
 
 SOFT = FixedCorotated(young=2e5, poisson=0.3, viscosity=150.0)
 
@@ -31,8 +30,8 @@ def box(name="box", position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 0.0)) -> Defor
     )
 
 
-def options(*actors, **changes) -> SimulateOptions:
-    objects = {a.name: ObjectPhysics() for a in actors}
+def options(*bodies, **changes) -> SimulateOptions:
+    objects = {a.name: ObjectPhysics() for a in bodies}
     return SimulateOptions(**{"objects": objects, "duration": 0.5, **changes})
 
 
@@ -40,14 +39,14 @@ def options(*actors, **changes) -> SimulateOptions:
 def fall() -> SimulationResult:
     body = box(position=(0, 0, 1.5))
     ground = Plane(name="ground", friction=0.7)
-    return roll([body], options(body, colliders=[ground], duration=2.5))
+    return simulate_bodies([body], options(body, colliders=[ground], duration=2.5))
 
 
 def test_it_falls_freely_then_deforms_then_rests(fall):
     modes = fall.objects["box"].modes
-    assert modes[1] == RIGID
-    assert DEFORMING in modes
-    assert modes[-1] == SLEEPING
+    assert modes[1] == BodyMode.RIGID
+    assert BodyMode.DEFORMING in modes
+    assert modes[-1] == BodyMode.SLEEPING
     assert fall.objects["box"].positions[-1, 2] == pytest.approx(0.3, abs=0.06)
 
 
@@ -60,9 +59,9 @@ def test_first_contact_is_when_a_free_fall_gets_there(fall):
 def test_the_ground_gives_back_the_momentum_of_the_whole_fall(fall):
     own = fall.objects["box"]
     wanted = own.mass * 9.81 * fall.times_s[-1]
-    # Once laid to rest no more is booked: the ground then carries the weight without an impulse.
-    lying = fall.times_s[np.argmax(own.modes == SLEEPING)]
-    given = fall.impulses[-1, 0, 2] + own.mass * 9.81 * (fall.times_s[-1] - lying)
+    # Nothing is logged while it sleeps: the ground then carries the weight without an impulse.
+    asleep = fall.times_s[np.argmax(own.modes == BodyMode.SLEEPING)]
+    given = fall.impulses[-1, 0, 2] + own.mass * 9.81 * (fall.times_s[-1] - asleep)
     assert given == pytest.approx(wanted, rel=0.03)
 
 
@@ -87,12 +86,14 @@ def test_a_result_comes_back_from_disk_as_it_was(fall, tmp_path):
 def test_a_moving_body_hits_a_standing_one_and_both_part():
     striker = box("striker", (0, 0, 0), (2.0, 0, 0))
     struck = box("struck", (0.9, 0, 0))
-    result = roll([striker, struck], options(striker, struck, gravity=(0, 0, 0), duration=0.8))
+    result = simulate_bodies(
+        [striker, struck], options(striker, struck, gravity=(0, 0, 0), duration=0.8)
+    )
     after = {k: o.velocities[-1, 0] for k, o in result.objects.items()}
     assert after["striker"] + after["struck"] == pytest.approx(2.0, abs=1e-3)
     assert after["struck"] > 1.0 > after["striker"]
-    assert result.objects["struck"].modes[0] == SLEEPING
-    assert result.objects["struck"].modes[-1] == RIGID
+    assert result.objects["struck"].modes[0] == BodyMode.SLEEPING
+    assert result.objects["struck"].modes[-1] == BodyMode.RIGID
     delta = {c.object_id: c.delta_v for c in result.contacts}
     assert delta["struck"] == pytest.approx(after["struck"], abs=1e-3)
 
@@ -100,7 +101,7 @@ def test_a_moving_body_hits_a_standing_one_and_both_part():
 def test_a_cancelled_rollout_keeps_what_was_made():
     body = box(position=(0, 0, 9))
     calls = []
-    result = roll(
+    result = simulate_bodies(
         [body],
         options(body, frame_rate=20.0),
         on_progress=lambda done, total: calls.append((done, total)),
@@ -115,7 +116,9 @@ def test_the_same_rollout_gives_the_same_bits():
     def run():
         body = box(position=(0, 0, 0.5), velocity=(1.0, 0, -2.0))
         ground = Plane(name="ground", friction=0.7)
-        return roll([body], options(body, colliders=[ground], duration=0.2)).objects["box"]
+        return simulate_bodies([body], options(body, colliders=[ground], duration=0.2)).objects[
+            "box"
+        ]
 
     a, b = run(), run()
     assert np.array_equal(a.positions, b.positions)

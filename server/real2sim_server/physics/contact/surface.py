@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .shared import F32, ONE, TINY, ZERO, law
+from ..numerics.device import F32, ONE, TINY, ZERO, device_function
 
 REACH = F32(1.5)
 """Half width of the spline: a node sees matter up to this many cells away."""
@@ -19,18 +19,20 @@ STICKS = F32(1e6)
 def _half_space_tables() -> Any:
     """What a node sees of matter that fills u > surface, as the surface passes it [cells].
 
-    Two tables at even steps: surface by centroid in [0, 1.5], and first moment by filled share.
+    Two tables at even steps: surface by centroid in [0, 1.5], and first moment by filled fraction.
     """
     u = np.linspace(-1.5, 1.5, 60_001)
     a = np.abs(u)
     n = np.where(a < 0.5, 0.75 - a**2, 0.5 * (1.5 - a) ** 2) * (u[1] - u[0])
-    share = np.cumsum(n[::-1])[::-1]
+    filled = np.cumsum(n[::-1])[::-1]
     moment = np.cumsum((u * n)[::-1])[::-1]
-    centroid = moment / np.maximum(share, 1e-300)
+    centroid = moment / np.maximum(filled, 1e-300)
     centroid[-1] = 1.5
     even = np.linspace(0.0, 1.0, _ENTRIES + 1)
     surface = np.interp(1.5 * even, centroid, u)
-    return surface.astype(np.float32), np.interp(even, share[::-1], moment[::-1]).astype(np.float32)
+    return surface.astype(np.float32), np.interp(even, filled[::-1], moment[::-1]).astype(
+        np.float32
+    )
 
 
 SURFACE, FLAT_MOMENT = _half_space_tables()
@@ -38,7 +40,7 @@ OPPOSED = F32(0.5)
 """Surfaces meet only where the cosine between their normals is beyond this; else they pass by."""
 
 
-@law
+@device_function
 def surface_offset(centroid: Any) -> Any:
     """Where a body's surface lies along its inward normal, seen from a node [cells].
 
@@ -56,17 +58,17 @@ def surface_offset(centroid: Any) -> Any:
     return low + fraction * (high - low)
 
 
-@law
-def face_score(moment: Any, share: Any) -> Any:
+@device_function
+def face_score(moment: Any, filled: Any) -> Any:
     """How well a body's first moment [cells] tells the normal: how large, and how like a face.
 
     Args:
-        moment: length of the first moment of the filled share.
-        share: filled share of the node's surroundings.
+        moment: length of the first moment of the filled fraction.
+        filled: filled fraction of the node's surroundings.
 
-    Among bodies of one share a face has the largest moment; edges and corners have less.
+    Among bodies of one filled a face has the largest moment; edges and corners have less.
     """
-    scaled = min(share, ONE) * F32(_ENTRIES)
+    scaled = min(filled, ONE) * F32(_ENTRIES)
     index = min(int(scaled), _ENTRIES - 1)
     fraction = scaled - F32(index)
     flat = FLAT_MOMENT[index] + fraction * (FLAT_MOMENT[index + 1] - FLAT_MOMENT[index])
@@ -74,13 +76,13 @@ def face_score(moment: Any, share: Any) -> Any:
     return likeness * likeness * moment
 
 
-@law
+@device_function
 def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
     """Relative velocity after a touch: no approach along ``n``, Coulomb friction across it.
 
     Args:
         v: velocity relative to the obstacle, three numbers.
-        n: unit normal out of the obstacle.
+        n: unit normal out of the collider_rows.
         friction: Coulomb coefficient; from STICKS on nothing slides.
         separable: false keeps the normal velocity at zero when it points away, too.
 

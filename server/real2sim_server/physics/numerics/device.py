@@ -1,4 +1,4 @@
-"""How laws are marked, and the constants they share."""
+"""How functions for kernels are marked, and their constants."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from numba.extending import register_jitable
 
 FASTMATH = {"contract", "nsz", "arcp"}
-"""Fused multiply-add and reciprocals; NaN and infinity keep their meaning for the guard."""
+"""Fused multiply-add and reciprocals; NaN and infinity keep their meaning, and show."""
 
-law: Any = register_jitable(fastmath=FASTMATH, error_model="numpy")
+device_function: Any = register_jitable(fastmath=FASTMATH, error_model="numpy")
 """Decorator of functions that kernels of every backend may call; Python may call them, too."""
 
 F32 = np.float32

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .shared import HALF, ONE, TINY, ZERO, law
+from .device import HALF, ONE, TINY, ZERO, device_function
 
 POLAR_STEPS = 16
 JACOBI_SWEEPS = 8
 
 
-@law
+@device_function
 def det(a: Any) -> Any:
     """Determinant."""
     return (
@@ -21,7 +21,7 @@ def det(a: Any) -> Any:
     )
 
 
-@law
+@device_function
 def cofactors(a: Any) -> Any:
     """Cofactor matrix: det(a) times the transposed inverse."""
     return (
@@ -37,7 +37,7 @@ def cofactors(a: Any) -> Any:
     )
 
 
-@law
+@device_function
 def multiply(a: Any, b: Any) -> Any:
     """a b."""
     return (
@@ -53,7 +53,7 @@ def multiply(a: Any, b: Any) -> Any:
     )
 
 
-@law
+@device_function
 def gram(a: Any) -> Any:
     """a a^T, symmetric."""
     return (
@@ -66,13 +66,13 @@ def gram(a: Any) -> Any:
     )
 
 
-@law
+@device_function
 def symmetric_times(s: Any, a: Any) -> Any:
     """s a of a symmetric s."""
     return multiply((s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]), a)
 
 
-@law
+@device_function
 def rotation_step(r: Any, determinant: Any) -> Any:
     """One of Newton's steps towards the rotation of a matrix, and how much it changed.
 
@@ -98,7 +98,7 @@ def rotation_step(r: Any, determinant: Any) -> Any:
     return n, change
 
 
-@law
+@device_function
 def polar_rotation(a: Any, determinant: Any) -> Any:
     """Rotation R of the polar decomposition a = R S, by Newton's iteration.
 
@@ -115,7 +115,7 @@ def polar_rotation(a: Any, determinant: Any) -> Any:
     return r
 
 
-@law
+@device_function
 def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
     """Tangent, cosine and sine of the rotation that makes the element ``pq`` vanish."""
     if abs(pq) < TINY:
@@ -128,7 +128,7 @@ def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
     return t, c, t * c
 
 
-@law
+@device_function
 def eigen_symmetric(s: Any) -> Any:
     """Eigenvalues (3) and eigenvectors (9, in columns) of a symmetric matrix, by cyclic Jacobi.
 
@@ -162,7 +162,7 @@ def eigen_symmetric(s: Any) -> Any:
     return (xx, yy, zz), (v0, v1, v2, v3, v4, v5, v6, v7, v8)
 
 
-@law
+@device_function
 def recompose(values: Any, vectors: Any) -> Any:
     """vectors diag(values) vectors^T, symmetric."""
     a, b, c = values

@@ -10,8 +10,8 @@ import pytest
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.physics import PhysicsError
 from real2sim_server.simulation.experiments import set_up, views, walls
-from real2sim_server.simulation.experiments.film import View, draw, look_at
-from real2sim_server.simulation.experiments.viewing import seen
+from real2sim_server.simulation.experiments.film import FilmView, draw, look_at
+from real2sim_server.simulation.experiments.viewing import visibility_of
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.rollout import simulate
 
@@ -67,10 +67,10 @@ def test_unknown_experiments_and_objects_are_named(experiment):
 def test_a_vehicle_that_drives_ahead_was_seen_from_behind(tiny_scene):
     state = ScenarioState.of(tiny_scene)
     blue = next(o for o in state.visible if o.object_id == "car_blue")
-    looks = seen(tiny_scene, blue)
-    assert looks.rear > 10 * looks.front
-    assert looks.direction[0] < 0
-    assert looks.whole == looks.rear + looks.front
+    seen = visibility_of(tiny_scene, blue)
+    assert seen.rear > 10 * seen.front
+    assert seen.direction[0] < 0
+    assert seen.whole == seen.rear + seen.front
 
 
 def test_a_wall_is_outlined_where_it_stands(experiment):
@@ -81,7 +81,7 @@ def test_a_wall_is_outlined_where_it_stands(experiment):
     assert walls(experiment("drop", objects=["car_red"])) == []
 
 
-def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_lens(
+def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_camera(
     tiny_scene, experiment, rollout
 ):
     made = experiment("wall", objects=["car_red"])
@@ -89,7 +89,7 @@ def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_lens(
     near = views(playback, made)[1]
     post = np.array([10.0, 3.5, 1.0])
     eye = post + np.array([-2.0, 0.0, 0.0])
-    looking = View(replace(near.camera, T_vehicle_camera=look_at(eye, post)), near.background)
+    looking = FilmView(replace(near.camera, T_vehicle_camera=look_at(eye, post)), near.background)
     seen_there, left_out = (
         draw(playback, [replace(looking, clear=clear)], 0, "cpu")[0] for clear in (0.0, 2.5)
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .shared import TINY, ZERO, law
+from ..numerics.device import TINY, ZERO, device_function
 
 PLANE, BOX, HEIGHT_FIELD = range(3)
 
@@ -19,8 +19,8 @@ FIRST_HEIGHT, COUNT_X, COUNT_Y, SPACING = 24, 25, 26, 27
 COLLIDER_ROW = 28
 
 
-@law
-def obstacle_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
+@device_function
+def collider_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
     """Signed distance [m] of a point [m] to a collider, and the unit normal out of it.
 
     Args:
@@ -37,7 +37,7 @@ def obstacle_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
     return height_distance(row, heights, x, y, z)
 
 
-@law
+@device_function
 def box_distance(row: Any, x: Any, y: Any, z: Any) -> Any:
     """Distance to an oriented box; inside it the normal is that of the nearest face."""
     px, py, pz = x - row[POINT], y - row[POINT + 1], z - row[POINT + 2]
@@ -66,7 +66,7 @@ def box_distance(row: Any, x: Any, y: Any, z: Any) -> Any:
     )
 
 
-@law
+@device_function
 def height_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
     """Distance to bilinear ground, along the normal under the point."""
     first, nx, ny = int(row[FIRST_HEIGHT]), int(row[COUNT_X]), int(row[COUNT_Y])
@@ -83,8 +83,8 @@ def height_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
     return (z - height) * up, (-slope_x * up, -slope_y * up, up)
 
 
-@law
-def obstacle_velocity(row: Any, x: Any, y: Any, z: Any) -> Any:
+@device_function
+def collider_velocity(row: Any, x: Any, y: Any, z: Any) -> Any:
     """Velocity [m/s] of the collider's material at a point [m]."""
     px, py, pz = x - row[POINT], y - row[POINT + 1], z - row[POINT + 2]
     wx, wy, wz = row[SPIN], row[SPIN + 1], row[SPIN + 2]
@@ -95,7 +95,7 @@ def obstacle_velocity(row: Any, x: Any, y: Any, z: Any) -> Any:
     )
 
 
-@law
+@device_function
 def unit(x: Any, y: Any, z: Any) -> Any:
     """Direction of a vector and its length; the zero vector stays zero."""
     length = math.sqrt(x * x + y * y + z * z)

@@ -9,10 +9,9 @@ import pytest
 
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.physics import PhysicsError, Plane
+from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.presets import ObjectPhysics
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
-
-from .scenes import at
 
 GROUND = Plane(name="ground", friction=0.7)
 

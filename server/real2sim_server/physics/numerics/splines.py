@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from .shared import HALF, THREE_HALVES, THREE_QUARTERS, law
+from .device import HALF, THREE_HALVES, THREE_QUARTERS, device_function
 
 
-@law
+@device_function
 def spline_weights(f: Any) -> Any:
     """Weights of the three nodes at offsets 0, 1, 2 for a particle at ``f`` in [0.5, 1.5).
 

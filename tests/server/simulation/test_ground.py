@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from real2sim_server.physics import PhysicsError
+from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.ground import find_road
 from real2sim_server.simulation.surroundings import clearance
-
-from .scenes import at
 
 BOXES = [(at(x, y, 1.0), (4.5, 1.8, 1.5)) for x, y in ((0, 0), (12, 3), (20, -2))]
 EVERYWHERE = np.array([-12.0, -12.0]), np.array([32.0, 12.0])

@@ -12,39 +12,29 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..constitutive.contact import OPPOSED, coulomb, face_score, surface_offset
-from ..constitutive.obstacle import FRICTION, SEPARABLE, obstacle_distance, obstacle_velocity, unit
-from ..constitutive.shared import ZERO, law
-from .layout import BLOCK
+from ..numerics.device import ZERO, device_function
+from .collider_distance import FRICTION, SEPARABLE, collider_distance, collider_velocity, unit
+from .surface import OPPOSED, coulomb, face_score, surface_offset
 
 
-@law
-def node_position(block: Any, node: Any, dx: Any) -> Any:
-    """World position [m] of a node of a block."""
-    x = (block[0] * BLOCK + node // (BLOCK * BLOCK)) * dx
-    y = (block[1] * BLOCK + node // BLOCK % BLOCK) * dx
-    z = (block[2] * BLOCK + node % BLOCK) * dx
-    return x, y, z
-
-
-@law
-def meet_obstacle(
+@device_function
+def resolve_node_collider(
     row: Any, heights: Any, dx: Any, body_friction: Any, at: Any, node: Any, moment: Any, total: Any
 ) -> None:
     """Contact of one body's node at ``at`` with one collider, where surfaces have met."""
-    distance, n = obstacle_distance(row, heights, at[0], at[1], at[2])
+    distance, n = collider_distance(row, heights, at[0], at[1], at[2])
     if distance > 0.0:
         return
     depth = (moment[0] * n[0] + moment[1] * n[1] + moment[2] * n[2]) / moment[3]
     if distance / dx + surface_offset(depth) > 0.0:
         return
     friction = row[FRICTION] if row[FRICTION] >= ZERO else body_friction
-    u = obstacle_velocity(row, at[0], at[1], at[2])
-    touch_node(node, n, u, friction, row[SEPARABLE] > 0.5, at, total)
+    u = collider_velocity(row, at[0], at[1], at[2])
+    apply_contact(node, n, u, friction, row[SEPARABLE] > 0.5, at, total)
 
 
-@law
-def touch_node(
+@device_function
+def apply_contact(
     node: Any, n: Any, u: Any, friction: Any, separable: Any, at: Any, total: Any
 ) -> None:
     """Touch of a node with an obstacle that moves at ``u``; adds to the touch's totals."""
@@ -56,11 +46,11 @@ def touch_node(
             node[axis] = u[axis] + after[axis]
         m = node[3]
         impulse = (m * change[0], m * change[1], m * change[2])
-        record(impulse, after, u, at, 1.0, total)
+        record_impulse(impulse, after, u, at, 1.0, total)
 
 
-@law
-def record(impulse: Any, slip: Any, other: Any, at: Any, share: Any, total: Any) -> None:
+@device_function
+def record_impulse(impulse: Any, slip: Any, other: Any, at: Any, fraction: Any, total: Any) -> None:
     """Add an impulse at a place, what it rubbed and what it did; see ``base.TOTALS``."""
     px, py, pz = impulse
     total[0] += px
@@ -69,18 +59,18 @@ def record(impulse: Any, slip: Any, other: Any, at: Any, share: Any, total: Any)
     total[3] += at[1] * pz - at[2] * py
     total[4] += at[2] * px - at[0] * pz
     total[5] += at[0] * py - at[1] * px
-    total[6] -= share * (px * slip[0] + py * slip[1] + pz * slip[2])
+    total[6] -= fraction * (px * slip[0] + py * slip[1] + pz * slip[2])
     total[7] += px * other[0] + py * other[1] + pz * other[2]
 
 
-@law
+@device_function
 def pair_friction(a: Any, b: Any) -> Any:
     """Coulomb coefficient between two surfaces."""
     return math.sqrt(a * b)
 
 
-@law
-def meet_node(
+@device_function
+def resolve_node_pair(
     node_a: Any, node_b: Any, moment_a: Any, moment_b: Any,
     friction: Any, dx: Any, at: Any, total_a: Any, total_b: Any,
 ) -> None:  # fmt: skip
@@ -115,5 +105,5 @@ def meet_node(
         for axis in range(3):
             node_a[axis] += on_a[axis] / ma
             node_b[axis] += on_b[axis] / mb
-        record(on_a, (-after[0], -after[1], -after[2]), node_b, at, 0.5, total_a)
-        record(on_b, after, node_a, at, 0.5, total_b)
+        record_impulse(on_a, (-after[0], -after[1], -after[2]), node_b, at, 0.5, total_a)
+        record_impulse(on_b, after, node_a, at, 0.5, total_b)
