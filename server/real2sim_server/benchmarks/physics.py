@@ -17,7 +17,8 @@ from ..physics.colliders import Plane
 from ..physics.materials import FixedCorotated, Material, NeoHookean
 from ..physics.particles import box_particles
 from ..physics.solver import Solver, SolverOptions
-from .peers.block import PEERS, PeerBlock, missing_reason, start_peer
+from .peers.block import PeerBlock
+from .peers.select import PEERS, missing_reason, start_peer
 
 SIZES = (10_000, 100_000, 1_000_000)
 MATERIALS: dict[str, Material] = {
@@ -52,7 +53,7 @@ def run(
         of REPEATS runs; ``cpu_rate`` is per second of processor time and thread, which says what
         an otherwise idle machine would do.
     """
-    tell = on_progress or (lambda done, parts: None)
+    report_progress = on_progress or (lambda done, parts: None)
     cases = [(m, n) for m in MATERIALS for n in SIZES]
     parts = len(cases) + 2 + peers
     report: dict[str, Any] = {
@@ -64,16 +65,16 @@ def run(
         "speed": [],
     }
     for done, (material, particles) in enumerate(cases):
-        tell(done, parts)
+        report_progress(done, parts)
         report["speed"].append(_speed(material, particles))
-    tell(len(cases), parts)
+    report_progress(len(cases), parts)
     report["domain"] = _domain()
-    tell(len(cases) + 1, parts)
+    report_progress(len(cases) + 1, parts)
     report["reference"] = _reference()
     if peers:
-        tell(len(cases) + 2, parts)
+        report_progress(len(cases) + 2, parts)
         report["peers"] = _peers()
-    tell(parts, parts)
+    report_progress(parts, parts)
     return report
 
 
@@ -210,9 +211,9 @@ def _block(material: str, particles: int, x: float = 0.0, name: str = "block") -
     kind = MATERIALS[material]
     pose = np.eye(4)
     pose[:3, 3] = x, 0.0, edge / 2 + 5.0
-    matter = box_particles([edge] * 3, spacing=SPACING, density=kind.density).moved(pose)
+    block = box_particles([edge] * 3, spacing=SPACING, density=kind.density).moved(pose)
     return Body(
-        name=name, particles=matter, material=kind, velocity=(0, 0, -2), angular_velocity=(1, 0, 0)
+        name=name, particles=block, material=kind, velocity=(0, 0, -2), angular_velocity=(1, 0, 0)
     )
 
 
@@ -221,7 +222,7 @@ def _options(backend: str = "cpu") -> SolverOptions:
 
 
 def _time_substep(solver: Solver) -> tuple[float, float]:
-    """Shortest elapsed time of a substep [s], and processor time per thread [s]; guard left out."""
+    """Shortest elapsed time of a substep [s], and processor time per thread [s]; no checks."""
     simulation, dt = solver.simulation, solver.time_step()
     simulation.advance(2, dt, solver.colliders)
     return _best(lambda steps: simulation.advance(steps, dt, solver.colliders))

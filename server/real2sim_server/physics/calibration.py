@@ -81,7 +81,7 @@ def calibrate(
         steps: tried at most, rejected ones included.
 
     Raises:
-        SolverError: for names or shapes that do not fit, or guesses that already blow up.
+        SolverError: for names or shapes that do not fit, or guesses that already diverge.
     """
     names = tuple(dict.fromkeys(parameters))
     target = _checked(solver, observed, names)
@@ -135,7 +135,8 @@ def _step(J: Tensor, off: Tensor, damping: float) -> Tensor:
     normal = scaled.T @ scaled + damping * torch.eye(len(scale), dtype=J.dtype)
     step = torch.linalg.solve(normal, -(scaled.T @ off)) / scale
     longest = float(step.abs().max())
-    return step * min(1.0, LONGEST_STEP / max(longest, 1e-30))
+    bounded: Tensor = step * min(1.0, LONGEST_STEP / max(longest, 1e-30))
+    return bounded
 
 
 def _scale(J: Tensor) -> Tensor:
@@ -158,7 +159,8 @@ def jacobian(path: Callable[[Tensor], Tensor], logs: Tensor) -> Tensor:
     """[M, K] of a path by forward-mode dual numbers, all parameters in one run."""
 
     def along(direction: Tensor) -> Tensor:
-        return torch.func.jvp(path, (logs,), (direction,))[1].reshape(-1)
+        tangent: Tensor = torch.func.jvp(path, (logs,), (direction,))[1]
+        return tangent.reshape(-1)
 
     with warnings.catch_warnings():
         # Torch compiles its own forward rules by a function it has deprecated, and lacks a batched

@@ -110,7 +110,7 @@ class Box(Collider):
             return self
         pose = np.array(self.T_world_box)
         pose[:3, 3] += duration * np.asarray(self.velocity)
-        pose[:3, :3] = _turn(np.asarray(self.angular_velocity) * duration) @ pose[:3, :3]
+        pose[:3, :3] = _rotation(np.asarray(self.angular_velocity) * duration) @ pose[:3, :3]
         return replace(self, T_world_box=pose)
 
 
@@ -149,11 +149,12 @@ def _vector(collider: Collider, name: str, length: int = 3) -> Float:
     return value
 
 
-def _turn(rotation_vector: Float) -> Float:
+def _rotation(rotation_vector: Float) -> Float:
     """Rotation matrix [3, 3] of a rotation vector [3] [rad] (Rodrigues)."""
     angle = float(np.linalg.norm(rotation_vector))
     if angle < 1e-300:
         return np.eye(3)
     x, y, z = rotation_vector / angle
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+    rotation: Float = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+    return rotation

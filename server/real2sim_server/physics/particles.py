@@ -45,7 +45,7 @@ class Particles:
             given = getattr(self, name).shape
             if given != shape:
                 raise ParticleError(f"{name} of {n} particles must be {shape}, not {given}")
-        _require(np.isfinite(self.positions).all(axis=1), "positions are not finite")
+        _require(np.asarray(np.isfinite(self.positions).all(axis=1)), "positions are not finite")
         _require(np.isfinite(self.volumes) & (self.volumes > 0), "volumes are not positive")
         _require(np.isfinite(self.masses) & (self.masses > 0), "masses are not positive")
 
@@ -60,7 +60,8 @@ class Particles:
     @property
     def centre_of_mass(self) -> Float:
         """[3] [m]."""
-        return self.masses @ self.positions / self.masses.sum()
+        centre: Float = self.masses @ self.positions / self.masses.sum()
+        return centre
 
     @property
     def inertia(self) -> Float:
@@ -71,7 +72,8 @@ class Particles:
         r = self.positions - self.centre_of_mass
         second = np.einsum("n,ni,nj->ij", self.masses, r, r)
         own = float((self.masses * np.cbrt(self.volumes) ** 2).sum()) / 6
-        return np.trace(second) * np.eye(3) - second + own * np.eye(3)
+        inertia: Float = np.trace(second) * np.eye(3) - second + own * np.eye(3)
+        return inertia
 
     def moved(self, T_dst_src: ArrayLike) -> Particles:
         """The particles in another frame, by a rigid [4, 4] transform."""

@@ -268,7 +268,7 @@ class DeformableBody:
             rotation=np.eye(3),
             centre=state.centre,
             velocity=state.velocity,
-            angular_velocity=np.linalg.solve(inertia, state.angular_momentum),
+            angular_velocity=np.asarray(np.linalg.solve(inertia, state.angular_momentum)),
             mass=state.mass,
             inertia=inertia,
         )

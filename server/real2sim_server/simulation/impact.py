@@ -200,8 +200,10 @@ def simulate_impact(
 
 
 def _mean_velocity(impact_bodies: Sequence[ImpactBody]) -> Float:
-    masses = np.array([c.body.rest.mass for c in impact_bodies])
-    return masses @ np.stack([c.velocity for c in impact_bodies]) / masses.sum()
+    masses = np.array([b.body.rest.mass for b in impact_bodies])
+    velocities = np.stack([b.velocity for b in impact_bodies])
+    mean: Float = masses @ velocities / masses.sum()
+    return mean
 
 
 def _free_path(
@@ -236,8 +238,9 @@ def _surface(box: Box, like: Float, cell: float) -> Float:
     pose, size = np.asarray(box.T_world_box), np.asarray(box.size)
     steps = [np.arange(-s / 2, s / 2 + cell / 4, cell / 2) for s in size]
     grid = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    points: Float = apply_transform(pose, grid)
-    return points[points[:, 2] < like[:, 2].max() + cell]
+    points = apply_transform(pose, grid)
+    near: Float = points[points[:, 2] < like[:, 2].max() + cell]
+    return near
 
 
 def _spawn_body(

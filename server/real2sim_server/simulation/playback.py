@@ -150,4 +150,5 @@ def _in_wheels(means: NDArray[np.float32], wheels: NDArray[np.float32]) -> NDArr
     """[G, W] which Gaussians belong to which wheel, by undersides [W, 3] in the same frame."""
     offset = means[:, None] - (wheels + np.array([0, 0, WHEEL_RADIUS], dtype=np.float32))
     in_disc = np.hypot(offset[..., 0], offset[..., 2]) < WHEEL_RADIUS + 0.02
-    return in_disc & (np.abs(offset[..., 1]) < WHEEL_HALF_WIDTH)
+    inside: NDArray[np.bool_] = in_disc & (np.abs(offset[..., 1]) < WHEEL_HALF_WIDTH)
+    return inside

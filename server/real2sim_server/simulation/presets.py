@@ -13,6 +13,8 @@ from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
 from ..physics.materials import FixedCorotated, Foam, Material, Snow
 
+Regions = Callable[[Float], NDArray[np.int64]]
+"""From places along the length [m] to indices of materials."""
 VEHICLES = ("car", "vehicle", "van", "truck", "bus")
 CRUMPLE_FRACTION = 0.26
 """Fraction of the length that is crumple zone, at each end."""
@@ -82,16 +84,16 @@ class Preset:
     wheels: bool
     clearance: float
     by_density: bool
-    build: Callable[[str, float], tuple[Sequence[Material], Callable[[Float], NDArray[np.int64]]]]
+    build: Callable[[str, float], tuple[Sequence[Material], Regions]]
 
 
-def _paper(category: str, length: float) -> tuple[Sequence[Material], Callable[[Float], NDArray]]:
+def _paper(category: str, length: float) -> tuple[Sequence[Material], Regions]:
     """Table II of the paper: E 2e6 Pa, nu 0.4, rho 200 kg/m^3, fixed corotated, all through."""
     soft = FixedCorotated(young=2e6, poisson=0.4, density=200.0)
     return (soft,), lambda x: np.zeros(len(x), dtype=np.int64)
 
 
-def _vehicle(category: str, length: float) -> tuple[Sequence[Material], Callable[[Float], NDArray]]:
+def _vehicle(category: str, length: float) -> tuple[Sequence[Material], Regions]:
     """Bumpers and crumple zones at both ends of a stiff cabin; other things are soft foam."""
     if category not in VEHICLES:
         foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)

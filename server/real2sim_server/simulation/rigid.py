@@ -15,7 +15,8 @@ def rotation_of(vector: Float) -> Float:
     if angle < 1e-12:
         return np.eye(3)
     k = cross_matrix(vector / angle)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+    rotation: Float = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+    return rotation
 
 
 def cross_matrix(vector: Float) -> Float:
@@ -92,7 +93,8 @@ class RigidMotion:
         # Rounding must not add up to a skewed frame.
         left, _, right = np.linalg.svd(turned)
         moved = replace(self, rotation=left @ right, centre=self.centre + duration * self.velocity)
-        return replace(moved, angular_velocity=np.linalg.solve(moved.world_inertia, momentum))
+        turning = np.linalg.solve(moved.world_inertia, momentum).astype(np.float64, copy=False)
+        return replace(moved, angular_velocity=turning)
 
 
 def inertia_about(centre: Float, positions: Float, masses: Float, *, cell: float) -> Float:
@@ -110,7 +112,8 @@ def inertia_about(centre: Float, positions: Float, masses: Float, *, cell: float
     r = positions - centre
     second = np.einsum("n,ni,nj->ij", masses, r, r)
     own = float(masses.sum()) * cell**2 / 2
-    return (np.trace(second) + own) * np.eye(3) - second
+    inertia: Float = (np.trace(second) + own) * np.eye(3) - second
+    return inertia
 
 
 def best_rotation(rest: Float, now: Float, masses: Float) -> Float:
@@ -122,7 +125,5 @@ def best_rotation(rest: Float, now: Float, masses: Float) -> Float:
     b = now - masses @ now / masses.sum()
     left, _, right = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, b, a))
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return left @ flip @ right
-
-
-__all__ = ["RigidMotion", "best_rotation", "cross_matrix", "inertia_about", "rotation_of"]
+    rotation: Float = left @ flip @ right
+    return rotation

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -57,20 +57,25 @@ class Tyres:
     frequency: float = 2.0
     damping: float = 0.35
     travel: float = 0.12
-    rest: Float = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.rest is None:
-            object.__setattr__(self, "rest", np.zeros(4))
+    rest: Float = field(default_factory=lambda: np.zeros(4))
 
     @classmethod
-    def of(cls, size: Sequence[float], centre: Float, weight: float, **options: float) -> Tyres:
+    def of(
+        cls,
+        size: Sequence[float],
+        centre: Float,
+        weight: float,
+        *,
+        friction: float = 0.7,
+        brake: float = 0.0,
+    ) -> Tyres:
         """Wheels under a box of ``size`` [m], axles at 30 % of the length from the middle.
 
         Args:
             size: (length, width, height).
             centre: [3] centre of mass in the object's frame [m].
             weight: mass times gravity [N].
+            friction, brake: see the class.
         """
         length, width, height = size
         x, y = 0.3 * length, 0.42 * width
@@ -78,7 +83,7 @@ class Tyres:
         front = np.clip((centre[0] + x) / (2 * x), 0.2, 0.8)
         left = np.clip((centre[1] + y) / (2 * y), 0.2, 0.8)
         fractions = np.array([f * s for f in (front, 1 - front) for s in (left, 1 - left)])
-        return cls(patches, weight * fractions, **options)
+        return cls(patches, weight * fractions, friction=friction, brake=brake)
 
     def standing(self, T_world_object: Float, road: Sequence[Collider], reach: float) -> Tyres:
         """Tyres whose rest is how the vehicle stands now, where that is within ``reach`` [m].

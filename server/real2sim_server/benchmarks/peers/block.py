@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-PEERS = ("taichi", "warp")
 CELLS = 40
 """Nodes along an edge of the peers' dense grid; it reaches from the origin to CELLS dx."""
 
@@ -52,19 +50,3 @@ class PeerRun:
 
     advance: Callable[[int], None]
     positions: Callable[[], Single]
-
-
-def missing_reason(peer: str) -> str:
-    """Why a peer cannot run here, or nothing."""
-    if importlib.util.find_spec(peer) is None:
-        return f"{peer} is not installed"
-    return ""
-
-
-def start_peer(peer: str, block: PeerBlock) -> PeerRun:
-    """Load a block into the peer of that name; only here is it imported."""
-    if peer == "taichi":
-        from .taichi_peer import start
-    else:
-        from .warp_peer import start
-    return start(block)

@@ -2,7 +2,7 @@
 
 # Taichi reads annotations as they stand, so they must not become strings.
 
-import taichi as ti
+import taichi as ti  # type: ignore[import-not-found, unused-ignore]
 
 from .block import CELLS, PeerBlock, PeerRun
 
@@ -12,12 +12,12 @@ POLAR_STEPS = 4
 def start(block: PeerBlock) -> PeerRun:
     """Load a block on the CPU."""
     ti.init(arch=ti.cpu, log_level=ti.ERROR, cpu_max_num_threads=block.threads, fast_math=True)
-    solver = Solver(block)
+    solver = TaichiSolver(block)
     return PeerRun(solver.advance, solver.x.to_numpy)
 
 
 @ti.data_oriented
-class Solver:
+class TaichiSolver:
     """Fields and kernels of one block."""
 
     def __init__(self, block: PeerBlock) -> None:
@@ -44,14 +44,14 @@ class Solver:
         ti.sync()
 
     @ti.kernel
-    def reset(self):  # type: ignore[no-untyped-def]
+    def reset(self):
         """No deformation, no gradient."""
         for p in self.x:
             self.F[p] = ti.Matrix.identity(ti.f32, 3)
             self.C[p] = ti.Matrix.zero(ti.f32, 3, 3)
 
     @ti.kernel
-    def scatter(self):  # type: ignore[no-untyped-def]
+    def scatter(self):
         """Deform particles and give their momentum to the grid."""
         ti.loop_config(block_dim=256)
         for p in self.x:
@@ -77,7 +77,7 @@ class Solver:
                 )
 
     @ti.kernel
-    def gather(self):  # type: ignore[no-untyped-def]
+    def gather(self):
         """Momentum to velocity, and velocities back to the particles."""
         for node in ti.grouped(self.grid):
             m = self.grid[node][3]

@@ -5,26 +5,27 @@ slabs across x, and even slabs, then odd ones, are launched from a pool of threa
 than the stencil, so that no two of one colour write to the same node.
 """
 
-# Warp reads annotations as they stand, so they must not become strings.
+# Warp reads annotations as they stand, so they must not become strings nor mean types to mypy.
 # ruff: noqa: PLR0917
+# mypy: ignore-errors
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-import warp as wp
+import warp as wp  # type: ignore[import-not-found, unused-ignore]
 
 from .block import CELLS, PeerBlock, PeerRun
 
 SLAB = 4
-"""Cells; a particle may stray by one before slabs of one colour meet."""
+"""Cells; a particle may leave by one before slabs of one colour meet."""
 POLAR_STEPS = wp.constant(4)
 SIDE = wp.constant(CELLS)
 
 
 @wp.struct
-class Rules:
+class WarpParameters:
     """Numbers that hold for a run."""
 
     mass: wp.float32
@@ -53,11 +54,11 @@ def scatter(
     C: wp.array(dtype=wp.mat33),
     F: wp.array(dtype=wp.mat33),
     grid: wp.array(dtype=wp.vec4),
-    rules: Rules,
+    params: WarpParameters,
 ):
     """Deform particles and give their momentum to the grid."""
     p = first + wp.tid()
-    at = x[p] / rules.dx
+    at = x[p] / params.dx
     bx = int(at[0] - 0.5)
     by = int(at[1] - 0.5)
     bz = int(at[2] - 0.5)
@@ -69,17 +70,17 @@ def scatter(
         0.5 * wp.cw_mul(a, a), wp.vec3(0.75, 0.75, 0.75) - wp.cw_mul(m, m), 0.5 * wp.cw_mul(b, b)
     )
     eye = wp.identity(n=3, dtype=wp.float32)
-    deformed = (eye + rules.dt * C[p]) * F[p]
+    deformed = (eye + params.dt * C[p]) * F[p]
     F[p] = deformed
     J = wp.determinant(deformed)
     R = polar_rotation(deformed)
-    tau = 2.0 * rules.mu * (deformed - R) * wp.transpose(deformed)
-    tau = tau + eye * (rules.lam * J * (J - 1.0))
-    Q = (-rules.dt * rules.volume * 4.0 / (rules.dx * rules.dx)) * tau + rules.mass * C[p]
-    start = rules.mass * v[p] - Q * (f * rules.dx)
-    qx = Q * wp.vec3(rules.dx, 0.0, 0.0)
-    qy = Q * wp.vec3(0.0, rules.dx, 0.0)
-    qz = Q * wp.vec3(0.0, 0.0, rules.dx)
+    tau = 2.0 * params.mu * (deformed - R) * wp.transpose(deformed)
+    tau = tau + eye * (params.lam * J * (J - 1.0))
+    Q = (-params.dt * params.volume * 4.0 / (params.dx * params.dx)) * tau + params.mass * C[p]
+    start = params.mass * v[p] - Q * (f * params.dx)
+    qx = Q * wp.vec3(params.dx, 0.0, 0.0)
+    qy = Q * wp.vec3(0.0, params.dx, 0.0)
+    qz = Q * wp.vec3(0.0, 0.0, params.dx)
     for i in range(3):
         for j in range(3):
             row = start + float(i) * qx + float(j) * qy
@@ -88,18 +89,18 @@ def scatter(
             for k in range(3):
                 weight = wij * w[k, 2]
                 g = weight * (row + float(k) * qz)
-                wp.atomic_add(grid, node + k, wp.vec4(g[0], g[1], g[2], weight * rules.mass))
+                wp.atomic_add(grid, node + k, wp.vec4(g[0], g[1], g[2], weight * params.mass))
 
 
 @wp.kernel
-def move_grid(first: int, grid: wp.array(dtype=wp.vec4), rules: Rules):
+def move_grid(first: int, grid: wp.array(dtype=wp.vec4), params: WarpParameters):
     """Momentum to velocity, with gravity."""
     node = first + wp.tid()
     g = grid[node]
     if g[3] > 0.0:
         inverse = 1.0 / g[3]
         grid[node] = wp.vec4(
-            g[0] * inverse, g[1] * inverse, g[2] * inverse + rules.dt * rules.gravity, g[3]
+            g[0] * inverse, g[1] * inverse, g[2] * inverse + params.dt * params.gravity, g[3]
         )
 
 
@@ -110,11 +111,11 @@ def gather(
     v: wp.array(dtype=wp.vec3),
     C: wp.array(dtype=wp.mat33),
     grid: wp.array(dtype=wp.vec4),
-    rules: Rules,
+    params: WarpParameters,
 ):
     """Velocities of the grid to the particles."""
     p = first + wp.tid()
-    at = x[p] / rules.dx
+    at = x[p] / params.dx
     bx = int(at[0] - 0.5)
     by = int(at[1] - 0.5)
     bz = int(at[2] - 0.5)
@@ -137,8 +138,8 @@ def gather(
                 velocity += seen
                 gradient += wp.outer(seen, wp.vec3(float(i), float(j), float(k)) - f)
     v[p] = velocity
-    C[p] = (4.0 / rules.dx) * gradient
-    x[p] = x[p] + rules.dt * velocity
+    C[p] = (4.0 / params.dx) * gradient
+    x[p] = x[p] + params.dt * velocity
 
 
 def start(block: PeerBlock) -> PeerRun:
@@ -146,11 +147,11 @@ def start(block: PeerBlock) -> PeerRun:
     wp.config.quiet = True
     wp.config.enable_backward = False
     wp.init()
-    solver = Solver(block)
+    solver = WarpSolver(block)
     return PeerRun(solver.advance, solver.positions)
 
 
-class Solver:
+class WarpSolver:
     """Arrays and launches of one block."""
 
     def __init__(self, block: PeerBlock) -> None:
@@ -165,9 +166,9 @@ class Solver:
         self.C = wp.zeros(n, dtype=wp.mat33, device="cpu")
         self.F = wp.array(eye, dtype=wp.mat33, device="cpu")
         self.grid = wp.zeros(CELLS**3, dtype=wp.vec4, device="cpu")
-        self.rules = Rules()
+        self.params = WarpParameters()
         for name in ("mass", "volume", "mu", "lam", "dx", "dt", "gravity"):
-            setattr(self.rules, name, getattr(block, name))
+            setattr(self.params, name, getattr(block, name))
         self.threads = block.threads
         self.pool = ThreadPoolExecutor(block.threads)
         wp.load_module(device="cpu")
@@ -178,11 +179,11 @@ class Solver:
         for _ in range(steps):
             self.grid.zero_()
             for colour in (0, 1):
-                inputs = [*particles, self.F, self.grid, self.rules]
+                inputs = [*particles, self.F, self.grid, self.params]
                 self._launch(scatter, self.slabs[colour::2], inputs)
-            self._launch(move_grid, self._shares(len(self.grid)), [self.grid, self.rules])
-            shares = self._shares(len(self.x))
-            self._launch(gather, shares, [*particles, self.grid, self.rules])
+            self._launch(move_grid, self._slices(len(self.grid)), [self.grid, self.params])
+            slices = self._slices(len(self.x))
+            self._launch(gather, slices, [*particles, self.grid, self.params])
 
     def positions(self) -> Any:
         """[N, 3] in the block's order [m]."""
@@ -190,7 +191,7 @@ class Solver:
         out[self.order] = self.x.numpy()
         return out
 
-    def _shares(self, count: int) -> list[tuple[int, int]]:
+    def _slices(self, count: int) -> list[tuple[int, int]]:
         cuts = np.linspace(0, count, self.threads + 1).astype(int)
         return [(int(a), int(b - a)) for a, b in itertools.pairwise(cuts)]
 

@@ -83,7 +83,8 @@ class Model:
     @property
     def plastic(self) -> NDArray[np.bool_]:
         """[N] which particles keep F_total and history of their own."""
-        return self.table[self.material, material_row.PLASTIC] > 0
+        flags: NDArray[np.bool_] = self.table[self.material, material_row.PLASTIC] > 0
+        return flags
 
     @property
     def bodies(self) -> int:

@@ -294,7 +294,8 @@ class BlockSimulation:
 
 def _block_of(cells: Any) -> Int:
     """Block [N, 3] of the first node of particles at ``cells`` [N, 3]."""
-    return np.floor((cells - 0.5) / BLOCK).astype(np.int64)
+    blocks: Int = np.floor((cells - 0.5) / BLOCK).astype(np.int64)
+    return blocks
 
 
 def _fastest_point(collider: Collider) -> float:

@@ -20,7 +20,6 @@ from ...geometry.rotation import Float
 from ..colliders import Collider, HeightField
 from ..contact.collider_distance import collider_distance
 from ..errors import ParticleError
-from ..numerics.device import device_function
 from .base import pack_colliders
 
 Int = NDArray[np.int64]
@@ -70,15 +69,6 @@ class Layout(NamedTuple):
     contact_start: Int
     contact_collider: Int
     near: NDArray[np.bool_]
-
-
-@device_function
-def node_position(block: Any, node: Any, dx: Any) -> Any:
-    """World position [m] of a node of a block."""
-    x = (block[0] * BLOCK + node // (BLOCK * BLOCK)) * dx
-    y = (block[1] * BLOCK + node // BLOCK % BLOCK) * dx
-    z = (block[2] * BLOCK + node % BLOCK) * dx
-    return x, y, z
 
 
 def arrange(
@@ -173,7 +163,7 @@ def _near_colliders(blocks: Int, dx: float, colliders: Sequence[Collider]) -> tu
     return start, np.nonzero(near)[1]
 
 
-def _distances(row: Float, heights: Float, points: Float) -> Float:
+def _distances(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:
     return np.array([collider_distance(row, heights, *p)[0] for p in points.tolist()])
 
 
@@ -184,4 +174,5 @@ def _chunks(block_start: Int) -> Int:
     wanted = work[-1] * np.arange(CHUNKS + 1) / CHUNKS
     cuts = np.searchsorted(work, wanted)
     cuts[0], cuts[-1] = 0, blocks
-    return cuts.astype(np.int64)
+    starts: Int = cuts.astype(np.int64)
+    return starts

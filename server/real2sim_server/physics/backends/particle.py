@@ -108,6 +108,15 @@ class StepParameters(NamedTuple):
 
 
 @device_function
+def node_position(block: Any, node: Any, dx: Any) -> Any:
+    """World position [m] of a node of a block."""
+    x = (block[0] * BLOCK + node // (BLOCK * BLOCK)) * dx
+    y = (block[1] * BLOCK + node // BLOCK % BLOCK) * dx
+    z = (block[2] * BLOCK + node % BLOCK) * dx
+    return x, y, z
+
+
+@device_function
 def first_node(x: Any) -> Any:
     """First node along one axis that a particle at ``x`` [cells] sees, and its distance from it."""
     # On a device floor gives no whole number.

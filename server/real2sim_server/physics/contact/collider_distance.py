@@ -99,5 +99,5 @@ def collider_velocity(row: Any, x: Any, y: Any, z: Any) -> Any:
 def unit(x: Any, y: Any, z: Any) -> Any:
     """Direction of a vector and its length; the zero vector stays zero."""
     length = math.sqrt(x * x + y * y + z * z)
-    inverse = 1.0 / max(length, TINY)
+    inverse = 1.0 / max(length, TINY)  # type: ignore[operator]
     return (x * inverse, y * inverse, z * inverse), length

@@ -22,7 +22,9 @@ from .gradients import gradients
 from .impact import hertz, stiff_discs, two_discs
 from .motion import affine_patch, free_fall, invariants, reproducibility, scale_invariance, spin
 
-CASES: dict[str, Callable[[str], list[Check]]] = {
+Case = Callable[[str], list[Check]]
+"""Takes the name of a backend."""
+CASES: dict[str, Case] = {
     case.__name__: case
     for case in (
         free_fall,
@@ -53,4 +55,4 @@ CASES: dict[str, Callable[[str], list[Check]]] = {
 }
 """All cases by name, the cheap ones first."""
 
-__all__ = ["CASES", "Check", "ReferenceCurve"]
+__all__ = ["CASES", "Case", "Check", "ReferenceCurve"]

@@ -170,6 +170,7 @@ def _axis(axis: int, length: float) -> np.ndarray:
 
 
 def _pushes(solver: Solver) -> np.ndarray:
-    """[3] what the walls pushed inwards so far, mean of both sides of each axis [N s]."""
+    """[3] impulse of the walls inwards so far, mean of both sides of each axis [N s]."""
     impulses = np.array([np.abs(c.impulse) for c in solver.contacts])
-    return impulses.sum(axis=0) / 2
+    mean: np.ndarray = impulses.sum(axis=0) / 2
+    return mean

@@ -28,15 +28,14 @@ def gradients(backend: str = "reference") -> list[Check]:
     names = ("stiffness", "yield stress", "viscosity", "friction", "speed")
     knobs = torch.zeros(len(names), dtype=torch.float64, requires_grad=True)
     outcome = _outcome(state, params)
-    outcome(knobs).backward()
-    assert knobs.grad is not None
+    [slopes] = torch.autograd.grad(outcome(knobs), [knobs])
     checks = []
     for i, name in enumerate(names):
         step = torch.zeros_like(knobs)
         step[i] = 1e-5
         with torch.no_grad():
             slope = float((outcome(knobs + step) - outcome(knobs - step)) / 2e-5)
-        checks.append(Check(f"gradient: {name}", float(knobs.grad[i]), slope, 1e-3 * abs(slope)))
+        checks.append(Check(f"gradient: {name}", float(slopes[i]), slope, 1e-3 * abs(slope)))
     return checks
 
 

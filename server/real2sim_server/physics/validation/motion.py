@@ -113,9 +113,9 @@ def scale_invariance(backend: str) -> list[Check]:
     for s in (1.0, 2.0):
         body = block(
             FixedCorotated(young=2e5 * s**2, poisson=0.4),
-            size=np.full(3, 0.4) * s,
+            size=(0.4 * s,) * 3,
             spacing=0.05 * s,
-            at=np.array([0.01, 0.02, 0.21]) * s,
+            at=(0.01 * s, 0.02 * s, 0.21 * s),
             velocity=(0.5 * s, 0, -1.0 * s),
         )
         solver = solve(

@@ -100,6 +100,7 @@ def draw_curve(curve: ReferenceCurve, title: str) -> str:
         if np.isfinite(curve.measured).any():
             axes.legend()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        FigureCanvasSVG(figure).print_svg(out, metadata=nothing)
+        FigureCanvasSVG(figure)
+        figure.savefig(out, format="svg", metadata=nothing)
     text = out.getvalue()
     return text[text.index("<svg") :]

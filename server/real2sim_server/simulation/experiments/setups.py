@@ -184,9 +184,9 @@ def _pair(request: _Request) -> Experiment:
         runners, standing = chosen[:count], chosen[count : 2 * count]
     else:
         visibilities = {s.object_id: visibility_of(request.scene, s) for s in chosen}
-        runners = sorted(chosen, key=lambda s: -visibilities[s.object_id].front)[:count]
+        runners = tuple(sorted(chosen, key=lambda s: -visibilities[s.object_id].front)[:count])
         rest = [s for s in chosen if s not in runners]
-        standing = sorted(rest, key=lambda s: -visibilities[s.object_id].rear)[:count]
+        standing = tuple(sorted(rest, key=lambda s: -visibilities[s.object_id].rear)[:count])
     objects: dict[str, ObjectPhysics] = {}
     meeting = []
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
@@ -265,4 +265,5 @@ def _viewer(
     slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
     along = (1.0 if x >= 0 else -1.0) * _level(pose[:3, 0])
     side = (1.0 if y >= 0 else -1.0) * slant * _level(np.cross([0, 0, 1], pose[:3, 0]))
-    return _level(along + side) + np.array([0.0, 0.0, rise])
+    direction: Float = _level(along + side) + np.array([0.0, 0.0, rise])
+    return direction

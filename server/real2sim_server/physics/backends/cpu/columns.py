@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped, unused-ignore]
 from numba import types
 from numba.extending import intrinsic
 
@@ -79,10 +79,10 @@ class _ColumnEmitter:
 
 
 @intrinsic
-def lay_out(typingctx, rows, first, scratch, plane):  # type: ignore[no-untyped-def]
+def lay_out(typingctx, rows, first, scratch, plane):
     """Nine numbers of each of BATCH particles from ``first`` on to planes from ``plane`` on."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         data, first, space, plane = arguments
         kinds = signature.args[0], signature.args[2]
         e = _ColumnEmitter(context, builder, kinds, (data, space))
@@ -102,10 +102,10 @@ def lay_out(typingctx, rows, first, scratch, plane):  # type: ignore[no-untyped-
 
 
 @intrinsic
-def bring_back_nine(typingctx, scratch, plane, rows, first):  # type: ignore[no-untyped-def]
+def bring_back_nine(typingctx, scratch, plane, rows, first):
     """Nine planes from ``plane`` on back to the rows of BATCH particles from ``first`` on."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         e, plane, first = _way_back(context, builder, signature, arguments)
         for half in range(0, BATCH, EIGHT):
             columns = e.columns(plane, half, EIGHT + 1)
@@ -120,10 +120,10 @@ def bring_back_nine(typingctx, scratch, plane, rows, first):  # type: ignore[no-
 
 
 @intrinsic
-def bring_back_six(typingctx, scratch, plane, rows, first):  # type: ignore[no-untyped-def]
+def bring_back_six(typingctx, scratch, plane, rows, first):
     """Six planes from ``plane`` on back to the rows of BATCH particles from ``first`` on."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         e, plane, first = _way_back(context, builder, signature, arguments)
         for half in range(0, BATCH, EIGHT):
             columns = e.columns(plane, half, 6)

@@ -7,7 +7,8 @@ from typing import Any
 from ...contact.node import pair_friction, resolve_node_collider, resolve_node_pair
 from ...numerics.device import ZERO
 from ..kernel import inner
-from ..layout import BLOCK, node_position
+from ..layout import BLOCK
+from ..particle import node_position
 
 
 @inner()

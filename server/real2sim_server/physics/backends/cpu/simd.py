@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped, unused-ignore]
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -89,13 +89,13 @@ def _unpack(builder: ir.IRBuilder, value: Any, count: int) -> list[Any]:
 
 
 @intrinsic
-def scatter(typingctx, tiles, first, wx, wy, wz, start, qx, qy, qz):  # type: ignore[no-untyped-def]
+def scatter(typingctx, tiles, first, wx, wy, wz, start, qx, qy, qz):
     """Add w (start + i qx + j qy + k qz) to the nodes at offsets (i, j, k) from ``first``.
 
     tiles: flat array; wx, wy, wz: weights, three each; start: four numbers; qx, qy, qz: three.
     """
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         e = _LaneEmitter(context, builder, signature.args[0], arguments[0])
         weights = [_unpack(builder, a, 3) for a in arguments[2:5]]
         along_z = e.spread(weights[2])
@@ -121,10 +121,10 @@ def scatter(typingctx, tiles, first, wx, wy, wz, start, qx, qy, qz):  # type: ig
 
 
 @intrinsic
-def gather(typingctx, tiles, first, wx, wy, wz):  # type: ignore[no-untyped-def]
+def gather(typingctx, tiles, first, wx, wy, wz):
     """Twelve numbers: sum w v, and sum w v times the offset i, j and k of each node."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         e = _LaneEmitter(context, builder, signature.args[0], arguments[0])
         weights = [_unpack(builder, a, 3) for a in arguments[2:5]]
         wx, wy = ([e.splat(w, e.line) for w in axis] for axis in weights[:2])

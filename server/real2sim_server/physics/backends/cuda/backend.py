@@ -35,7 +35,7 @@ class CudaSolverBackend:
 
     def __init__(self) -> None:
         try:
-            usable = cuda.is_available()
+            usable = bool(cuda.is_available())  # type: ignore[no-untyped-call]
             reason = "no CUDA device was found"
         except Exception as problem:
             usable, reason = False, f"{type(problem).__name__}: {problem}"

@@ -21,7 +21,7 @@ from ...contact.node import pair_friction, resolve_node_collider, resolve_node_p
 from ...numerics.device import F32, ONE, ZERO, device_function
 from ...numerics.splines import spline_weights
 from ..base import TOTALS
-from ..layout import BLOCK, node_position
+from ..layout import BLOCK
 from ..particle import (
     COLUMNS,
     NODES,
@@ -33,12 +33,13 @@ from ..particle import (
     deform,
     momentum,
     move,
+    node_position,
     place,
     tile_node,
     velocity_gradient,
 )
 
-SIMULATED = bool(config.ENABLE_CUDASIM)
+SIMULATED = bool(config.ENABLE_CUDASIM)  # type: ignore[attr-defined]
 THREADS = 2 if SIMULATED else 128
 """Of a group. The simulator starts a Python thread for each."""
 NODE_THREADS = 2 if SIMULATED else NODES
@@ -112,7 +113,7 @@ def collect_moment(field: Any, node: Any, layout: Any, work: Any) -> None:
 
 
 @cuda.jit(device=True)
-def add_particles(block, thread, dt, state, layout, params, tile):  # type: ignore[no-untyped-def]
+def add_particles(block, thread, dt, state, layout, params, tile):
     """Add momentum and mass of one block's particles to its tile."""
     for p in range(layout.block_start[block] + thread, layout.block_start[block + 1], THREADS):
         first, f = place(p, state.xi)
@@ -131,7 +132,7 @@ def add_particles(block, thread, dt, state, layout, params, tile):  # type: igno
 
 
 @cuda.jit(device=True)
-def add_volumes(block, thread, state, layout, tile):  # type: ignore[no-untyped-def]
+def add_volumes(block, thread, state, layout, tile):
     """Add w V (x_p - x_i) and w V of one block's particles to its tile; V at rest."""
     for p in range(layout.block_start[block] + thread, layout.block_start[block + 1], THREADS):
         first, f = place(p, state.xi)
@@ -171,7 +172,7 @@ def gather_sums(first: Any, f: Any, tile: Any) -> Any:
 
 
 @cuda.jit(device=True)
-def clear(thread, tile):  # type: ignore[no-untyped-def]
+def clear(thread, tile):
     """Zero a tile."""
     for index in range(thread, TILE, THREADS):
         for c in range(4):
@@ -179,7 +180,7 @@ def clear(thread, tile):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def store(thread, tile, out):  # type: ignore[no-untyped-def]
+def store(thread, tile, out):
     """Copy a tile out of shared memory."""
     for index in range(thread, TILE, THREADS):
         for c in range(4):
@@ -187,7 +188,7 @@ def store(thread, tile, out):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def load_velocities(block, thread, layout, work, tile):  # type: ignore[no-untyped-def]
+def load_velocities(block, thread, layout, work, tile):
     """Copy the velocities around a block to its tile."""
     for index in range(thread, TILE, THREADS):
         o, node = field_of(index)
@@ -197,7 +198,7 @@ def load_velocities(block, thread, layout, work, tile):  # type: ignore[no-untyp
 
 
 @functools.cache
-def kernels_of(dtype: type[np.floating[Any]]) -> Kernels:
+def kernels_of(dtype: Any) -> Kernels:
     """The kernels for one precision; compiled when first launched.
 
     Shared memory needs its type when it is compiled, hence the functions in a function.
@@ -205,7 +206,7 @@ def kernels_of(dtype: type[np.floating[Any]]) -> Kernels:
     number = from_dtype(np.dtype(dtype))
 
     @cuda.jit
-    def scatter(dt, state, layout, work, params, progress):  # type: ignore[no-untyped-def]
+    def scatter(dt, state, layout, work, params, progress):
         """Particles of one block to its tile, then volumes where contact asks for them."""
         if progress[HALTED] != 0:
             return
@@ -227,7 +228,7 @@ def kernels_of(dtype: type[np.floating[Any]]) -> Kernels:
         store(thread, tile, work.moments[slot])
 
     @cuda.jit
-    def gather(dt, state, layout, work, params, progress, moving):  # type: ignore[no-untyped-def]
+    def gather(dt, state, layout, work, params, progress, moving):
         """Fields to the particles of one block when ``moving``, then stress."""
         if progress[HALTED] != 0:
             return
@@ -249,7 +250,7 @@ def kernels_of(dtype: type[np.floating[Any]]) -> Kernels:
 
 
 @cuda.jit
-def collect(dt, layout, work, params, progress):  # type: ignore[no-untyped-def]
+def collect(dt, layout, work, params, progress):
     """Tiles to the fields of one group: sums, gravity, contact. Nodes do not know each other."""
     if progress[HALTED] != 0:
         return
@@ -271,7 +272,7 @@ def collect(dt, layout, work, params, progress):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def collide(a, b, node, at, layout, work, params):  # type: ignore[no-untyped-def]
+def collide(a, b, node, at, layout, work, params):
     """Contact of two bodies at one node; what it did goes to the totals of both."""
     on_a = cuda.local.array(TOTALS, float64)
     on_b = cuda.local.array(TOTALS, float64)
@@ -293,7 +294,7 @@ def collide(a, b, node, at, layout, work, params):  # type: ignore[no-untyped-de
 
 
 @cuda.jit(device=True)
-def obstruct(field, node, at, layout, work, params):  # type: ignore[no-untyped-def]
+def obstruct(field, node, at, layout, work, params):
     """Contact of one body's node with every collider near its field."""
     friction = params.friction[layout.field_body[field]]
     for contact in range(layout.contact_start[field], layout.contact_start[field + 1]):
@@ -311,7 +312,7 @@ def obstruct(field, node, at, layout, work, params):  # type: ignore[no-untyped-
 
 
 @cuda.jit
-def finish(progress):  # type: ignore[no-untyped-def]
+def finish(progress):
     """End of a substep, by one thread: count it, and halt when particles must be sorted."""
     if progress[HALTED] == 0:
         progress[DONE] += 1
@@ -319,7 +320,7 @@ def finish(progress):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit
-def measure(state, layout, params, out):  # type: ignore[no-untyped-def]
+def measure(state, layout, params, out):
     """Fill ``out`` [P MEASURE_THREADS, COLUMNS] float64, one row for each thread of each block."""
     block, thread = cuda.blockIdx.x, cuda.threadIdx.x
     row = out[block * MEASURE_THREADS + thread]
@@ -333,7 +334,7 @@ def measure(state, layout, params, out):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit
-def reorder(source, order, out):  # type: ignore[no-untyped-def]
+def reorder(source, order, out):
     """Rows of ``source`` [N, C] in another order."""
     p = cuda.grid(1)
     if p < order.shape[0]:

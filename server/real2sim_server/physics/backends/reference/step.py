@@ -209,7 +209,7 @@ def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
     square = t.square().sum(-1, keepdim=True)
     speed = torch.where(square > 0, square, torch.ones_like(square)).sqrt()
     keep = (1 - friction * approach.abs() / speed).clamp(min=0)
-    slides = (square > 0) & (friction < STICKS)
+    slides = (square > 0) & (friction < float(STICKS))
     slid = torch.where(slides, keep, torch.zeros_like(keep)) * t
     return torch.where((approach >= 0) & separable, v, slid)
 
@@ -276,12 +276,9 @@ def _resolve_collider_contact(
             distance, n = _distance(collider, nodes)
             gap = distance / params.dx + surface_offset(_depth(moment[b], n))
             closed = (mass[b] > 0) & (distance <= 0) & (gap <= 0)
-            own = collider.friction is None
-            friction = (
-                params.friction[b]
-                if own
-                else params.friction.new_tensor(min(collider.friction, float(STICKS)))
-            )
+            friction = params.friction[b]
+            if collider.friction is not None:
+                friction = friction.new_tensor(min(collider.friction, float(STICKS)))
             u = _material_velocity(collider, nodes)
             after = u + coulomb(fields[b] - u, n, friction, collider.separable)
             new = torch.where(closed[:, None], after, fields[b])
@@ -337,4 +334,5 @@ def _material_velocity(collider: Collider, points: Tensor) -> Tensor:
         return torch.zeros_like(points)
     arm = points - torch.as_tensor(collider.T_world_box)[:3, 3]
     spin = torch.as_tensor(collider.angular_velocity).expand_as(arm)
-    return torch.as_tensor(collider.velocity) + torch.linalg.cross(spin, arm)
+    velocity: Tensor = torch.as_tensor(collider.velocity) + torch.linalg.cross(spin, arm)
+    return velocity

@@ -34,7 +34,7 @@ def stress_update(
     """
     codes = rows[:, material_row.LAW].detach().round().long()
     parts = []
-    for code in codes.unique().tolist():
+    for code in sorted(set(codes.tolist())):
         index = torch.nonzero(codes == code)[:, 0]
         answer = _stress_of_law(code, F[index], history[index], rows[index], dt)
         parts.append((index, answer))
@@ -78,7 +78,8 @@ def inverse(a: Tensor) -> Tensor:
     x, y, z = a.unbind(-2)
     yz = torch.linalg.cross(y, z)
     columns = torch.stack([yz, torch.linalg.cross(z, x), torch.linalg.cross(x, y)], dim=-1)
-    return columns / (x * yz).sum(-1)[:, None, None]
+    inverted: Tensor = columns / (x * yz).sum(-1)[:, None, None]
+    return inverted
 
 
 def _neo_hookean(F: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,7 +132,8 @@ def log_symmetric(b: Tensor) -> Tensor:
     for term in range(1, SERIES_TERMS):
         power = power @ square
         total = total + power / (2 * term + 1)
-    return 2 ** (SQUARE_ROOTS + 1) * total
+    logarithm: Tensor = 2 ** (SQUARE_ROOTS + 1) * total
+    return logarithm
 
 
 def _deviator(e: Tensor) -> tuple[Tensor, Tensor]:
