@@ -129,6 +129,12 @@ def make_env(**options: Any) -> DriveEnv:
 
     Raises:
         ImportError: gymnasium is missing.
+
+    Examples:
+        >>> env = real2sim.make_env(scene="street")
+        >>> obs, info = env.reset(seed=0)
+        >>> obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> env.close()
     """
     try:
         from .env import DriveEnv

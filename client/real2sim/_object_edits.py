@@ -51,6 +51,7 @@ class ObjectEdits(Generic[R]):
 
     @property
     def object_id(self) -> str:
+        """Id of the object in its scenario."""
         return self.info.object_id
 
     def __repr__(self) -> str:
@@ -76,6 +77,12 @@ class ObjectEdits(Generic[R]):
             start_us, end_us: only in between, growing and fading smoothly; default: at all times.
             blend_us: how long growing and fading take; default: half a second.
             snap: put it onto the ground.
+
+        Examples:
+            >>> car.translate(x=1.5, frame="object").revision
+            1
+            >>> car.translate(y=-3.0, start_us=500_000, end_us=1_500_000).revision
+            2
         """
         when = _time_range(start_us, end_us, blend_us)
         return self._make(Translate, x=x, y=y, z=z, frame=frame, time_range=when, snap=snap)
@@ -90,18 +97,32 @@ class ObjectEdits(Generic[R]):
         end_us: int | None = None,
         blend_us: int | None = None,
     ) -> R:
-        """Turn it about its own centre [rad]; times as of :meth:`translate`."""
+        """Turn it about its own centre [rad]; times as of :meth:`translate`.
+
+        Examples:
+            >>> result = car.rotate(angle=0.26)
+        """
         when = _time_range(start_us, end_us, blend_us)
         return self._make(Rotate, angle=angle, axis=axis, frame=frame, time_range=when)
 
     def scale(self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom") -> R:
-        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays."""
+        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays.
+
+        Examples:
+            >>> result = car.scale(x=1.5)
+            >>> scenario.objects["car_red"].info.size
+            (6.0, 1.8, 1.5)
+        """
         return self._make(Scale, x=x, y=y, z=z, anchor=anchor)
 
     def set_pose(
         self, *, position: Vector, quaternion: Quaternion = UPRIGHT, snap: bool = False
     ) -> R:
-        """Place the object in the world [m], for the whole time range."""
+        """Place the object in the world [m], for the whole time range.
+
+        Examples:
+            >>> result = car.set_pose(position=(18.0, 1.0, 0.75))
+        """
         pose = checked(Pose, position=position, quaternion=quaternion)
         return self._make(SetPose, pose=pose, snap=snap)
 
@@ -113,7 +134,21 @@ class ObjectEdits(Generic[R]):
         quaternions: Sequence[Quaternion],
         snap: bool = False,
     ) -> R:
-        """Let it follow a trajectory; it exists only within these times."""
+        """Let it follow a trajectory; it exists only within these times.
+
+        Args:
+            times_us: [T] increasing [us].
+            positions: [T] of the centre of its box in the world [m].
+            quaternions: [T] wxyz.
+            snap: put it onto the ground at every pose.
+
+        Examples:
+            >>> result = car.set_trajectory(
+            ...     times_us=[0, 2_000_000],
+            ...     positions=[(14, -3, 0.75), (24, -3, 0.75)],
+            ...     quaternions=[(1, 0, 0, 0), (1, 0, 0, 0)],
+            ... )
+        """
         track = checked(
             Track,
             times_us=list(times_us),
@@ -123,7 +158,11 @@ class ObjectEdits(Generic[R]):
         return self._make(SetTrajectory, trajectory=track, snap=snap)
 
     def retime(self, *, delay_us: int = 0, speed: float = 1.0) -> R:
-        """Let it do the same later (or earlier), faster or slower."""
+        """Let it do the same later (or earlier), faster or slower.
+
+        Examples:
+            >>> result = scenario.objects["car_blue"].retime(delay_us=300_000, speed=1.2)
+        """
         return self._make(Retime, delay_us=delay_us, speed=speed)
 
     def replace(
@@ -139,6 +178,12 @@ class ObjectEdits(Generic[R]):
             asset: id in the asset library; or
             recorded: id of an object of the scene.
             fit: ``box`` fills the object's box, ``length`` keeps the look's proportions.
+
+        Raises:
+            ValueError: not exactly one of ``asset`` and ``recorded``.
+
+        Examples:
+            >>> result = car.replace(recorded="car_blue", fit="length")
         """
         return self._make(Replace, asset_id=asset, recorded_id=recorded, fit=fit)
 
@@ -156,7 +201,10 @@ class ObjectEdits(Generic[R]):
             mass: [kg].
             material: ``rigid``, ``metal``, ``foam``, ``rubber``, ``jelly``, ``sand`` or ``snow``.
             friction: Coulomb coefficient.
-            restitution: 0 to 1, share of the approach speed that is left after a bounce.
+            restitution: 0 to 1, fraction of the approach speed that is left after a bounce.
+
+        Examples:
+            >>> result = car.set_physics(material="metal", mass=1200.0, friction=0.6)
         """
         return self._make(
             SetPhysics, mass=mass, material=material, friction=friction, restitution=restitution
@@ -169,15 +217,32 @@ class ObjectEdits(Generic[R]):
         angular: Vector | None = None,
         frame: str = "world",
     ) -> R:
-        """Say how fast it enters the physics [m/s, rad/s]; left out: as on its trajectory."""
+        """Say how fast it enters the physics [m/s, rad/s]; left out: as on its trajectory.
+
+        Examples:
+            >>> result = car.set_velocity(linear=(8.0, 0.0, 0.0), frame="object")
+        """
         return self._make(SetVelocity, linear=linear, angular=angular, frame=frame)
 
     def delete(self) -> R:
-        """Remove the object; :meth:`restore` or undo brings it back."""
+        """Remove the object; :meth:`restore` or undo brings it back.
+
+        Examples:
+            >>> result = car.delete()
+            >>> "car_red" in scenario.objects
+            False
+        """
         return self._make(Delete)
 
     def restore(self) -> R:
-        """Bring it back after :meth:`delete`."""
+        """Bring it back after :meth:`delete`.
+
+        Examples:
+            >>> result = car.delete()
+            >>> result = car.restore()
+            >>> "car_red" in scenario.objects
+            True
+        """
         return self._make(Restore)
 
     def _edit(self, operation: Operation) -> R:
@@ -212,7 +277,12 @@ class ScenarioEdits(Generic[R]):
         quaternion: Quaternion = UPRIGHT,
         region_id: str | None = None,
     ) -> R:
-        """Hide the background inside a box [m]; delete its id to bring it back."""
+        """Hide the background inside a box [m]; :meth:`remove` its id to bring it back.
+
+        Examples:
+            >>> scenario.erase_region(position=(10, 0, 1), size=(2, 2, 3), region_id="sign").created
+            ['sign']
+        """
         pose = checked(Pose, position=position, quaternion=quaternion)
         return self._edit(checked(EraseRegion, region_id=region_id, pose=pose, size=size))
 
@@ -225,7 +295,11 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add an invisible box that does not yield, for the physics."""
+        """Add an invisible box that does not yield, for the physics.
+
+        Examples:
+            >>> result = scenario.add_box(position=(20, 0, 0.5), size=(0.5, 6, 1))
+        """
         shape = checked(BoxShape, position=position, quaternion=quaternion, size=size)
         return self._collider(shape, friction, collider_id)
 
@@ -237,7 +311,11 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add a plane that things stay above, for the physics."""
+        """Add a plane that objects stay above, for the physics.
+
+        Examples:
+            >>> result = scenario.add_plane(point=(0, 0, 0), friction=0.9)
+        """
         return self._collider(
             checked(PlaneShape, point=point, normal=normal), friction, collider_id
         )
@@ -245,19 +323,44 @@ class ScenarioEdits(Generic[R]):
     def add_ground(
         self, *, offset: float = 0.0, friction: float | None = None, collider_id: str | None = None
     ) -> R:
-        """Add the recorded ground, moved up by ``offset`` [m], for the physics."""
+        """Add the recorded ground, moved up by ``offset`` [m], for the physics.
+
+        Examples:
+            >>> result = scenario.add_ground(collider_id="road")
+            >>> [collider.collider_id for collider in scenario.info.colliders]
+            ['road']
+        """
         return self._collider(checked(GroundShape, offset=offset), friction, collider_id)
 
     def set_time(self, *, start_us: int | None = None, end_us: int | None = None) -> R:
-        """Set the span in which the scenario plays; left out: as recorded."""
+        """Set the span in which the scenario plays; left out: as recorded.
+
+        Examples:
+            >>> result = scenario.set_time(start_us=500_000)
+            >>> scenario.info.start_us, scenario.info.end_us
+            (500000, 2000000)
+        """
         return self._edit(checked(SetTime, start_us=start_us, end_us=end_us))
 
     def remove(self, thing_id: str) -> R:
-        """Remove an object, erased region or collider by its id."""
+        """Remove an object, erased region or collider by its id.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> list(scenario.objects)
+            ['car_red', 'car_blue']
+        """
         return self._edit(checked(Delete, object_id=thing_id))
 
     def restore(self, thing_id: str) -> R:
-        """Bring a removed object, region or collider back."""
+        """Bring a removed object, region or collider back.
+
+        Examples:
+            >>> result = scenario.remove("post")
+            >>> result = scenario.restore("post")
+            >>> "post" in scenario.objects
+            True
+        """
         return self._edit(checked(Restore, object_id=thing_id))
 
     def _edit(self, operation: Operation) -> R:

@@ -54,6 +54,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         scene, scenario: exactly one of them, or its name or id.
         sensors: camera names or specs; all rgb.
         options: of ``DriveSession.reset``; ``seed`` and ``action`` are the environment's.
+
+    Examples:
+        >>> env = real2sim.make_env(scene="street", sensors=["front"], render_mode="rgb_array")
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
@@ -90,14 +93,29 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        """Start an episode; ``options`` override those of the environment for this one."""
+        """Start an episode; ``options`` override those of the environment for this one.
+
+        Examples:
+            >>> obs, info = env.reset(seed=3, options={"dt_us": 50_000})
+            >>> obs["state"].shape, obs["route"].shape, obs["front"].shape
+            ((5,), (20, 2), (64, 96, 3))
+            >>> env.close()
+        """
         super().reset(seed=seed)
         drawn = seed if seed is not None else int(self.np_random.integers(2**31))
         self._last = self._begin(drawn, options)
         return self._seen(self._last), self._info(self._last)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Drive one clock step."""
+        """Drive one clock step.
+
+        Examples:
+            >>> obs, info = env.reset(seed=0)
+            >>> obs, reward, terminated, truncated, info = env.step(np.array([0.5, 0.0]))
+            >>> reward > 0, terminated
+            (True, False)
+            >>> env.close()
+        """
         push, turn = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0).tolist()
         plan = Control(
             acceleration=push * (ACCELERATION if push > 0 else BRAKING), steering=turn * STEERING
@@ -108,7 +126,13 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         return self._seen(last), reward, last.terminated, last.truncated, self._info(last)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The newest image of the first camera, uint8 [H, W, 3]."""
+        """The newest image of the first camera, uint8 [H, W, 3].
+
+        Examples:
+            >>> env.render().shape
+            (64, 96, 3)
+            >>> env.close()
+        """
         if self.render_mode is None:
             return None
         return self._last.image(next(iter(self._last.frames)))
@@ -119,7 +143,11 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         return self._last
 
     def close(self) -> None:
-        """End the session."""
+        """End the session.
+
+        Examples:
+            >>> env.close()
+        """
         self._session.close()
         self._client.close()
 

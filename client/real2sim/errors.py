@@ -44,6 +44,14 @@ class Real2SimError(Exception):
 
     Attributes:
         hint: what to do about it; None where nothing is known. A traceback shows it.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> try:
+        ...     client.scenes.get("nowhere")
+        ... except real2sim.NotFoundError as error:
+        ...     print(error.status, error.code)
+        404 UNKNOWN_SCENE
     """
 
     def __init__(self, message: str, *, hint: str | None = None) -> None:

@@ -38,6 +38,12 @@ class Image:
             axis, 0 where nothing was hit) or ``instance`` (uint16 [H, W], 0 is background).
         dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``.
         shape: of the array; empty where only the image itself tells.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> image = client.scenes.render("street", camera="front")
+        >>> np.asarray(image).shape, image.modality
+        ((64, 96, 3), 'rgb')
     """
 
     data: bytes = field(repr=False)
@@ -52,6 +58,10 @@ class Image:
 
         Raises:
             ImageDecodeError: broken data, or a png where neither Pillow nor OpenCV is installed.
+
+        Examples:
+            >>> image.array.dtype
+            dtype('uint8')
         """
         array = _DECODERS[self.codec](self)
         if (self.shape and array.shape != self.shape) or array.dtype != np.dtype(self.dtype):
@@ -72,6 +82,13 @@ class Image:
 
         The bytes go out as they came where the suffix fits the codec (``.jpg``, ``.png``,
         ``.npy`` for raw); rgb can also be written as ``.jpg``, and anything as ``.npy``.
+
+        Raises:
+            ValueError: a suffix that the image cannot be written as.
+
+        Examples:
+            >>> image.save(folder / "front.jpg").suffix
+            '.jpg'
         """
         target = Path(path)
         write_atomically(target, self._bytes_for(target.suffix.lower()))
@@ -114,6 +131,14 @@ class Frame(Image):
         t_us: instant shown.
         T_world_sensor: [4, 4] float64, camera frame (x right, y down, z forward) to world.
         K: [3, 3] float64 intrinsics [px].
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> session = client.session(scene="street").open()
+        >>> frame = session.reset(sensors=["front"]).frames["front"]["rgb"]
+        >>> frame.sensor, float(frame.K[0, 0]), frame.array.shape
+        ('front', 60.0, (64, 96, 3))
+        >>> result = session.close()
     """
 
     sensor: str

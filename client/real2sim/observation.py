@@ -29,6 +29,14 @@ class View:
         revision: of the session's edits.
         frames: camera -> modality -> frame.
         timing: milliseconds by stage, measured by the worker.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> with client.session(scene="street") as session:
+        ...     obs = session.reset()
+        ...     view = session.render(["left"])
+        >>> sorted(view.frames), view.t_us
+        (['left'], 0)
     """
 
     t_us: int
@@ -41,6 +49,10 @@ class View:
 
         Raises:
             KeyError: this instant has no such frame; the sentence names those it has.
+
+        Examples:
+            >>> view.image("left").shape
+            (64, 96, 3)
         """
         try:
             return self.frames[camera][modality].array
@@ -67,6 +79,13 @@ class Observation(View):
         truncated: the episode ended because its time was over.
         reason: why it ended.
         warming_up: whether the vehicle still moves as recorded; plans wait.
+
+    Examples:
+        >>> client = real2sim.connect()
+        >>> with client.session(scene="street") as session:
+        ...     obs = session.reset(sensors=["front"], privileged=True)
+        >>> obs.step, obs.command, len(obs.agents), round(obs.ego.speed, 2)
+        (0, 'straight', 3, 5.0)
     """
 
     step: int
@@ -83,7 +102,12 @@ class Observation(View):
 
     @property
     def over(self) -> bool:
-        """Whether the episode has ended, either way."""
+        """Whether the episode has ended, either way.
+
+        Examples:
+            >>> obs.over
+            False
+        """
         return self.terminated or self.truncated
 
 

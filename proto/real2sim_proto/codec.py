@@ -37,6 +37,10 @@ def encode(message: dict[str, Any]) -> bytes:
 
     Raises:
         CodecError: a value of a type that the wire does not carry.
+
+    Examples:
+        >>> encode({"v": 1, "type": "bye", "id": 3}).hex()
+        '83a17601a474797065a3627965a2696403'
     """
     try:
         packed: bytes = msgpack.packb(message, default=_pack_array, use_bin_type=True)
@@ -51,6 +55,10 @@ def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]
     Raises:
         CodecError: too large, not msgpack, trailing bytes, not a map with string keys, nested
             deeper than MAX_DEPTH, an unknown ext type, or an array whose parts disagree.
+
+    Examples:
+        >>> decode(encode({"route": np.zeros((2, 2))}))["route"].shape
+        (2, 2)
     """
     if len(data) > max_bytes:
         raise CodecError(f"message of {len(data)} bytes is larger than the allowed {max_bytes}")

@@ -17,3 +17,4 @@ CONVENTIONS: dict[str, str] = {
     "depth_png": "16 bit, steps of 1/256 m, 0 where nothing was hit, 65535 from 255.99 m on",
     "instance": "uint16 [H, W], 0 is background",
 }
+"""What each convention says, by its name."""

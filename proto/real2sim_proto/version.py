@@ -12,7 +12,12 @@ SUPPORTED_SUBPROTOCOLS = (DRIVE_SUBPROTOCOL,)
 
 
 def protocol_mismatch(offered: list[str]) -> str:
-    """Sentence that names both sides' versions and what to do."""
+    """Sentence that names both sides' versions and what to do.
+
+    Examples:
+        >>> protocol_mismatch(["real2sim.v9.msgpack"]).partition(";")[0]
+        'the client offers drive protocol real2sim.v9.msgpack'
+    """
     given = ", ".join(offered) if offered else "none"
     spoken = ", ".join(SUPPORTED_SUBPROTOCOLS)
     return (

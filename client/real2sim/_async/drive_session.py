@@ -207,7 +207,7 @@ class AsyncDriveSession(SessionBase):
             >>> drivers = {"car_blue": {"kind": "external"}}
             >>> obs = await session.reset(agents={"drivers": drivers})
             >>> await session.steer("car_blue", [500_000, 1_000_000], [(10, 0, 0), (12, 1, 0.3)])
-            1
+            0
         """
         driven = await self._request(self._protocol.agent(object_id, times_us, poses))
         return driven.step

@@ -208,7 +208,7 @@ class DriveSession(SessionBase):
             >>> drivers = {"car_blue": {"kind": "external"}}
             >>> obs = session.reset(agents={"drivers": drivers})
             >>> session.steer("car_blue", [500_000, 1_000_000], [(10, 0, 0), (12, 1, 0.3)])
-            1
+            0
         """
         driven = self._request(self._protocol.agent(object_id, times_us, poses))
         return driven.step

@@ -25,7 +25,7 @@ DT = 0.2
 LANE_CHANGE = 12.0
 """Way over which an offset is reached [m]."""
 REAR = 0.25
-"""Share of the vehicle's length behind its rear axle."""
+"""Fraction of the vehicle's length behind its rear axle."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,16 @@ class DepthSampling:
     progress, comfort and nearness to the route is driven. What moves is not told from what stands,
     so that it keeps a stopping distance behind a car rather than a time, and crossing traffic is
     only seen where it is.
+
+    Examples:
+        >>> planner = DepthSampling(speed=6.0)
+        >>> with real2sim.connect() as client, client.session(scene="street") as session:
+        ...     sensors = planner.needs.sensors(session.welcome.cameras)
+        ...     obs = session.reset(sensors=sensors)
+        ...     planner.reset(obs)
+        ...     obs = session.step(planner.plan(obs))
+        >>> obs.step
+        1
     """
 
     needs = Needs(modalities=("depth",), width=160)
@@ -213,8 +223,8 @@ def _way(speed: float, acceleration: float, times: Array, *, limit: float) -> Ar
         acceleration, limit = min(acceleration, -1.0), speed
     fine = np.linspace(0.0, times[-1], 10 * len(times) + 1)
     speeds = np.clip(speed + acceleration * fine, 0.0, max(limit, speed))
-    gone = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * np.diff(fine))])
-    return np.stack([np.interp(times, fine, gone), np.interp(times, fine, speeds)], axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * np.diff(fine))])
+    return np.stack([np.interp(times, fine, travelled), np.interp(times, fine, speeds)], axis=1)
 
 
 def _poses(path: Path, way: Array, offsets: Sequence[float]) -> Array:
@@ -236,11 +246,11 @@ def _poses(path: Path, way: Array, offsets: Sequence[float]) -> Array:
     cos, sin = np.cos(headings[0]), np.sin(headings[0])
     aside = float(cos * path.offset[1] - sin * path.offset[0])
     slope = float(np.clip(np.tan(-headings[0]), -1.0, 1.0)) * LANE_CHANGE
-    share = np.clip(way[:, 0] / LANE_CHANGE, 0.0, 1.0)
+    fraction = np.clip(way[:, 0] / LANE_CHANGE, 0.0, 1.0)
     change = np.array(offsets)[:, None] - aside
     square, cube = 3 * change - 2 * slope, slope - 2 * change
-    shift = aside + share * (slope + share * (square + share * cube))
-    turn = np.where(share < 1.0, slope + share * (2 * square + share * 3 * cube), 0.0)
+    shift = aside + fraction * (slope + fraction * (square + fraction * cube))
+    turn = np.where(fraction < 1.0, slope + fraction * (2 * square + fraction * 3 * cube), 0.0)
     x, y = middle[0] - np.sin(heading) * shift, middle[1] + np.cos(heading) * shift
     yaw = heading + np.arctan(turn / LANE_CHANGE)
     return np.stack([x, y, yaw], axis=2)

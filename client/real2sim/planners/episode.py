@@ -30,7 +30,12 @@ class StageTimes:
 
     @classmethod
     def of(cls, milliseconds: Sequence[float]) -> StageTimes:
-        """Statistics of at least one measurement."""
+        """Statistics of at least one measurement.
+
+        Examples:
+            >>> StageTimes.of([1.0, 2.0, 3.0]).p50
+            2.0
+        """
         p50, p95, p99 = np.percentile(milliseconds, (50, 95, 99))
         mean = float(np.mean(milliseconds))
         return cls(len(milliseconds), mean, float(p50), float(p95), float(p99))
@@ -97,6 +102,15 @@ def run_episode(
         sensors: what every observation shows.
         on_observation: called with every observation, the first included; its time is not counted.
         options: of reset.
+
+    Examples:
+        >>> planner = real2sim.planners.FollowRoute(speed=5.0)
+        >>> with real2sim.connect() as client, client.session(scene="street") as session:
+        ...     summary = run_episode(session, planner, steps=5, privileged=True)
+        >>> summary.steps, round(summary.distance, 1)
+        (5, 2.5)
+        >>> sorted(summary.stages)[:3]
+        ['loop', 'plan', 'step']
     """
     obs = session.reset(sensors=sensors, **options)
     planner.reset(obs)

@@ -48,6 +48,15 @@ class FollowRoute:
     """A planner for examples and tests: the route as a path, a speed limit at each point of it.
 
     Others are only seen in sessions that are reset with ``privileged=True``.
+
+    Examples:
+        >>> planner = FollowRoute(speed=5.0)
+        >>> with real2sim.connect() as client, client.session(scene="street") as session:
+        ...     obs = session.reset(privileged=True)
+        ...     planner.reset(obs)
+        ...     obs = session.step(planner.plan(obs))
+        >>> obs.step
+        1
     """
 
     needs = Needs(privileged=True)
@@ -277,10 +286,10 @@ def _nearest_arc(route: Array, arc: Array) -> float:
         return 0.0
     begin, step = route[:-1], np.diff(route, axis=0)
     length2 = np.maximum((step**2).sum(axis=1), 1e-12)
-    share = np.clip(-(begin * step).sum(axis=1) / length2, 0.0, 1.0)
-    distance = np.linalg.norm(begin + share[:, None] * step, axis=1)
+    fraction = np.clip(-(begin * step).sum(axis=1) / length2, 0.0, 1.0)
+    distance = np.linalg.norm(begin + fraction[:, None] * step, axis=1)
     i = int(distance.argmin())
-    return float(arc[i] + share[i] * math.sqrt(length2[i]))
+    return float(arc[i] + fraction[i] * math.sqrt(length2[i]))
 
 
 def _in_vehicle_frame(ego: EgoState, agent: AgentState) -> tuple[Array, Array]:

@@ -67,6 +67,15 @@ class Idm:
     """A planner that knows all objects: along the route, as fast as the one ahead lets it.
 
     Others are taken to keep their speed along the route for the length of the plan.
+
+    Examples:
+        >>> planner = Idm(speed=6.0, follower=Follower(headway=1.5))
+        >>> with real2sim.connect() as client, client.session(scene="street") as session:
+        ...     obs = session.reset(privileged=True)
+        ...     planner.reset(obs)
+        ...     obs = session.step(planner.plan(obs))
+        >>> obs.step
+        1
     """
 
     needs = Needs(privileged=True)

@@ -66,7 +66,17 @@ class PolicyShape:
 
 
 class LearnedPolicy:
-    """A planner that sees one camera, its speed, and which way to turn."""
+    """A planner that sees one camera, its speed, and which way to turn.
+
+    Examples:
+        >>> from safetensors.torch import save_file
+        >>> shape = PolicyShape(camera="front")
+        >>> path = folder / "untrained.safetensors"
+        >>> save_file(network(shape).state_dict(), path, shape.metadata())
+        >>> planner = LearnedPolicy(path)
+        >>> planner.needs.cameras
+        ('front',)
+    """
 
     def __init__(self, path: str | Path) -> None:
         """Load the weights in a file that ``real2sim train-policy`` wrote.
@@ -119,9 +129,9 @@ def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.floa
         sums = np.cumsum(pixels, axis=axis, dtype=np.float64)
         sums = np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis=axis)
         below = np.floor(edges).astype(int)
-        share = (edges - below).reshape([-1 if a == axis else 1 for a in range(3)])
+        fraction = (edges - below).reshape([-1 if a == axis else 1 for a in range(3)])
         above = np.minimum(below + 1, pixels.shape[axis])
-        at = sums.take(below, axis) * (1 - share) + sums.take(above, axis) * share
+        at = sums.take(below, axis) * (1 - fraction) + sums.take(above, axis) * fraction
         pixels = np.diff(at, axis=axis) / (edges[1] - edges[0])
     return np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32)
 
@@ -142,6 +152,7 @@ def network(shape: PolicyShape) -> Any:
     class Policy(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
+            # Files of weights name the layers as the attributes are named here.
             widths = (3, 16, 24, 32, 48)
             layers: list[Any] = []
             for before, after in itertools.pairwise(widths):

@@ -51,6 +51,15 @@ class PidFollowRoute:
     The error that steers is how far to the side the route lies a preview distance ahead, so that
     it holds offset and heading at once. Blind for everything else: it runs into whatever stands on
     the route.
+
+    Examples:
+        >>> planner = PidFollowRoute(speed=6.0)
+        >>> with real2sim.connect() as client, client.session(scene="street") as session:
+        ...     obs = session.reset(action="control")
+        ...     planner.reset(obs)
+        ...     obs = session.step(planner.plan(obs))
+        >>> obs.step
+        1
     """
 
     needs = Needs(action="control")

@@ -65,6 +65,12 @@ class Needs:
 
         Raises:
             ValueError: a camera that the scene lacks.
+
+        Examples:
+            >>> with real2sim.connect() as client:
+            ...     cameras = client.scenes.get("street").cameras
+            >>> Needs(modalities=("rgb",), width=64).sensors(cameras)
+            [{'camera': 'front', 'modalities': ['rgb'], 'width': 64}]
         """
         if not self.modalities:
             return []
@@ -82,7 +88,12 @@ class Needs:
 
 
 def needs_of(planner: Planner) -> Needs:
-    """What a planner asks for; nothing where it does not say."""
+    """What a planner asks for; nothing where it does not say.
+
+    Examples:
+        >>> needs_of(load_planner("depth_sampling")).modalities
+        ('depth',)
+    """
     found = getattr(planner, "needs", None)
     return found if isinstance(found, Needs) else Needs()
 
@@ -102,6 +113,13 @@ def load_planner(name: str) -> Planner:
 
     Raises:
         ValueError: no such module or class, or it is not a planner.
+
+    Examples:
+        >>> load_planner("idm").speed
+        8.0
+        >>> load_planner("cruise_control")
+        Traceback (most recent call last):
+        ValueError: planner 'cruise_control' is unknown; give alpasim, ... or 'module:Class'
     """
     given, equals, argument = name.partition("=")
     module_name, colon, attribute = BUILT_IN.get(given, given).partition(":")
