@@ -102,13 +102,13 @@ def _street() -> DrivingLog:
 
 def _first_scene(log: DrivingLog, options: TrainOptions, gaussians: int) -> Scene:
     scene = initialise_scene(log, options=options.initialise)
-    share = min(1.0, gaussians / scene.gaussian_count)
-    objects = {k: replace(o, cloud=_thinned(o.cloud, share)) for k, o in scene.objects.items()}
+    fraction = min(1.0, gaussians / scene.gaussian_count)
+    objects = {k: replace(o, cloud=_thinned(o.cloud, fraction)) for k, o in scene.objects.items()}
     held = sum(len(o.cloud) for o in objects.values())
     rest = max(0, gaussians - held) / max(1, len(scene.background))
     return replace(scene, background=_thinned(scene.background, rest), objects=objects)
 
 
-def _thinned(cloud: GaussianCloud, share: float) -> GaussianCloud:
-    kept = np.linspace(0, len(cloud) - 1, round(len(cloud) * min(share, 1.0))).round()
+def _thinned(cloud: GaussianCloud, fraction: float) -> GaussianCloud:
+    kept = np.linspace(0, len(cloud) - 1, round(len(cloud) * min(fraction, 1.0))).round()
     return cloud.select(torch.from_numpy(kept.astype(np.int64)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from .driving_log import DrivingLog, LogError
 
-ENDS_ONLY = 3
+SWEEPS_CHECKED = 3
 
 
 @runtime_checkable
@@ -101,4 +101,4 @@ def _check_tracks(log: DrivingLog) -> None:
 
 
 def _few(count: int) -> set[int]:
-    return {round(i) for i in np.linspace(0, count - 1, min(ENDS_ONLY, count)).tolist()}
+    return {round(i) for i in np.linspace(0, count - 1, min(SWEEPS_CHECKED, count)).tolist()}

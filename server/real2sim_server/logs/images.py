@@ -53,7 +53,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
     while True:
         marker = data[position + 1]
         (length,) = struct.unpack(">H", data[position + 2 : position + 4])
-        # Start-of-frame markers; C4, C8 and CC share the range but hold tables.
+        # Start-of-frame markers; C4, C8 and CC fraction the range but hold tables.
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
             return width, height

@@ -18,11 +18,11 @@ from .images import write_image
 from .overlay import draw_frame, points_in_box
 from .top_view import draw_top_view
 
-LOOKS = 3
-GAP = 1.6
+INSPECTED_FRAMES = 3
+GAP_FACTOR = 1.6
 """A frame is missing where the time step is this many times the usual one."""
 
-FASTEST = 70.0
+MAX_EGO_SPEED = 70.0
 NEAR_BOXES = 30.0
 FEW_POINTS = 5
 PICTURE_WIDTH = 960
@@ -120,7 +120,9 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
     Raises:
         LogError: a frame that is looked at cannot be read.
     """
-    chosen = sorted({round(i) for i in np.linspace(0, log.frame_count - 1, LOOKS).tolist()})
+    chosen = sorted(
+        {round(i) for i in np.linspace(0, log.frame_count - 1, INSPECTED_FRAMES).tolist()}
+    )
     sweeps = {frame: log.lidar(frame) for frame in chosen}
     moving = [t for t in log.tracks if t.trajectory.moves]
     counts = [len(s.points) for s in sweeps.values()]
@@ -169,7 +171,7 @@ def _delay(log: DrivingLog, camera: str) -> float:
 def _gaps(steps: Float) -> tuple[tuple[int, float], ...]:
     if len(steps) < 2:
         return ()
-    wide = np.flatnonzero(steps > GAP * np.median(steps))
+    wide = np.flatnonzero(steps > GAP_FACTOR * np.median(steps))
     return tuple((int(i), float(steps[i])) for i in wide)
 
 
@@ -185,7 +187,7 @@ def _problems(log: DrivingLog, sweeps: dict[int, LidarSweep], steps: Float) -> l
         problems.append(f"cameras without images, left out: {', '.join(without)}")
     if len(steps):
         speed = _ego_steps(log) / steps
-        if speed.max() > FASTEST:
+        if speed.max() > MAX_EGO_SPEED:
             frame = int(speed.argmax())
             problems.append(f"the ego jumps after frame {frame} ({speed[frame]:.0f} m/s)")
     if not any(len(s.points) for s in sweeps.values()):

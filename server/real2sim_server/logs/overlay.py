@@ -71,8 +71,8 @@ def _draw_points(picture: NDArray[np.uint8], lens: Camera, points: Float) -> Non
         return
     pixels, depth = pixels[inside].astype(int), points[inside, 2]
     low, high = np.log(DEPTH_RANGE)
-    share = np.clip((np.log(depth) - low) / (high - low), 0, 1)
-    scale = np.round((1 - share) * 255).astype(np.uint8)
+    fraction = np.clip((np.log(depth) - low) / (high - low), 0, 1)
+    scale = np.round((1 - fraction) * 255).astype(np.uint8)
     colours = cv2.applyColorMap(scale[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
     radius = max(1, round(lens.width / 1000))
     for i in np.argsort(-depth):
@@ -118,8 +118,8 @@ def _clip(start: Float, end: Float) -> Float | None:
     line = np.stack([start, end])
     for i in (0, 1):
         if line[i, 2] < NEAR:
-            share = (NEAR - line[i, 2]) / (line[1 - i, 2] - line[i, 2])
-            line[i] = line[i] + share * (line[1 - i] - line[i])
+            fraction = (NEAR - line[i, 2]) / (line[1 - i, 2] - line[i, 2])
+            line[i] = line[i] + fraction * (line[1 - i] - line[i])
     return line
 
 

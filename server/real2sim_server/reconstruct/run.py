@@ -143,7 +143,7 @@ def reconstruct(
             _training_options(training, iterations, options),
             Path(out),
             resume=resume,
-            stages=_Told(on_progress, on_training, timing_s),
+            stages=_Callbacks(on_progress, on_training, timing_s),
         )
     with stages("write"):
         scene = save_scene(scene, out, overwrite=overwrite)
@@ -170,7 +170,7 @@ def reconstruct(
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Callbacks:
     """Who is told of progress."""
 
     on_progress: OnProgress | None
@@ -186,7 +186,7 @@ def _training_options(
 
 
 def _train(
-    log: DrivingLog, options: TrainOptions, out: Path, *, resume: bool, stages: _Told
+    log: DrivingLog, options: TrainOptions, out: Path, *, resume: bool, stages: _Callbacks
 ) -> tuple[Scene, TrainingFigures]:
     folder = out.parent / f"{out.name}.training"
     result = train(

@@ -8,14 +8,14 @@ from contextlib import contextmanager
 
 OnProgress = Callable[[str, int, int], None]
 """Called with the name of a stage, how many of its steps are done, and how many it has."""
-Tell = Callable[[int, int], None]
+ReportStep = Callable[[int, int], None]
 
 
 class Stages:
     """Times stages into ``timing_s`` and passes on their progress.
 
     Args:
-        on_progress: told when a stage begins, goes on and ends; may be None.
+        on_progress: called when a stage begins, goes on and ends; may be None.
         timing_s: seconds by stage, written; may be None.
     """
 
@@ -24,15 +24,15 @@ class Stages:
         self._timing_s = timing_s if timing_s is not None else {}
 
     @contextmanager
-    def __call__(self, name: str) -> Iterator[Tell]:
+    def __call__(self, name: str) -> Iterator[ReportStep]:
         """Run a stage; yields a function that takes steps done and steps in all."""
 
-        def tell(done: int, total: int) -> None:
+        def report_step(done: int, total: int) -> None:
             if self._on_progress is not None:
                 self._on_progress(name, done, total)
 
         start = time.perf_counter()
-        tell(0, 1)
-        yield tell
+        report_step(0, 1)
+        yield report_step
         self._timing_s[name] = time.perf_counter() - start
-        tell(1, 1)
+        report_step(1, 1)

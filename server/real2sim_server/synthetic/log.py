@@ -20,9 +20,9 @@ from .bvh import build_geometry
 from .casting import Instances
 from .config import SyntheticConfig
 from .sensors import shoot_image, shoot_lidar
-from .shading import World
+from .shading import RaycastWorld
 from .surroundings import build_surroundings
-from .traffic import Drive, Vehicle, plan_drive, poses_at
+from .traffic import DrivePlan, PlannedVehicle, plan_drive, poses_at
 from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
 
 LIDAR_POSITION = (0.9, 0.0, 1.73)
@@ -67,8 +67,8 @@ class SyntheticSource:
     """
 
     config: SyntheticConfig
-    world: World
-    drive: Drive
+    world: RaycastWorld
+    drive: DrivePlan
     roots: NDArray[np.int64]
     body_paints: NDArray[np.int64]
     rig: CameraRig
@@ -185,7 +185,7 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
     body_paints = len(paints) + np.arange(len(drive.vehicles), dtype=np.int64)
     paints += [(*v.colour, 0.0, 0.0, 0.0, 0.0, 0.0) for v in drive.vehicles]
     geometry, roots = build_geometry(meshes)
-    world = World(
+    world = RaycastWorld(
         *geometry,
         np.array(paints),
         np.array([shape_row(shape) for shape in SHAPES]),
@@ -209,7 +209,7 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
     )
 
 
-def _tracks(vehicles: tuple[Vehicle, ...]) -> tuple[ObjectTrack, ...]:
+def _tracks(vehicles: tuple[PlannedVehicle, ...]) -> tuple[ObjectTrack, ...]:
     seen: Counter[str] = Counter()
     tracks = []
     for vehicle in vehicles:

@@ -1,7 +1,7 @@
 """What surfaces are made of: albedo and gloss as functions of texture coordinates.
 
 Every material takes the size of a pixel on the surface and fades what is finer, so that textures
-do not alias at a distance. Colours are linear RGB; the last value is the share of mirror
+do not alias at a distance. Colours are linear RGB; the last value is the fraction of mirror
 reflection.
 """
 
@@ -124,7 +124,7 @@ def _repairs(s, d, fs, fd, seed):
 
 @njit(cache=True, error_model="numpy", fastmath=True)
 def _markings(s, side, d, fs, fd, crossing, lane, kerb):
-    """Share of white paint at a point of the road."""
+    """Fraction of white paint at a point of the road."""
     from_crossing = abs(s - crossing)
     if from_crossing < 2.2:
         stripe = d - math.floor(d)
@@ -216,20 +216,20 @@ def _window(paint, p, u, v, f):
         reach = w * (0.14 + 0.16 * hash01(number, 8, 5))
         cloth = 0.22 + 0.2 * hash01(number, 9, 5)
         folds = 1.0 + 0.3 * math.sin(u * 45.0) * ramp(0.06 - f, 0.0, 0.04)
-        share = 1.0 - band(u, reach, w - reach, f + 0.02)
+        fraction = 1.0 - band(u, reach, w - reach, f + 0.02)
         if curtain < 0.15:
-            share = max(share, band(v, h * (0.3 + 0.5 * hash01(number, 10, 5)), h, f))
+            fraction = max(fraction, band(v, h * (0.3 + 0.5 * hash01(number, 10, 5)), h, f))
         cloth *= folds
-        share *= 0.8
-        r, g, b = blend(r, cloth, share), blend(g, cloth, share), blend(b, cloth, share)
+        fraction *= 0.8
+        r, g, b = blend(r, cloth, fraction), blend(g, cloth, fraction), blend(b, cloth, fraction)
     elif shop >= 0.5:
         # Goods behind the pane: blocks of colour up to chest height.
         column = math.floor(u / 0.55)
         tall = h * (0.2 + 0.4 * hash01(number * 16 + column, 1, 6))
-        share = band(v, 0.12, tall, f) * band(u - column * 0.55, 0.06, 0.5, f) * 0.8
-        r = blend(r, 0.3 * hash01(number * 16 + column, 2, 6), share)
-        g = blend(g, 0.25 * hash01(number * 16 + column, 3, 6), share)
-        b = blend(b, 0.25 * hash01(number * 16 + column, 4, 6), share)
+        fraction = band(v, 0.12, tall, f) * band(u - column * 0.55, 0.06, 0.5, f) * 0.8
+        r = blend(r, 0.3 * hash01(number * 16 + column, 2, 6), fraction)
+        g = blend(g, 0.25 * hash01(number * 16 + column, 3, 6), fraction)
+        b = blend(b, 0.25 * hash01(number * 16 + column, 4, 6), fraction)
     return (
         blend(paint[p, 0], r, glass),
         blend(paint[p, 1], g, glass),

@@ -62,7 +62,7 @@ def layered_noise(x, y, octaves, footprint, seed):
 
 @njit(cache=True, error_model="numpy", fastmath=True)
 def band(x, low, high, footprint):
-    """Share of a pixel of width ``footprint`` around x that lies in [low, high]."""
+    """Fraction of a pixel of width ``footprint`` around x that lies in [low, high]."""
     half = 0.5 * max(footprint, 1e-6)
     return max(0.0, min(x + half, high) - max(x - half, low)) / (2.0 * half)
 

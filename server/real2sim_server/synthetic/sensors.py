@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..geometry.rotation import Float
 from .casting import Instances, cast, new_stack
 from .light import tone
-from .shading import World, ray_colour, surface_at
+from .shading import RaycastWorld, ray_colour, surface_at
 
 FAR = 1e6
 CHUNK = 256
@@ -39,7 +39,7 @@ class Samples(NamedTuple):
 
 
 def shoot_image(
-    world: World,
+    world: RaycastWorld,
     instances: Instances,
     T_world_camera: Float,
     k: Float,
@@ -88,7 +88,7 @@ def _sheared_grid(samples: int) -> Float:
 def _shoot(world, instances, m, k, positions, size):
     """Fields of :class:`Samples` for rays through image positions [N, 2].
 
-    ``m`` is the camera's pose in the world, ``size`` the share of a pixel that a ray stands for.
+    ``m`` is the camera's pose in the world, ``size`` the fraction of a pixel that a ray stands for.
     """
     n = len(positions)
     colours, planes = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)

@@ -21,7 +21,7 @@ SHADOW_REACH = 90.0
 CAR_SHADE_REACH = 1.1
 
 
-class World(NamedTuple):
+class RaycastWorld(NamedTuple):
     """All that a ray can meet, apart from where the vehicles are.
 
     One flat tuple, because parallel kernels take no nested ones.
@@ -201,13 +201,13 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
 
 @njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
 def _openness(instances, instance, x, y, z, nz):
-    """Share of the sky's light that reaches a point: less beside and under vehicles."""
-    share = 1.0
+    """Fraction of the sky's light that reaches a point: less beside and under vehicles."""
+    fraction = 1.0
     if instance >= 0:
         height = z - (instances.to_world[instance, 2, 3] - instances.half_size[instance, 2])
-        share *= 0.45 + 0.55 * min(max(height / 0.8, 0.0), 1.0)
+        fraction *= 0.45 + 0.55 * min(max(height / 0.8, 0.0), 1.0)
     if z > 2.0 or (instance >= 0 and nz < 0.5):
-        return share
+        return fraction
     m = instances.to_object
     for i in range(len(instances.radius)):
         reach = instances.radius[i] + CAR_SHADE_REACH
@@ -220,8 +220,8 @@ def _openness(instances, instance, x, y, z, nz):
         if pz + m[i, 2, 3] > instances.half_size[i, 2]:
             continue
         distance = math.sqrt(outx * outx + outy * outy)
-        share *= 1.0 - 0.9 * math.exp(-distance / 0.3)
-    return share
+        fraction *= 1.0 - 0.9 * math.exp(-distance / 0.3)
+    return fraction
 
 
 @njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
@@ -231,8 +231,8 @@ def _reflection(world, gloss, open_, lit, dx, dy, dz, nx, ny, nz):
     rx, ry, rz = dx + 2.0 * cos * nx, dy + 2.0 * cos * ny, dz + 2.0 * cos * nz
     r, g, b = mirrored(rx, ry, rz, world.seed)
     glint = lit * 5.0 * max(rx * SUN_X + ry * SUN_Y + rz * SUN_Z, 0.0) ** 60
-    share = fresnel * (0.3 + 0.7 * open_)
-    return share * (r + glint), share * (g + glint), share * (b + 0.9 * glint)
+    fraction = fresnel * (0.3 + 0.7 * open_)
+    return fraction * (r + glint), fraction * (g + glint), fraction * (b + 0.9 * glint)
 
 
 @njit(cache=True, error_model="numpy", fastmath=True)

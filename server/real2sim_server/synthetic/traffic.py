@@ -27,7 +27,7 @@ Distance = Callable[[Float], Float]
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class DrivePlan:
     """Everything about a drive but what it looks like.
 
     Attributes:
@@ -40,11 +40,11 @@ class Drive:
     street: Street
     frame_times_us: NDArray[np.int64]
     ego: Trajectory
-    vehicles: tuple[Vehicle, ...]
+    vehicles: tuple[PlannedVehicle, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Vehicle:
+class PlannedVehicle:
     """A vehicle on the street.
 
     Attributes:
@@ -58,7 +58,7 @@ class Vehicle:
     trajectory: Trajectory
 
 
-def plan_drive(config: SyntheticConfig) -> Drive:
+def plan_drive(config: SyntheticConfig) -> DrivePlan:
     """Lay the street and plan who drives and parks where."""
     street_rng, traffic_rng = (np.random.default_rng([config.seed, i]) for i in range(2))
     times_us = np.arange(config.frames, dtype=np.int64) * config.frame_period_us
@@ -66,7 +66,7 @@ def plan_drive(config: SyntheticConfig) -> Drive:
     street = lay_street(street_rng, drive_length=float(distance(np.array(config.duration))))
     ego = _drive_ego(street, distance, times_us)
     vehicles = _place_vehicles(street, distance, config, times_us, traffic_rng)
-    return Drive(street, times_us, ego, tuple(vehicles))
+    return DrivePlan(street, times_us, ego, tuple(vehicles))
 
 
 def _drive_distance(config: SyntheticConfig, rng: np.random.Generator) -> Distance:
@@ -102,7 +102,7 @@ def _place_vehicles(
     config: SyntheticConfig,
     times_us: NDArray[np.int64],
     rng: np.random.Generator,
-) -> list[Vehicle]:
+) -> list[PlannedVehicle]:
     """All vehicles, moving ones first."""
     ahead = (config.moving_cars + 1) // 2
     return [
@@ -118,7 +118,7 @@ def _drive_ahead(
     distance: Distance,
     times_us: NDArray[np.int64],
     rng: np.random.Generator,
-) -> list[Vehicle]:
+) -> list[PlannedVehicle]:
     vehicles = []
     t = _seconds(times_us)
     gap = rng.uniform(11, 14)
@@ -138,7 +138,7 @@ def _drive_towards(
     config: SyntheticConfig,
     times_us: NDArray[np.int64],
     rng: np.random.Generator,
-) -> list[Vehicle]:
+) -> list[PlannedVehicle]:
     vehicles = []
     speed = rng.uniform(0.8, 1.1) * config.speed
     start = rng.uniform(24, 32)
@@ -161,12 +161,12 @@ def _moving(
     rng: np.random.Generator,
     *,
     turn: float,
-) -> Vehicle:
+) -> PlannedVehicle:
     z = SHAPES[shape].size[2] / 2
     # Both directions keep right, so those who come towards us drive left of the centre line.
     d = EGO_OFFSET if turn == 0.0 else -EGO_OFFSET
     trajectory = _follow(street, s, np.full_like(s, d), times_us, turn=turn, z=z)
-    return Vehicle(shape, _colour(rng), trajectory)
+    return PlannedVehicle(shape, _colour(rng), trajectory)
 
 
 def _park(
@@ -175,7 +175,7 @@ def _park(
     config: SyntheticConfig,
     times_us: NDArray[np.int64],
     rng: np.random.Generator,
-) -> list[Vehicle]:
+) -> list[PlannedVehicle]:
     farthest = float(distance(np.array(config.duration))) + 50.0
     bays = np.arange(np.floor(-8.0 / PARKING_BAY), np.floor(farthest / PARKING_BAY))
     middles = (bays + 0.5) * PARKING_BAY
@@ -192,7 +192,7 @@ def _park(
         turn = (np.pi if side > 0 else 0.0) + rng.normal(scale=0.012)
         z = SHAPES[shape].size[2] / 2
         trajectory = _follow(street, at, offset, ends, turn=turn, z=z)
-        vehicles.append(Vehicle(shape, _colour(rng), trajectory))
+        vehicles.append(PlannedVehicle(shape, _colour(rng), trajectory))
     return vehicles
 
 

@@ -199,7 +199,7 @@ def _ring(shape: VehicleShape, x: float, rear: float, front: float) -> Float:
 
 
 def _plan(x: float, rear: float, front: float, shape: VehicleShape) -> float:
-    """Half width as a share of the full one: corners rounded in plan view."""
+    """Half width as a fraction of the full one: corners rounded in plan view."""
     boxy = shape.boxiness < 0.4
     for distance, reach, depth in (
         (front - x, 0.35 if boxy else 0.75, 0.1 if boxy else 0.17),

@@ -20,7 +20,7 @@ from real2sim_server.synthetic import (
     generate_log,
     synthesize,
 )
-from real2sim_server.synthetic.traffic import Drive, plan_drive
+from real2sim_server.synthetic.traffic import DrivePlan, plan_drive
 from real2sim_server.synthetic.vehicles import SHAPES
 
 SEED = 3
@@ -250,7 +250,7 @@ def test_vehicles_keep_clear_of_each_other() -> None:
             _assert_clear(drive, int(t_us))
 
 
-def _assert_clear(drive: Drive, t_us: int) -> None:
+def _assert_clear(drive: DrivePlan, t_us: int) -> None:
     ego = drive.ego.transform(t_us)
     boxes = [(ego[:2, 3] + 1.4 * ego[:2, 0], ego, DrivingLog.ego_size)]
     for vehicle in drive.vehicles:

@@ -10,7 +10,7 @@ from real2sim_server.geometry.transform import apply_transform
 from real2sim_server.logs import DrivingLog, LidarSweep, ObjectTrack, open_log
 from real2sim_server.logs.overlay import points_in_box
 from real2sim_server.logs.tracking import TrackingOptions, track_moving_objects
-from real2sim_server.logs.tracking.free_space import Witness
+from real2sim_server.logs.tracking.free_space import SweepRays
 from real2sim_server.logs.tracking.ground import find_ground
 from real2sim_server.logs.tracking.motion import smooth
 from real2sim_server.synthetic import SyntheticConfig, generate_log
@@ -38,7 +38,7 @@ class _Score:
 
     Attributes:
         seen: sightings: a moving object within NEAR with at least SEEN points, per frame.
-        recall: share of the sightings with a track within 2.5 m.
+        recall: fraction of the sightings with a track within 2.5 m.
         errors, turns: [m] and [rad] of those.
         matched: ids of the tracks.
     """
@@ -162,11 +162,11 @@ def test_witness_tells_gone_from_hidden() -> None:
     board = np.abs(y) < 2
     distance = np.where(board, 10.0, 20.0)
     points = np.stack([distance, y * distance / 20, z * distance / 20], axis=1)
-    witness = Witness(points.astype(np.float32), np.zeros(3))
+    rays = SweepRays(points.astype(np.float32), np.zeros(3))
     line = np.linspace(-0.2, 0.2, 50)
     free_air = np.stack([np.full(50, 15.0), 5 + line, 0 * line], axis=1)
     on_wall = np.stack([np.full(50, 20.0), 6 + line, 0 * line], axis=1)
     behind_board = np.stack([np.full(50, 15.0), line, 0 * line], axis=1)
-    assert witness.count(free_air) == (50, 0)
-    assert witness.count(on_wall) == (0, 50)
-    assert witness.count(behind_board) == (0, 0)
+    assert rays.count(free_air) == (50, 0)
+    assert rays.count(on_wall) == (0, 50)
+    assert rays.count(behind_board) == (0, 0)

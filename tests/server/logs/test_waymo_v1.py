@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from real2sim_server.geometry.transform import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
 from real2sim_server.logs.readers.formats.wire_format import (
-    Message,
+    ProtoMessage,
     list_records,
     masked_crc32c,
     read_record,
@@ -148,7 +148,7 @@ def test_sample_boxes_project_onto_the_images_as_the_dataset_itself_projects_the
 def _published_bounds(path: Path) -> list[tuple[str, str, list[float]]]:
     """Camera, track and left, top, right, bottom of ``projected_lidar_labels``."""
     names = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
-    frame = Message(read_record(path, list_records(path)[0]), "frame")
+    frame = ProtoMessage(read_record(path, list_records(path)[0]), "frame")
     found = []
     for camera in frame.messages(9, "labels"):
         for label in camera.messages(2, "label"):
@@ -190,4 +190,4 @@ def test_other_file_is_named(folder: Path) -> None:
 
 def test_message_that_is_none_is_named() -> None:
     with pytest.raises(LogError, match="here: is no protocol-buffer message"):
-        Message(b"\x0a\xff\x01", "here")
+        ProtoMessage(b"\x0a\xff\x01", "here")

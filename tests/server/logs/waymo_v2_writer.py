@@ -370,9 +370,9 @@ def _ego_at(log: DrivingLog, times_us: Float) -> Float:
     if len(known) == 1:
         return np.tile(log.ego.transform(int(known[0])), (len(times_us), 1, 1))
     before = np.clip(np.searchsorted(known, times_us, side="right") - 1, 0, len(known) - 2)
-    share = (times_us - known[before]) / (known[before + 1] - known[before])
+    fraction = (times_us - known[before]) / (known[before + 1] - known[before])
     start, end = log.ego.positions[before], log.ego.positions[before + 1]
     rotations = slerp(
-        log.ego.quaternions[before], log.ego.quaternions[before + 1], np.clip(share, 0, 1)
+        log.ego.quaternions[before], log.ego.quaternions[before + 1], np.clip(fraction, 0, 1)
     )
-    return transform_from(start + share[:, None] * (end - start), rotations)
+    return transform_from(start + fraction[:, None] * (end - start), rotations)

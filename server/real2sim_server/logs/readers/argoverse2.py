@@ -21,13 +21,13 @@ from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform, transform_from
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from .box_tracks import Box, build_tracks
-from .choice import choose_sequence
+from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.parquet_files import read_feather
 from .formats.tables import check_ego_covers, check_frame_times
 from .image_matching import TimedImages, match_images
 from .lens import Lens
+from .selection import select_sequence
 
 AXLE_HEIGHT = 0.33
 """Height of the ego frame above the road [m], from the user guide."""
@@ -80,7 +80,7 @@ class Argoverse2Reader:
             LogError: see :class:`LogReader`.
         """
         logs = _logs(path)
-        folder = logs[choose_sequence(path, sorted(logs), sequence)]
+        folder = logs[select_sequence(path, sorted(logs), sequence)]
         sweeps, times_us = _list_sweeps(folder / "sensors" / "lidar")
         city = _read_ego(folder / "city_SE3_egovehicle.feather")
         check_ego_covers(city, times_us, str(folder / "city_SE3_egovehicle.feather"))
@@ -240,7 +240,7 @@ def _read_tracks(path: Path, ego: Trajectory) -> tuple[tuple[ObjectTrack, ...], 
         category = str(table["category"][row]).lower()
         length, width, height = sizes[row]
         boxes.append(
-            Box(
+            FrameBox(
                 key=str(table["track_uuid"][row]),
                 category=CATEGORIES.get(category, category),
                 size=(length, width, height),

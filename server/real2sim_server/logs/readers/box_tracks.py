@@ -15,7 +15,7 @@ from ..driving_log import LogError, ObjectTrack
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class FrameBox:
     """One object in one frame.
 
     Attributes:
@@ -44,7 +44,7 @@ def upright_pose(centre: Iterable[float], heading: float) -> Float:
     return pose
 
 
-def build_tracks(boxes: Iterable[Box]) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
+def build_tracks(boxes: Iterable[FrameBox]) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
     """Tracks in order of first appearance, and the dataset's name of each by object id.
 
     An object has its median size and its most frequent category; it is called
@@ -54,7 +54,7 @@ def build_tracks(boxes: Iterable[Box]) -> tuple[tuple[ObjectTrack, ...], dict[st
         LogError: a size that is not positive, a pose that is not finite or no rigid transform, or
             two boxes of one object at one instant.
     """
-    by_key: dict[str, list[Box]] = defaultdict(list)
+    by_key: dict[str, list[FrameBox]] = defaultdict(list)
     for box in sorted(boxes, key=lambda b: (b.time_us, b.key)):
         _check(box)
         by_key[box.key].append(box)
@@ -72,7 +72,7 @@ def build_tracks(boxes: Iterable[Box]) -> tuple[tuple[ObjectTrack, ...], dict[st
     return tuple(tracks), keys
 
 
-def _check(box: Box) -> None:
+def _check(box: FrameBox) -> None:
     if not (np.isfinite(box.size).all() and min(box.size) > 0):
         raise LogError(
             f"{box.where}: the box of {box.key!r} needs a positive length, width and height, not "
@@ -82,7 +82,7 @@ def _check(box: Box) -> None:
         raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
 
 
-def _trajectory(key: str, members: list[Box]) -> Trajectory:
+def _trajectory(key: str, members: list[FrameBox]) -> Trajectory:
     times_us = [b.time_us for b in members]
     for one, two in pairwise(members):
         if one.time_us == two.time_us:

@@ -20,7 +20,7 @@ from ...geometry.transform import invert_transform
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import image_size
-from .box_tracks import Box, build_tracks
+from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.json_tables import read_json
 from .formats.tables import check_rigid, parse_numbers, read_lines
@@ -144,7 +144,7 @@ def _read_tracks(
     return build_tracks(boxes)
 
 
-def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> list[Box]:
+def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> list[FrameBox]:
     where = f"{path}: instance {key!r}"
     try:
         kind = str(value["class_name"]).lower()
@@ -166,7 +166,9 @@ def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> lis
         if category == "car" and size[0] > TRUCK_LENGTH:
             category = "truck"
         length, width, height = size
-        boxes.append(Box(key, category, (length, width, height), int(times_us[frame]), pose, where))
+        boxes.append(
+            FrameBox(key, category, (length, width, height), int(times_us[frame]), pose, where)
+        )
     return boxes
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 
-MOST_ZOOM = 4.0
+MAX_ZOOM = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Lens:
         """
         if not any(self.distortion) or self._fits(1.0):
             return self.K.copy()
-        low, high = 1.0, MOST_ZOOM
+        low, high = 1.0, MAX_ZOOM
         for _ in range(40):
             middle = (low + high) / 2
             low, high = (low, middle) if self._fits(middle) else (middle, high)

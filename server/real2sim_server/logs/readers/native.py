@@ -41,7 +41,7 @@ class NativeReader:
         manifest = path / MANIFEST
         if sequence is not None:
             raise LogError(f"{path}: holds one log; it has no sequence {sequence!r}")
-        content = _Section(_load(manifest), str(manifest))
+        content = _JsonSection(_load(manifest), str(manifest))
         times_us = check_frame_times(content.integers("frame_times_us"), str(manifest))
         rig = _read_rig(content)
         ego = content.section("ego")
@@ -79,7 +79,7 @@ def _load(manifest: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Section:
+class _JsonSection:
     """A JSON object with checked access; ``where`` names it in errors."""
 
     content: Mapping[str, Any]
@@ -92,16 +92,16 @@ class _Section:
             raise LogError(f"{self.where}: {key!r} must be {kind.__name__}, found {found}")
         return value
 
-    def section(self, key: str) -> _Section:
-        return _Section(self.get(key, dict), f"{self.where}: {key}")
+    def section(self, key: str) -> _JsonSection:
+        return _JsonSection(self.get(key, dict), f"{self.where}: {key}")
 
-    def sections(self, key: str) -> list[_Section]:
+    def sections(self, key: str) -> list[_JsonSection]:
         found = []
         for i, item in enumerate(self.get(key, list)):
             where = f"{self.where}: {key}[{i}]"
             if not isinstance(item, dict):
                 raise LogError(f"{where} must be an object, found {item!r}")
-            found.append(_Section(item, where))
+            found.append(_JsonSection(item, where))
         return found
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -138,7 +138,7 @@ class _Section:
         return length, width, height
 
 
-def _read_rig(content: _Section) -> CameraRig:
+def _read_rig(content: _JsonSection) -> CameraRig:
     cameras = []
     for entry in content.sections("cameras"):
         name = entry.get("name", str)
@@ -157,7 +157,7 @@ def _read_rig(content: _Section) -> CameraRig:
         raise LogError(f"{content.where}: {error}") from error
 
 
-def _read_trajectory(section: _Section) -> Trajectory:
+def _read_trajectory(section: _JsonSection) -> Trajectory:
     times_us = section.integers("times_us")
     positions = section.numbers("positions", (-1, 3))
     quaternions = section.numbers("quaternions", (-1, 4))
@@ -167,7 +167,7 @@ def _read_trajectory(section: _Section) -> Trajectory:
         raise LogError(f"{section.where}: {error}") from error
 
 
-def _read_tracks(content: _Section) -> tuple[ObjectTrack, ...]:
+def _read_tracks(content: _JsonSection) -> tuple[ObjectTrack, ...]:
     tracks: dict[str, ObjectTrack] = {}
     for entry in content.sections("tracks"):
         object_id = entry.get("object_id", str)
@@ -183,7 +183,7 @@ def _read_tracks(content: _Section) -> tuple[ObjectTrack, ...]:
 
 
 def _read_image_times(
-    content: _Section, rig: CameraRig, times_us: NDArray[np.int64], ego: Trajectory
+    content: _JsonSection, rig: CameraRig, times_us: NDArray[np.int64], ego: Trajectory
 ) -> dict[str, NDArray[np.int64]]:
     """Times of images by camera; the key may be left out, and so may any camera."""
     if "image_times_us" not in content.content:
@@ -212,7 +212,7 @@ def _image_files(path: Path, rig: CameraRig, frame_count: int) -> dict[str, list
     return images
 
 
-def _sweep_files(path: Path, content: _Section, frame_count: int) -> list[Path] | None:
+def _sweep_files(path: Path, content: _JsonSection, frame_count: int) -> list[Path] | None:
     if not content.get("lidar", bool):
         return None
     files = [path / "lidar" / f"{f:06d}.npz" for f in range(frame_count)]

@@ -21,17 +21,17 @@ from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform, transform_from
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from .box_tracks import Box, build_tracks
-from .choice import choose_sequence
+from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.json_tables import Tables
 from .formats.tables import check_ego_covers, check_frame_times
 from .image_matching import MatchedImages, TimedImages, match_images
 from .lens import Lens
+from .selection import select_sequence
 
 LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
 TOLERANCE_US = 60_000
-HALF_TURN_US = 25_000
+HALF_SWEEP_US = 25_000
 EGO_SIZE = (4.084, 1.73, 1.562)
 """Renault Zoe [m]."""
 
@@ -71,7 +71,7 @@ class NuScenesReader:
         folder = sorted(p.parent for p in path.glob("v1.0-*/scene.json"))[0]
         tables = Tables(folder, TABLES)
         scenes = {str(s["name"]): str(s["token"]) for s in tables.rows("scene")}
-        name = choose_sequence(folder / "scene.json", sorted(scenes), sequence)
+        name = select_sequence(folder / "scene.json", sorted(scenes), sequence)
         samples = {s["token"] for s in tables.rows("sample") if s["scene_token"] == scenes[name]}
         recordings = _recordings(tables, samples)
         cameras = {c: r for c, r in recordings.items() if c.startswith("CAM_")}
@@ -245,7 +245,7 @@ def _tracks(
         name = str(tables.row("category", instance["category_token"])["name"])
         width, length, height = (float(v) for v in row["size"])
         boxes.append(
-            Box(
+            FrameBox(
                 key=str(row["instance_token"]),
                 category=_category(name),
                 size=(length, width, height),
@@ -294,7 +294,7 @@ class _NuScenesSource:
         sweep_us = min(max(sweep_us, self.ego.start_us), self.ego.end_us)
         moved = invert_transform(self.ego.transform(frame_us)) @ self.ego.transform(sweep_us)
         mount = moved @ self.T_vehicle_lidar
-        offset = np.full(len(rows), sweep_us - HALF_TURN_US - frame_us, dtype=np.int32)
+        offset = np.full(len(rows), sweep_us - HALF_SWEEP_US - frame_us, dtype=np.int32)
         return LidarSweep(
             points=apply_transform(mount, rows[:, :3].astype(np.float64)).astype(np.float32),
             intensity=np.clip(rows[:, 3] / 255, 0, 1),

@@ -1,4 +1,4 @@
-"""Fits a box of one size to all sightings of a moving thing."""
+"""Fits a box of one size to all clusters of a moving object."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from .clusters import Cluster
+from .clusters import LidarCluster
 from .motion import smooth
 
 DEVIATION = 0.15
 """Of the middle of a fitted box [m]."""
 
-SLOW = 0.7
+MIN_HEADING_SPEED = 0.7
 """Below this speed [m/s] the direction of motion says nothing about the heading."""
 
-FULL = 80.0
+EXTENT_PERCENTILE = 80.0
 """Percentile of extents that counts as the size: the largest may have a neighbour in it."""
 
 
@@ -59,12 +59,12 @@ class FittedBox:
         return "van" if height > 1.85 else "car"
 
 
-def fit_box(clusters: Mapping[int, Cluster], times: Float) -> FittedBox:
-    """A box of the size that shows over all frames, moving smoothly, heading where it goes.
+def fit_box(clusters: Mapping[int, LidarCluster], times: Float) -> FittedBox:
+    """A box of the size observed over all frames, with a smooth path and headings along it.
 
-    A scanner sees the near sides only (an L from above), so the box hangs on those: along each of
-    its axes the face towards the sensor is where the points begin, and the far face follows from
-    the size. Seen from behind all the time, a car gets a car's length.
+    A scanner sees the near sides only (an L from above), so the box is anchored to those: along
+    each of its axes the face towards the sensor is where the points begin, and the far face
+    follows from the size. A car only seen from behind is given a car's typical length.
 
     Args:
         clusters: by frame, in the world.
@@ -74,7 +74,7 @@ def fit_box(clusters: Mapping[int, Cluster], times: Float) -> FittedBox:
     rough = [clusters[f].centre if f in clusters else None for f in frames.tolist()]
     states = smooth(times[frames], rough, 3 * DEVIATION)
     size: tuple[float, float, float] = 0.0, 0.0, 0.0
-    places: list[Float | None] = []
+    positions: list[Float | None] = []
     for _ in range(2):
         headings = _headings(states)
         faces = {
@@ -83,14 +83,16 @@ def fit_box(clusters: Mapping[int, Cluster], times: Float) -> FittedBox:
             if f in clusters
         }
         size = _size(clusters, faces)
-        places = [
-            _hang(faces[f], clusters[f], headings[i], size) if f in faces else None
+        positions = [
+            _anchor_box(faces[f], clusters[f], headings[i], size) if f in faces else None
             for i, f in enumerate(frames.tolist())
         ]
-        states = smooth(times[frames], places, DEVIATION)
+        states = smooth(times[frames], positions, DEVIATION)
     grounds = np.interp(frames, list(clusters), [c.ground for c in clusters.values()])
-    centres = np.column_stack([states[:, :2], _calm(grounds) + size[2] / 2])
-    apart = [np.sum((p - s[:2]) ** 2) for p, s in zip(places, states, strict=True) if p is not None]
+    centres = np.column_stack([states[:, :2], _running_mean(grounds) + size[2] / 2])
+    apart = [
+        np.sum((p - s[:2]) ** 2) for p, s in zip(positions, states, strict=True) if p is not None
+    ]
     residual = float(np.sqrt(np.mean(apart)))
     return FittedBox(frames, centres, _headings(states), states[:, 2:], size, residual)
 
@@ -98,22 +100,22 @@ def fit_box(clusters: Mapping[int, Cluster], times: Float) -> FittedBox:
 def _headings(states: Float) -> Float:
     """Direction of motion [T]; while standing, that of the nearest moment of motion."""
     velocity = states[:, 2:]
-    fast = np.flatnonzero(np.linalg.norm(velocity, axis=1) > SLOW)
+    fast = np.flatnonzero(np.linalg.norm(velocity, axis=1) > MIN_HEADING_SPEED)
     if not len(fast):
-        gone = states[-1, :2] - states[0, :2]
-        return np.full(len(states), np.arctan2(gone[1], gone[0]))
+        displacement = states[-1, :2] - states[0, :2]
+        return np.full(len(states), np.arctan2(displacement[1], displacement[0]))
     nearest = fast[np.abs(np.arange(len(states))[:, None] - fast).argmin(axis=1)]
     angles = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0])[nearest])
-    return _calm(angles)
+    return _running_mean(angles)
 
 
-def _calm(values: Float, reach: int = 3) -> Float:
+def _running_mean(values: Float, reach: int = 3) -> Float:
     """Running mean over up to 2 reach + 1 values."""
     padded = np.pad(values, reach, mode="edge")
     return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode="valid")
 
 
-def _faces(cluster: Cluster, heading: float, velocity: Float) -> Float:
+def _faces(cluster: LidarCluster, heading: float, velocity: Float) -> Float:
     """Where the points begin and end [2, 2] (axis; low, high) along and across the heading.
 
     Points that were measured earlier or later than the frame are moved along.
@@ -130,13 +132,13 @@ def _axes(heading: float) -> Float:
 
 
 def _size(
-    clusters: Mapping[int, Cluster], faces: Mapping[int, Float]
+    clusters: Mapping[int, LidarCluster], faces: Mapping[int, Float]
 ) -> tuple[float, float, float]:
     extents = np.array([np.ptp(f, axis=1) for f in faces.values()])
-    length, width = np.percentile(extents, FULL, axis=0)
+    length, width = np.percentile(extents, EXTENT_PERCENTILE, axis=0)
     tops = [np.percentile(c.points[:, 2], 99) - c.ground for c in clusters.values()]
-    height = float(np.percentile(tops, FULL))
-    # A vehicle seen from one end or one side only keeps what its other side tells it is.
+    height = float(np.percentile(tops, EXTENT_PERCENTILE))
+    # A vehicle seen from one end or one side only is completed by typical sizes.
     if width > 1.2 and length < 3.6:
         length = next(typical for top, typical in TYPICAL_LENGTHS if height < top)
     elif length > 2.6 and width < 1.5:
@@ -144,8 +146,8 @@ def _size(
     return float(max(length, 0.5)), float(max(width, 0.5)), max(height, 0.5)
 
 
-def _hang(
-    faces: Float, cluster: Cluster, heading: float, size: tuple[float, float, float]
+def _anchor_box(
+    faces: Float, cluster: LidarCluster, heading: float, size: tuple[float, float, float]
 ) -> Float:
     """Middle [2] of a box whose near faces are where the points begin."""
     axes = _axes(heading)

@@ -1,4 +1,4 @@
-"""Groups of points that stand together above the ground."""
+"""Clusters of points above the ground."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ HEIGHTS = (0.25, 4.2)
 """Only points this far above the ground [m] count: neither kerbs nor bridges."""
 
 EGO_MARGIN = 0.6
-FEWEST_POINTS = 6
-LONGEST = 20.0
-HIGHEST_BOTTOM = 1.2
-LOWEST_TOP = 0.5
+MIN_POINTS = 6
+MAX_EXTENT = 20.0
+MAX_BOTTOM = 1.2
+MIN_TOP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Cluster:
-    """Points of one thing in one sweep.
+class LidarCluster:
+    """Points of one object in one sweep.
 
     Attributes:
         points: [N, 3] world [m].
@@ -49,8 +49,8 @@ def find_clusters(
     *,
     reach: float,
     ego_size: tuple[float, float, float],
-) -> list[Cluster]:
-    """Things that stand on the ground within ``reach`` [m] of the vehicle.
+) -> list[LidarCluster]:
+    """Objects on the ground within ``reach`` [m] of the vehicle.
 
     Points in the same or in neighbouring cells of a grid seen from above belong together; what is
     too long, too few points, too flat or too far above the ground for something that drives or
@@ -67,15 +67,15 @@ def find_clusters(
     sensor = apply_transform(T_world_vehicle, sweep.origin.astype(np.float64)[None])[0]
     world = apply_transform(T_world_vehicle, points)
     lift = world[:, 2] - points[:, 2]
-    clusters: list[Cluster] = []
+    clusters: list[LidarCluster] = []
     for members in _groups(points, reach):
         bottom, top = np.percentile(points[members, 2] - below[members], [2, 98])
         extent = np.ptp(points[members, :2], axis=0)
-        if np.hypot(*extent) > LONGEST or bottom > HIGHEST_BOTTOM or top < LOWEST_TOP:
+        if np.hypot(*extent) > MAX_EXTENT or bottom > MAX_BOTTOM or top < MIN_TOP:
             continue
         low, high = world[members, :2].min(axis=0), world[members, :2].max(axis=0)
         clusters.append(
-            Cluster(
+            LidarCluster(
                 points=world[members],
                 offset=offset[members],
                 centre=(low + high) / 2,
@@ -106,4 +106,4 @@ def _groups(points: Float, reach: float) -> list[NDArray[np.intp]]:
     order = np.argsort(mine, kind="stable")
     _, starts = np.unique(mine[order], return_index=True)
     groups = np.split(order, starts[1:])
-    return [g for g in groups if len(g) >= FEWEST_POINTS]
+    return [g for g in groups if len(g) >= MIN_POINTS]

@@ -1,4 +1,4 @@
-"""Tells what has gone from what is merely out of sight."""
+"""Distinguishes free space from what is merely occluded."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scipy.spatial import cKDTree
 from ...geometry.rotation import Float
 
 BEAM = 0.013
-"""A beam tells about directions this near to its own [rad]."""
+"""A beam observes directions this near to its own [rad]."""
 
 NEIGHBOURS = 4
 SAME_RANGE = 0.4
-"""A beam that ends this near to a point hit the thing that the point was on [m]."""
+"""A beam that ends this near to a point hit the same surface [m]."""
 
-LEAST_RANGE = 1.0
+MIN_RANGE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
-    """Everything that one sweep saw: points [N, 3] in the world, seen from ``sensor`` [3]."""
+class SweepRays:
+    """Rays of one sweep: from ``sensor`` [3] to ``points`` [N, 3], world [m]."""
 
     points: NDArray[np.float32]
     sensor: Float
@@ -33,28 +33,28 @@ class Witness:
         """Directions as a tree, and ranges; built when it is needed first."""
         rays = self.points - self.sensor
         ranges = np.linalg.norm(rays, axis=1)
-        seen = ranges > LEAST_RANGE
+        seen = ranges > MIN_RANGE
         return cKDTree(rays[seen] / ranges[seen, None]), ranges[seen]
 
     def count(self, points: Float) -> tuple[int, int]:
-        """How many of points [N, 3] in the world are seen to be free, and to be occupied.
+        """How many of points [N, 3] in the world are observed free, and how many occupied.
 
-        A beam that goes on behind a point says that it is free there, one that ends there that it
-        is not, and one that ends before says nothing.
+        A beam that passes a point observes free space there, one that ends at the point observes
+        it occupied, and one that ends before it observes nothing.
         """
         tree, ranges = self._beams
         rays = points - self.sensor
-        away = np.linalg.norm(rays, axis=1)
-        near = away > LEAST_RANGE
+        distance = np.linalg.norm(rays, axis=1)
+        near = distance > MIN_RANGE
         if not near.any() or len(ranges) < NEIGHBOURS:
             return 0, 0
-        rays, away = rays[near] / away[near, None], away[near]
+        rays, distance = rays[near] / distance[near, None], distance[near]
         apart, index = tree.query(rays, k=NEIGHBOURS, distance_upper_bound=BEAM)
         known = np.isfinite(apart)
         found = np.where(known, ranges[np.minimum(index, len(ranges) - 1)], np.nan)
-        beyond = found - away[:, None]
+        beyond = found - distance[:, None]
         occupied = (np.abs(beyond) < SAME_RANGE).any(axis=1)
-        # NaN compares false: what no beam tells about is neither.
+        # NaN compares false: what no beam observes is neither.
         passed = (beyond > SAME_RANGE).sum(axis=1)
         free = ~occupied & (passed > 0) & (passed == known.sum(axis=1))
         return int(free.sum()), int(occupied.sum())

@@ -16,76 +16,80 @@ from ...geometry.rotation import Float
 ACCELERATION = 2.5
 """Standard deviation of accelerations [m/s^2]."""
 
-FIRST_SPEED = 12.0
-"""Standard deviation of the speed of a thing that is seen for the first time [m/s]."""
+INITIAL_SPEED = 12.0
+"""Standard deviation of the speed of a new track [m/s]."""
 
-MEASURE = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]])
+OBSERVATION = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]])
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class KalmanState:
     """Mean [4] (x, y, vx, vy) and covariance [4, 4]."""
 
     mean: Float
     covariance: Float
 
     @classmethod
-    def first(cls, place: Float, deviation: float) -> State:
-        """Of a thing at ``place`` [2] with unknown velocity."""
-        variances = [deviation**2] * 2 + [FIRST_SPEED**2] * 2
-        return cls(np.array([*place, 0.0, 0.0]), np.diag(variances))
+    def first(cls, position: Float, deviation: float) -> KalmanState:
+        """At a measured ``position`` [2] with unknown velocity."""
+        variances = [deviation**2] * 2 + [INITIAL_SPEED**2] * 2
+        return cls(np.array([*position, 0.0, 0.0]), np.diag(variances))
 
-    def predict(self, seconds: float) -> State:
+    def predict(self, seconds: float) -> KalmanState:
         """After a time."""
-        move = _move(seconds)
-        noise = _noise(seconds)
-        return State(move @ self.mean, move @ self.covariance @ move.T + noise)
+        transition = _transition(seconds)
+        noise = _process_noise(seconds)
+        return KalmanState(
+            transition @ self.mean, transition @ self.covariance @ transition.T + noise
+        )
 
-    def distance(self, place: Float, deviation: float) -> float:
-        """Mahalanobis distance of a measured place [2]."""
-        residual = place - self.mean[:2]
-        spread = self.covariance[:2, :2] + deviation**2 * np.eye(2)
-        return float(np.sqrt(residual @ np.linalg.solve(spread, residual)))
+    def distance(self, position: Float, deviation: float) -> float:
+        """Mahalanobis distance of a measured position [2]."""
+        residual = position - self.mean[:2]
+        innovation_covariance = self.covariance[:2, :2] + deviation**2 * np.eye(2)
+        return float(np.sqrt(residual @ np.linalg.solve(innovation_covariance, residual)))
 
-    def update(self, place: Float, deviation: float) -> State:
-        """With a measured place [2] of a standard deviation [m]."""
-        spread = MEASURE @ self.covariance @ MEASURE.T + deviation**2 * np.eye(2)
-        gain = np.linalg.solve(spread, MEASURE @ self.covariance).T
-        keep = np.eye(4) - gain @ MEASURE
-        mean = self.mean + gain @ (place - MEASURE @ self.mean)
+    def update(self, position: Float, deviation: float) -> KalmanState:
+        """With a measured position [2] of a standard deviation [m]."""
+        innovation_covariance = (
+            OBSERVATION @ self.covariance @ OBSERVATION.T + deviation** 2 * np.eye(2)
+        )
+        gain = np.linalg.solve(innovation_covariance, OBSERVATION @ self.covariance).T
+        keep = np.eye(4) - gain @ OBSERVATION
+        mean = self.mean + gain @ (position - OBSERVATION @ self.mean)
         covariance = keep @ self.covariance @ keep.T + deviation**2 * gain @ gain.T
-        return State(mean, covariance)
+        return KalmanState(mean, covariance)
 
 
-def smooth(times: Float, places: Sequence[Float | None], deviation: float) -> Float:
-    """States [T, 4] at ``times`` [T] [s] from measured places, None where there is none.
+def smooth(times: Float, positions: Sequence[Float | None], deviation: float) -> Float:
+    """States [T, 4] at ``times`` [T] [s] from measured positions, None where there is none.
 
-    Forward Kalman filter and backward pass; the first place must be known.
+    Forward Kalman filter and backward pass; the first position must be known.
     """
-    assert places[0] is not None
-    state = State.first(places[0], deviation).update(places[0], deviation)
+    assert positions[0] is not None
+    state = KalmanState.first(positions[0], deviation).update(positions[0], deviation)
     filtered, predicted = [state], [state]
     for i in range(1, len(times)):
-        ahead = state.predict(times[i] - times[i - 1])
-        place = places[i]
-        state = ahead if place is None else ahead.update(place, deviation)
-        predicted.append(ahead)
+        predicted_state = state.predict(times[i] - times[i - 1])
+        position = positions[i]
+        state = predicted_state if position is None else predicted_state.update(position, deviation)
+        predicted.append(predicted_state)
         filtered.append(state)
     means = [filtered[-1].mean]
     for i in range(len(times) - 2, -1, -1):
-        move = _move(times[i + 1] - times[i])
-        gain = np.linalg.solve(predicted[i + 1].covariance, move @ filtered[i].covariance).T
+        transition = _transition(times[i + 1] - times[i])
+        gain = np.linalg.solve(predicted[i + 1].covariance, transition @ filtered[i].covariance).T
         means.append(filtered[i].mean + gain @ (means[-1] - predicted[i + 1].mean))
     return np.array(means[::-1])
 
 
-def _move(seconds: float) -> Float:
-    move = np.eye(4)
-    move[0, 2] = move[1, 3] = seconds
-    return move
+def _transition(seconds: float) -> Float:
+    transition = np.eye(4)
+    transition[0, 2] = transition[1, 3] = seconds
+    return transition
 
 
-def _noise(seconds: float) -> Float:
+def _process_noise(seconds: float) -> Float:
     t = seconds
     block = np.array([[t**4 / 4, t**3 / 2], [t**3 / 2, t**2]]) * ACCELERATION**2
     noise = np.zeros((4, 4))

@@ -13,29 +13,29 @@ from ...geometry.rotation import Float, yaw_quaternion
 from ...geometry.transform import apply_transform, invert_transform
 from ...scene import Trajectory
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
-from .association import Track, follow
+from .association import Track, associate
 from .boxes import FittedBox, fit_box
-from .clusters import Cluster, find_clusters
-from .free_space import Witness
+from .clusters import LidarCluster, find_clusters
+from .free_space import SweepRays
 
-LONGEST, WIDEST, HIGHEST = 20.0, 3.9, 4.3
-STRAIGHT = 0.6
-"""Least share of the way that must lead from start to end: what jitters goes nowhere."""
+MAX_LENGTH, MAX_WIDTH, MAX_HEIGHT = 20.0, 3.9, 4.3
+MIN_STRAIGHTNESS = 0.6
+"""Least displacement as a fraction of the path length: what jitters goes nowhere."""
 
-EMPTY = 0.6
-"""Least share of the places it has left that must be seen to be empty."""
+MIN_FREE_FRACTION = 0.6
+"""Least fraction of the tested points at former positions that must be seen to be empty."""
 
-FEW_POINTS = 20
-MOST_POINTS = 200
-LOOKS = 6
-WITNESS_STEP = 4
+MIN_TESTED_POINTS = 20
+MAX_TESTED_POINTS = 200
+TESTED_FRAMES = 6
+RAYS_EVERY = 4
 MARGIN = 0.3
-STEADY, SMALL = 0.4, 1.2
-ROUGHEST = 0.5
-"""A way that jumps about more than this [m] is of several things."""
+EGO_PART_MOTION, EGO_PART_SIZE = 0.4, 1.2
+MAX_RESIDUAL = 0.5
+"""A track whose fit leaves more than this [m] is of several objects."""
 
 JOIN_SPEED = 1.5
-FEW_COMMON = 4
+MAX_COMMON_APART = 4
 JOIN_SECONDS = 1.5
 JOIN_DISTANCE = 1.0
 
@@ -45,18 +45,18 @@ class TrackingOptions:
     """What counts as a moving object.
 
     Attributes:
-        reach: how far from the vehicle objects are looked for [m], along each axis.
+        reach: how far from the vehicle objects are detected [m], along each axis.
         least_distance: how far an object must go [m].
         least_speed: its least mean speed [m/s].
         least_frames: in how many frames it must be seen.
-        patience: after how many frames without a sighting it is lost.
+        max_missed: a track ends after so many frames without a cluster.
     """
 
     reach: float = 55.0
     least_distance: float = 1.5
     least_speed: float = 0.5
     least_frames: int = 6
-    patience: int = 4
+    max_missed: int = 4
 
 
 def track_moving_objects(
@@ -67,9 +67,9 @@ def track_moving_objects(
 ) -> tuple[ObjectTrack, ...]:
     """Find what moves in the LiDAR sweeps of a log, with the log's own poses.
 
-    The ground is taken away, what stands on it grouped, groups followed from frame to frame, and
-    boxes of constant size fitted to those that really move: where a moving thing has been, nothing
-    is afterwards.
+    Ground points are removed, the rest is clustered, clusters are associated from frame to frame,
+    and boxes of constant size are fitted to the tracks that move: the positions that a moving
+    object has left are free space afterwards.
 
     Args:
         log: with LiDAR; its tracks are not looked at.
@@ -83,57 +83,60 @@ def track_moving_objects(
         LogError: a sweep cannot be read.
     """
     options = options or TrackingOptions()
-    scans, witnesses = [], {}
+    scans, rays_by_frame = [], {}
     for frame in range(log.frame_count):
         pose, sweep = log.ego.transform(int(log.frame_times_us[frame])), log.lidar(frame)
         scans.append(find_clusters(sweep, pose, reach=options.reach, ego_size=log.ego_size))
-        if frame % WITNESS_STEP == 0 or frame == log.frame_count - 1:
-            witnesses[frame] = _witness(sweep, pose)
+        if frame % RAYS_EVERY == 0 or frame == log.frame_count - 1:
+            rays_by_frame[frame] = _sweep_rays(sweep, pose)
         if on_progress is not None:
             on_progress(frame + 1, log.frame_count)
     times = (log.frame_times_us - log.frame_times_us[0]) * 1e-6
-    trails = follow(scans, times, patience=options.patience)
-    moving = [t for t in trails if _goes_somewhere(t, times, options)]
-    joined = [(part, fit_box(part, times)) for part in _join(moving, times)]
+    tracks = associate(scans, times, max_missed=options.max_missed)
+    moving = [t for t in tracks if _has_moved(t, times, options)]
+    joined = [(part, fit_box(part, times)) for part in _merge_tracks(moving, times)]
     boxes = [
         box
         for part, box in joined
-        if _is_mover(part, box, times, options)
-        and not _rides_along(log, box)
-        and _leaves_nothing(part, box, witnesses)
+        if _moves_like_object(part, box, times, options)
+        and not _is_part_of_ego(log, box)
+        and _vacates_positions(part, box, rays_by_frame)
     ]
-    return _name(log, sorted(boxes, key=lambda box: int(box.frames[0])))
+    return _named_tracks(log, sorted(boxes, key=lambda box: int(box.frames[0])))
 
 
-def _witness(sweep: LidarSweep, pose: Float) -> Witness:
+def _sweep_rays(sweep: LidarSweep, pose: Float) -> SweepRays:
     world = apply_transform(pose, sweep.points.astype(np.float64))
     sensor = apply_transform(pose, sweep.origin.astype(np.float64)[None])[0]
-    return Witness(world.astype(np.float32), sensor)
+    return SweepRays(world.astype(np.float32), sensor)
 
 
-def _goes_somewhere(trail: Track, times: Float, options: TrackingOptions) -> bool:
-    """A first, cheap sieve: half of what is asked for in the end."""
-    if len(trail.clusters) < max(3, options.least_frames // 2):
+def _has_moved(track: Track, times: Float, options: TrackingOptions) -> bool:
+    """A first, cheap test: half of the distance and speed that count in the end."""
+    if len(track.clusters) < max(3, options.least_frames // 2):
         return False
-    frames = sorted(trail.clusters)
-    centres = np.array([trail.clusters[f].centre for f in frames])
+    frames = sorted(track.clusters)
+    centres = np.array([track.clusters[f].centre for f in frames])
     ends = max(1, len(frames) // 5)
-    gone = np.linalg.norm(centres[-ends:].mean(axis=0) - centres[:ends].mean(axis=0))
+    displacement = np.linalg.norm(centres[-ends:].mean(axis=0) - centres[:ends].mean(axis=0))
     seconds = times[frames[-1]] - times[frames[0]]
-    return bool(gone > options.least_distance / 2 and gone > options.least_speed / 2 * seconds)
+    return bool(
+        displacement > options.least_distance / 2
+        and displacement > options.least_speed / 2 * seconds
+    )
 
 
-def _join(trails: Sequence[Track], times: Float) -> list[dict[int, Cluster]]:
-    """Put together what is one thing: parts side by side, and trails that were cut in two."""
-    parts = [dict(t.clusters) for t in trails]
+def _merge_tracks(tracks: Sequence[Track], times: Float) -> list[dict[int, LidarCluster]]:
+    """Merge the tracks of one object: parts side by side, and tracks that were cut in two."""
+    parts = [dict(t.clusters) for t in tracks]
     boxes = [fit_box(p, times) for p in parts]
     merged = True
     while merged:
         merged = False
         for i in range(len(parts)):
             for j in range(i + 1, len(parts)):
-                if _belong_together(boxes[i], boxes[j], times):
-                    parts[i] = _united(parts[i], parts.pop(j))
+                if _same_object(boxes[i], boxes[j], times):
+                    parts[i] = _merged_clusters(parts[i], parts.pop(j))
                     boxes.pop(j)
                     boxes[i] = fit_box(parts[i], times)
                     merged = True
@@ -143,7 +146,7 @@ def _join(trails: Sequence[Track], times: Float) -> list[dict[int, Cluster]]:
     return parts
 
 
-def _belong_together(one: FittedBox, two: FittedBox, times: Float) -> bool:
+def _same_object(one: FittedBox, two: FittedBox, times: Float) -> bool:
     common = np.intersect1d(one.frames, two.frames)
     if len(common):
         a, b = common - one.frames[0], common - two.frames[0]
@@ -154,7 +157,7 @@ def _belong_together(one: FittedBox, two: FittedBox, times: Float) -> bool:
         differ = np.linalg.norm(one.velocities[a] - two.velocities[b], axis=1).mean()
         if np.mean(together) > 0.5:
             return bool(differ < JOIN_SPEED)
-        if len(common) > FEW_COMMON:
+        if len(common) > MAX_COMMON_APART:
             return False
     early, late = (one, two) if one.frames[0] < two.frames[0] else (two, one)
     gap = times[late.frames[0]] - times[early.frames[-1]]
@@ -165,61 +168,66 @@ def _belong_together(one: FittedBox, two: FittedBox, times: Float) -> bool:
     return bool(np.linalg.norm(expected - late.centres[0, :2]) < reach)
 
 
-def _inside(box: FittedBox, index: int, places: Float) -> NDArray[np.bool_]:
-    """Which places [..., >= 2] lie above or below the box, or next to it."""
+def _inside(box: FittedBox, index: int, positions: Float) -> NDArray[np.bool_]:
+    """Which positions [..., >= 2] lie above or below the box, or next to it."""
     cos, sin = np.cos(box.headings[index]), np.sin(box.headings[index])
-    x, y = places[..., 0] - box.centres[index, 0], places[..., 1] - box.centres[index, 1]
+    x, y = positions[..., 0] - box.centres[index, 0], positions[..., 1] - box.centres[index, 1]
     along, across = cos * x + sin * y, cos * y - sin * x
     half = np.array(box.size[:2]) / 2 + MARGIN
     return np.asarray((np.abs(along) < half[0]) & (np.abs(across) < half[1]))
 
 
-def _united(one: dict[int, Cluster], two: dict[int, Cluster]) -> dict[int, Cluster]:
+def _merged_clusters(
+    one: dict[int, LidarCluster], two: dict[int, LidarCluster]
+) -> dict[int, LidarCluster]:
     both = {**two, **one}
     for frame in set(one) & set(two):
         a, b = one[frame], two[frame]
         points = np.concatenate([a.points, b.points])
         middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-        both[frame] = Cluster(
+        both[frame] = LidarCluster(
             points, np.concatenate([a.offset, b.offset]), middle, min(a.ground, b.ground), a.sensor
         )
     return dict(sorted(both.items()))
 
 
-def _is_mover(
-    clusters: Mapping[int, Cluster], box: FittedBox, times: Float, options: TrackingOptions
+def _moves_like_object(
+    clusters: Mapping[int, LidarCluster], box: FittedBox, times: Float, options: TrackingOptions
 ) -> bool:
     length, width, height = box.size
-    if len(clusters) < options.least_frames or length > LONGEST or width > WIDEST:
+    if len(clusters) < options.least_frames or length > MAX_LENGTH or width > MAX_WIDTH:
         return False
     steps = np.linalg.norm(np.diff(box.centres[:, :2], axis=0), axis=1)
-    gone = float(np.linalg.norm(box.centres[-1, :2] - box.centres[0, :2]))
+    displacement = float(np.linalg.norm(box.centres[-1, :2] - box.centres[0, :2]))
     seconds = times[box.frames[-1]] - times[box.frames[0]]
-    if height > HIGHEST or gone < options.least_distance or box.residual > ROUGHEST:
+    if height > MAX_HEIGHT or displacement < options.least_distance or box.residual > MAX_RESIDUAL:
         return False
-    way = float(steps.sum())
-    return way > options.least_speed * seconds and gone > STRAIGHT * way
+    path_length = float(steps.sum())
+    return (
+        path_length > options.least_speed * seconds
+        and displacement > MIN_STRAIGHTNESS * path_length
+    )
 
 
-def _rides_along(log: DrivingLog, box: FittedBox) -> bool:
-    """Whether it is a part of the recording vehicle: small, and always at the same place on it."""
+def _is_part_of_ego(log: DrivingLog, box: FittedBox) -> bool:
+    """Whether it is a part of the recording vehicle: small, and steady in the vehicle frame."""
     poses = np.array([log.ego.transform(int(log.frame_times_us[f])) for f in box.frames])
-    places = apply_transform(invert_transform(poses), box.centres[:, None])[:, 0]
-    steady = np.abs(places - places.mean(axis=0)).max() < STEADY
-    return bool(steady and max(box.size[:2]) < SMALL)
+    positions = apply_transform(invert_transform(poses), box.centres[:, None])[:, 0]
+    steady = np.abs(positions - positions.mean(axis=0)).max() < EGO_PART_MOTION
+    return bool(steady and max(box.size[:2]) < EGO_PART_SIZE)
 
 
-def _leaves_nothing(
-    clusters: Mapping[int, Cluster], box: FittedBox, witnesses: Mapping[int, Witness]
+def _vacates_positions(
+    clusters: Mapping[int, LidarCluster], box: FittedBox, rays_by_frame: Mapping[int, SweepRays]
 ) -> bool:
-    """Whether the places where it was are seen to be empty when it is elsewhere.
+    """Whether its former positions are observed free when it is elsewhere.
 
-    The visible part of a wall wanders as the vehicle drives by, but the wall stays.
+    The visible part of a wall moves along as the vehicle drives by, but the wall stays.
     """
     frames = sorted(clusters)
-    looked = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, LOOKS).tolist()]
+    looked = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, TESTED_FRAMES).tolist()]
     free = occupied = 0
-    for there, witness in witnesses.items():
+    for there, rays in rays_by_frame.items():
         index = there - int(box.frames[0])
         if not 0 <= index < len(box.frames):
             continue
@@ -227,12 +235,12 @@ def _leaves_nothing(
             points = clusters[here].points
             left = points[~_inside(box, index, points)]
             if len(left):
-                found = witness.count(left[:: max(1, len(left) // MOST_POINTS)])
+                found = rays.count(left[:: max(1, len(left) // MAX_TESTED_POINTS)])
                 free, occupied = free + found[0], occupied + found[1]
-    return free + occupied >= FEW_POINTS and free > EMPTY * (free + occupied)
+    return free + occupied >= MIN_TESTED_POINTS and free > MIN_FREE_FRACTION * (free + occupied)
 
 
-def _name(log: DrivingLog, boxes: Sequence[FittedBox]) -> tuple[ObjectTrack, ...]:
+def _named_tracks(log: DrivingLog, boxes: Sequence[FittedBox]) -> tuple[ObjectTrack, ...]:
     numbers: Counter[str] = Counter()
     tracks = []
     for box in boxes:

@@ -40,7 +40,7 @@ class SideScore:
         azimuth: where it was looked at from [rad], 0 from ahead, pi from behind.
         seen: whether a camera of the log saw this side.
         psnr: [dB]; what is missing counts as black.
-        coverage: share of the pixels where anything of the vehicle is drawn.
+        coverage: fraction of the pixels where anything of the vehicle is drawn.
     """
 
     object_id: str

@@ -59,8 +59,8 @@ def box_outline(corners: Float, k: Float) -> Float:
     start, end = corners[EDGES[:, 0]], corners[EDGES[:, 1]]
     crossing = (start[:, 2] < NEAR) != (end[:, 2] < NEAR)
     start, end = start[crossing], end[crossing]
-    share = (NEAR - start[:, 2]) / (end[:, 2] - start[:, 2])
-    cut = start + share[:, None] * (end - start)
+    fraction = (NEAR - start[:, 2]) / (end[:, 2] - start[:, 2])
+    cut = start + fraction[:, None] * (end - start)
     points = np.concatenate([corners[corners[:, 2] >= NEAR], cut])
     if len(points) < 3:
         return np.zeros((0, 2))

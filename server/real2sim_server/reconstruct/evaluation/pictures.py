@@ -17,7 +17,7 @@ ERROR_FULL = 64.0
 DEPTH_NEAR, DEPTH_FAR = 2.0, 80.0
 """Ends of the logarithmic colours of depth images [m]."""
 CROP_MARGIN = 0.15
-"""Crops reach so far beyond the outline of a box, as a share of its size."""
+"""Crops reach so far beyond the outline of a box, as a fraction of its size."""
 MIN_CROP = 12
 """Objects that are smaller on the image are not shown [px]."""
 
@@ -37,8 +37,8 @@ def depth_image(depth: NDArray[np.float32]) -> Image:
     import cv2
 
     near, far = np.log(DEPTH_NEAR), np.log(DEPTH_FAR)
-    share = (far - np.log(np.maximum(depth, DEPTH_NEAR))) / (far - near)
-    return np.where((depth > 0)[..., None], _coloured(share, cv2.COLORMAP_TURBO), np.uint8(0))
+    fraction = (far - np.log(np.maximum(depth, DEPTH_NEAR))) / (far - near)
+    return np.where((depth > 0)[..., None], _coloured(fraction, cv2.COLORMAP_TURBO), np.uint8(0))
 
 
 def object_crops(
@@ -83,10 +83,10 @@ def jpeg(image: Image, *, width: int | None = None) -> bytes:
     return encode_rgb(image, "jpeg", quality=88)
 
 
-def _coloured(share: NDArray[np.float32], colours: int) -> Image:
+def _coloured(fraction: NDArray[np.float32], colours: int) -> Image:
     import cv2
 
-    levels = np.rint(np.clip(share, 0, 1) * 255).astype(np.uint8)
+    levels = np.rint(np.clip(fraction, 0, 1) * 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(levels, colours)[..., ::-1])
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...render import Frame, Instance, RasterOptions, render_cameras
@@ -48,6 +49,23 @@ def render_view(
         backend=backend,
     )
     return frame
+
+
+def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.uint8]:
+    """RGB [H, W, 3] of ``camera`` on the recording vehicle at ``t_us``, objects as recorded.
+
+    Raises:
+        TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
+    """
+    options = RasterOptions(depth=False, instance=False)
+    [frame] = render_cameras(
+        scene_instances(scene, t_us),
+        [camera],
+        scene.ego.transform(t_us),
+        sky=scene.sky,
+        options=options,
+    )
+    return frame.rgb
 
 
 @dataclass(frozen=True)

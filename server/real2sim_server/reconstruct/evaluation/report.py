@@ -16,7 +16,6 @@ from ...logs import DrivingLog
 from ...render import Frame
 from ...scene import Camera, Scene
 from ..training.data import image_time
-from .choice import compared_cameras
 from .pictures import (
     DEPTH_FAR,
     DEPTH_NEAR,
@@ -29,6 +28,7 @@ from .pictures import (
 )
 from .rendering import render_view
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
+from .selection import select_cameras
 from .shifted import true_view
 from .truth import Truth, find_truth
 
@@ -52,7 +52,7 @@ figcaption{font-size:.8rem;color:#4a525c}
 
 
 @dataclass(frozen=True, eq=False)
-class _Subject:
+class _ReportContext:
     """What the page is about."""
 
     scene: Scene
@@ -63,7 +63,7 @@ class _Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class _Figure:
     """A picture with its caption."""
 
     image: Image
@@ -91,8 +91,8 @@ def write_report(
         LogError: images that cannot be read.
     """
     options = options or EvaluateOptions()
-    cameras = compared_cameras(scene, log, options.width)
-    subject = _Subject(scene, log, evaluation, find_truth(log), options.backend)
+    cameras = select_cameras(scene, log, options.width)
+    subject = _ReportContext(scene, log, evaluation, find_truth(log), options.backend)
     frames = _spread(evaluation.frames, SHOWN_FRAMES)
     parts = [
         _heading(evaluation),
@@ -185,7 +185,7 @@ def _view_figures(evaluation: Evaluation) -> str:
     return "<h2>All views</h2>" + _table(head, rows)
 
 
-def _view(subject: _Subject, camera: Camera, frame: int) -> str:
+def _view(subject: _ReportContext, camera: Camera, frame: int) -> str:
     log, evaluation = subject.log, subject.evaluation
     image, rendered = logged_pair(subject.scene, log, camera, frame, subject.backend)
     assert rendered.depth is not None
@@ -193,10 +193,10 @@ def _view(subject: _Subject, camera: Camera, frame: int) -> str:
     title = f"<h3>Frame {frame}, {escape(camera.name)}: {_number(score.psnr)} dB</h3>"
     views = _row(
         [
-            _Shown(image, "recorded"),
-            _Shown(rendered.rgb, "rendered"),
-            _Shown(error_image(rendered.rgb, image), "error"),
-            _Shown(depth_image(rendered.depth), "rendered depth"),
+            _Figure(image, "recorded"),
+            _Figure(rendered.rgb, "rendered"),
+            _Figure(error_image(rendered.rgb, image), "error"),
+            _Figure(depth_image(rendered.depth), "rendered depth"),
         ]
     )
     return title + views + _objects(log, camera, frame, image, rendered)
@@ -205,26 +205,26 @@ def _view(subject: _Subject, camera: Camera, frame: int) -> str:
 def _objects(log: DrivingLog, camera: Camera, frame: int, image: Image, rendered: Frame) -> str:
     crops = []
     for object_id, window in object_crops(log, camera, frame, SHOWN_OBJECTS):
-        crops.append(_Shown(image[window], f"{object_id}, recorded"))
-        crops.append(_Shown(rendered.rgb[window], f"{object_id}, rendered"))
+        crops.append(_Figure(image[window], f"{object_id}, recorded"))
+        crops.append(_Figure(rendered.rgb[window], f"{object_id}, rendered"))
     return _row(crops, crops=True) if crops else ""
 
 
-def _beside(subject: _Subject, camera: Camera, frame: int) -> str:
+def _beside(subject: _ReportContext, camera: Camera, frame: int) -> str:
     truth, t_us = subject.truth, image_time(subject.log, camera.name, frame)
     parts = [f"<h2>Frame {frame} from {SHOWN_SHIFT:g} m beside the path</h2>"]
     for left, side in ((SHOWN_SHIFT, "left"), (-SHOWN_SHIFT, "right")):
         view = render_view(subject.scene, camera, t_us, left=left, backend=subject.backend)
-        shown = [_Shown(view.rgb, f"rendered, {side}")]
+        shown = [_Figure(view.rgb, f"rendered, {side}")]
         if truth.log is not None:
             image, _, _ = true_view(truth.log, camera, t_us, left)
             error = error_image(view.rgb, image)
-            shown = [_Shown(image, f"truth, {side}"), *shown, _Shown(error, "error")]
+            shown = [_Figure(image, f"truth, {side}"), *shown, _Figure(error, "error")]
         parts.append(_row(shown))
     return "".join(parts)
 
 
-def _row(shown: Sequence[_Shown], *, crops: bool = False) -> str:
+def _row(shown: Sequence[_Figure], *, crops: bool = False) -> str:
     figures = []
     for item in shown:
         width = CROP_WIDTH if crops else min(IMAGE_WIDTH, item.image.shape[1])

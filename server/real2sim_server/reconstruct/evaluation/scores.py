@@ -13,15 +13,15 @@ from ...logs import DrivingLog
 from ...render import Frame
 from ...scene import Camera, Scene
 from ..options import ReconstructError
-from ..stages import OnProgress, Stages, Tell
+from ..stages import OnProgress, ReportStep, Stages
 from ..training.data import image_time, resized
 from .around import AroundScore, evaluate_around
 from .box_error import box_error
-from .choice import choose_frames, compared_cameras
 from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
 from .lidar_depth import depth_errors, median_error, points_in_camera
 from .object_regions import moving_mask, moving_tracks
 from .rendering import measure_rate, render_view
+from .selection import select_cameras, select_frames
 from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
 from .truth import find_truth
 
@@ -31,7 +31,7 @@ class EvaluateOptions:
     """What is measured.
 
     Attributes:
-        frames: ``held-out``, ``all`` or indices; see :func:`.choice.choose_frames`.
+        frames: ``held-out``, ``all`` or indices; see :func:`.selection.select_frames`.
         width: of the compared images [px]; as logged by default.
         shifts: distances beside the recorded path [m], where truth exists.
         shifted_frames: at most so many frames, evenly spread, are looked at from there.
@@ -77,7 +77,7 @@ class LoggedViewScore:
             same sweep that the camera can see [m]; infinite where most hit nothing, nan without
             points.
         lidar_points: how many these are.
-        lidar_missed: share of them at which nothing is rendered, 0 to 1.
+        lidar_missed: fraction of them at which nothing is rendered, 0 to 1.
     """
 
     camera: str
@@ -173,21 +173,23 @@ def evaluate_scene(
     options = options or EvaluateOptions()
     timing_s: dict[str, float] = {}
     stages = Stages(on_progress, timing_s)
-    chosen = choose_frames(scene, log, options.frames)
-    cameras = compared_cameras(scene, log, options.width)
+    chosen = select_frames(scene, log, options.frames)
+    cameras = select_cameras(scene, log, options.width)
     pairs = [(camera, frame) for frame in chosen.frames for camera in cameras]
     views, errors = [], []
-    with stages("views") as tell:
+    with stages("views") as report_step:
         for done, (camera, frame) in enumerate(pairs):
             view, error = _score(scene, log, camera, frame, options.backend)
             views.append(view)
             errors.append(error)
-            tell(done + 1, len(pairs))
+            report_step(done + 1, len(pairs))
     times = [image_time(log, cameras[0].name, frame) for frame in chosen.frames]
     with stages("rate"):
         rate = measure_rate(scene, cameras, times, repeats=options.repeats, backend=options.backend)
-    with stages("shifted") as tell:
-        shifted, missing = _shifted(scene, log, cameras, times, options=options, tell=tell)
+    with stages("shifted") as report_step:
+        shifted, missing = _shifted(
+            scene, log, cameras, times, options=options, report_step=report_step
+        )
     with stages("around"):
         around = _around(scene, log) if options.around else None
     return Evaluation(
@@ -260,7 +262,7 @@ def _shifted(
     times_us: Sequence[int],
     *,
     options: EvaluateOptions,
-    tell: Tell,
+    report_step: ReportStep,
 ) -> tuple[tuple[ShiftScore, ...], str]:
     if not options.shifts:
         return (), "no shifts were asked for"
@@ -276,7 +278,7 @@ def _shifted(
         [times_us[i] for i in spread],
         options.shifts,
         backend=options.backend,
-        on_view=tell,
+        on_view=report_step,
     )
     return scores, ""
 

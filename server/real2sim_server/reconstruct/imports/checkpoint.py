@@ -1,4 +1,4 @@
-"""Reading checkpoint files without trusting them, and what all importers share."""
+"""Reading checkpoint files without trusting them, and what all importers fraction."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class StreetTracks:
 
 
 @dataclass(frozen=True)
-class _Row:
+class _TrackRow:
     """One line of ``track_info.txt``."""
 
     frame: int
@@ -91,7 +91,7 @@ def read_street_tracks(
     )
 
 
-def _visible_rows(folder: Path, cameras: tuple[int, ...], suffix: str) -> list[_Row]:
+def _visible_rows(folder: Path, cameras: tuple[int, ...], suffix: str) -> list[_TrackRow]:
     file = folder / "track" / f"track_info{suffix}.txt"
     seen_file = folder / "track" / f"track_camera_vis{suffix}.json"
     try:
@@ -107,11 +107,11 @@ def _visible_rows(folder: Path, cameras: tuple[int, ...], suffix: str) -> list[_
     return rows
 
 
-def _parse(file: Path, number: int, line: str) -> _Row:
+def _parse(file: Path, number: int, line: str) -> _TrackRow:
     words = line.split()
     try:
         height, width, length, x, y, z, heading = (float(w) for w in words[4:11])
-        row = _Row(
+        row = _TrackRow(
             int(words[0]), int(words[1]), words[2], (length, width, height), (x, y, z), heading
         )
     except (ValueError, IndexError) as error:
@@ -124,7 +124,7 @@ def _parse(file: Path, number: int, line: str) -> _Row:
     return row
 
 
-def _seen_by(file: Path, seen: Mapping[str, Any], row: _Row) -> set[int]:
+def _seen_by(file: Path, seen: Mapping[str, Any], row: _TrackRow) -> set[int]:
     try:
         return {int(camera) for camera in seen[str(row.track)][str(row.frame)]}
     except (KeyError, TypeError, ValueError) as error:
@@ -133,7 +133,9 @@ def _seen_by(file: Path, seen: Mapping[str, Any], row: _Row) -> set[int]:
         ) from error
 
 
-def _deal_columns(rows: list[_Row], frames: StreetFolder) -> tuple[NDArray[np.int64], Float, Float]:
+def _deal_columns(
+    rows: list[_TrackRow], frames: StreetFolder
+) -> tuple[NDArray[np.int64], Float, Float]:
     """Each row gets the first free column of its frame, in file order."""
     count = len(frames.times_us)
     inside = [r for r in rows if 0 <= r.frame - frames.first_frame < count]

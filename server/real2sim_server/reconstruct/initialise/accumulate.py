@@ -17,7 +17,7 @@ from ..options import InitialiseOptions
 from .points import PointSet, path_distance, thin, voxel_levels
 from .walls import ScanLimit
 
-HALF_TURN_US = 50_000
+HALF_SWEEP_US = 50_000
 EGO_MARGIN = 0.45
 """Returns this close beside the recording vehicle are its own mirrors [m]."""
 SHELL = 0.3
@@ -175,11 +175,11 @@ def _near_box(
     chosen = np.flatnonzero(np.abs(in_world[:, 0] - centre[0]) < reach)
     chosen = chosen[np.abs(in_world[chosen, 1] - centre[1]) < reach]
     early, late = (
-        invert_transform(pose_around(track.trajectory, t_us + sign * HALF_TURN_US))
+        invert_transform(pose_around(track.trajectory, t_us + sign * HALF_SWEEP_US))
         for sign in (-1, 1)
     )
     # Within half a turn of the scanner the path of a point in the box is straight to a millimetre.
-    fraction = (offset_us[chosen] / (2 * HALF_TURN_US) + 0.5)[:, None]
+    fraction = (offset_us[chosen] / (2 * HALF_SWEEP_US) + 0.5)[:, None]
     points = in_world[chosen]
     in_box = apply_transform(early, points) * (1 - fraction)
     return chosen, in_box + apply_transform(late, points) * fraction

@@ -1,4 +1,4 @@
-"""Colours of Gaussians that no camera saw."""
+"""Inpainting: colours of Gaussians that no camera observed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from .ground import GroundSurface
 from .pull_push import pull_push
 
 MIRROR_REACH = 0.15
-"""An unseen point takes the colour of its mirror image when that was seen this near [m]."""
-TRUST = 1.0
-"""Distance at which a seen neighbour's colour has lost most of its say [m]."""
-LEAST_SEEN = 30
-"""Fewer seen points than this tell nothing about a paint."""
-LIKENESS = 0.06
+"""An unobserved point takes the colour of a point observed this near to its mirror image [m]."""
+TRUST_REACH = 1.0
+"""Distance over which the weight of an observed neighbour's colour falls to 1/e [m]."""
+MIN_OBSERVED = 30
+"""Fewer observed points than this say nothing about the colour of a body."""
+COLOUR_SIGMA = 0.06
 """Standard deviation of colours that count as one."""
 GREY = np.array([0.4, 0.4, 0.4], dtype=np.float32)
 
@@ -69,11 +69,11 @@ def fill_from_neighbours(
     known: Known,
     prior: Colours,
     *,
-    trust_reach: float = TRUST,
+    trust_reach: float = TRUST_REACH,
 ) -> Colours:
-    """Colour unseen points from seen ones nearby, and from ``prior`` [N, 3] where none is near.
+    """Colour unobserved points from seen ones nearby, and from ``prior`` [N, 3] where none is near.
 
-    Neighbours' colours have lost most of their say at the distance ``trust_reach`` [m].
+    The weight of neighbours' colours falls to 1/e over ``trust_reach`` [m].
     """
     from scipy.spatial import cKDTree
 
@@ -91,7 +91,7 @@ def fill_from_neighbours(
     return filled.astype(np.float32)
 
 
-def own_paint(
+def body_color(
     heights: NDArray[np.float32],
     colours: Colours,
     known: Known,
@@ -100,31 +100,31 @@ def own_paint(
 ) -> Colours:
     """The commonest colour of an object's seen points at about the same height.
 
-    Lamps, plates and reflections are no guide to the rest of a body, its paint is; so it is the
-    mode that counts and not the mean.
+    Lamps, plates and reflections are no guide to the rest of a body, its paint is: hence the mode
+    and not the mean.
 
     Args:
-        heights: [N] as a share of the object's height, 0 at its middle.
+        heights: [N] as a fraction of the object's height, 0 at its middle.
         colours: [N, 3] where ``known`` [N].
         prior: [N, 3] for bands of height of which too little was seen.
         edges: where bands end.
     """
-    if known.sum() < LEAST_SEEN:
+    if known.sum() < MIN_OBSERVED:
         return prior
     bands = np.searchsorted(edges, heights)
-    paint = np.broadcast_to(commonest(colours[known]), colours.shape).copy()
+    filled = np.broadcast_to(modal_colour(colours[known]), colours.shape).copy()
     for band in range(len(edges) + 1):
         seen = known & (bands == band)
-        if seen.sum() >= LEAST_SEEN:
-            paint[bands == band] = commonest(colours[seen])
-    return paint
+        if seen.sum() >= MIN_OBSERVED:
+            filled[bands == band] = modal_colour(colours[seen])
+    return filled
 
 
-def commonest(colours: Colours) -> Colours:
+def modal_colour(colours: Colours) -> Colours:
     """The colour [3] around which most of ``colours`` [N, 3] lie."""
     few = colours[:: -(-len(colours) // 400)]
     distance = np.linalg.norm(few[:, None] - few[None], axis=2)
-    votes = np.exp(-0.5 * (distance / LIKENESS) ** 2)
+    votes = np.exp(-0.5 * (distance / COLOUR_SIGMA) ** 2)
     winner = votes[votes.sum(axis=1).argmax()]
     return np.asarray((few * winner[:, None]).sum(axis=0) / winner.sum(), dtype=np.float32)
 
@@ -132,9 +132,10 @@ def commonest(colours: Colours) -> Colours:
 def fill_from_mirror(
     points: NDArray[np.float32], colours: Colours, known: Known
 ) -> tuple[Colours, Known]:
-    """Colour unseen points of an object from its other side, across y = 0.
+    """Colour unobserved points of an object from its other side, across y = 0.
 
-    Vehicles look alike from the left and the right; their unseen side is best guessed so.
+    Vehicles look alike from the left and the right: the observed side is the best prior for the
+    other one.
     """
     from scipy.spatial import cKDTree
 
@@ -144,16 +145,16 @@ def fill_from_mirror(
     distance, index = cKDTree(points[known]).query(mirrored, workers=-1)
     near = distance < MIRROR_REACH
     colours, now_known = colours.copy(), known.copy()
-    unseen = np.flatnonzero(~known)[near]
-    colours[unseen] = colours[known][index[near]]
-    now_known[unseen] = True
+    unobserved = np.flatnonzero(~known)[near]
+    colours[unobserved] = colours[known][index[near]]
+    now_known[unobserved] = True
     return colours, now_known
 
 
 def fill_ground(
     surface: GroundSurface, points: NDArray[np.float32], colours: Colours, known: Known
 ) -> Colours:
-    """Colour unseen ground points from the seen ground around them, ever more smoothly inwards."""
+    """Colour unobserved ground points from the observed ground around, ever smoother inwards."""
     if known.all() or not known.any():
         return np.where(known[:, None], colours, GREY)
     shape = surface.heights.shape

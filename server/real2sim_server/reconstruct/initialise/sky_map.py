@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from ...scene import Sky
 from ...scene.sky import face_directions
-from .views import SHRINK, View
+from .views import DEPTH_DOWNSCALE, ProjectedView
 
 SLOTS = 15
 """Samples of which the median is taken for a direction."""
 PANORAMA = (256, 512)
 ZENITH = np.array([0.75, 0.82, 0.9])
-"""Colour of a sky that was never seen."""
+"""Colour of a sky that no camera observed."""
 FADE = 1 / 24
-"""Share of a turn over which a seen colour loses its say."""
+"""Fraction of a full turn over which the weight of an observed colour falls to 1/e."""
 GROUND_ELEVATION = -0.03
 """Below this elevation [rad] directions are given the colour of the ground."""
 
@@ -31,10 +31,10 @@ class SkySamples:
         self._slots: list[NDArray[np.uint8]] = []
         self._counts = np.zeros(n, dtype=np.uint8)
 
-    def add(self, view: View) -> None:
+    def add(self, view: ProjectedView) -> None:
         """Take the pixels of ``view`` that show neither a Gaussian nor a tracked object."""
         texels, u, v = self._texels_in(view)
-        row, column = (v / SHRINK).astype(np.int64), (u / SHRINK).astype(np.int64)
+        row, column = (v / DEPTH_DOWNSCALE).astype(np.int64), (u / DEPTH_DOWNSCALE).astype(np.int64)
         free = uncovered(view)[row, column] & (self._counts[texels] < SLOTS)
         texels, u, v = texels[free], u[free], v[free]
         colours = _bilinear(view.image, u, v)
@@ -46,7 +46,7 @@ class SkySamples:
             self._slots[s][texels[mine]] = colours[mine]
         self._counts[texels] += 1
 
-    def _texels_in(self, view: View) -> tuple[NDArray[np.int64], ...]:
+    def _texels_in(self, view: ProjectedView) -> tuple[NDArray[np.int64], ...]:
         """Texels inside the image and their pixel coordinates u, v."""
         camera = view.camera
         rotation = view.T_camera_world[:3, :3].astype(np.float32)
@@ -76,7 +76,7 @@ class SkySamples:
         return chosen.astype(np.float32) / 255
 
 
-def uncovered(view: View) -> NDArray[np.bool_]:
+def uncovered(view: ProjectedView) -> NDArray[np.bool_]:
     """[H / 2, W / 2] bool: no Gaussian and no object there; pinholes closed."""
     import cv2
 
@@ -118,7 +118,7 @@ def _panorama(
         if elevation[r] < GROUND_ELEVATION or len(seen) == 0:
             panorama[r] = ground_colour if elevation[r] < 0 else ZENITH
         else:
-            # What was never seen looks like what was seen at the same elevation.
+            # Directions never observed take the colours observed at the same elevation.
             nearest = int(seen[np.abs(seen - r).argmin()])
             panorama[r] = _around(values[nearest], counts[nearest] > 0)
     return _softened(panorama)

@@ -16,12 +16,12 @@ from ..options import InitialiseOptions, ReconstructError
 from ..stages import OnProgress, Stages
 from .accumulate import Accumulation, accumulate, drive_path
 from .ground import GroundSurface, box_bottoms, fit_ground, spread_ground
-from .inpainting import ColourPrior, fill_from_mirror, fill_from_neighbours, fill_ground, own_paint
+from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
 from .sky_map import SkySamples
 from .surfels import Surfels, fit_surfels
-from .views import Placed, View, chosen_frames, gather_views
+from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
 
 OPACITY = 0.95
@@ -32,12 +32,12 @@ SKY_FRAMES = 15
 WALL_FRAMES = 16
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
-PAINT_REACH = 0.2
+BODY_COLOR_REACH = 0.2
 """How far the colours of a vehicle's seen parts reach beyond them [m]."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Parts:
+class _SurfelSet:
     """All Gaussians in the making.
 
     In this order: ground, structure, continued walls, then object by object.
@@ -50,11 +50,11 @@ class _Parts:
     ground_count: int
     walls: slice
 
-    def without(self, dropped: NDArray[np.int64]) -> _Parts:
+    def without(self, dropped: NDArray[np.int64]) -> _SurfelSet:
         """Without the walls at these indices."""
         kept = np.ones(len(self.surfels), dtype=np.bool_)
         kept[dropped] = False
-        return _Parts(
+        return _SurfelSet(
             self.surfels.select(kept),
             self.intensity[kept],
             self.instance[kept],
@@ -94,8 +94,8 @@ def initialise_scene(
     stages = Stages(on_progress, timing_s)
     if len(log.rig) == 0 or log.frame_count == 0:
         raise ReconstructError(f"log {log.name!r} has no camera images; colours come from them")
-    with stages("accumulate") as tell:
-        measured = accumulate(log, options, lambda f: tell(f + 1, log.frame_count))
+    with stages("accumulate") as report_step:
+        measured = accumulate(log, options, lambda f: report_step(f + 1, log.frame_count))
     if len(measured.background) == 0:
         raise ReconstructError(
             f"log {log.name!r} has no usable LiDAR points; stage 0 builds everything from LiDAR"
@@ -103,12 +103,12 @@ def initialise_scene(
     with stages("shape"):
         surface = _fit_ground(log, measured.background)
         parts = _shape(log, measured, surface, options)
-    with stages("walls") as tell:
-        parts = _keep_real_walls(log, parts, options, tell)
-    with stages("colour") as tell:
-        colours, known, sky_samples = _look(log, parts, options, tell)
+    with stages("walls") as report_step:
+        parts = _keep_real_walls(log, parts, options, report_step)
+    with stages("colour") as report_step:
+        colours, known, sky_samples = _sample_colours(log, parts, options, report_step)
     with stages("fill"):
-        colours = _fill_unseen(log, parts, surface, colours, known)
+        colours = _inpaint(log, parts, surface, colours, known)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
     return _assemble(log, parts, colours, sky, options)
 
@@ -121,7 +121,7 @@ def _fit_ground(log: DrivingLog, background: PointSet) -> GroundSurface:
 
 def _shape(
     log: DrivingLog, measured: Accumulation, surface: GroundSurface, options: InitialiseOptions
-) -> _Parts:
+) -> _SurfelSet:
     """Gaussians without colour: the ground, what stands on it, and the objects."""
     path = drive_path(log)
     ground = _ground_surfels(surface, options)
@@ -149,7 +149,7 @@ def _shape(
         intensity += [points.intensity, np.zeros(len(plate), np.float32)]
         instance.append(np.full(len(body) + len(plate), index + 1, np.uint16))
         is_underside.append(np.repeat([False, True], [len(body), len(plate)]))
-    return _Parts(
+    return _SurfelSet(
         Surfels.join(surfels),
         np.concatenate(intensity),
         np.concatenate(instance),
@@ -176,7 +176,7 @@ def _above_ground(background: PointSet, surface: GroundSurface) -> PointSet:
 
 
 def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOptions) -> PointSet:
-    """Thinned points of an object, its unseen parts completed."""
+    """Thinned points of an object, its unobserved parts completed."""
     thinned = thin_to(points, options.object_voxel, options.max_object // 2)
     if track.size[0] >= VEHICLE_LENGTH:
         thinned = mirrored(thinned, voxel=options.object_voxel)
@@ -185,44 +185,50 @@ def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOpti
 
 
 def _keep_real_walls(
-    log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
-) -> _Parts:
+    log: DrivingLog,
+    parts: _SurfelSet,
+    options: InitialiseOptions,
+    report_step: Callable[[int, int], None],
+) -> _SurfelSet:
     """Drop continued walls that look like sky, or different from every view."""
     if parts.walls.start == parts.walls.stop:
         return parts
     frames = chosen_frames(log, WALL_FRAMES)
     done = 0
 
-    def on_view(view: View) -> None:
+    def on_view(view: ProjectedView) -> None:
         nonlocal done
         done += 1
-        tell(done, len(frames) * len(log.rig))
+        report_step(done, len(frames) * len(log.rig))
 
-    placed = Placed(parts.surfels, parts.instance)
+    placed = PlacedSurfels(parts.surfels, parts.instance)
     samples = gather_views(log, placed, frames=frames, slots=options.samples, on_view=on_view)
     colours, known = (values[parts.walls] for values in samples.mean())
-    real = real_walls(colours, known, samples.spread()[parts.walls])
+    real = real_walls(colours, known, samples.deviation()[parts.walls])
     return parts.without(parts.walls.start + np.flatnonzero(~real))
 
 
-def _look(
-    log: DrivingLog, parts: _Parts, options: InitialiseOptions, tell: Callable[[int, int], None]
+def _sample_colours(
+    log: DrivingLog,
+    parts: _SurfelSet,
+    options: InitialiseOptions,
+    report_step: Callable[[int, int], None],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], SkySamples]:
     frames = chosen_frames(log, options.max_colour_frames)
     sky_frames = set(frames[:: -(-len(frames) // SKY_FRAMES)])
     sky = SkySamples(options.sky_resolution)
     done = 0
 
-    def on_view(view: View) -> None:
+    def on_view(view: ProjectedView) -> None:
         nonlocal done
         done += 1
         if view.frame in sky_frames:
             sky.add(view)
-        tell(done, len(frames) * len(log.rig))
+        report_step(done, len(frames) * len(log.rig))
 
     samples = gather_views(
         log,
-        Placed(parts.surfels, parts.instance),
+        PlacedSurfels(parts.surfels, parts.instance),
         frames=frames,
         slots=options.samples,
         on_view=on_view,
@@ -230,9 +236,9 @@ def _look(
     return *samples.mean(), sky
 
 
-def _fill_unseen(
+def _inpaint(
     log: DrivingLog,
-    parts: _Parts,
+    parts: _SurfelSet,
     surface: GroundSurface,
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
@@ -248,11 +254,11 @@ def _fill_unseen(
     filled[structure] = fill_from_neighbours(
         points[structure], colours[structure], known[structure], prior.colour(height, intensity)
     )
-    return _fill_objects(log, parts, filled, known)
+    return _inpaint_objects(log, parts, filled, known)
 
 
-def _fill_objects(
-    log: DrivingLog, parts: _Parts, colours: NDArray[np.float32], known: NDArray[np.bool_]
+def _inpaint_objects(
+    log: DrivingLog, parts: _SurfelSet, colours: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Fill each object's body from itself, then its underside, in place."""
     bodies = ~parts.is_underside
@@ -270,9 +276,9 @@ def _fill_objects(
         points = parts.surfels.points[mine]
         mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
         likely = prior.colour(relative[mine], parts.intensity[mine])
-        paint = own_paint(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
+        body = body_color(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
         colours[mine] = fill_from_neighbours(
-            points, mirrored, now_known, paint, trust_reach=PAINT_REACH
+            points, mirrored, now_known, body, trust_reach=BODY_COLOR_REACH
         )
     colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
     return colours
@@ -286,7 +292,7 @@ def _median_colour(colours: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _assemble(
     log: DrivingLog,
-    parts: _Parts,
+    parts: _SurfelSet,
     colours: NDArray[np.float32],
     sky: Sky,
     options: InitialiseOptions,
@@ -316,7 +322,7 @@ def _assemble(
 
 
 def _cloud(
-    parts: _Parts, colours: NDArray[np.float32], members: NDArray[np.int64]
+    parts: _SurfelSet, colours: NDArray[np.float32], members: NDArray[np.int64]
 ) -> GaussianCloud:
     surfels = parts.surfels.select(members)
     dc = (colours[members] - 0.5) / SH_C0

@@ -65,7 +65,7 @@ def fit_surfels(
 
     Normals are the least principal axes. Along each tangent the scale follows the distance to the
     neighbours on either side, so that gaps between scan lines close without blurring along them.
-    Where neighbours spread in all directions (leaves) the Gaussian becomes round.
+    Where neighbours variances in all directions (leaves) the Gaussian becomes round.
 
     Args:
         points: [N, 3] float32 [m].
@@ -101,14 +101,14 @@ def _fit_chunk(
     """Axes [N, 3, 3] and scales [N, 3] from neighbour ``offsets`` [N, K, 3]."""
     centred = offsets - offsets.mean(axis=1, keepdims=True)
     covariance = np.einsum("nki,nkj->nij", centred, centred) / offsets.shape[1]
-    spread, vectors = np.linalg.eigh(covariance)
+    variances, vectors = np.linalg.eigh(covariance)
     axes = vectors[:, :, ::-1].copy()
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     local = np.einsum("nki,nij->nkj", offsets, axes)
     tangent = np.stack([_gap(local, 0), _gap(local, 1)], axis=1)
     # Three neighbouring Gaussians then cover the middle of a gap by more than 90 %.
     tangent = np.clip(0.6 * tangent, 2 * smallest, bound[:, None])
-    thickness = np.sqrt(np.maximum(spread[:, 0], 0) / np.maximum(spread[:, 2], 1e-12))
+    thickness = np.sqrt(np.maximum(variances[:, 0], 0) / np.maximum(variances[:, 2], 1e-12))
     normal = tangent.mean(axis=1) * np.clip(thickness, 0.12, 0.8)
     scales = np.concatenate([tangent, np.maximum(normal, smallest)[:, None]], axis=1)
     return axes, scales.astype(np.float32)

@@ -213,13 +213,13 @@ def robust_mean(colours, weights, result, known):
             continue
         for c in range(3):
             median = weighted_median(colours[i, :, c], weights[i], total)
-            value, share = np.float32(0.0), np.float32(0.0)
+            value, fraction = np.float32(0.0), np.float32(0.0)
             for s in range(slots):
                 if abs(np.float32(colours[i, s, c]) - median) <= 24:
                     value += weights[i, s] * np.float32(colours[i, s, c])
-                    share += weights[i, s]
-            # share is never 0: the median itself is among the samples.
-            result[i, c] = value / (share * np.float32(255.0))
+                    fraction += weights[i, s]
+            # fraction is never 0: the median itself is among the samples.
+            result[i, c] = value / (fraction * np.float32(255.0))
 
 
 @njit(cache=True, nogil=True)

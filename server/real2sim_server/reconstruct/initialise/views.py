@@ -17,7 +17,7 @@ from ...scene import Camera
 from . import view_kernels as kernels
 from .surfels import Surfels
 
-SHRINK = 2
+DEPTH_DOWNSCALE = 2
 """The depth image is this much smaller than the camera image."""
 PYRAMID = 4
 OBJECT_MARGIN = 0.12
@@ -29,7 +29,7 @@ _NearestObjects = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedSurfels:
     """All Gaussians of a scene in the making.
 
     Attributes:
@@ -42,7 +42,7 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ProjectedView:
     """One camera at one frame.
 
     Attributes:
@@ -71,7 +71,7 @@ def chosen_frames(log: DrivingLog, limit: int) -> list[int]:
 class ColourSamples:
     """Gathers the best views of each Gaussian."""
 
-    def __init__(self, placed: Placed, slots: int) -> None:
+    def __init__(self, placed: PlacedSurfels, slots: int) -> None:
         n = len(placed.surfels)
         self._placed = placed
         self._means = np.ascontiguousarray(placed.surfels.points, dtype=np.float32)
@@ -86,8 +86,10 @@ class ColourSamples:
         self._colours = np.zeros((n, slots, 3), dtype=np.uint8)
         self._weights = np.zeros((n, slots), dtype=np.float32)
 
-    def add(self, log: DrivingLog, camera: Camera, frame: int, image: NDArray[np.uint8]) -> View:
-        """Look at all Gaussians from ``camera`` at ``frame``."""
+    def add(
+        self, log: DrivingLog, camera: Camera, frame: int, image: NDArray[np.uint8]
+    ) -> ProjectedView:
+        """Project all Gaussians into ``camera`` at ``frame`` and sample their colours."""
         t_us = log.image_time_us(camera.name, frame)
         T_camera_world = camera.viewmat(log.ego.transform(t_us))
         poses = _instance_poses(log, t_us)
@@ -97,11 +99,11 @@ class ColourSamples:
         present = np.array([pose is not None for pose in poses])
         self._project(transforms, present)
         k = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]], np.float32)
-        shape = (-(-camera.height // SHRINK), -(-camera.width // SHRINK))
-        depth, objects = self._depths(k / np.float32(SHRINK), shape)
-        nearest = nearest_objects(objects, float(k[0]) / SHRINK, shape)
+        shape = (-(-camera.height // DEPTH_DOWNSCALE), -(-camera.width // DEPTH_DOWNSCALE))
+        depth, objects = self._depths(k / np.float32(DEPTH_DOWNSCALE), shape)
+        nearest = nearest_objects(objects, float(k[0]) / DEPTH_DOWNSCALE, shape)
         self._gather(k, depth, nearest, _pyramid(image))
-        return View(camera, frame, T_camera_world, image, depth, np.isfinite(nearest[0]))
+        return ProjectedView(camera, frame, T_camera_world, image, depth, np.isfinite(nearest[0]))
 
     def mean(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Colours [N, 3] float32 in [0, 1], and which are known [N] bool; the others are 0."""
@@ -110,7 +112,7 @@ class ColourSamples:
         kernels.robust_mean(self._colours, self._weights, colours, known)
         return colours, known
 
-    def spread(self) -> NDArray[np.float32]:
+    def deviation(self) -> NDArray[np.float32]:
         """Standard deviation [N] of the brightness of each Gaussian's samples, 0 to 255."""
         used = self._weights > 0
         count = np.maximum(used.sum(axis=1), 1)
@@ -170,7 +172,7 @@ class ColourSamples:
                 self._footprints[part],
                 self._placed.instance[part],
                 k,
-                SHRINK,
+                DEPTH_DOWNSCALE,
                 depth,
                 *nearest,
                 pyramid,
@@ -204,20 +206,20 @@ def _ranges(start: int, stop: int, count: int) -> list[slice]:
 
 def gather_views(
     log: DrivingLog,
-    placed: Placed,
+    placed: PlacedSurfels,
     *,
     frames: list[int],
     slots: int,
-    on_view: Callable[[View], None],
+    on_view: Callable[[ProjectedView], None],
 ) -> ColourSamples:
-    """Look at all Gaussians from all cameras at ``frames``, occlusion respected.
+    """Sample the colours of all Gaussians from all cameras at ``frames``, occlusion respected.
 
     A view counts for a Gaussian when nothing lies before it in a depth image of all Gaussians,
     and no other object lies before it that is drawn somewhat larger than it is. Of the ``slots``
     nearest, most frontal views, those that agree with their median are averaged.
 
     Args:
-        on_view: called with each view after it was looked at.
+        on_view: called with each view after it was sampled.
     """
     samples = ColourSamples(placed, slots)
     for camera, frame, image in _images(log, frames):

@@ -20,7 +20,7 @@ REACH, HEIGHT = 45.0, 14.0
 """Walls up to this far from the drive are continued by this much [m]."""
 MIN_POINTS, MIN_EXTENT = 6, 0.8
 """A column is a wall when it has so many points over such a height [m]."""
-MAX_SPREAD = 28.0
+MAX_DEVIATION = 28.0
 """Views of a real wall differ less than this in brightness, standard deviation of 0 to 255."""
 
 
@@ -120,16 +120,16 @@ def _rise(columns: _Columns, step: float) -> Surfels:
 
 
 def real_walls(
-    colours: NDArray[np.float32], known: NDArray[np.bool_], spread: NDArray[np.float32]
+    colours: NDArray[np.float32], known: NDArray[np.bool_], deviation: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Which candidates [N] are walls: seen, alike from all views, and not coloured like a sky.
 
     Args:
         colours: [N, 3] float32 in [0, 1].
         known: [N] bool.
-        spread: [N] float32, standard deviation of brightness between views, 0 to 255.
+        deviation: [N] float32, standard deviation of brightness between views, 0 to 255.
     """
     red, blue = colours[:, 0], colours[:, 2]
     blown_out = colours.min(axis=1) > 0.9
     bluish = (blue > red + 0.02) & (blue > 0.45)
-    return known & (spread < MAX_SPREAD) & ~blown_out & ~bluish
+    return known & (deviation < MAX_DEVIATION) & ~blown_out & ~bluish

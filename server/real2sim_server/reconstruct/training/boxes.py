@@ -19,16 +19,16 @@ from ...scene import Trajectory
 
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 """What vehicles usually do: standard deviations [m/s^2] and [rad/s^2]."""
-LEAST_NOISE, LEAST_YAW_NOISE = 0.02, 0.005
+MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
 """Boxes that scatter less are left as they are [m], [rad]."""
-LEAST_POSES = 5
+MIN_POSES = 5
 
 
 def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> DrivingLog:
     """``log`` with boxes that scatter independently from frame to frame.
 
     Args:
-        fraction: standard deviation of positions as a share of the box's length, width and
+        fraction: standard deviation of positions as a fraction of the box's length, width and
             height along its own axes, and of headings [rad].
     """
     tracks = []
@@ -60,12 +60,12 @@ def smoothed_boxes(log: DrivingLog) -> DrivingLog:
 
 def _smoothed(track: ObjectTrack) -> ObjectTrack:
     given = track.trajectory
-    if len(given.times_us) < LEAST_POSES:
+    if len(given.times_us) < MIN_POSES:
         return track
     step = float(np.median(np.diff(given.times_us))) * 1e-6
     heading = np.unwrap(quaternion_yaw(given.quaternions))
-    smooth = _whittaker(given.positions, ACCELERATION * step**2, LEAST_NOISE)
-    turned = _whittaker(heading[:, None], YAW_ACCELERATION * step**2, LEAST_YAW_NOISE)[:, 0]
+    smooth = _whittaker(given.positions, ACCELERATION * step**2, MIN_NOISE)
+    turned = _whittaker(heading[:, None], YAW_ACCELERATION * step**2, MIN_YAW_NOISE)[:, 0]
     if smooth is given.positions and np.array_equal(turned, heading):
         return track
     return _with_poses(track, smooth, turned - heading)

@@ -26,7 +26,7 @@ class Checkpoint:
     Attributes:
         iteration: steps done.
         counts: Gaussians of the background and of each object.
-        guess_counts: likewise of the guesses; empty as long as there are none.
+        prior_counts: likewise of the priors; empty as long as there are none.
         optimizer_steps: of the optimiser.
         options: of training, JSON values.
         log_name: of the log it learns from.
@@ -36,7 +36,7 @@ class Checkpoint:
 
     iteration: int
     counts: tuple[int, ...]
-    guess_counts: tuple[int, ...]
+    prior_counts: tuple[int, ...]
     optimizer_steps: int
     options: dict[str, Any]
     log_name: str
@@ -76,6 +76,6 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise ReconstructError(
             f"{path}: not a checkpoint of version {VERSION} of {FORMAT}; train from the start"
         )
-    for name in ("counts", "guess_counts"):
+    for name in ("counts", "prior_counts"):
         state[name] = tuple(state[name])
     return Checkpoint(**state, tensors=tensors)

@@ -19,8 +19,8 @@ from .schedule import TrainOptions
 
 NEAR, FAR = 0.5, 80.0
 """LiDAR depths outside are not compared [m]."""
-AHEAD = 4
-"""Images that are decoded before they are needed."""
+PREFETCH = 4
+"""Images that are decoded ahead of the step that takes them."""
 
 
 def held_out_frames(frame_count: int, every: int) -> list[int]:
@@ -34,7 +34,7 @@ def held_out_frames(frame_count: int, every: int) -> list[int]:
     return list(range(min(2, every - 1), frame_count - 1, every))
 
 
-class _SomeFrames:
+class _FrameSubset:
     """A source without the frames that are held out."""
 
     def __init__(self, log: DrivingLog, frames: list[int]) -> None:
@@ -49,18 +49,18 @@ class _SomeFrames:
 
 def training_log(log: DrivingLog, hold_out: int) -> DrivingLog:
     """``log`` without the held-out frames; paths and boxes stay whole."""
-    away = set(held_out_frames(log.frame_count, hold_out))
-    frames = [f for f in range(log.frame_count) if f not in away]
+    held_out = set(held_out_frames(log.frame_count, hold_out))
+    frames = [f for f in range(log.frame_count) if f not in held_out]
     return replace(
         log,
         frame_times_us=log.frame_times_us[frames],
-        source=_SomeFrames(log, frames),
+        source=_FrameSubset(log, frames),
         image_times_us={k: v[frames] for k, v in log.image_times_us.items()},
     )
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TrainingView:
     """One training image.
 
     Attributes:
@@ -83,7 +83,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stored:
+class _CachedImage:
     image: NDArray[np.uint8]
     points: NDArray[np.float32]
 
@@ -92,7 +92,7 @@ class _Stored:
         return self.image.nbytes + self.points.nbytes
 
 
-class Views:
+class TrainingViews:
     """The views of some frames of a log.
 
     Decoded images are kept up to ``options.image_bytes``, the least recently used leave first.
@@ -113,9 +113,9 @@ class Views:
         without = set(log.provenance.get("cameras_without_images", ()))
         names = [name for name in log.rig.names if name not in without]
         self._keys = [(name, frame) for frame in frames for name in names]
-        self._kept: OrderedDict[int, _Stored] = OrderedDict()
+        self._kept: OrderedDict[int, _CachedImage] = OrderedDict()
         self._nbytes = 0
-        self._coming: dict[int, Future[_Stored]] = {}
+        self._coming: dict[int, Future[_CachedImage]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="views")
 
     def __len__(self) -> int:
@@ -125,8 +125,8 @@ class Views:
         """Stop reading ahead."""
         self._pool.shutdown(cancel_futures=True)
 
-    def looks(self) -> list[tuple[Camera, int]]:
-        """Camera at full training size and time of every view."""
+    def viewpoints(self) -> list[tuple[Camera, int]]:
+        """Camera at full training size and time [us] of every view."""
         rig, found = self._log.rig, []
         for name, frame in self._keys:
             camera = rig[name].resized(max(16, self._width(rig[name])))
@@ -141,12 +141,12 @@ class Views:
 
     def prefetch(self, iteration: int) -> None:
         """Begin to read what the next iterations will ask for."""
-        for ahead in range(1, AHEAD + 1):
+        for ahead in range(1, PREFETCH + 1):
             index = self.order(iteration + ahead)
             if index not in self._kept and index not in self._coming:
                 self._coming[index] = self._pool.submit(self._read, index)
 
-    def view(self, index: int, divisor: int = 1) -> View:
+    def view(self, index: int, divisor: int = 1) -> TrainingView:
         """The view at ``index``, at a ``divisor``-th of the training width.
 
         Raises:
@@ -158,7 +158,7 @@ class Views:
         camera = self._log.rig[name].resized(max(16, width // divisor))
         pixels, depths = _pixels(stored.points, camera)
         image = resized(stored.image, camera).astype(np.float32) / 255
-        return View(
+        return TrainingView(
             camera=camera,
             frame=frame,
             t_us=image_time(self._log, name, frame),
@@ -171,7 +171,7 @@ class Views:
         options = self._options
         return min(options.width or camera.width, options.max_width, camera.width)
 
-    def _stored(self, index: int) -> _Stored:
+    def _stored(self, index: int) -> _CachedImage:
         if index in self._kept:
             self._kept.move_to_end(index)
             return self._kept[index]
@@ -183,11 +183,11 @@ class Views:
             self._nbytes -= self._kept.popitem(last=False)[1].nbytes
         return stored
 
-    def _read(self, index: int) -> _Stored:
+    def _read(self, index: int) -> _CachedImage:
         name, frame = self._keys[index]
         full = self._log.rig[name]
         image = resized(self._log.image(name, frame), full.resized(self._width(full)))
-        return _Stored(image, self._points(full, frame))
+        return _CachedImage(image, self._points(full, frame))
 
     def _points(self, camera: Camera, frame: int) -> NDArray[np.float32]:
         """LiDAR points [M, 3] in the camera frame, those the image may show."""
@@ -242,4 +242,11 @@ def _pixels(
     return flat[first], depth[first]
 
 
-__all__ = ["View", "Views", "held_out_frames", "image_time", "resized", "training_log"]
+__all__ = [
+    "TrainingView",
+    "TrainingViews",
+    "held_out_frames",
+    "image_time",
+    "resized",
+    "training_log",
+]

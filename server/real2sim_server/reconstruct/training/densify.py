@@ -63,8 +63,8 @@ class Densifier:
         self._seed = seed
         self._first = round(options.start * iterations)
         self._last = round(options.stop * iterations)
-        self._guess_round = round(options.guess_round * iterations)
-        self._hidden_rounds = {round(share * iterations) for share in options.hidden_rounds}
+        self._prior_round = round(options.prior_round * iterations)
+        self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
 
     def is_due(self, iteration: int) -> bool:
         """Whether a round follows the step ``iteration``."""
@@ -85,9 +85,9 @@ class Densifier:
         """Whether Gaussians that images hardly show go after the step ``iteration``."""
         return iteration + 1 in self._hidden_rounds
 
-    def takes_guesses(self, iteration: int) -> bool:
-        """Whether guesses take their places after the step ``iteration``."""
-        return iteration + 1 == self._guess_round
+    def inserts_priors(self, iteration: int) -> bool:
+        """Whether priors take their places after the step ``iteration``."""
+        return iteration + 1 == self._prior_round
 
     @torch.no_grad()
     def round(
@@ -160,14 +160,14 @@ class Densifier:
         if len(alive) == 0:
             return gaussians
         wanted = min(options.max_gaussians, round(len(gaussians) * (1 + options.growth)))
-        drawn = relocation.draw(opacities[alive], max(0, wanted - len(alive)), rng)
+        drawn = relocation.sample_by_weight(opacities[alive], max(0, wanted - len(alive)), rng)
         source = torch.cat([alive, alive[drawn]])
         copies = torch.bincount(source, minlength=len(gaussians))
         order = torch.argsort(gaussians.owners[source], stable=True)
         source = source[order]
         moved = rearrange(gaussians, optimizer, source, copies[source] > 1)
         many = (copies[source] > 1).nonzero()[:, 0]
-        new_opacity, factor = relocation.share(
+        new_opacity, factor = relocation.compute_relocation(
             moved.logits[many].sigmoid(), copies[source][many], options.min_opacity
         )
         moved.logits[many] = torch.logit(new_opacity)
@@ -203,7 +203,7 @@ def rearrange(
     of_objects = source >= gaussians.counts[0]
     for name in FIELDS:
         mine = fresh[of_objects] if name in OBJECT_FIELDS else fresh
-        optimizer.take(name, gaussians.rows(name, source), mine)
+        optimizer.gather(name, gaussians.rows(name, source), mine)
     return gaussians.take(source)
 
 
@@ -212,7 +212,7 @@ def reset_opacity(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
     """Lower all opacities to 0.01, so that only what is needed comes back."""
     limit = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     gaussians.logits.clamp_(max=limit)
-    optimizer.forget("logits")
+    optimizer.reset_moments("logits")
 
 
 def generator(seed: int, iteration: int) -> np.random.Generator:

@@ -100,7 +100,7 @@ class Gaussians:
         return clouds
 
 
-def joined(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]:
+def concatenate(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]:
     """Both together, sorted by owner, and [N] bool: which of them are ``second``'s."""
     fields = {}
     for name in FIELDS:
@@ -122,11 +122,11 @@ def mirror(cloud: GaussianCloud) -> GaussianCloud:
         cloud,
         means=cloud.means * sign([1.0, -1, 1]),
         quats=cloud.quats * sign([1.0, -1, 1, -1]),
-        sh=cloud.sh * sign(ODD_IN_Y[:k])[:, None],
+        sh=cloud.sh * sign(MIRROR_SIGNS[:k])[:, None],
     )
 
 
-ODD_IN_Y = (1.0, -1, 1, 1, -1, -1, 1, 1, 1, -1, -1, -1, 1, 1, 1, 1)
+MIRROR_SIGNS = (1.0, -1, 1, 1, -1, -1, 1, 1, 1, -1, -1, -1, 1, 1, 1, 1)
 """Sign of each basis function of the spherical harmonics when y changes its sign."""
 
 
@@ -134,15 +134,15 @@ def from_scene(scene: Scene, options: TrainOptions) -> Gaussians:
     """Raw parameters of a scene; opacities are lowered so that all of them can still learn."""
     clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
     clouds = [c.with_sh_degree(options.sh_degree) for c in clouds]
-    joined = GaussianCloud.concatenate(clouds).with_sh_degree(options.sh_degree)
+    concatenate = GaussianCloud.concatenate(clouds).with_sh_degree(options.sh_degree)
     counts = tuple(len(c) for c in clouds)
-    opacities = joined.opacities.clamp(0.01, options.initial_opacity)
+    opacities = concatenate.opacities.clamp(0.01, options.initial_opacity)
     return Gaussians(
-        means=leaf(joined.means),
-        log_scales=leaf(joined.scales.log()),
-        quats=leaf(joined.quats),
+        means=leaf(concatenate.means),
+        log_scales=leaf(concatenate.scales.log()),
+        quats=leaf(concatenate.quats),
         logits=leaf(torch.logit(opacities)),
-        sh=leaf(joined.sh),
+        sh=leaf(concatenate.sh),
         fourier=leaf(_fourier(scene, sum(counts) - counts[0], options.harmonics)),
         counts=counts,
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...logs import DrivingLog
 from . import losses
-from .data import Views, held_out_frames
+from .data import TrainingViews, held_out_frames
 from .model import SceneModel
 from .object_masks import box_mask
 from .schedule import TrainOptions
@@ -53,7 +53,7 @@ def score_held_out(
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).round().astype(int)]
     if not frames:
         return HeldOutScore(float("nan"), float("nan"), float("nan"), 0)
-    views = Views(log, frames, options)
+    views = TrainingViews(log, frames, options)
     moving = [k for k, o in model.scene.objects.items() if o.trajectory.moves]
     scores = []
     for index in range(len(views)):

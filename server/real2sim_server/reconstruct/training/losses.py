@@ -15,7 +15,7 @@ from . import ssim_kernels
 FRAME_STEP = 0.1
 """Second differences are given as for frames so far apart [s]."""
 KEPT_QUANTILE = 0.95
-"""Share of LiDAR points that count; the rest are edges, reflections and moving things."""
+"""Fraction of LiDAR points that count; the rest are edges, reflections and moving things."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class LossWeights:
     """Factors of the terms of the loss; a term of weight 0 is not computed.
 
     Attributes:
-        ssim: share of 1 - SSIM in the photometric loss, the rest is L1 (Kerbl et al. 2023).
+        ssim: fraction of 1 - SSIM in the photometric loss, the rest is L1 (Kerbl et al. 2023).
         depth: mean distance from LiDAR along the view [m] (drivestudio: 0.01).
         sky: cross-entropy of accumulated opacity where the sky is seen (Street Gaussians: 0.05).
         object_entropy: entropy of the objects' opacity inside their projected boxes, and what of
@@ -53,15 +53,15 @@ class _Photometric(torch.autograd.Function):
     """(1 - s) L1 + s (1 - SSIM) in one pass: the gradient is known as soon as the value is."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, truth: Tensor, share: float) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, image: Tensor, truth: Tensor, fraction: float) -> tuple[Tensor, ...]:
         x, y = image.detach(), truth
-        similarity, gradient = _ssim_and_gradient(x, y, scale=-share)
+        similarity, gradient = _ssim_and_gradient(x, y, scale=-fraction)
         difference = x - y
         if ctx.needs_input_grad[0]:
-            gradient += difference.sign() * ((1 - share) / x.numel())
+            gradient += difference.sign() * ((1 - fraction) / x.numel())
             ctx.save_for_backward(gradient)
         l1 = difference.abs().mean()
-        loss = (1 - share) * l1 + share * (1 - similarity)
+        loss = (1 - fraction) * l1 + fraction * (1 - similarity)
         parts = l1, torch.tensor(similarity), (difference * difference).mean()
         ctx.mark_non_differentiable(*parts)
         return (loss, *parts)
@@ -73,21 +73,21 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric(
-    image: Tensor, truth: Tensor, *, ssim_share: float
+    image: Tensor, truth: Tensor, *, ssim_weight: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """``(1 - s) L1 + s (1 - SSIM)`` of RGB images.
 
     Args:
         image: [H, W, 3] float32, carries the gradient.
         truth: [H, W, 3] float32 in [0, 1].
-        ssim_share: s.
+        ssim_weight: s.
 
     Returns:
         The loss; without gradients mean absolute error, SSIM, and mean squared error.
     """
     if image.device.type != "cpu":
-        return _photometric_plain(image, truth, ssim_share)
-    loss, l1, similarity, squared = _Photometric.apply(image, truth, ssim_share)
+        return _photometric_plain(image, truth, ssim_weight)
+    loss, l1, similarity, squared = _Photometric.apply(image, truth, ssim_weight)
     return loss, l1, similarity, squared
 
 
@@ -115,11 +115,11 @@ def ssim_plain(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _photometric_plain(
-    image: Tensor, truth: Tensor, share: float
+    image: Tensor, truth: Tensor, fraction: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     difference = image - truth
     l1, similarity = difference.abs().mean(), ssim_plain(image, truth)
-    loss = (1 - share) * l1 + share * (1 - similarity)
+    loss = (1 - fraction) * l1 + fraction * (1 - similarity)
     return loss, l1.detach(), similarity.detach(), (difference.detach() ** 2).mean()
 
 

@@ -18,19 +18,19 @@ from .gaussians import Gaussians
 from .poses import ObjectPoses
 from .schedule import TrainOptions
 
-MIRRORED = ("car", "truck", "van", "bus")
+SYMMETRIC_CATEGORIES = ("car", "truck", "van", "bus")
 """Categories whose two sides look alike."""
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedView:
     """A view drawn from the model.
 
     Attributes:
         output: images of one camera; carries gradients.
         rgb: [H, W, 3], with the camera's exposure.
         drawn: indices of the trained instances drawn: 0 for the background, then 1 + object;
-            those of guesses come behind them.
+            those of priors come behind them.
     """
 
     output: RenderOutput
@@ -43,7 +43,7 @@ class SceneModel:
 
     Attributes:
         mirrored: by object, whether training shows its other side now and then.
-        guesses: Gaussians that are drawn too but do not learn; None for none.
+        priors: Gaussians that are drawn too but do not learn; None for none.
 
     Args:
         scene: of stage 0; its cameras, ego path, boxes and times stay as they are.
@@ -64,13 +64,13 @@ class SceneModel:
         self.options = options
         self.backend = backend
         self.gaussians = packing.from_scene(scene, options)
-        self.guesses: Gaussians | None = None
+        self.priors: Gaussians | None = None
         self.poses = ObjectPoses(scene, key_times_us if options.refine_poses else None)
         self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution))
         cameras = len(scene.rig)
         self.exposure = packing.leaf(torch.eye(3, 4).expand(cameras, 3, 4))
         self.cameras = torch.zeros(cameras, 6, requires_grad=True)
-        vehicles = [o.category in MIRRORED for o in scene.objects.values()]
+        vehicles = [o.category in SYMMETRIC_CATEGORIES for o in scene.objects.values()]
         self.mirrored = tuple(options.mirror > 0 and vehicle for vehicle in vehicles)
         half = [np.array(o.size) / 2 for o in scene.objects.values()]
         self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float()
@@ -104,7 +104,7 @@ class SceneModel:
         degree: int | None = None,
         mirrored: tuple[bool, ...] = (),
         depth: bool = False,
-    ) -> Rendered:
+    ) -> RenderedView:
         """Draw ``camera``, of the rig at any size, on the recording vehicle at ``t_us``.
 
         Args:
@@ -115,9 +115,9 @@ class SceneModel:
         degree = self.options.sh_degree if degree is None else degree
         clouds = self.gaussians.clouds(degree=degree, tones=self._tones(t_us), mirrored=mirrored)
         instances, drawn = self.instances(clouds, t_us)
-        if self.guesses is not None:
+        if self.priors is not None:
             with torch.no_grad():
-                behind = self.guesses.clouds(degree=degree, mirrored=mirrored)
+                behind = self.priors.clouds(degree=degree, mirrored=mirrored)
                 instances += self.instances(behind, t_us)[0]
         options = RasterOptions(depth=depth, instance=False, track_screen=True)
         output = rasterize(
@@ -132,10 +132,10 @@ class SceneModel:
             check_values=False,
         )
         rgb = output.rgb[0]
-        if self.options.rates.exposure > 0:
+        if self.options.learning_rates.exposure > 0:
             affine = self.exposure[self.scene.rig.names.index(camera.name)]
             rgb = rgb @ affine[:, :3].T + affine[:, 3]
-        return Rendered(output, rgb, tuple(drawn))
+        return RenderedView(output, rgb, tuple(drawn))
 
     def objects_alpha(self, camera: Camera, t_us: int) -> Tensor:
         """[H, W] accumulated opacity of the objects alone; carries gradients."""
@@ -180,16 +180,16 @@ class SceneModel:
     def viewmat(self, camera: Camera, t_us: int) -> Tensor:
         """``T_camera_world`` [4, 4] float64, refined where cameras are."""
         viewmat = torch.from_numpy(camera.viewmat(self.scene.ego.transform(t_us)))
-        if self.options.rates.camera <= 0:
+        if self.options.learning_rates.camera <= 0:
             return viewmat
         change = self.cameras[self.scene.rig.names.index(camera.name)].double()
         return _small_motion(change) @ viewmat
 
     def export(self, **provenance: Any) -> Scene:
-        """The scene as it is now with its guesses, immutable, on its own memory."""
+        """The scene as it is now with its priors, immutable, on its own memory."""
         gaussians = self.gaussians
-        if self.guesses is not None:
-            gaussians, _ = packing.joined(gaussians, self.guesses)
+        if self.priors is not None:
+            gaussians, _ = packing.concatenate(gaussians, self.priors)
         with torch.no_grad():
             clouds = gaussians.clouds(degree=self.options.sh_degree)
         clouds = [_own(cloud) for cloud in clouds]
@@ -218,7 +218,7 @@ class SceneModel:
         )
 
     def _refined(self, camera: Camera, index: int) -> Camera:
-        if self.options.rates.camera <= 0:
+        if self.options.learning_rates.camera <= 0:
             return camera
         change = _small_motion(self.cameras[index].detach().double()).numpy()
         return replace(camera, T_vehicle_camera=camera.T_vehicle_camera @ np.linalg.inv(change))

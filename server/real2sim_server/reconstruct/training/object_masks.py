@@ -11,7 +11,7 @@ from ...scene import Camera, Scene
 
 NEAR = 0.2
 """Boxes that reach behind this depth are cut there [m]."""
-STEPS = 9
+EDGE_SAMPLES = 9
 """Points along each edge of a box, so that cut boxes keep their outline."""
 
 
@@ -43,5 +43,5 @@ def box_mask(
 
 def _along_edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points on the lines between all pairs of the 8 corners; their hull is that of the box."""
-    share = np.linspace(0, 1, STEPS)[:, None, None, None]
-    return np.asarray((corners[:, None] * share + corners[None] * (1 - share)).reshape(-1, 3))
+    fraction = np.linspace(0, 1, EDGE_SAMPLES)[:, None, None, None]
+    return np.asarray((corners[:, None] * fraction + corners[None] * (1 - fraction)).reshape(-1, 3))

@@ -71,7 +71,7 @@ class SelectiveAdam:
             np.float32(EPSILON),
         )
 
-    def take(self, name: str, source: Tensor, fresh: Tensor) -> None:
+    def gather(self, name: str, source: Tensor, fresh: Tensor) -> None:
         """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows start anew.
 
         Args:
@@ -83,7 +83,7 @@ class SelectiveAdam:
             taken[fresh] = 0
             moments[name] = taken
 
-    def forget(self, name: str, rows: Tensor | None = None) -> None:
+    def reset_moments(self, name: str, rows: Tensor | None = None) -> None:
         """Set moments to zero, of ``rows`` (mask or indices) or of all."""
         for moments in (self.first, self.second):
             moments[name][slice(None) if rows is None else rows] = 0

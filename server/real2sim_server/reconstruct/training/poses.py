@@ -78,20 +78,20 @@ class ObjectPoses:
     def at(self, t_us: int) -> tuple[list[int], Tensor]:
         """Indices of the objects that exist at ``t_us``, K of them, and their ``T_world_object``
         [K, 4, 4] float64, which carry gradients."""
-        there = [index for index, key in enumerate(self.keys) if key.covers(t_us)]
-        if not there:
+        present = [index for index, key in enumerate(self.keys) if key.covers(t_us)]
+        if not present:
             return [], torch.zeros(0, 4, 4, dtype=torch.float64)
-        keys = [self.keys[index] for index in there]
+        keys = [self.keys[index] for index in present]
         before, after, fractions = zip(*(key.bracket(t_us) for key in keys), strict=True)
         first = np.array([key.first_row for key in keys])
         rows = torch.from_numpy(first + before), torch.from_numpy(first + after)
         later = torch.tensor(fractions, dtype=torch.float64)[:, None]
-        shares = (1 - later).float(), later.float()
-        shift = self.shifts[rows[0]] * shares[0] + self.shifts[rows[1]] * shares[1]
-        yaw = self.yaws[rows[0]] * shares[0] + self.yaws[rows[1]] * shares[1]
-        poses = [self._given[index].pose(t_us) for index in there]
+        weights = (1 - later).float(), later.float()
+        shift = self.shifts[rows[0]] * weights[0] + self.shifts[rows[1]] * weights[1]
+        yaw = self.yaws[rows[0]] * weights[0] + self.yaws[rows[1]] * weights[1]
+        poses = [self._given[index].pose(t_us) for index in present]
         given = transform_from(*(np.array(part) for part in zip(*poses, strict=True)))
-        return there, torch.from_numpy(given) @ _corrections(shift.double(), yaw[:, 0].double())
+        return present, torch.from_numpy(given) @ _corrections(shift.double(), yaw[:, 0].double())
 
     def roughness(self) -> Tensor:
         """Mean squared second differences of all refined trajectories [m, rad] at 10 Hz."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from .losses import psnr_of
 
 SMOOTHING = 0.98
-"""Share of the past in the running loss and PSNR."""
+"""Fraction of the past in the running loss and PSNR."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ OnTraining = Callable[[TrainingProgress], None]
 
 
 @dataclass
-class Running:
+class RunningMeans:
     """Smoothed figures and the time spent by stage [s]."""
 
     loss: float = 0.0
@@ -62,7 +62,7 @@ class Running:
         return psnr_of(self.squared / max(self.weight, 1e-9))
 
 
-class Clock:
+class RateMeter:
     """Steps per second since the last look."""
 
     def __init__(self, iteration: int) -> None:
@@ -76,13 +76,13 @@ class Clock:
         return rate
 
 
-class Stopwatch:
+class StageTimer:
     """Adds the seconds of a block to a stage."""
 
     def __init__(self, stages: dict[str, float]) -> None:
         self._stages = stages
 
-    def __call__(self, name: str) -> Stopwatch:
+    def __call__(self, name: str) -> StageTimer:
         """For ``with``: the block's seconds count as those of ``name``."""
         self._name = name
         return self

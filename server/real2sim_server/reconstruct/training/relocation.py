@@ -11,14 +11,16 @@ from torch import Tensor
 MAX_COPIES = 51
 
 
-def draw(weights: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+def sample_by_weight(weights: Tensor, count: int, rng: np.random.Generator) -> Tensor:
     """``count`` indices [count] int64 drawn with probability proportional to ``weights`` [N]."""
     sums = np.cumsum(weights.double().numpy())
     chosen = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
     return torch.from_numpy(np.minimum(chosen, len(sums) - 1))
 
 
-def share(opacities: Tensor, copies: Tensor, min_opacity: float) -> tuple[Tensor, Tensor]:
+def compute_relocation(
+    opacities: Tensor, copies: Tensor, min_opacity: float
+) -> tuple[Tensor, Tensor]:
     """Opacity [M] of each of ``copies`` [M] that look together like one, and factor on its size.
 
     Kheradmand et al. 2024, eq. 9.

@@ -1,4 +1,4 @@
-"""From a log to a trained scene: stage 0, training, and a look at what was held out."""
+"""From a log to a trained scene: stage 0, training, and the score of what was held out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..initialise.stage0 import initialise_scene
 from ..options import ReconstructError
 from ..stages import OnProgress, Stages
 from .boxes import smoothed_boxes
-from .data import Views, held_out_frames, training_log
+from .data import TrainingViews, held_out_frames, training_log
 from .held_out import HeldOutScore, score_held_out
 from .model import SceneModel
 from .progress import OnTraining, TrainingProgress
@@ -71,8 +71,8 @@ def train(
         resume: go on from the checkpoint in ``folder``; the result is the same, bit for bit on
             the CPU, as without a break.
         backend: of the renderer.
-        on_progress: told the stage and how far it is.
-        on_training: told figures every ``options.log_every`` steps.
+        on_progress: called with the stage, steps done and steps in all.
+        on_training: called with figures every ``options.log_every`` steps.
         timing_s: filled with the seconds of each stage.
 
     Raises:
@@ -81,8 +81,8 @@ def train(
     """
     timing_s = {} if timing_s is None else timing_s
     stages = Stages(on_progress, timing_s)
-    with stages("check") as told:
-        check_log(log, on_progress=told)
+    with stages("check") as report_step:
+        check_log(log, on_progress=report_step)
     scene = _first_scene(
         log, options, folder, resume=resume, on_progress=on_progress, timing_s=timing_s
     )
@@ -92,9 +92,9 @@ def train(
     elif trainer.metrics is not None:
         trainer.metrics.cut(-1)
     start, first = time.perf_counter(), trainer.iteration
-    with one_torch_thread(), stages("train") as tell:
+    with one_torch_thread(), stages("train") as report_step:
         trainer.run(
-            on_progress=_both(on_training, tell),
+            on_progress=_combined(on_training, report_step),
             on_preview=_previewer(log, options, folder / PREVIEWS),
         )
     seconds = time.perf_counter() - start
@@ -135,9 +135,11 @@ def _first_scene(
     return save_scene(scene, folder / INITIAL, overwrite=True)
 
 
-def _both(on_training: OnTraining | None, tell: Callable[[int, int], None]) -> OnTraining:
+def _combined(
+    on_training: OnTraining | None, report_step: Callable[[int, int], None]
+) -> OnTraining:
     def report(progress: TrainingProgress) -> None:
-        tell(progress.iteration, progress.iterations)
+        report_step(progress.iteration, progress.iterations)
         if on_training is not None:
             on_training(progress)
 
@@ -149,7 +151,7 @@ def _previewer(
 ) -> Callable[[SceneModel, int], None]:
     """Writes the image of a held-out frame above what the model shows, camera beside camera."""
     frames = held_out_frames(log.frame_count, options.hold_out) or [log.frame_count // 2]
-    views = Views(log, [frames[len(frames) // 2]], options)
+    views = TrainingViews(log, [frames[len(frames) // 2]], options)
 
     def write(model: SceneModel, iteration: int) -> None:
         import cv2

@@ -1,4 +1,4 @@
-"""How long training takes, how fast everything moves when, and the presets."""
+"""Options of training: iterations, learning rates over time, densification, presets."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .losses import LossWeights
 
 DENSIFY_METHODS = ("none", "gradient", "mcmc")
 COLOUR_BASES = ("cosine", "real_dft")
-REST_OF_HARMONICS = 1 / 20
+HIGHER_HARMONICS_RATE = 1 / 20
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes; pairs fall exponentially from the first to the second value.
+    """Adam's step sizes; pairs decay exponentially from the first to the second value.
 
     Attributes:
         means: [m] a step.
@@ -48,18 +48,18 @@ class LearningRates:
 
 
 @dataclass(frozen=True)
-class HiddenLimits:
+class VisibilityLimits:
     """Which Gaussians count as hidden: see :mod:`.visibility`.
 
     Attributes:
-        share: visible share up to which all are.
-        buried_share: visible share up to which those are that lie deep behind what is seen.
-        buried_depth: how deep that is [m].
+        fraction: visible fraction up to which all are.
+        occluded_fraction: visible fraction up to which those are that lie deep behind what is seen.
+        occluded_depth: how deep that is [m].
     """
 
-    share: float = 0.005
-    buried_share: float = 0.03
-    buried_depth: float = 0.3
+    fraction: float = 0.005
+    occluded_fraction: float = 0.03
+    occluded_depth: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class DensifyOptions:
     Attributes:
         method: ``gradient`` (Kerbl et al. 2023, absgrad of Ye et al. 2024), ``mcmc``
             (Kheradmand et al. 2024) or ``none``.
-        start, stop: share of all iterations between which it happens.
+        start, stop: fraction of all iterations between which it happens.
         every: iterations from one round to the next.
         max_gaussians: never more than so many.
         background_gradient: absgrad on the image above which background grows.
@@ -79,14 +79,14 @@ class DensifyOptions:
         max_scale: larger ones near the drive are removed [m].
         reset_every: iterations between resets of opacity; 0 for never.
         noise: of ``mcmc``: factor on the learning rate of means.
-        growth: of ``mcmc``: share by which the number grows in a round.
-        hidden_rounds: shares of all iterations at which Gaussians go that images hardly show.
-        guess_round: share of all iterations at which they go once more, and stage 0's guesses take
-            their places; what stands before these closes up in the rest.
+        growth: of ``mcmc``: fraction by which the number grows in a round.
+        hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
+        prior_round: fraction of all iterations at which they go once more, and priors of stage 0
+            take their places; what stands before these closes up in the rest.
         background_limits: of what counts as hidden in the background.
         object_limits: likewise in objects.
-        last_object_limits: likewise when guesses take their places; what a window shows of an
-            object's inside is hardly ever learnt well, and is better painted onto the window.
+        last_object_limits: likewise when priors take their places; what a window shows of an
+            object's inside is hardly ever learnt well, and is better drawn as the window's colour.
     """
 
     method: str = "gradient"
@@ -103,13 +103,17 @@ class DensifyOptions:
     noise: float = 5e5
     growth: float = 0.05
     hidden_rounds: tuple[float, ...] = (0.35, 0.6)
-    guess_round: float = 0.85
-    background_limits: HiddenLimits = field(default_factory=HiddenLimits)
-    object_limits: HiddenLimits = field(
-        default_factory=lambda: HiddenLimits(share=0.01, buried_share=0.03, buried_depth=0.3)
+    prior_round: float = 0.85
+    background_limits: VisibilityLimits = field(default_factory=VisibilityLimits)
+    object_limits: VisibilityLimits = field(
+        default_factory=lambda: VisibilityLimits(
+            fraction=0.01, occluded_fraction=0.03, occluded_depth=0.3
+        )
     )
-    last_object_limits: HiddenLimits = field(
-        default_factory=lambda: HiddenLimits(share=0.03, buried_share=0.3, buried_depth=0.15)
+    last_object_limits: VisibilityLimits = field(
+        default_factory=lambda: VisibilityLimits(
+            fraction=0.03, occluded_fraction=0.3, occluded_depth=0.15
+        )
     )
 
 
@@ -122,15 +126,15 @@ class TrainOptions:
         seed: of the order of images and all noise.
         width: of the training images [px]; None for the logged width. Never above ``max_width``.
         max_width: largest width of training images [px].
-        coarse: (share of iterations, divisor of the width) stages before full size.
+        coarse: (fraction of iterations, divisor of the width) stages before full size.
         sh_degree: highest degree of the spherical harmonics.
-        sh_every: share of the iterations after which the degree grows by one.
+        sh_every: fraction of the iterations after which the degree grows by one.
         harmonics: time-varying colours of objects, number of basis functions; 0 for none.
         harmonics_basis: ``cosine`` (half periods) or ``real_dft``.
         hold_out: every so many frames one is kept back for evaluation; 0 trains on all.
         refine_poses: whether object boxes are refined.
-        pose_start: share of the iterations before which boxes stay.
-        mirror: share of steps at which vehicles are shown mirrored about their long axis.
+        pose_start: fraction of the iterations before which boxes stay.
+        mirror: fraction of steps at which vehicles are shown mirrored about their long axis.
         initial_opacity: of Gaussians from LiDAR.
         sky_resolution: edge of a face of the sky [px].
         depth_points: LiDAR points that count in one step, at most.
@@ -139,7 +143,7 @@ class TrainOptions:
         log_every, preview_every, checkpoint_every: iterations between lines of metrics, preview
             pictures and checkpoints; 0 for none but the last.
         initialise: of stage 0.
-        rates, losses, densify: see there.
+        learning_rates, losses, densify: see there.
 
     Raises:
         ReconstructError: for a value out of range.
@@ -167,7 +171,7 @@ class TrainOptions:
     preview_every: int = 2000
     checkpoint_every: int = 1000
     initialise: InitialiseOptions = field(default_factory=InitialiseOptions)
-    rates: LearningRates = field(default_factory=LearningRates)
+    learning_rates: LearningRates = field(default_factory=LearningRates)
     losses: LossWeights = field(default_factory=LossWeights)
     densify: DensifyOptions = field(default_factory=DensifyOptions)
 
@@ -197,9 +201,9 @@ class TrainOptions:
 
     def divisor(self, iteration: int) -> int:
         """By which the image width is divided at ``iteration``."""
-        share = iteration / self.iterations
+        fraction = iteration / self.iterations
         for until, divisor in self.coarse:
-            if share < until:
+            if fraction < until:
                 return divisor
         return 1
 
@@ -228,7 +232,7 @@ PRESETS: dict[str, TrainOptions] = {
             object_voxel=0.05,
             sky_resolution=128,
         ),
-        rates=LearningRates(colour=5e-3),
+        learning_rates=LearningRates(colour=5e-3),
         densify=DensifyOptions(max_gaussians=300_000, every=100, stop=0.7, reset_every=0),
     ),
     "standard": TrainOptions(
@@ -236,7 +240,7 @@ PRESETS: dict[str, TrainOptions] = {
         sh_degree=3,
         coarse=((0.01, 4), (0.02, 2)),
         initialise=InitialiseOptions(max_background=800_000, voxel=0.1),
-        rates=LearningRates(exposure=1e-3),
+        learning_rates=LearningRates(exposure=1e-3),
         losses=LossWeights(object_entropy=0.1),
         densify=DensifyOptions(max_gaussians=3_000_000),
     ),
@@ -266,32 +270,34 @@ def preset(name: str, **changes: Any) -> TrainOptions:
     return replace(PRESETS[name], **changes)
 
 
-def falling(span: tuple[float, float], share: float) -> float:
-    """From the first to the second value of ``span``, exponentially, as ``share`` goes 0 to 1."""
+def exponential_decay(span: tuple[float, float], fraction: float) -> float:
+    """From the first to the second value of ``span`` as ``fraction`` goes from 0 to 1."""
     first, last = span
-    return float(first * (last / first) ** min(max(share, 0.0), 1.0)) if first > 0 else 0.0
+    return float(first * (last / first) ** min(max(fraction, 0.0), 1.0)) if first > 0 else 0.0
 
 
-def rates_at(options: TrainOptions, share: float, *, functions: int) -> dict[str, float | Tensor]:
-    """Step sizes by name of parameter after ``share`` of the iterations.
+def learning_rates_at(
+    options: TrainOptions, fraction: float, *, functions: int
+) -> dict[str, float | Tensor]:
+    """Step sizes by name of parameter after ``fraction`` of the iterations.
 
     Args:
         functions: number of spherical harmonics, whose rates differ.
     """
-    rates = options.rates
-    columns = torch.full((functions, 3), rates.colour * REST_OF_HARMONICS)
+    rates = options.learning_rates
+    columns = torch.full((functions, 3), rates.colour * HIGHER_HARMONICS_RATE)
     columns[0] = rates.colour
-    poses_move = float(options.refine_poses and share >= options.pose_start)
+    poses_move = float(options.refine_poses and fraction >= options.pose_start)
     return {
-        "means": falling(rates.means, share),
+        "means": exponential_decay(rates.means, fraction),
         "log_scales": rates.scales,
         "quats": rates.quats,
         "logits": rates.opacities,
         "sh": columns.reshape(-1),
         "fourier": rates.fourier,
-        "sky": falling(rates.sky, share),
-        "pose_translation": poses_move * falling(rates.pose_translation, share),
-        "pose_yaw": poses_move * falling(rates.pose_yaw, share),
+        "sky": exponential_decay(rates.sky, fraction),
+        "pose_translation": poses_move * exponential_decay(rates.pose_translation, fraction),
+        "pose_yaw": poses_move * exponential_decay(rates.pose_yaw, fraction),
         "exposure": rates.exposure,
         "camera": rates.camera,
     }

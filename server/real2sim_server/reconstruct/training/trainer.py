@@ -1,4 +1,4 @@
-"""The training loop: one image a step, until the scene looks like the log."""
+"""The training loop: one image a step."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ...scene.spherical_harmonics import SH_C0
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from .data import View, Views, held_out_frames, image_time
+from .data import TrainingView, TrainingViews, held_out_frames, image_time
 from .densify import Densifier, ScreenSums, generator, reset_opacity
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
-from .model import Rendered, SceneModel
+from .model import RenderedView, SceneModel
 from .object_masks import box_mask
 from .optimizer import SelectiveAdam
-from .progress import Clock, OnTraining, Running, Stopwatch, TrainingProgress
-from .schedule import HiddenLimits, TrainOptions, from_values, rates_at
-from .visibility import Look, drop_hidden, guesses_behind, hidden_sky, visibility
+from .progress import OnTraining, RateMeter, RunningMeans, StageTimer, TrainingProgress
+from .schedule import TrainOptions, VisibilityLimits, from_values, learning_rates_at
+from .visibility import Viewpoint, hidden_sky, occluded_priors, prune_hidden, visibility
 
-LOOKS = 64
-"""Views at which Gaussians are looked for before hidden ones go."""
+VISIBILITY_VIEWS = 64
+"""Views that decide which Gaussians are hidden."""
 CONSTANT_SH = (-0.55 / SH_C0, 0.55 / SH_C0)
 """Range of the constant coefficients: colours from -0.05 to 1.05."""
 CHECKPOINT = "checkpoint"
@@ -56,9 +56,9 @@ class Trainer:
         backend: str | Backend = "auto",
     ) -> None:
         self.log, self.options, self.folder = log, options, folder
-        away = set(held_out_frames(log.frame_count, options.hold_out))
-        frames = [f for f in range(log.frame_count) if f not in away]
-        self.views = Views(log, frames, options)
+        held_out = set(held_out_frames(log.frame_count, options.hold_out))
+        frames = [f for f in range(log.frame_count) if f not in held_out]
+        self.views = TrainingViews(log, frames, options)
         keys = {image_time(log, name, f) for f in frames for name in log.rig.names}
         key_times = np.array(sorted(keys), dtype=np.int64)
         self.model = SceneModel(scene, options, key_times, backend=backend)
@@ -71,7 +71,7 @@ class Trainer:
         )
         self.sums = ScreenSums.zeros(len(self.model.gaussians))
         self.iteration = 0
-        self.running = Running()
+        self.running = RunningMeans()
         self.metrics = MetricsFile(folder / "metrics.jsonl") if folder else None
 
     def run(
@@ -89,7 +89,7 @@ class Trainer:
         """
         options = self.options
         last = options.iterations if until is None else min(until, options.iterations)
-        clock = Clock(self.iteration)
+        clock = RateMeter(self.iteration)
         while self.iteration < last:
             terms = self.step()
             done = self.iteration
@@ -103,7 +103,7 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """One iteration; the terms of its loss."""
         i = self.iteration
-        timed = Stopwatch(self.running.stages)
+        timed = StageTimer(self.running.stages)
         with timed("data"):
             view = self.views.view(self.views.order(i), self.options.divisor(i))
             self.views.prefetch(i)
@@ -142,11 +142,13 @@ class Trainer:
             bool(m and d < self.options.mirror) for m, d in zip(vehicles, drawn, strict=True)
         )
 
-    def _terms(self, view: View, rendered: Rendered) -> tuple[dict[str, Tensor], Tensor]:
+    def _terms(
+        self, view: TrainingView, rendered: RenderedView
+    ) -> tuple[dict[str, Tensor], Tensor]:
         """Weighted terms of the loss, and the mean squared error of the image."""
         weights, output = self.options.losses, rendered.output
         picture, _, _, squared = losses.photometric(
-            rendered.rgb, view.image, ssim_share=weights.ssim
+            rendered.rgb, view.image, ssim_weight=weights.ssim
         )
         terms = {"picture": picture}
         if weights.depth > 0 and len(view.pixels) and output.depth is not None:
@@ -164,7 +166,7 @@ class Trainer:
             terms["scale"] = weights.scale * self.model.gaussians.log_scales.exp().mean()
         return terms, squared
 
-    def _regularisers(self, view: View) -> dict[str, Tensor]:
+    def _regularisers(self, view: TrainingView) -> dict[str, Tensor]:
         weights, model = self.options.losses, self.model
         gaussians, objects = model.gaussians, len(model.gaussians.counts) > 1
         terms = {}
@@ -179,7 +181,7 @@ class Trainer:
             terms["box"] = weights.box * losses.outside_box(means, half)
         if weights.smooth > 0 and objects and self.options.refine_poses:
             terms["smooth"] = weights.smooth * model.poses.roughness()
-        if weights.exposure > 0 and self.options.rates.exposure > 0:
+        if weights.exposure > 0 and self.options.learning_rates.exposure > 0:
             change = model.exposure - torch.eye(3, 4)
             terms["exposure"] = weights.exposure * change.square().sum()
         late = self.iteration >= self.options.densify.stop * self.options.iterations
@@ -191,7 +193,7 @@ class Trainer:
         return terms
 
     @torch.no_grad()
-    def _update(self, rendered: Rendered) -> None:
+    def _update(self, rendered: RenderedView) -> None:
         gaussians = self.model.gaussians
         seen = torch.zeros(len(gaussians), dtype=torch.bool)
         rows = self._rows(rendered.drawn)
@@ -208,8 +210,8 @@ class Trainer:
             gradient = parameters[name].grad
             if gradient is not None:
                 masks[name] = gradient.reshape(len(gradient), -1).any(1)
-        share = self.iteration / self.options.iterations
-        rates = rates_at(self.options, share, functions=int(gaussians.sh.shape[1]))
+        fraction = self.iteration / self.options.iterations
+        rates = learning_rates_at(self.options, fraction, functions=int(gaussians.sh.shape[1]))
         self.optimizer.step(parameters, rates, masks)
         # A colour no surface has would make up for another one before it, and show when that goes.
         gaussians.sh[:, 0].clamp_(*CONSTANT_SH)
@@ -230,44 +232,46 @@ class Trainer:
             self.sums = ScreenSums.zeros(len(self.model.gaussians))
         limits = self.options.densify
         if self.densifier.drops_hidden(i):
-            self._drop_hidden(self._some_looks(), limits.object_limits)
-        if self.densifier.takes_guesses(i):
-            looks = self._some_looks()
-            # Guesses first: they are to stand behind what is dropped then, too.
-            self._take_guesses(looks)
-            self._drop_hidden(looks, limits.last_object_limits)
+            self._drop_hidden(self._sample_viewpoints(), limits.object_limits)
+        if self.densifier.inserts_priors(i):
+            viewpoints = self._sample_viewpoints()
+            # Priors first: they are to stand behind what is dropped then, too.
+            self._insert_priors(viewpoints)
+            self._drop_hidden(viewpoints, limits.last_object_limits)
         if self.densifier.resets_opacity(i):
             reset_opacity(self.model.gaussians, self.optimizer)
 
-    def _drop_hidden(self, looks: list[Look], object_limits: HiddenLimits) -> None:
-        self.model.gaussians = drop_hidden(
+    def _drop_hidden(self, viewpoints: list[Viewpoint], object_limits: VisibilityLimits) -> None:
+        self.model.gaussians = prune_hidden(
             self.model.gaussians,
             self.optimizer,
-            visibility(self.model, looks),
+            visibility(self.model, viewpoints),
             background_limits=self.options.densify.background_limits,
             object_limits=object_limits,
         )
         self.sums = ScreenSums.zeros(len(self.model.gaussians))
 
-    def _take_guesses(self, looks: list[Look]) -> None:
+    def _insert_priors(self, viewpoints: list[Viewpoint]) -> None:
         """Stage 0's, as opaque as they were, for what images hardly show, and its sky likewise."""
         model = self.model
         opaque = replace(self.options, initial_opacity=0.99, refine_poses=False)
         times = np.array([model.scene.start_us, model.scene.end_us])
         first = SceneModel(model.scene, opaque, times, backend=model.backend)
-        hidden = hidden_sky(model, looks)
+        hidden = hidden_sky(model, viewpoints)
         model.sky.data[hidden] = first.sky.data[hidden]
-        self.optimizer.forget("sky")
-        limit = self.options.densify.background_limits.share
-        model.guesses = guesses_behind(model, first, looks, limit=limit)
+        self.optimizer.reset_moments("sky")
+        limit = self.options.densify.background_limits.fraction
+        model.priors = occluded_priors(model, first, viewpoints, limit=limit)
 
-    def _some_looks(self) -> list[Look]:
+    def _sample_viewpoints(self) -> list[Viewpoint]:
         """Training views drawn at random, enough to tell what is hidden."""
-        looks = self.views.looks()
-        return [looks[self.views.order(k)] for k in range(min(LOOKS, len(looks)))]
+        viewpoints = self.views.viewpoints()
+        return [
+            viewpoints[self.views.order(k)] for k in range(min(VISIBILITY_VIEWS, len(viewpoints)))
+        ]
 
     def _report(
-        self, terms: dict[str, float], clock: Clock, on_progress: OnTraining | None
+        self, terms: dict[str, float], clock: RateMeter, on_progress: OnTraining | None
     ) -> None:
         rate = clock.rate(self.iteration)
         progress = TrainingProgress(
@@ -289,16 +293,16 @@ class Trainer:
         if self.folder is None:
             return
         tensors = {f"model.{k}": v for k, v in self.model.parameters().items()}
-        guesses = self.model.guesses
-        if guesses is not None:
-            tensors |= {f"guesses.{k}": v for k, v in guesses.tensors().items()}
+        priors = self.model.priors
+        if priors is not None:
+            tensors |= {f"priors.{k}": v for k, v in priors.tensors().items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {"sums.gradients": self.sums.gradients, "sums.views": self.sums.views}
         running = self.running
         checkpoint = Checkpoint(
             iteration=self.iteration,
             counts=self.model.gaussians.counts,
-            guess_counts=() if guesses is None else guesses.counts,
+            prior_counts=() if priors is None else priors.counts,
             optimizer_steps=self.optimizer.steps,
             options=asdict(self.options),
             log_name=self.log.name,
@@ -324,17 +328,17 @@ class Trainer:
             raise ReconstructError(
                 f"{self.folder}: was begun with other options; resume with the same or start anew"
             )
-        parts: dict[str, dict[str, Tensor]] = {"model": {}, "guesses": {}, "adam": {}, "sums": {}}
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "priors": {}, "adam": {}, "sums": {}}
         for name, tensor in held.tensors.items():
             group, key = name.split(".", 1)
             parts[group][key] = tensor
         self.model.load(parts["model"], held.counts)
-        if held.guess_counts:
-            self.model.guesses = Gaussians(**parts["guesses"], counts=held.guess_counts)
+        if held.prior_counts:
+            self.model.priors = Gaussians(**parts["priors"], counts=held.prior_counts)
         self.optimizer.restore(parts["adam"], held.optimizer_steps)
         self.sums = ScreenSums(**parts["sums"])
         self.iteration = held.iteration
-        self.running = Running(**held.running)
+        self.running = RunningMeans(**held.running)
         if self.metrics is not None:
             self.metrics.cut(held.iteration)
 

@@ -1,11 +1,11 @@
 """Which Gaussians the training images show, and what becomes of those that none shows.
 
 A Gaussian behind a surface gets gradients only through the thin gaps in that surface, and Adam
-takes full steps along them: it drifts into a shred that a turned or moved object reveals. Little of
-it is seen, and it lies deep behind what is; the layers of a surface are seen little each as well,
-but lie close together. Such Gaussians are dropped, and what stage 0 guessed for places that nobody
-saw (mirrored sides, paint, ground under cars) takes their place while the surfaces before it finish
-learning, so that these close up.
+takes full steps along them: it becomes a floater that a turned or moved object reveals. Little of
+it is visible, and it lies deep behind what is; the layers of a surface are little visible each as
+well, but lie close together. Such Gaussians are pruned, and the priors of stage 0 for unobserved
+places (mirrored sides, body colours, ground under cars) take their place while the surfaces before
+them finish learning, so that these close up.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Sky
 from ...scene.spherical_harmonics import SH_C0
 from .densify import rearrange, rotations
-from .gaussians import Gaussians, joined
+from .gaussians import Gaussians, concatenate
 from .model import SceneModel
 from .optimizer import SelectiveAdam
-from .schedule import HiddenLimits
+from .schedule import VisibilityLimits
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
-FAINT = -3.0
-"""Logit of an opacity that hides next to nothing and is well above what blending skips."""
-GUESS_SHARE = 0.01
-"""Visible share behind what was trained up to which a guess comes back: more costs what logged
-views show, less leaves holes in sides that only a turned object shows."""
-SKY_SHARE = 0.1
-"""Visible share up to which a texel of the sky counts as hidden."""
+FAINT_LOGIT = -3.0
+"""Logit of an opacity that occludes next to nothing and is well above what blending skips."""
+PRIOR_FRACTION = 0.01
+"""Visible fraction behind what was trained up to which a prior is drawn: more costs logged views,
+less leaves holes in sides that only a turned object shows."""
+SKY_FRACTION = 0.1
+"""Visible fraction up to which a texel of the sky counts as hidden."""
 EPS2D = RasterOptions().eps2d
 
-Look = tuple[Camera, int]
-"""A camera at the size of its training images, and when it looks [us]."""
+Viewpoint = tuple[Camera, int]
+"""A camera at the size of its training images, and the time of its image [us]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,47 +47,49 @@ class Visibility:
     """How much of N Gaussians some views show, and how deep behind what they show these lie.
 
     Attributes:
-        shares: [N] float32, the sum of a Gaussian's blending weights over all pixels, by what it
+        fractions: [N] float32, the sum of a Gaussian's blending weights over all pixels, by what it
             would be over the whole image plane if nothing stood before it; 0 for what is never
             before a camera.
         depths: [N] float32, from the surface in the pixels that show it back to its centre, mean
             by blending weight [m]; negative before the surface, 0 for what no pixel shows.
     """
 
-    shares: Tensor
+    fractions: Tensor
     depths: Tensor
 
-    def hidden(self, limits: HiddenLimits) -> Tensor:
+    def hidden(self, limits: VisibilityLimits) -> Tensor:
         """[N] bool."""
-        buried = (self.depths > limits.buried_depth) & (self.shares <= limits.buried_share)
-        return (self.shares <= limits.share) | buried
+        occluded = (self.depths > limits.occluded_depth) & (
+            self.fractions <= limits.occluded_fraction
+        )
+        return (self.fractions <= limits.fraction) | occluded
 
 
 @torch.no_grad()
-def visibility(model: SceneModel, looks: Iterable[Look]) -> Visibility:
-    """What ``looks`` show of each Gaussian of ``model``.
+def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Visibility:
+    """What ``viewpoints`` show of each Gaussian of ``model``.
 
-    Where training shows vehicles mirrored, they are looked at from both sides: what is hidden on
-    one is learnt on the other.
+    Where training shows vehicles mirrored, both sides count: what is hidden on one is learnt on
+    the other.
     """
     gaussians = model.gaussians
     starts = gaussians.starts
-    shown, bare, deep = (torch.zeros(len(gaussians)) for _ in range(3))
-    turns = [(), model.mirrored] if any(model.mirrored) else [()]
-    sides = [gaussians.clouds(degree=0, mirrored=mirrored) for mirrored in turns]
-    for (camera, t_us), clouds in itertools.product(looks, sides):
+    visible, unoccluded, depth_sums = (torch.zeros(len(gaussians)) for _ in range(3))
+    flips = [(), model.mirrored] if any(model.mirrored) else [()]
+    sides = [gaussians.clouds(degree=0, mirrored=mirrored) for mirrored in flips]
+    for (camera, t_us), clouds in itertools.product(viewpoints, sides):
         viewmat = model.viewmat(camera, t_us).detach()
         instances, drawn = model.instances(clouds, t_us)
         weights = blending_weights(instances, viewmat, camera, model)
         for index, instance, (weight, inverse) in zip(drawn, instances, weights, strict=True):
             rows = slice(starts[index], starts[index + 1])
-            alone = unhindered_weights(instance, viewmat, camera)
+            alone = unoccluded_weights(instance, viewmat, camera)
             surface = weight / inverse.clamp(min=1e-9)
             counted = torch.where(alone > 0, weight, 0)
-            shown[rows] += counted
-            bare[rows] += alone
-            deep[rows] += counted * (_depths(instance, viewmat) - surface)
-    return Visibility(shown / bare.clamp(min=1e-9), deep / shown.clamp(min=1e-9))
+            visible[rows] += counted
+            unoccluded[rows] += alone
+            depth_sums[rows] += counted * (_depths(instance, viewmat) - surface)
+    return Visibility(visible / unoccluded.clamp(min=1e-9), depth_sums / visible.clamp(min=1e-9))
 
 
 def blending_weights(
@@ -122,7 +124,7 @@ def blending_weights(
     return [(s[:, 0], s[:, 1]) for s in sums]
 
 
-def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> Tensor:
+def unoccluded_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> Tensor:
     """[N] integral over the image plane of each Gaussian's opacity [px].
 
     0 for Gaussians whose centre is not on the image.
@@ -145,14 +147,14 @@ def unhindered_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
 
 
 @torch.no_grad()
-def hidden_sky(model: SceneModel, looks: Iterable[Look]) -> Tensor:
-    """[6, R, R] bool, texels of the sky of which next to nothing is seen wherever cameras look."""
-    shown, bare = (torch.zeros_like(model.sky) for _ in range(2))
+def hidden_sky(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Tensor:
+    """[6, R, R] bool, texels of the sky that are hardly visible in any view."""
+    visible, unoccluded = (torch.zeros_like(model.sky) for _ in range(2))
     clouds = model.gaussians.clouds(degree=0)
-    for camera, t_us in looks:
+    for camera, t_us in viewpoints:
         viewmat = model.viewmat(camera, t_us).detach()
         instances, _ = model.instances(clouds, t_us)
-        for drawn, total in ((instances, shown), ([], bare)):
+        for drawn, total in ((instances, visible), ([], unoccluded)):
             faces = torch.zeros_like(model.sky).requires_grad_()
             with torch.enable_grad():
                 rasterize(
@@ -166,7 +168,7 @@ def hidden_sky(model: SceneModel, looks: Iterable[Look]) -> Tensor:
                     backend=model.backend,
                 ).rgb.sum().backward()
             total.add_(faces.grad)
-    return shown.sum(-1) <= SKY_SHARE * bare.sum(-1)
+    return visible.sum(-1) <= SKY_FRACTION * unoccluded.sum(-1)
 
 
 def _depths(instance: Instance, viewmat: Tensor) -> Tensor:
@@ -183,15 +185,15 @@ def _to_camera(instance: Instance, viewmat: Tensor) -> Tensor:
     return (viewmat.double() @ pose).float()
 
 
-def drop_hidden(
+def prune_hidden(
     gaussians: Gaussians,
     optimizer: SelectiveAdam,
     seen: Visibility,
     *,
-    background_limits: HiddenLimits,
-    object_limits: HiddenLimits,
+    background_limits: VisibilityLimits,
+    object_limits: VisibilityLimits,
 ) -> Gaussians:
-    """Without those of which next to nothing is seen, or little and that deep behind the rest."""
+    """Without those hardly visible, or little visible and occluded deep behind the rest."""
     hidden = torch.where(
         gaussians.owners > 0, seen.hidden(object_limits), seen.hidden(background_limits)
     )
@@ -199,27 +201,27 @@ def drop_hidden(
     return rearrange(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
 
 
-def guesses_behind(
-    model: SceneModel, first: SceneModel, looks: list[Look], *, limit: float
+def occluded_priors(
+    model: SceneModel, first: SceneModel, viewpoints: list[Viewpoint], *, limit: float
 ) -> Gaussians:
-    """What stage 0 guessed for places that ``model`` hides; nothing of it is to learn.
+    """Gaussians of stage 0 that ``model`` occludes; they are drawn and do not learn.
 
-    A guess of the background must have been hidden in stage 0 too: where it was seen, training had
-    its reasons to remove it. Objects leave the place where they were seen, and are given everything
-    that their trained Gaussians hide.
+    A prior of the background must have been hidden in stage 0 too: where it was visible, training
+    had its reasons to prune it. Objects can be moved, and are given every prior that their trained
+    Gaussians occlude.
 
     Args:
         model: trained.
         first: of stage 0, with the same objects.
-        looks: training views.
-        limit: visible share up to which a Gaussian of the background was hidden in stage 0.
+        viewpoints: training views.
+        limit: visible fraction up to which a Gaussian of the background was hidden in stage 0.
     """
-    hidden = visibility(first, looks).shares <= limit
+    hidden = visibility(first, viewpoints).fractions <= limit
     offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
-    guesses, trained = first.gaussians.take(offered), model.gaussians
-    # Faint, so that no guess hides another: several may stand behind one gap of the surface.
-    faint = replace(guesses, logits=torch.full_like(guesses.logits, FAINT))
-    model.gaussians, is_guess = joined(trained, faint)
-    behind = visibility(model, looks).shares[is_guess] <= GUESS_SHARE
+    priors, trained = first.gaussians.take(offered), model.gaussians
+    # Faint, so that no prior occludes another: several may stand behind one gap of the surface.
+    faint = replace(priors, logits=torch.full_like(priors.logits, FAINT_LOGIT))
+    model.gaussians, is_prior = concatenate(trained, faint)
+    behind = visibility(model, viewpoints).fractions[is_prior] <= PRIOR_FRACTION
     model.gaussians = trained
-    return guesses.take(behind.nonzero()[:, 0])
+    return priors.take(behind.nonzero()[:, 0])

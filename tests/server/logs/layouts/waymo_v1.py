@@ -91,8 +91,8 @@ def _image(log: DrivingLog, frame: int, name: str) -> bytes:
 def _laser(log: DrivingLog, frame: int) -> bytes:
     sweep = log.lidar(frame)
     x, y, z = (sweep.points.astype(np.float64) - sweep.origin).T
-    share = (np.arctan2(z, np.hypot(x, y)) - LOW) / (HIGH - LOW)
-    row = BEAMS - 1 - np.clip((share * BEAMS).astype(int), 0, BEAMS - 1)
+    fraction = (np.arctan2(z, np.hypot(x, y)) - LOW) / (HIGH - LOW)
+    row = BEAMS - 1 - np.clip((fraction * BEAMS).astype(int), 0, BEAMS - 1)
     column = ((np.pi - np.arctan2(y, x)) / (2 * np.pi) * COLUMNS).astype(int) % COLUMNS
     values = np.zeros((BEAMS, COLUMNS, 4), np.float32)
     values[row, column, 0] = np.sqrt(x * x + y * y + z * z)

@@ -15,8 +15,8 @@ from real2sim_server.logs import open_log, write_native_log
 from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
 from real2sim_server.reconstruct.evaluation import EvaluateOptions, evaluate_scene
 from real2sim_server.reconstruct.evaluation.box_error import box_error
-from real2sim_server.reconstruct.evaluation.choice import choose_frames
 from real2sim_server.reconstruct.evaluation.scores import logged_mask
+from real2sim_server.reconstruct.evaluation.selection import select_frames
 from real2sim_server.reconstruct.evaluation.shifted import evaluate_shifts, true_view
 from real2sim_server.reconstruct.evaluation.truth import find_truth
 from real2sim_server.scene.io import save_scene
@@ -69,23 +69,23 @@ def with_provenance(scene, **reconstruction):
 
 def test_frames_that_training_kept_back_are_compared_and_count_as_unseen(street, street_scene):
     trained = with_provenance(street_scene, stage=1, held_out_frames=[1, 4])
-    assert choose_frames(trained, street, "held-out") == choose_frames(trained, street, [4, 1])
-    assert choose_frames(trained, street, "held-out").frames == (1, 4)
-    assert choose_frames(trained, street, "held-out").unseen
-    assert not choose_frames(trained, street, [1, 2]).unseen
+    assert select_frames(trained, street, "held-out") == select_frames(trained, street, [4, 1])
+    assert select_frames(trained, street, "held-out").frames == (1, 4)
+    assert select_frames(trained, street, "held-out").unseen
+    assert not select_frames(trained, street, [1, 2]).unseen
 
 
 def test_without_training_every_fourth_frame_is_compared_and_counts_as_seen(street, street_scene):
-    chosen = choose_frames(street_scene, street, "held-out")
+    chosen = select_frames(street_scene, street, "held-out")
     assert (chosen.frames, chosen.unseen) == ((2,), False)
-    assert choose_frames(street_scene, street, "all").frames == tuple(range(6))
+    assert select_frames(street_scene, street, "all").frames == tuple(range(6))
 
 
 def test_a_frame_that_is_not_there_is_refused(street, street_scene):
     with pytest.raises(ReconstructError, match=r"frame 6: .* has frames 0 to 5"):
-        choose_frames(street_scene, street, [2, 6])
+        select_frames(street_scene, street, [2, 6])
     with pytest.raises(ReconstructError, match="'held-out', 'all' or numbers, not 'some'"):
-        choose_frames(street_scene, street, "some")
+        select_frames(street_scene, street, "some")
 
 
 def test_a_scene_of_another_rig_is_refused(street, street_scene):

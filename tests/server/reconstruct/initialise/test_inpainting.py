@@ -3,9 +3,9 @@
 import numpy as np
 
 from real2sim_server.reconstruct.initialise.inpainting import (
-    commonest,
+    body_color,
     fill_from_neighbours,
-    own_paint,
+    modal_colour,
 )
 
 WHITE, RED, DARK = np.float32([0.9, 0.9, 0.88]), np.float32([0.8, 0.1, 0.1]), np.float32([0.1] * 3)
@@ -19,14 +19,14 @@ def noisy(colour, count, seed=0):
 
 def test_the_commonest_colour_is_not_the_mean():
     colours = np.concatenate([noisy(WHITE, 300), noisy(RED, 200, 1)])
-    assert np.abs(commonest(colours) - WHITE).max() < 0.02
+    assert np.abs(modal_colour(colours) - WHITE).max() < 0.02
 
 
 def test_lamps_do_not_colour_the_rest_of_a_body():
     colours = np.concatenate([noisy(WHITE, 100), noisy(RED, 60, 1), np.zeros((50, 3), np.float32)])
     known = np.arange(len(colours)) < 160
     heights = np.full(len(colours), 0.1, np.float32)
-    paint = own_paint(heights, colours, known, np.tile(DARK, (len(colours), 1)), EDGES)
+    paint = body_color(heights, colours, known, np.tile(DARK, (len(colours), 1)), EDGES)
     assert np.abs(paint[~known] - WHITE).max() < 0.03
 
 
@@ -34,7 +34,7 @@ def test_bands_of_height_have_their_own_paint():
     colours = np.concatenate([noisy(DARK, 100), noisy(WHITE, 200, 1)])
     heights = np.repeat(np.float32([-0.45, 0.1]), [100, 200])
     known = np.ones(300, bool)
-    paint = own_paint(heights, colours, known, np.tile(RED, (300, 1)), EDGES)
+    paint = body_color(heights, colours, known, np.tile(RED, (300, 1)), EDGES)
     assert np.abs(paint[0] - DARK).max() < 0.03
     assert np.abs(paint[-1] - WHITE).max() < 0.03
 
@@ -42,7 +42,7 @@ def test_bands_of_height_have_their_own_paint():
 def test_of_an_object_that_was_hardly_seen_the_prior_remains():
     colours, prior = noisy(WHITE, 10), np.tile(RED, (10, 1))
     known = np.arange(10) < 5
-    assert (own_paint(np.zeros(10, np.float32), colours, known, prior, EDGES) == prior).all()
+    assert (body_color(np.zeros(10, np.float32), colours, known, prior, EDGES) == prior).all()
 
 
 def test_a_shorter_reach_leaves_more_to_the_prior():

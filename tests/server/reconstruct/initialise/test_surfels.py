@@ -13,8 +13,8 @@ def grid(step_x: float, step_y: float, count: int = 20) -> np.ndarray:
 
 def inner(points: np.ndarray) -> np.ndarray:
     low, high = points.min(0), points.max(0)
-    share = (points[:, :2] - low[:2]) / (high - low)[:2]
-    return ((share > 0.2) & (share < 0.8)).all(axis=1)
+    fraction = (points[:, :2] - low[:2]) / (high - low)[:2]
+    return ((fraction > 0.2) & (fraction < 0.8)).all(axis=1)
 
 
 def test_gaussians_on_a_plane_lie_flat_on_it():

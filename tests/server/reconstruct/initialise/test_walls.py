@@ -49,5 +49,5 @@ def test_sky_unseen_and_inconsistent_candidates_are_no_walls():
     brick, blue, white = (0.5, 0.35, 0.3), (0.45, 0.6, 0.8), (1.0, 1.0, 1.0)
     colours = np.array([brick, brick, brick, blue, white], np.float32)
     known = np.array([True, False, True, True, True])
-    spread = np.array([5, 5, 80, 2, 1], np.float32)
-    assert real_walls(colours, known, spread).tolist() == [True, False, False, False, False]
+    deviation = np.array([5, 5, 80, 2, 1], np.float32)
+    assert real_walls(colours, known, deviation).tolist() == [True, False, False, False, False]

@@ -33,7 +33,7 @@ TINY = TrainOptions(
         object_voxel=0.2,
         sky_resolution=16,
     ),
-    rates=LearningRates(means=(5e-3, 5e-4), colour=0.03, scales=0.02, opacities=0.1),
+    learning_rates=LearningRates(means=(5e-3, 5e-4), colour=0.03, scales=0.02, opacities=0.1),
     densify=DensifyOptions(every=10, start=0.1, stop=0.9, max_gaussians=40_000),
 )
 

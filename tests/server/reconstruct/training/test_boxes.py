@@ -61,7 +61,7 @@ def test_training_moves_a_box_back_to_where_the_image_shows_it(tiny_log, tiny_sc
         hold_out=0,
         pose_start=0.0,
         harmonics=0,
-        rates=LearningRates(
+        learning_rates=LearningRates(
             means=(0.0, 0.0),
             scales=0.0,
             quats=0.0,

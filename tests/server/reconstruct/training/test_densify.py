@@ -9,7 +9,7 @@ import torch
 from real2sim_server.reconstruct.training.densify import Densifier, ScreenSums, rotations
 from real2sim_server.reconstruct.training.gaussians import FIELDS, Gaussians, leaf
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
-from real2sim_server.reconstruct.training.relocation import share
+from real2sim_server.reconstruct.training.relocation import compute_relocation
 from real2sim_server.reconstruct.training.schedule import DensifyOptions
 
 COUNTS = (30, 10, 8)
@@ -123,7 +123,7 @@ def test_mcmc_moves_dead_ones_to_live_ones_and_keeps_the_number():
 
 
 def test_two_copies_look_like_the_one_they_replace():
-    opacity, factor = share(torch.tensor([0.6]), torch.tensor([2]), 0.005)
+    opacity, factor = compute_relocation(torch.tensor([0.6]), torch.tensor([2]), 0.005)
     assert float(1 - (1 - opacity) ** 2) == pytest.approx(0.6, rel=1e-5)
     # eq. 9 written out for N = 2: o / (2 a - a^2 / sqrt(2)).
     a = float(opacity)

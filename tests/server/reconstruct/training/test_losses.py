@@ -32,15 +32,15 @@ def test_ssim_of_equal_pictures_is_one(pictures):
     assert losses.ssim(pictures[1], pictures[1]) == pytest.approx(1, abs=1e-6)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_photometric_loss_and_gradient_equal_torch(pictures, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])
+def test_photometric_loss_and_gradient_equal_torch(pictures, fraction):
     image, truth = pictures
     ours, plain = image.clone().requires_grad_(), image.clone().double().requires_grad_()
-    loss, l1, similarity, squared = losses.photometric(ours, truth, ssim_share=share)
+    loss, l1, similarity, squared = losses.photometric(ours, truth, ssim_weight=fraction)
     (3 * loss).backward()
     difference = plain - truth
-    expected = (1 - share) * difference.abs().mean()
-    expected = expected + share * (1 - losses.ssim_plain(plain, truth.double()))
+    expected = (1 - fraction) * difference.abs().mean()
+    expected = expected + fraction * (1 - losses.ssim_plain(plain, truth.double()))
     (3 * expected).backward()
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), abs=1e-5)
     assert float(l1) == pytest.approx(float(difference.detach().abs().mean()), rel=1e-5)

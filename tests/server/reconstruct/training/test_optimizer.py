@@ -46,6 +46,6 @@ def test_moments_follow_their_rows():
     optimizer.step({"x": x}, {"x": 0.1}, {})
     before = optimizer.first["x"].clone()
     source = torch.tensor([3, 1, 1])
-    optimizer.take("x", source, torch.tensor([False, False, True]))
+    optimizer.gather("x", source, torch.tensor([False, False, True]))
     assert torch.equal(optimizer.first["x"][:2], before[[3, 1]])
     assert not optimizer.first["x"][2].any()

@@ -94,24 +94,24 @@ def test_a_scene_that_was_exported_shares_nothing_with_the_model(trained):
     assert torch.equal(scene.background.means, before)
 
 
-def test_guesses_are_drawn_from_their_round_on_stay_as_they_are_and_are_exported(
+def test_priors_are_drawn_from_their_round_on_stay_as_they_are_and_are_exported(
     tiny_log, tiny_scene
 ):
     options = replace(TINY, iterations=20)
     trainer = Trainer(tiny_log, tiny_scene, options)
     trainer.run(until=16)
-    assert trainer.model.guesses is None
+    assert trainer.model.priors is None
     trainer.run(until=17)
-    guesses = trainer.model.guesses
-    given = {name: tensor.detach().clone() for name, tensor in guesses.tensors().items()}
+    priors = trainer.model.priors
+    given = {name: tensor.detach().clone() for name, tensor in priors.tensors().items()}
     trainer.run()
     trainer.views.close()
-    assert len(guesses) > 0
+    assert len(priors) > 0
     for name, tensor in given.items():
-        assert torch.equal(guesses.tensors()[name], tensor), name
+        assert torch.equal(priors.tensors()[name], tensor), name
     exported = trainer.model.export().background
-    assert len(exported) == trainer.model.gaussians.counts[0] + guesses.counts[0]
-    torch.testing.assert_close(exported.means[-1], given["means"][guesses.counts[0] - 1])
+    assert len(exported) == trainer.model.gaussians.counts[0] + priors.counts[0]
+    torch.testing.assert_close(exported.means[-1], given["means"][priors.counts[0] - 1])
 
 
 def losses_of(folder) -> list[tuple[int, float]]:
@@ -120,7 +120,7 @@ def losses_of(folder) -> list[tuple[int, float]]:
 
 
 @pytest.mark.parametrize(
-    ("every", "until", "since"), [(20, 33, 20), (12, 38, 36)], ids=["early", "among guesses"]
+    ("every", "until", "since"), [(20, 33, 20), (12, 38, 36)], ids=["early", "among priors"]
 )
 def test_a_run_that_was_broken_off_goes_on_bit_for_bit(
     tiny_log, tiny_scene, tmp_path, every, until, since

@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from real2sim_server.reconstruct.training import SceneModel, Trainer
-from real2sim_server.reconstruct.training.gaussians import Gaussians, joined
+from real2sim_server.reconstruct.training.gaussians import Gaussians, concatenate
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
-from real2sim_server.reconstruct.training.schedule import DensifyOptions, HiddenLimits
+from real2sim_server.reconstruct.training.schedule import DensifyOptions, VisibilityLimits
 from real2sim_server.reconstruct.training.visibility import (
     Visibility,
-    drop_hidden,
-    guesses_behind,
     hidden_sky,
-    unhindered_weights,
+    occluded_priors,
+    prune_hidden,
+    unoccluded_weights,
     visibility,
 )
 from real2sim_server.render import Instance
@@ -35,7 +35,7 @@ def model(tiny_scene) -> SceneModel:
 
 
 @pytest.fixture
-def looks(tiny_scene) -> list[tuple[Camera, int]]:
+def viewpoints(tiny_scene) -> list[tuple[Camera, int]]:
     return [(camera, tiny_scene.start_us) for camera in tiny_scene.rig]
 
 
@@ -78,9 +78,9 @@ def dropped(
     optimizer: SelectiveAdam,
     seen: Visibility,
     *,
-    object_limits: HiddenLimits = LIMITS.object_limits,
+    object_limits: VisibilityLimits = LIMITS.object_limits,
 ) -> Gaussians:
-    return drop_hidden(
+    return prune_hidden(
         gaussians,
         optimizer,
         seen,
@@ -89,42 +89,42 @@ def dropped(
     )
 
 
-def shares_of(model: SceneModel, looks: list[tuple[Camera, int]]) -> torch.Tensor:
-    return visibility(model, looks).shares
+def fractions_of(model: SceneModel, viewpoints: list[tuple[Camera, int]]) -> torch.Tensor:
+    return visibility(model, viewpoints).fractions
 
 
-def test_a_gaussian_alone_is_all_visible(model, looks):
-    [share] = shares_of(model_of(model, [ahead(model, 5, 0.2, 0.7)]), looks)
-    assert share == pytest.approx(1, abs=0.02)
+def test_a_gaussian_alone_is_all_visible(model, viewpoints):
+    [fraction] = fractions_of(model_of(model, [ahead(model, 5, 0.2, 0.7)]), viewpoints)
+    assert fraction == pytest.approx(1, abs=0.02)
 
 
-def test_one_behind_an_opaque_wall_is_hidden_and_the_wall_is_not(model, looks):
+def test_one_behind_an_opaque_wall_is_hidden_and_the_wall_is_not(model, viewpoints):
     wall = [ahead(model, 4 + 0.01 * k, 1.0, 0.99) for k in range(4)]
-    shares = shares_of(model_of(model, [*wall, ahead(model, 8, 0.05, 0.7)]), looks)
-    assert shares[0] > 0.8
-    assert shares[-1] < 1e-3
+    fractions = fractions_of(model_of(model, [*wall, ahead(model, 8, 0.05, 0.7)]), viewpoints)
+    assert fractions[0] > 0.8
+    assert fractions[-1] < 1e-3
 
 
-def test_half_of_what_stands_behind_a_half_transparent_wall_is_visible(model, looks):
-    shares = shares_of(
-        model_of(model, [ahead(model, 4, 5.0, 0.5), ahead(model, 8, 0.1, 0.7)]), looks
+def test_half_of_what_stands_behind_a_half_transparent_wall_is_visible(model, viewpoints):
+    fractions = fractions_of(
+        model_of(model, [ahead(model, 4, 5.0, 0.5), ahead(model, 8, 0.1, 0.7)]), viewpoints
     )
-    assert shares[1] == pytest.approx(0.5, abs=0.03)
+    assert fractions[1] == pytest.approx(0.5, abs=0.03)
 
 
-def test_what_is_never_before_a_camera_has_no_share(model, looks):
-    [share] = shares_of(model_of(model, [ahead(model, -5, 0.2, 0.7)]), looks)
-    assert share == 0
+def test_what_is_never_before_a_camera_has_no_visible_fraction(model, viewpoints):
+    [fraction] = fractions_of(model_of(model, [ahead(model, -5, 0.2, 0.7)]), viewpoints)
+    assert fraction == 0
 
 
 def test_sides_of_vehicles_that_training_shows_mirrored_count_as_seen(tiny_log, tiny_scene):
-    looks = Trainer(tiny_log, tiny_scene, TINY, backend="cpu").views.looks()
+    viewpoints = Trainer(tiny_log, tiny_scene, TINY, backend="cpu").views.viewpoints()
     times = np.array([tiny_scene.start_us, tiny_scene.end_us])
 
     def seen(mirror: float) -> torch.Tensor:
         options = replace(TINY, refine_poses=False, mirror=mirror)
         model = SceneModel(tiny_scene, options, times, backend="cpu")
-        return (shares_of(model, looks) > 0.05)[model.gaussians.counts[0] :]
+        return (fractions_of(model, viewpoints) > 0.05)[model.gaussians.counts[0] :]
 
     plain, mirrored = seen(0.0), seen(0.5)
     assert bool((mirrored & ~plain).any())
@@ -133,7 +133,7 @@ def test_sides_of_vehicles_that_training_shows_mirrored_count_as_seen(tiny_log, 
 def test_the_unhindered_weight_is_the_area_of_the_ellipse_on_the_image(model):
     camera = model.scene.rig.cameras[0]
     viewmat = torch.from_numpy(camera.viewmat(model.scene.ego.transform(model.scene.start_us)))
-    [weight] = unhindered_weights(Instance(ahead(model, 5, 0.2, 0.7)), viewmat, camera)
+    [weight] = unoccluded_weights(Instance(ahead(model, 5, 0.2, 0.7)), viewmat, camera)
     squared = (camera.K[0, 0] * 0.2 / 5) ** 2 + 0.3
     assert weight == pytest.approx(0.7 * 2 * math.pi * squared, rel=1e-3)
 
@@ -141,10 +141,10 @@ def test_the_unhindered_weight_is_the_area_of_the_ellipse_on_the_image(model):
 def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     gaussians = some_gaussians()
     optimizer: SelectiveAdam = marked(gaussians)
-    shares = torch.full((len(gaussians),), 0.03)
-    shares[:5] = 0.001
-    seen = Visibility(shares, torch.zeros(len(gaussians)))
-    left = dropped(gaussians, optimizer, seen, object_limits=HiddenLimits(share=0.05))
+    fractions = torch.full((len(gaussians),), 0.03)
+    fractions[:5] = 0.001
+    seen = Visibility(fractions, torch.zeros(len(gaussians)))
+    left = dropped(gaussians, optimizer, seen, object_limits=VisibilityLimits(fraction=0.05))
     assert left.counts == (COUNTS[0] - 5, 0, 0)
     torch.testing.assert_close(optimizer.first["means"], left.means.detach())
     torch.testing.assert_close(left.means, gaussians.means[5 : COUNTS[0]])
@@ -152,9 +152,9 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
 
 def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
     gaussians = some_gaussians()
-    shares, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
-    depths[2], depths[3], shares[3] = 0.5, 0.5, 0.5
-    seen = Visibility(shares, depths)
+    fractions, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
+    depths[2], depths[3], fractions[3] = 0.5, 0.5, 0.5
+    seen = Visibility(fractions, depths)
     left = dropped(gaussians, marked(gaussians), seen)
     kept = [i for i in range(len(gaussians)) if i != 2]
     torch.testing.assert_close(left.means, gaussians.means[kept])
@@ -167,58 +167,58 @@ def test_inside_of_objects_goes_at_less_depth_and_more_share_than_in_the_backgro
     assert left.counts == (COUNTS[0], 0, 0)
 
 
-def test_depth_behind_the_surface_is_measured_along_the_axis(model, looks):
+def test_depth_behind_the_surface_is_measured_along_the_axis(model, viewpoints):
     wall = [ahead(model, 4, 5.0, 0.9)]
-    seen = visibility(model_of(model, [*wall, ahead(model, 8, 0.1, 0.5)]), looks[:1])
+    seen = visibility(model_of(model, [*wall, ahead(model, 8, 0.1, 0.5)]), viewpoints[:1])
     surface = (4 * 0.9 + 8 * 0.1 * 0.5) / (0.9 + 0.1 * 0.5)
     assert float(seen.depths[1]) == pytest.approx(8 - surface, abs=0.15)
     assert float(seen.depths[0]) == pytest.approx(0, abs=0.1)
 
 
-def test_the_sky_is_hidden_behind_what_covers_it_and_where_no_camera_looks(model, looks):
+def test_the_sky_is_hidden_behind_what_covers_it_and_where_no_camera_looks(model, viewpoints):
     wall = [ahead(model, 4, 30.0, 0.99)]
     bare, walled = model_of(model, [ahead(model, -5, 0.1, 0.5)]), model_of(model, wall)
-    open_to_view = ~hidden_sky(bare, looks)
+    open_to_view = ~hidden_sky(bare, viewpoints)
     assert 0 < int(open_to_view.sum()) < open_to_view.numel()
-    assert int((~hidden_sky(walled, looks)).sum()) < 0.8 * int(open_to_view.sum())
+    assert int((~hidden_sky(walled, viewpoints)).sum()) < 0.8 * int(open_to_view.sum())
 
 
 def test_two_packs_are_joined_owner_by_owner():
     a, b = some_gaussians(), some_gaussians()
-    both, of_b = joined(a, b)
+    both, of_b = concatenate(a, b)
     assert both.counts == tuple(2 * n for n in COUNTS)
     torch.testing.assert_close(both.take((~of_b).nonzero()[:, 0]).fourier, a.fourier)
     torch.testing.assert_close(both.take(of_b.nonzero()[:, 0]).means, b.means)
 
 
-def test_guesses_come_back_where_nothing_shows_them_and_nowhere_else(model, looks):
+def test_priors_come_back_where_nothing_shows_them_and_nowhere_else(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99), ahead(model, 4.1, 3.0, 0.99)]
     behind, beside = ahead(model, 8, 0.2, 0.7), ahead(model, 3, 0.2, 0.7)
     trained, first = model_of(model, wall), model_of(model, [*wall, behind, beside])
-    guesses = guesses_behind(trained, first, looks, limit=0.05)
-    torch.testing.assert_close(guesses.means, behind.means)
+    priors = occluded_priors(trained, first, viewpoints, limit=0.05)
+    torch.testing.assert_close(priors.means, behind.means)
     assert len(trained.gaussians) == len(wall)
 
 
-def test_guesses_that_training_has_laid_open_stay_away(model, looks):
+def test_priors_that_training_has_laid_open_stay_away(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     first = model_of(model, [*wall, ahead(model, 8, 0.2, 0.7)])
-    assert len(guesses_behind(trained, first, looks, limit=0.05)) == 0
+    assert len(occluded_priors(trained, first, viewpoints, limit=0.05)) == 0
 
 
-def test_objects_get_back_what_they_hide_though_stage_0_showed_it(model, looks):
+def test_objects_get_back_what_they_hide_though_stage_0_showed_it(model, viewpoints):
     shown, wall = ahead(model, 8, 0.2, 0.7), [ahead(model, 4, 3.0, 0.99)] * 3
     trained, first = model_of(model, wall, subject=wall), model_of(model, [shown], subject=[shown])
-    assert guesses_behind(trained, first, looks, limit=0.05).counts == (0, 1)
+    assert occluded_priors(trained, first, viewpoints, limit=0.05).counts == (0, 1)
 
 
-def test_a_guess_stays_away_though_another_stands_before_it(model, looks):
+def test_a_prior_stays_away_though_another_stands_before_it(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     pair = [ahead(model, 8, 0.2, 0.99), ahead(model, 8.5, 0.1, 0.99)]
     first = model_of(model, [*wall, *pair])
-    assert len(guesses_behind(trained, first, looks, limit=0.05)) == 0
+    assert len(occluded_priors(trained, first, viewpoints, limit=0.05)) == 0
 
 
 def test_training_drops_what_is_hidden_at_its_rounds(tiny_log, tiny_scene):

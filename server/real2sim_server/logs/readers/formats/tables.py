@@ -1,4 +1,4 @@
-"""Text tables of numbers and checks that the readers share; every failure is a LogError."""
+"""Text tables of numbers and checks that the readers fraction; every failure is a LogError."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def _crc_kernel() -> Any:
     return crc32c
 
 
-class Message:
+class ProtoMessage:
     """The fields of one protocol-buffer message, by number; nested messages stay bytes."""
 
     def __init__(self, data: bytes, where: str) -> None:
@@ -132,14 +132,14 @@ class Message:
         except (IndexError, ValueError) as error:
             raise LogError(f"{where}: is no protocol-buffer message ({error})") from error
 
-    def message(self, number: int, name: str) -> Message:
+    def message(self, number: int, name: str) -> ProtoMessage:
         """The nested message of a field; an empty one where it is absent."""
         found = self.messages(number, name)
-        return found[-1] if found else Message(b"", f"{self.where}: {name}")
+        return found[-1] if found else ProtoMessage(b"", f"{self.where}: {name}")
 
-    def messages(self, number: int, name: str) -> list[Message]:
+    def messages(self, number: int, name: str) -> list[ProtoMessage]:
         """All nested messages of a repeated field."""
-        return [Message(value, f"{self.where}: {name}") for value in self.blobs(number)]
+        return [ProtoMessage(value, f"{self.where}: {name}") for value in self.blobs(number)]
 
     def blobs(self, number: int) -> list[bytes]:
         """All values of a repeated field of bytes."""

@@ -17,9 +17,9 @@ from ....geometry.rotation import Float
 from ....geometry.transform import invert_transform
 from ....scene import Trajectory
 from ...driving_log import DrivingLog, LogError, ObjectTrack
-from ..box_tracks import Box, build_tracks, upright_pose
-from ..choice import choose_sequence
+from ..box_tracks import FrameBox, build_tracks, upright_pose
 from ..formats.tables import check_frame_times, check_images, read_lines, read_number_table
+from ..selection import select_sequence
 from .files import KittiCalibration, calibration_from, oxts_poses, read_entries
 from .tracking import KITTI_EGO_SIZE, MISSING_SCANS, KittiSource, read_rig
 
@@ -52,7 +52,7 @@ class KittiRawReader:
             LogError: see :class:`LogReader`.
         """
         drives = _drives(path)
-        drive = drives[choose_sequence(path, sorted(drives), sequence)]
+        drive = drives[select_sequence(path, sorted(drives), sequence)]
         calibration_file, calibration = _read_calibration(drive)
         images = _image_files(drive)
         count = len(images[MAIN])
@@ -178,7 +178,7 @@ def _read_tracklets(
                 raise LogError(f"{where}: frame {first + i} is not in 0 to {len(times_us) - 1}")
             local = upright_pose((x, y, z + height / 2), heading)
             boxes.append(
-                Box(
+                FrameBox(
                     key=str(number),
                     category=CATEGORIES.get(kind, kind),
                     size=(length, width, height),

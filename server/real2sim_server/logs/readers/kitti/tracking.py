@@ -31,7 +31,7 @@ from .files import (
     read_times,
 )
 
-TURN_US = 100_000
+SWEEP_US = 100_000
 MISSING_SCANS = {"0001": range(177, 181)}
 """Scans that the published data set lacks, by sequence; these frames get an empty sweep."""
 
@@ -250,7 +250,7 @@ class KittiSource:
         return LidarSweep(
             points=compensate_sweep(in_vehicle, offset, self.vehicle_poses, frame),
             intensity=np.clip(scan[:, 3], 0, 1),
-            offset_us=np.round(offset * TURN_US).astype(np.int32),
+            offset_us=np.round(offset * SWEEP_US).astype(np.int32),
             origin=self.T_vehicle_velo[:3, 3].astype(np.float32),
         )
 

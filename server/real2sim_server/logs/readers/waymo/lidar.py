@@ -79,12 +79,12 @@ class RangeImage:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """Times of one turn of the TOP laser, which goes from behind over the left to the front.
+class SweepTiming:
+    """Times of one sweep of the TOP laser, which goes from behind over the left to the front.
 
     Attributes:
         start_us: of the first column, relative to the frame's time stamp.
-        duration_us: of the turn.
+        duration_us: of the sweep.
     """
 
     start_us: float
@@ -92,7 +92,7 @@ class Turn:
 
 
 def merge_range_images(
-    images: Iterable[RangeImage], T_world_vehicle: Float, turn: Turn
+    images: Iterable[RangeImage], T_world_vehicle: Float, timing: SweepTiming
 ) -> LidarSweep:
     """All points of a frame in its vehicle frame.
 
@@ -102,7 +102,7 @@ def merge_range_images(
     Args:
         images: all returns of all lasers.
         T_world_vehicle: pose of the frame [4, 4], in the world of the pixel poses.
-        turn: when the columns of the TOP laser were measured.
+        timing: when the columns of the TOP laser were measured.
     """
     points, intensities, offsets = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
     origin = np.zeros(3)
@@ -111,8 +111,8 @@ def merge_range_images(
         points.append(found)
         intensities.append(np.clip(image.values[row, column, 1], 0, 1))
         width = image.values.shape[1]
-        share = (column + 0.5) / width * turn.duration_us + turn.start_us
-        offsets.append(share if image.laser.number == TOP else np.zeros(len(column)))
+        fraction = (column + 0.5) / width * timing.duration_us + timing.start_us
+        offsets.append(fraction if image.laser.number == TOP else np.zeros(len(column)))
         if image.laser.number == TOP or not origin.any():
             origin = image.laser.T_vehicle_laser[:3, 3]
     return LidarSweep(

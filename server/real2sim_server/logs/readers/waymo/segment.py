@@ -19,10 +19,10 @@ from ....geometry.transform import invert_transform
 from ....scene import Camera, CameraRig, Trajectory
 from ....scene.camera import T_VEHICLE_OPTICAL
 from ...driving_log import DrivingLog, FrameSource, LogError
-from ..box_tracks import Box, build_tracks, upright_pose
+from ..box_tracks import FrameBox, build_tracks, upright_pose
 from ..formats.tables import check_frame_times, check_rigid
 from ..lens import Lens
-from .lidar import Turn
+from .lidar import SweepTiming
 
 CAMERA_NAMES = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 FRONT = 1
@@ -40,7 +40,7 @@ TRUCK_LENGTH = 7.0
 EGO_SIZE = (5.18, 2.05, 1.78)
 """Chrysler Pacifica without its roof sensors [m]."""
 
-TURN_US = 100_000
+SWEEP_US = 100_000
 LICENCE = "Waymo Open Dataset terms, non-commercial"
 
 
@@ -134,14 +134,14 @@ class WaymoFrame:
     def time_us(self) -> int:
         """When ``pose`` holds [us]."""
         front = self.images.get(FRONT)
-        return front.time_us if front is not None else self.start_us + TURN_US // 2
+        return front.time_us if front is not None else self.start_us + SWEEP_US // 2
 
 
-def turns(frames: Sequence[WaymoFrame]) -> list[Turn]:
-    """When the TOP laser turned, frame by frame."""
+def sweep_timings(frames: Sequence[WaymoFrame]) -> list[SweepTiming]:
+    """When the TOP laser swept, frame by frame."""
     starts = np.array([f.start_us for f in frames])
-    duration = float(np.median(np.diff(starts))) if len(starts) > 1 else float(TURN_US)
-    return [Turn(f.start_us - f.time_us, duration) for f in frames]
+    duration = float(np.median(np.diff(starts))) if len(starts) > 1 else float(SWEEP_US)
+    return [SweepTiming(f.start_us - f.time_us, duration) for f in frames]
 
 
 def build_waymo_log(
@@ -208,7 +208,7 @@ def _pinhole(camera: WaymoCamera) -> Camera:
     return Camera(camera.name, lens.width, lens.height, lens.pinhole_K, camera.T_vehicle_camera)
 
 
-def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[Box]:
+def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[FrameBox]:
     boxes = []
     for frame in frames:
         to_world = to_first @ frame.pose
@@ -216,7 +216,7 @@ def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[Box]:
             if not np.isfinite([*box.centre, box.heading]).all():
                 raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
             boxes.append(
-                Box(
+                FrameBox(
                     key=box.key,
                     category=_category(box),
                     size=box.size,

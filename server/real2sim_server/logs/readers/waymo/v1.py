@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from ....geometry.rotation import Float
 from ...driving_log import DrivingLog, LidarSweep, LogError
 from ...images import check_encoded_image, decode_image
-from ..choice import choose_sequence
-from ..formats.wire_format import Message, Record, list_records, read_record
-from .lidar import TOP, Laser, RangeImage, Turn, merge_range_images
+from ..formats.wire_format import ProtoMessage, Record, list_records, read_record
+from ..selection import select_sequence
+from .lidar import TOP, Laser, RangeImage, SweepTiming, merge_range_images
 from .segment import (
     WaymoBox,
     WaymoCamera,
     WaymoFrame,
     WaymoImage,
     build_waymo_log,
-    turns,
+    sweep_timings,
     waymo_camera,
 )
 
@@ -53,19 +53,19 @@ class WaymoV1Reader:
         Raises:
             LogError: see :class:`LogReader`.
         """
-        name = choose_sequence(path, sorted(p.stem for p in path.glob(f"*{SUFFIX}")), sequence)
+        name = select_sequence(path, sorted(p.stem for p in path.glob(f"*{SUFFIX}")), sequence)
         file = path / f"{name}{SUFFIX}"
         records = list_records(file)
         frames, first = [], None
         for i, record in enumerate(records):
-            message = Message(read_record(file, record), f"{file} frame {i}")
+            message = ProtoMessage(read_record(file, record), f"{file} frame {i}")
             frames.append(_read_frame(message))
             first = first or message.message(1, "context")
         assert first is not None
         cameras = [_read_camera(m) for m in first.messages(2, "camera_calibrations")]
         lasers = [_read_laser(m) for m in first.messages(3, "laser_calibrations")]
         source = _WaymoV1Source(
-            file, records, {c.name: c for c in cameras}, lasers, frames, turns(frames)
+            file, records, {c.name: c for c in cameras}, lasers, frames, sweep_timings(frames)
         )
         return build_waymo_log(
             name=f"waymo_{first.text(1) or name}",
@@ -81,7 +81,7 @@ class WaymoV1Reader:
         )
 
 
-def _read_camera(message: Message) -> WaymoCamera:
+def _read_camera(message: ProtoMessage) -> WaymoCamera:
     return waymo_camera(
         message.integer(1),
         size=(message.integer(4), message.integer(5)),
@@ -92,7 +92,7 @@ def _read_camera(message: Message) -> WaymoCamera:
     )
 
 
-def _read_laser(message: Message) -> Laser:
+def _read_laser(message: ProtoMessage) -> Laser:
     beams = message.doubles(2)
     return Laser(
         number=message.integer(1),
@@ -102,14 +102,14 @@ def _read_laser(message: Message) -> Laser:
     )
 
 
-def _transform(message: Message, number: int, name: str) -> Float:
+def _transform(message: ProtoMessage, number: int, name: str) -> Float:
     values = message.message(number, name).doubles(1)
     if len(values) != 16:
         raise LogError(f"{message.where}: {name} must hold 16 numbers, not {len(values)}")
     return values.reshape(4, 4)
 
 
-def _read_frame(message: Message) -> WaymoFrame:
+def _read_frame(message: ProtoMessage) -> WaymoFrame:
     images = {}
     for image in message.messages(4, "image"):
         readout = image.number(8) - image.number(7) - image.number(6)
@@ -123,7 +123,7 @@ def _read_frame(message: Message) -> WaymoFrame:
     )
 
 
-def _read_box(message: Message) -> WaymoBox:
+def _read_box(message: ProtoMessage) -> WaymoBox:
     box = message.message(1, "box")
     x, y, z, width, length, height, heading = (box.number(i) for i in range(1, 8))
     key = message.text(4)
@@ -144,9 +144,9 @@ class _WaymoV1Source:
     cameras: dict[str, WaymoCamera]
     lasers: Sequence[Laser]
     frames: Sequence[WaymoFrame]
-    turns: Sequence[Turn]
+    timings: Sequence[SweepTiming]
     _lock: threading.Lock = field(default_factory=threading.Lock)
-    _latest: dict[int, Message] = field(default_factory=dict)
+    _latest: dict[int, ProtoMessage] = field(default_factory=dict)
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         data, where = self._encoded(camera, frame)
@@ -161,7 +161,7 @@ class _WaymoV1Source:
 
     def lidar(self, frame: int) -> LidarSweep:
         images = _range_images(self._message(frame), self.lasers)
-        return merge_range_images(images, self.frames[frame].pose, self.turns[frame])
+        return merge_range_images(images, self.frames[frame].pose, self.timings[frame])
 
     def _encoded(self, camera: str, frame: int) -> tuple[bytes, str]:
         number = self.cameras[camera].number
@@ -170,17 +170,17 @@ class _WaymoV1Source:
                 return image.blob(2), f"{image.where} of camera {camera!r}"
         raise LogError(f"{self.file} frame {frame}: has no image of camera {camera!r}")
 
-    def _message(self, frame: int) -> Message:
+    def _message(self, frame: int) -> ProtoMessage:
         """The frame's message; the latest is kept, since all cameras of a frame are in one."""
         with self._lock:
             if frame not in self._latest:
                 payload = read_record(self.file, self.records[frame])
                 self._latest.clear()
-                self._latest[frame] = Message(payload, f"{self.file} frame {frame}")
+                self._latest[frame] = ProtoMessage(payload, f"{self.file} frame {frame}")
             return self._latest[frame]
 
 
-def _range_images(frame: Message, lasers: Sequence[Laser]) -> list[RangeImage]:
+def _range_images(frame: ProtoMessage, lasers: Sequence[Laser]) -> list[RangeImage]:
     by_number = {laser.number: laser for laser in lasers}
     images = []
     for message in frame.messages(5, "laser"):
@@ -200,10 +200,10 @@ def _range_images(frame: Message, lasers: Sequence[Laser]) -> list[RangeImage]:
     return images
 
 
-def _matrix(message: Message, number: int, *, channels: int) -> NDArray[np.float32]:
+def _matrix(message: ProtoMessage, number: int, *, channels: int) -> NDArray[np.float32]:
     """[H, W, C >= channels] of a zlib-compressed ``MatrixFloat``."""
     try:
-        matrix = Message(zlib.decompress(message.blob(number)), message.where)
+        matrix = ProtoMessage(zlib.decompress(message.blob(number)), message.where)
     except zlib.error as error:
         raise LogError(f"{message.where}: a compressed matrix is broken ({error})") from error
     shape, values = matrix.message(2, "shape").integers(1), matrix.floats(1)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ....geometry.rotation import Float
 from ...driving_log import DrivingLog, LidarSweep, LogError
 from ...images import check_encoded_image, decode_image
-from ..choice import choose_sequence
 from ..formats.parquet_files import ParquetFile
-from .lidar import TOP, Laser, RangeImage, Turn, merge_range_images
+from ..selection import select_sequence
+from .lidar import TOP, Laser, RangeImage, SweepTiming, merge_range_images
 from .segment import (
     CAMERA_NAMES,
     WaymoBox,
@@ -26,7 +26,7 @@ from .segment import (
     WaymoFrame,
     WaymoImage,
     build_waymo_log,
-    turns,
+    sweep_timings,
     waymo_camera,
 )
 
@@ -70,8 +70,8 @@ class WaymoV2Reader:
         """
         root = _split(path)
         known = sorted(p.stem for p in (root / "vehicle_pose").glob("*.parquet"))
-        segment = choose_sequence(root / "vehicle_pose", known, sequence)
-        files = _Files(root, segment)
+        segment = select_sequence(root / "vehicle_pose", known, sequence)
+        files = _SegmentFiles(root, segment)
         cameras = _read_cameras(files)
         images = _read_images(files)
         frames = _read_frames(files, images, _read_boxes(files))
@@ -81,7 +81,7 @@ class WaymoV2Reader:
             cameras={c.name: c for c in cameras},
             lidar_files=_open_lidar(files),
             frames=tuple(frames),
-            turns=tuple(turns(frames)),
+            timings=tuple(sweep_timings(frames)),
         )
         return build_waymo_log(
             name=f"waymo_{segment}",
@@ -103,7 +103,7 @@ def _split(path: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class _Files:
+class _SegmentFiles:
     """The Parquet files of one segment."""
 
     root: Path
@@ -119,7 +119,7 @@ class _Files:
         return self.open(component) if self.path(component).exists() else None
 
 
-def _read_cameras(files: _Files) -> list[WaymoCamera]:
+def _read_cameras(files: _SegmentFiles) -> list[WaymoCamera]:
     file = files.optional("camera_calibration")
     if file is None:
         if files.path("camera_image").exists():
@@ -150,7 +150,7 @@ def _transforms(file: ParquetFile, name: str) -> Float:
     return values.reshape(-1, 4, 4)
 
 
-def _read_images(files: _Files) -> dict[tuple[int, int], tuple[int, WaymoImage]]:
+def _read_images(files: _SegmentFiles) -> dict[tuple[int, int], tuple[int, WaymoImage]]:
     """Row and pose of every image, by camera number and frame time stamp."""
     file = files.optional("camera_image")
     if file is None:
@@ -183,7 +183,7 @@ def _readout_seconds(file: ParquetFile) -> Float:
     return seconds
 
 
-def _read_boxes(files: _Files) -> dict[int, list[WaymoBox]]:
+def _read_boxes(files: _SegmentFiles) -> dict[int, list[WaymoBox]]:
     file = files.optional("lidar_box")
     boxes: dict[int, list[WaymoBox]] = defaultdict(list)
     if file is None:
@@ -207,7 +207,7 @@ def _read_boxes(files: _Files) -> dict[int, list[WaymoBox]]:
 
 
 def _read_frames(
-    files: _Files,
+    files: _SegmentFiles,
     images: Mapping[tuple[int, int], tuple[int, WaymoImage]],
     boxes: Mapping[int, list[WaymoBox]],
 ) -> list[WaymoFrame]:
@@ -215,9 +215,9 @@ def _read_frames(
     times, poses = file.numbers(TIME).tolist(), _transforms(file, POSE)
     if len(times) == 0:
         raise LogError(f"{file.path}: holds no poses")
-    strangers = ({t for _, t in images} | set(boxes)) - set(times)
-    if strangers:
-        raise LogError(f"{file.path}: has no pose for the frame of {min(strangers)} us")
+    unmatched = ({t for _, t in images} | set(boxes)) - set(times)
+    if unmatched:
+        raise LogError(f"{file.path}: has no pose for the frame of {min(unmatched)} us")
     by_time: dict[int, dict[int, WaymoImage]] = defaultdict(dict)
     for (number, time), (_, image) in images.items():
         by_time[time][number] = image
@@ -238,7 +238,7 @@ class _Lidar:
     pose_rows: Mapping[tuple[int, int], int]
 
 
-def _open_lidar(files: _Files) -> _Lidar | None:
+def _open_lidar(files: _SegmentFiles) -> _Lidar | None:
     ranges = files.optional("lidar")
     if ranges is None:
         return None
@@ -284,7 +284,7 @@ class _WaymoV2Source:
     cameras: Mapping[str, WaymoCamera]
     lidar_files: _Lidar | None
     frames: tuple[WaymoFrame, ...]
-    turns: tuple[Turn, ...]
+    timings: tuple[SweepTiming, ...]
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         data, where = self._encoded(camera, frame)
@@ -300,7 +300,7 @@ class _WaymoV2Source:
     def lidar(self, frame: int) -> LidarSweep:
         files, here = self.lidar_files, self.frames[frame]
         images = [] if files is None else _range_images(files, here.start_us)
-        return merge_range_images(images, here.pose, self.turns[frame])
+        return merge_range_images(images, here.pose, self.timings[frame])
 
     def _encoded(self, camera: str, frame: int) -> tuple[bytes, str]:
         number, start_us = self.cameras[camera].number, self.frames[frame].start_us

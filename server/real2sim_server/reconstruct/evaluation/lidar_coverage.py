@@ -1,4 +1,7 @@
-"""How close rendered views come to the logged images."""
+"""PSNR of logged views over all pixels, and over those that the LiDAR covers.
+
+Figures of a reconstruction report; :mod:`.scores` holds the full evaluation.
+"""
 
 from __future__ import annotations
 
@@ -10,36 +13,36 @@ from numpy.typing import NDArray
 
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
-from ...render import RasterOptions, render_cameras
 from ...scene import Camera, Scene
 from ..options import ReconstructError
+from ..training.data import resized
 from .image_metrics import psnr
-from .rendering import scene_instances
+from .rendering import render_logged_view
 
 NEAR = 0.5
 """LiDAR points nearer to the camera plane do not count as covering [m]."""
 
 
 @dataclass(frozen=True)
-class ViewScore:
+class CoverageScore:
     """One rendered view against its logged image.
 
     Attributes:
         camera, frame: which view.
         psnr: over all pixels [dB].
         psnr_lidar: over the pixels that LiDAR covers [dB]; nan where there are none.
-        lidar_share: share of pixels that LiDAR covers, 0 to 1.
+        lidar_fraction: fraction of pixels that LiDAR covers, 0 to 1.
     """
 
     camera: str
     frame: int
     psnr: float
     psnr_lidar: float
-    lidar_share: float
+    lidar_fraction: float
 
 
 @dataclass(frozen=True)
-class EvaluationReport:
+class CoverageReport:
     """Scores of several views.
 
     Attributes:
@@ -47,7 +50,7 @@ class EvaluationReport:
         psnr, psnr_lidar: means of the views' values [dB].
     """
 
-    views: tuple[ViewScore, ...]
+    views: tuple[CoverageScore, ...]
     psnr: float
     psnr_lidar: float
 
@@ -59,7 +62,7 @@ def evaluate_views(
     frames: Sequence[int],
     cameras: Sequence[str] | None = None,
     width: int | None = None,
-) -> EvaluationReport:
+) -> CoverageReport:
     """Render logged views and compare them with the logged images.
 
     A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least NEAR in
@@ -83,28 +86,11 @@ def evaluate_views(
     views = tuple(
         _score(scene, log, log.rig[name], frame, width) for frame in frames for name in names
     )
-    return EvaluationReport(
+    return CoverageReport(
         views=views,
         psnr=_mean([v.psnr for v in views]),
         psnr_lidar=_mean([v.psnr_lidar for v in views]),
     )
-
-
-def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.uint8]:
-    """RGB [H, W, 3] of ``camera`` on the recording vehicle at ``t_us``, objects as recorded.
-
-    Raises:
-        TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
-    """
-    options = RasterOptions(depth=False, instance=False)
-    [frame] = render_cameras(
-        scene_instances(scene, t_us),
-        [camera],
-        scene.ego.transform(t_us),
-        sky=scene.sky,
-        options=options,
-    )
-    return frame.rgb
 
 
 def lidar_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
@@ -128,24 +114,15 @@ def lidar_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]
 
 def _score(
     scene: Scene, log: DrivingLog, camera: Camera, frame: int, width: int | None
-) -> ViewScore:
+) -> CoverageScore:
     truth = log.image(camera.name, frame)
     camera = camera if width is None else camera.resized(width)
-    truth = _resized(truth, camera)
+    truth = resized(truth, camera)
     image = render_logged_view(scene, camera, int(log.frame_times_us[frame]))
     mask = lidar_mask(log, camera, frame)
-    return ViewScore(
+    return CoverageScore(
         camera.name, frame, psnr(image, truth), psnr(image, truth, mask), float(mask.mean())
     )
-
-
-def _resized(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    import cv2
-
-    if image.shape[1] == camera.width:
-        return image
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _mean(values: list[float]) -> float:

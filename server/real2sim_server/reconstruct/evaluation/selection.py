@@ -10,12 +10,12 @@ from ...scene import Camera, Scene
 from ..options import ReconstructError
 from ..training.data import held_out_frames, image_time
 
-EVERY = 4
+DEFAULT_HOLD_OUT = 4
 """One of so many frames is held out where a scene does not say otherwise."""
 
 
 @dataclass(frozen=True)
-class ChosenFrames:
+class SelectedFrames:
     """Frames to compare.
 
     Attributes:
@@ -27,7 +27,7 @@ class ChosenFrames:
     unseen: bool
 
 
-def choose_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) -> ChosenFrames:
+def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) -> SelectedFrames:
     """The frames that are asked for.
 
     ``held-out`` means those that training kept back, as the scene's provenance lists them. A
@@ -40,9 +40,11 @@ def choose_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) ->
     Raises:
         ReconstructError: an unknown word, no frame, or one the log or the scene's path lacks.
     """
-    listed = _kept_back(scene)
+    listed = _held_out(scene)
     if frames == "held-out":
-        chosen = listed or held_out_frames(log.frame_count, EVERY) or [log.frame_count // 2]
+        chosen = (
+            listed or held_out_frames(log.frame_count, DEFAULT_HOLD_OUT) or [log.frame_count // 2]
+        )
     elif frames == "all":
         chosen = list(range(log.frame_count))
     elif isinstance(frames, str):
@@ -50,10 +52,10 @@ def choose_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) ->
     else:
         chosen = sorted(set(frames))
     _check(scene, log, chosen)
-    return ChosenFrames(tuple(chosen), bool(listed) and set(chosen) <= set(listed))
+    return SelectedFrames(tuple(chosen), bool(listed) and set(chosen) <= set(listed))
 
 
-def compared_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Camera, ...]:
+def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Camera, ...]:
     """The log's cameras, calibrated as the scene has them, at ``width`` or as logged [px].
 
     Raises:
@@ -73,7 +75,7 @@ def compared_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[
     )
 
 
-def _kept_back(scene: Scene) -> list[int]:
+def _held_out(scene: Scene) -> list[int]:
     reconstruction = scene.provenance.get("reconstruction")
     listed = reconstruction.get("held_out_frames") if isinstance(reconstruction, dict) else None
     return sorted({int(frame) for frame in listed}) if listed else []

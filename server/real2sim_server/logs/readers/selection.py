@@ -9,7 +9,7 @@ from ..driving_log import LogError
 SHOWN = 20
 
 
-def choose_sequence(folder: Path, known: list[str], sequence: str | None) -> str:
+def select_sequence(folder: Path, known: list[str], sequence: str | None) -> str:
     """``sequence``, or the only one that is known.
 
     Raises:
