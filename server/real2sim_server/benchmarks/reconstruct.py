@@ -15,7 +15,8 @@ import torch
 from ..logs import DrivingLog
 from ..reconstruct.initialise.stage0 import initialise_scene
 from ..reconstruct.options import InitialiseOptions
-from ..reconstruct.training.schedule import DensifyOptions, TrainOptions
+from ..reconstruct.training.densify import DensifyOptions
+from ..reconstruct.training.schedule import TrainOptions
 from ..reconstruct.training.threads import one_torch_thread
 from ..reconstruct.training.trainer import Trainer
 from ..scene import GaussianCloud, Scene

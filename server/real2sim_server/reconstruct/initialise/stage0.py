@@ -203,8 +203,8 @@ def _keep_real_walls(
 
     placed = PlacedSurfels(parts.surfels, parts.instance)
     samples = gather_views(log, placed, frames=frames, slots=options.samples, on_view=on_view)
-    colours, known = (values[parts.walls] for values in samples.mean())
-    real = real_walls(colours, known, samples.deviation()[parts.walls])
+    colours, known = samples.mean()
+    real = real_walls(colours[parts.walls], known[parts.walls], samples.deviation()[parts.walls])
     return parts.without(parts.walls.start + np.flatnonzero(~real))
 
 

@@ -2,12 +2,13 @@
 
 from .boxes import smoothed_boxes, with_box_noise
 from .data import held_out_frames, training_log
+from .densify import DensifyOptions
 from .held_out import HeldOutScore, score_held_out
 from .losses import LossWeights
 from .model import SceneModel
 from .progress import OnTraining, TrainingProgress
 from .run import TrainResult, train
-from .schedule import PRESETS, DensifyOptions, LearningRates, TrainOptions, preset
+from .schedule import PRESETS, LearningRates, TrainOptions, preset
 from .trainer import Trainer
 
 __all__ = [

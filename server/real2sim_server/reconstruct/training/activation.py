@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from . import activation_kernels as kernels
@@ -105,9 +106,12 @@ class _Activate(torch.autograd.Function):
         scales, opacities = torch.empty_like(log_scales), torch.empty_like(logits)
         colours = sh.new_empty(len(sh), functions, 3)
         starts = np.array(first_rows(counts))
-        arrays = (log_scales, logits, sh, fourier, tones)
         kernels.activate_rows(
-            *(tensor.detach().contiguous().numpy() for tensor in arrays),
+            _array(log_scales),
+            _array(logits),
+            _array(sh),
+            _array(fourier),
+            _array(tones),
             starts,
             scales.numpy(),
             opacities.numpy(),
@@ -124,10 +128,23 @@ class _Activate(torch.autograd.Function):
         if not tones.shape[1]:
             by_fourier.zero_()
         gradients = (torch.empty_like(scales), torch.empty_like(opacities), by_sh, by_fourier)
-        arrays = (*by_outputs, scales, opacities, tones)
+        by_scales, by_opacities, by_colours = by_outputs
+        by_log_scales, by_logits = gradients[:2]
         kernels.activate_backward(
-            *(tensor.detach().contiguous().numpy() for tensor in arrays),
+            _array(by_scales),
+            _array(by_opacities),
+            _array(by_colours),
+            _array(scales),
+            _array(opacities),
+            _array(tones),
             ctx.starts,
-            *(gradient.numpy() for gradient in gradients),
+            by_log_scales.numpy(),
+            by_logits.numpy(),
+            by_sh.numpy(),
+            by_fourier.numpy(),
         )
         return (*gradients, None, None, None)
+
+
+def _array(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.detach().contiguous().numpy()

@@ -15,8 +15,18 @@ from ..._files import atomic_folder
 from ..options import ReconstructError
 
 FORMAT = "real2sim-training"
-VERSION = 3
+VERSION = 4
 STATE_FILE, TENSOR_FILE = "state.json", "state.safetensors"
+KEYS_OF_VERSION_3 = {
+    "guess_counts": "prior_counts",
+    "guess_round": "prior_round",
+    "rates": "learning_rates",
+    "share": "fraction",
+    "buried_share": "occluded_fraction",
+    "buried_depth": "occluded_depth",
+}
+PRIORS_OF_VERSION_3 = "guesses."
+"""Version 3 is the same under other names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +82,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise ReconstructError(f"{folder}: no checkpoint of a training run") from error
     except (ValueError, OSError, SafetensorError) as error:
         raise ReconstructError(f"{folder}: damaged checkpoint: {error}") from error
+    if state.get("format") == FORMAT and state.get("version") == 3:
+        state, tensors = _upgraded(state), {_upgraded_name(k): t for k, t in tensors.items()}
     if state.pop("format", None) != FORMAT or state.pop("version", None) != VERSION:
         raise ReconstructError(
             f"{path}: not a checkpoint of version {VERSION} of {FORMAT}; train from the start"
@@ -79,3 +91,17 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     for name in ("counts", "prior_counts"):
         state[name] = tuple(state[name])
     return Checkpoint(**state, tensors=tensors)
+
+
+def _upgraded(values: Any) -> Any:
+    """JSON values of version 3 under the names of VERSION."""
+    if not isinstance(values, dict):
+        return values
+    renamed = {KEYS_OF_VERSION_3.get(key, key): _upgraded(v) for key, v in values.items()}
+    return renamed | ({"version": VERSION} if "version" in renamed else {})
+
+
+def _upgraded_name(tensor: str) -> str:
+    if tensor.startswith(PRIORS_OF_VERSION_3):
+        return "priors." + tensor.removeprefix(PRIORS_OF_VERSION_3)
+    return tensor

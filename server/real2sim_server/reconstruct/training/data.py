@@ -113,9 +113,9 @@ class TrainingViews:
         without = set(log.provenance.get("cameras_without_images", ()))
         names = [name for name in log.rig.names if name not in without]
         self._keys = [(name, frame) for frame in frames for name in names]
-        self._kept: OrderedDict[int, _CachedImage] = OrderedDict()
+        self._cache: OrderedDict[int, _CachedImage] = OrderedDict()
         self._nbytes = 0
-        self._coming: dict[int, Future[_CachedImage]] = {}
+        self._pending: dict[int, Future[_CachedImage]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="views")
 
     def __len__(self) -> int:
@@ -133,7 +133,12 @@ class TrainingViews:
             found.append((camera, image_time(self._log, name, frame)))
         return found
 
-    def order(self, iteration: int) -> int:
+    def sample_viewpoints(self, count: int) -> list[tuple[Camera, int]]:
+        """At most ``count`` of :meth:`viewpoints`, drawn at random."""
+        viewpoints = self.viewpoints()
+        return [viewpoints[self.index_at(k)] for k in range(min(count, len(viewpoints)))]
+
+    def index_at(self, iteration: int) -> int:
         """Index of the view of ``iteration``: all in random order, then all in another."""
         epoch, place = divmod(iteration, len(self))
         rng = np.random.Generator(np.random.Philox(key=[self._options.seed, epoch]))
@@ -142,9 +147,9 @@ class TrainingViews:
     def prefetch(self, iteration: int) -> None:
         """Begin to read what the next iterations will ask for."""
         for ahead in range(1, PREFETCH + 1):
-            index = self.order(iteration + ahead)
-            if index not in self._kept and index not in self._coming:
-                self._coming[index] = self._pool.submit(self._read, index)
+            index = self.index_at(iteration + ahead)
+            if index not in self._cache and index not in self._pending:
+                self._pending[index] = self._pool.submit(self._read, index)
 
     def view(self, index: int, divisor: int = 1) -> TrainingView:
         """The view at ``index``, at a ``divisor``-th of the training width.
@@ -172,15 +177,15 @@ class TrainingViews:
         return min(options.width or camera.width, options.max_width, camera.width)
 
     def _stored(self, index: int) -> _CachedImage:
-        if index in self._kept:
-            self._kept.move_to_end(index)
-            return self._kept[index]
-        coming = self._coming.pop(index, None)
-        stored = coming.result() if coming is not None else self._read(index)
-        self._kept[index] = stored
+        if index in self._cache:
+            self._cache.move_to_end(index)
+            return self._cache[index]
+        pending = self._pending.pop(index, None)
+        stored = pending.result() if pending is not None else self._read(index)
+        self._cache[index] = stored
         self._nbytes += stored.nbytes
-        while self._nbytes > self._options.image_bytes and len(self._kept) > 1:
-            self._nbytes -= self._kept.popitem(last=False)[1].nbytes
+        while self._nbytes > self._options.image_bytes and len(self._cache) > 1:
+            self._nbytes -= self._cache.popitem(last=False)[1].nbytes
         return stored
 
     def _read(self, index: int) -> _CachedImage:

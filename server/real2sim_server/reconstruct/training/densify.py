@@ -1,29 +1,95 @@
-"""Where Gaussians are added and removed: by gradients on the image, or by moving dead ones."""
+"""Strategies of densification: when Gaussians are added and removed, and which.
+
+A strategy is called twice a step, as in gsplat: :meth:`Strategy.step_pre_backward` with what
+was drawn and :meth:`Strategy.step_post_backward` after the optimiser's step. What it does to the
+Gaussians are the functions of :mod:`.operations`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ...render import ScreenStatistics
-from . import relocation
-from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
+from ...render import RenderOutput, ScreenStatistics
+from ..options import ReconstructError
+from . import operations
+from .gaussians import Gaussians
 from .optimizer import SelectiveAdam
-from .schedule import DensifyOptions
 
-SPLIT_SHRINK = 1.6
-"""By which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
-RESET_OPACITY = 0.01
 BOX_MARGIN = 1.15
 """Objects' Gaussians may stick out of their boxes by this factor: mirrors, antennas, bad boxes."""
 
 
+@dataclass(frozen=True)
+class VisibilityLimits:
+    """Which Gaussians count as hidden: see :mod:`.visibility`.
+
+    Attributes:
+        fraction: visible fraction up to which all are.
+        occluded_fraction: visible fraction up to which those are that lie deep behind a surface.
+        occluded_depth: how deep that is [m].
+    """
+
+    fraction: float = 0.005
+    occluded_fraction: float = 0.03
+    occluded_depth: float = 0.3
+
+
+@dataclass(frozen=True)
+class DensifyOptions:
+    """When and how Gaussians are added and removed.
+
+    Attributes:
+        method: name of a strategy, see STRATEGIES.
+        start, stop: fraction of all iterations between which it happens.
+        every: iterations from one round to the next.
+        max_gaussians: never more than so many.
+        background_gradient: absgrad on the image above which background grows.
+        object_gradient: plain gradient above which objects grow.
+        split_scale: Gaussians larger than this are split, smaller ones duplicated [m].
+        min_opacity: below it Gaussians are removed, or moved by ``mcmc``.
+        max_scale: larger ones near the drive are removed [m].
+        reset_every: iterations between resets of opacity; 0 for never.
+        noise: of ``mcmc``: factor on the learning rate of means.
+        growth: of ``mcmc``: fraction by which the number grows in a round.
+        hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
+        prior_round: fraction of all iterations at which they are pruned once more, and priors of
+            stage 0 take their places; what stands before these closes up in the rest.
+        background_limits: of what counts as hidden in the background.
+        object_limits: likewise in objects.
+        last_object_limits: likewise when priors take their places; what a window shows of an
+            object's inside is hardly ever learnt well, and is better drawn as the window's colour.
+    """
+
+    method: str = "gradient"
+    start: float = 0.02
+    stop: float = 0.5
+    every: int = 100
+    max_gaussians: int = 1_000_000
+    background_gradient: float = 6e-4
+    object_gradient: float = 2e-4
+    split_scale: float = 0.2
+    min_opacity: float = 0.005
+    max_scale: float = 4.0
+    reset_every: int = 3000
+    noise: float = 5e5
+    growth: float = 0.05
+    hidden_rounds: tuple[float, ...] = (0.35, 0.6)
+    prior_round: float = 0.85
+    background_limits: VisibilityLimits = field(default_factory=VisibilityLimits)
+    object_limits: VisibilityLimits = field(
+        default_factory=lambda: VisibilityLimits(0.01, occluded_fraction=0.03, occluded_depth=0.3)
+    )
+    last_object_limits: VisibilityLimits = field(
+        default_factory=lambda: VisibilityLimits(0.03, occluded_fraction=0.3, occluded_depth=0.15)
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class ScreenSums:
-    """What was seen on images since the last round.
+    """What was visible on images since the last round.
 
     Attributes:
         gradients: [N, 2] float32 sums, see ScreenStatistics.
@@ -35,7 +101,7 @@ class ScreenSums:
 
     @classmethod
     def zeros(cls, count: int) -> ScreenSums:
-        """For ``count`` Gaussians that were not seen yet."""
+        """For ``count`` Gaussians that were not visible yet."""
         return cls(torch.zeros(count, 2), torch.zeros(count))
 
     def add(self, rows: list[slice], screen: ScreenStatistics) -> None:
@@ -45,8 +111,28 @@ class ScreenSums:
             self.views[part] += (radii > 0).any(0)
 
 
-class Densifier:
-    """Changes the set of Gaussians and keeps the optimiser's moments in step with it.
+@dataclass(frozen=True, eq=False)
+class TrainingStep:
+    """A step that was taken.
+
+    Attributes:
+        iteration: counted from 0.
+        rows: of the Gaussians of each drawn instance.
+        screen: where these were on the image, with gradients.
+        means_rate: learning rate of the means in this step [m].
+    """
+
+    iteration: int
+    rows: list[slice]
+    screen: ScreenStatistics
+    means_rate: float
+
+
+class Strategy:
+    """Leaves the set of Gaussians as it is; others add and remove.
+
+    Attributes:
+        state: what was visible since the last round; a part of checkpoints.
 
     Args:
         options: see there.
@@ -59,68 +145,39 @@ class Densifier:
         self, options: DensifyOptions, half_sizes: Tensor, *, seed: int, iterations: int
     ) -> None:
         self.options = options
+        self.state = ScreenSums.zeros(0)
         self._half_sizes = half_sizes
         self._seed = seed
         self._first = round(options.start * iterations)
         self._last = round(options.stop * iterations)
-        self._prior_round = round(options.prior_round * iterations)
-        self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
 
-    def is_due(self, iteration: int) -> bool:
-        """Whether a round follows the step ``iteration``."""
-        options = self.options
-        return (
-            options.method != "none"
-            and self._first <= iteration < self._last
-            and (iteration + 1) % options.every == 0
-        )
+    def initialize_state(self, count: int) -> None:
+        """Begin anew for ``count`` Gaussians, after something else changed the set."""
+        self.state = ScreenSums.zeros(count)
 
-    def resets_opacity(self, iteration: int) -> bool:
-        """Whether opacities are lowered after the step ``iteration``."""
-        every = self.options.reset_every
-        gradient = self.options.method == "gradient"
-        return gradient and 0 < every <= iteration + 1 < self._last and (iteration + 1) % every == 0
+    def step_pre_backward(self, output: RenderOutput) -> None:
+        """After the image of a step is drawn, before the loss is differentiated.
 
-    def drops_hidden(self, iteration: int) -> bool:
-        """Whether Gaussians that images hardly show go after the step ``iteration``."""
-        return iteration + 1 in self._hidden_rounds
+        Raises:
+            ReconstructError: the renderer keeps no screen statistics.
+        """
+        if output.screen is None:
+            raise ReconstructError("this renderer does not count what it draws; choose another")
 
-    def inserts_priors(self, iteration: int) -> bool:
-        """Whether priors take their places after the step ``iteration``."""
-        return iteration + 1 == self._prior_round
-
-    @torch.no_grad()
-    def round(
-        self, gaussians: Gaussians, optimizer: SelectiveAdam, sums: ScreenSums, iteration: int
+    def step_post_backward(
+        self, gaussians: Gaussians, optimizer: SelectiveAdam, step: TrainingStep
     ) -> Gaussians:
-        """The Gaussians after one round; the moments in ``optimizer`` follow."""
-        rng = generator(self._seed, iteration)
-        if self.options.method == "mcmc":
-            return self._relocate(gaussians, optimizer, rng)
-        return self._grow_and_prune(gaussians, optimizer, sums, rng)
+        """The Gaussians after the optimiser's step; the moments in ``optimizer`` follow."""
+        self.state.add(step.rows, step.screen)
+        return gaussians
 
-    def _grow_and_prune(
-        self,
-        gaussians: Gaussians,
-        optimizer: SelectiveAdam,
-        sums: ScreenSums,
-        rng: np.random.Generator,
-    ) -> Gaussians:
-        dead = self._dead(gaussians)
-        growing = self._growing(gaussians, sums, dead)
-        large = gaussians.log_scales.amax(-1).exp() > self.options.split_scale
-        split, clone = growing & large, growing & ~large
-        kept = (~dead & ~split).nonzero()[:, 0]
-        cloned, halves = clone.nonzero()[:, 0], split.nonzero()[:, 0].repeat(2)
-        source = torch.cat([kept, cloned, halves])
-        kind = torch.zeros(len(source), dtype=torch.int64)
-        kind[len(kept) :] = 1
-        kind[len(kept) + len(cloned) :] = 2
-        order = torch.argsort(gaussians.owners[source], stable=True)
-        source, kind = source[order], kind[order]
-        grown = rearrange(gaussians, optimizer, source, kind > 0)
-        half = (kind == 2).nonzero()[:, 0]
-        return _spread(grown, half, rng)
+    def step_end(self, gaussians: Gaussians, optimizer: SelectiveAdam, iteration: int) -> None:
+        """Last in a step, in place, after hidden Gaussians were pruned; nothing by default."""
+
+    def _is_due(self, iteration: int) -> bool:
+        """Whether a round of adding and removing follows the step ``iteration``."""
+        in_span = self._first <= iteration < self._last
+        return in_span and (iteration + 1) % self.options.every == 0
 
     def _dead(self, gaussians: Gaussians) -> Tensor:
         """[N] bool: transparent, too large, or outside the box of their object."""
@@ -135,108 +192,92 @@ class Densifier:
             dead[background:] |= outside.any(-1)
         return dead
 
-    def _growing(self, gaussians: Gaussians, sums: ScreenSums, dead: Tensor) -> Tensor:
+
+class GradientStrategy(Strategy):
+    """Duplicates and splits where gradients on the image are large, prunes, resets opacities.
+
+    Kerbl et al. 2023, with absolute gradients (Ye et al. 2024) in the background.
+    """
+
+    @torch.no_grad()
+    def step_post_backward(
+        self, gaussians: Gaussians, optimizer: SelectiveAdam, step: TrainingStep
+    ) -> Gaussians:
+        """Duplicate, split and prune in rounds."""
+        super().step_post_backward(gaussians, optimizer, step)
+        if not self._is_due(step.iteration):
+            return gaussians
+        dead = self._dead(gaussians)
+        growing = self._growing(gaussians, dead)
+        large = gaussians.log_scales.amax(-1).exp() > self.options.split_scale
+        refined = operations.refine(
+            gaussians,
+            optimizer,
+            duplicate=growing & ~large,
+            split=growing & large,
+            prune=dead,
+            rng=operations.step_generator(self._seed, step.iteration),
+        )
+        self.initialize_state(len(refined))
+        return refined
+
+    def step_end(self, gaussians: Gaussians, optimizer: SelectiveAdam, iteration: int) -> None:
+        """Reset opacities every ``options.reset_every`` iterations."""
+        every = self.options.reset_every
+        if 0 < every <= iteration + 1 < self._last and (iteration + 1) % every == 0:
+            operations.reset_opacity(gaussians, optimizer)
+
+    def _growing(self, gaussians: Gaussians, dead: Tensor) -> Tensor:
+        """[N] bool: the strongest gradients above the threshold, as many as the budget allows."""
         options, background = self.options, gaussians.counts[0]
-        mean = sums.gradients / sums.views.clamp(min=1)[:, None]
+        mean = self.state.gradients / self.state.views.clamp(min=1)[:, None]
         excess = torch.empty(len(gaussians))
         excess[:background] = mean[:background, 1] / options.background_gradient
         excess[background:] = mean[background:, 0] / options.object_gradient
         excess[dead] = 0
-        room = max(0, options.max_gaussians - len(gaussians) + int(dead.sum()))
+        budget = max(0, options.max_gaussians - len(gaussians) + int(dead.sum()))
         growing = excess >= 1
-        if int(growing.sum()) > room:
-            first = torch.argsort(excess, descending=True, stable=True)[:room]
+        if int(growing.sum()) > budget:
+            strongest = torch.argsort(excess, descending=True, stable=True)[:budget]
             growing = torch.zeros_like(growing)
-            growing[first] = True
+            growing[strongest] = True
         return growing
 
-    def _relocate(
-        self, gaussians: Gaussians, optimizer: SelectiveAdam, rng: np.random.Generator
-    ) -> Gaussians:
-        options = self.options
-        opacities = gaussians.logits.sigmoid()
-        dead = self._dead(gaussians)
-        alive = (~dead).nonzero()[:, 0]
-        if len(alive) == 0:
-            return gaussians
-        wanted = min(options.max_gaussians, round(len(gaussians) * (1 + options.growth)))
-        drawn = relocation.sample_by_weight(opacities[alive], max(0, wanted - len(alive)), rng)
-        source = torch.cat([alive, alive[drawn]])
-        copies = torch.bincount(source, minlength=len(gaussians))
-        order = torch.argsort(gaussians.owners[source], stable=True)
-        source = source[order]
-        moved = rearrange(gaussians, optimizer, source, copies[source] > 1)
-        many = (copies[source] > 1).nonzero()[:, 0]
-        new_opacity, factor = relocation.compute_relocation(
-            moved.logits[many].sigmoid(), copies[source][many], options.min_opacity
-        )
-        moved.logits[many] = torch.logit(new_opacity)
-        moved.log_scales[many] += factor.log()[:, None]
-        return moved
+
+class McmcStrategy(Strategy):
+    """Moves dead Gaussians to live ones, and all of them by noise (Kheradmand et al. 2024)."""
 
     @torch.no_grad()
-    def jitter(self, gaussians: Gaussians, rate: float, iteration: int) -> None:
-        """Noise of MCMC on the means, along each Gaussian's own shape; none for other methods.
-
-        Kheradmand et al. 2024, eq. 8: the more transparent a Gaussian, the more it wanders.
-        """
-        if self.options.method != "mcmc":
-            return
-        rng = generator(self._seed, iteration)
-        noise = torch.from_numpy(rng.standard_normal((len(gaussians), 3), dtype=np.float32))
-        opacity = gaussians.logits.sigmoid()
-        freedom = torch.sigmoid(-100 * (opacity - self.options.min_opacity))
-        turn = rotations(gaussians.quats)
-        along = torch.einsum("nji,nj->ni", turn, noise) * (2 * gaussians.log_scales).exp()
-        step = torch.einsum("nij,nj->ni", turn, along)
-        gaussians.means.add_(step * (freedom * rate * self.options.noise)[:, None])
-
-
-def rearrange(
-    gaussians: Gaussians, optimizer: SelectiveAdam, source: Tensor, fresh: Tensor
-) -> Gaussians:
-    """Rows ``source`` [M] (sorted by owner) of Gaussians and of all moments.
-
-    Args:
-        fresh: [M] bool, rows that start with moments of zero.
-    """
-    of_objects = source >= gaussians.counts[0]
-    for name in FIELDS:
-        mine = fresh[of_objects] if name in OBJECT_FIELDS else fresh
-        optimizer.gather(name, gaussians.rows(name, source), mine)
-    return gaussians.take(source)
+    def step_post_backward(
+        self, gaussians: Gaussians, optimizer: SelectiveAdam, step: TrainingStep
+    ) -> Gaussians:
+        """Inject noise in every step; relocate and grow in rounds."""
+        super().step_post_backward(gaussians, optimizer, step)
+        options = self.options
+        operations.inject_noise(
+            gaussians,
+            rate=step.means_rate,
+            strength=options.noise,
+            min_opacity=options.min_opacity,
+            rng=operations.step_generator(self._seed, step.iteration),
+        )
+        if not self._is_due(step.iteration):
+            return gaussians
+        relocated = operations.relocate(
+            gaussians,
+            optimizer,
+            self._dead(gaussians),
+            count=min(options.max_gaussians, round(len(gaussians) * (1 + options.growth))),
+            min_opacity=options.min_opacity,
+            rng=operations.step_generator(self._seed, step.iteration),
+        )
+        self.initialize_state(len(relocated))
+        return relocated
 
 
-@torch.no_grad()
-def reset_opacity(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
-    """Lower all opacities to 0.01, so that only what is needed comes back."""
-    limit = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-    gaussians.logits.clamp_(max=limit)
-    optimizer.reset_moments("logits")
-
-
-def generator(seed: int, iteration: int) -> np.random.Generator:
-    """Noise that depends on seed and iteration alone, so that a resumed run draws the same."""
-    return np.random.Generator(np.random.Philox(key=[seed, (1 << 40) + iteration]))
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """[N, 3, 3] of quaternions [N, 4] wxyz of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
-def _spread(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> Gaussians:
-    """Draw the places of ``halves`` from the Gaussians they came from, and shrink them."""
-    scales = gaussians.log_scales[halves].exp()
-    noise = rng.standard_normal((len(halves), 3), dtype=np.float32)
-    offset = torch.from_numpy(noise) * scales
-    turned = torch.einsum("nij,nj->ni", rotations(gaussians.quats[halves]), offset)
-    gaussians.means[halves] += turned
-    gaussians.log_scales[halves] -= float(np.log(SPLIT_SHRINK))
-    return gaussians
+STRATEGIES: dict[str, type[Strategy]] = {
+    "none": Strategy,
+    "gradient": GradientStrategy,
+    "mcmc": McmcStrategy,
+}
+"""By the name that ``DensifyOptions.method`` gives."""

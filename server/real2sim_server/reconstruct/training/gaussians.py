@@ -10,7 +10,6 @@ from torch import Tensor
 from ...scene import GaussianCloud, Scene
 from ...scene.colour import TimeColour
 from .activation import activated, first_rows
-from .schedule import TrainOptions
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
 OBJECT_FIELDS = ("fourier",)
@@ -60,7 +59,7 @@ class Gaussians:
         """From rows [M] of Gaussians (sorted by owner) to rows of the tensor ``name``."""
         return index[index >= self.counts[0]] - self.counts[0] if name in OBJECT_FIELDS else index
 
-    def take(self, source: Tensor) -> Gaussians:
+    def select(self, source: Tensor) -> Gaussians:
         """The Gaussians ``source`` [M] int64, which must stay sorted by owner."""
         counts = torch.bincount(self.owners[source], minlength=len(self.counts))
         taken = {
@@ -130,20 +129,28 @@ MIRROR_SIGNS = (1.0, -1, 1, 1, -1, -1, 1, 1, 1, -1, -1, -1, 1, 1, 1, 1)
 """Sign of each basis function of the spherical harmonics when y changes its sign."""
 
 
-def from_scene(scene: Scene, options: TrainOptions) -> Gaussians:
-    """Raw parameters of a scene; opacities are lowered so that all of them can still learn."""
+def from_scene(
+    scene: Scene, *, sh_degree: int, harmonics: int, initial_opacity: float
+) -> Gaussians:
+    """Raw parameters of a scene.
+
+    Args:
+        sh_degree: of the spherical harmonics.
+        harmonics: F, basis functions of time-varying colours.
+        initial_opacity: upper bound, so that all opacities can still learn.
+    """
     clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
-    clouds = [c.with_sh_degree(options.sh_degree) for c in clouds]
-    concatenate = GaussianCloud.concatenate(clouds).with_sh_degree(options.sh_degree)
+    clouds = [c.with_sh_degree(sh_degree) for c in clouds]
+    concatenate = GaussianCloud.concatenate(clouds).with_sh_degree(sh_degree)
     counts = tuple(len(c) for c in clouds)
-    opacities = concatenate.opacities.clamp(0.01, options.initial_opacity)
+    opacities = concatenate.opacities.clamp(0.01, initial_opacity)
     return Gaussians(
         means=leaf(concatenate.means),
         log_scales=leaf(concatenate.scales.log()),
         quats=leaf(concatenate.quats),
         logits=leaf(torch.logit(opacities)),
         sh=leaf(concatenate.sh),
-        fourier=leaf(_fourier(scene, sum(counts) - counts[0], options.harmonics)),
+        fourier=leaf(_fourier(scene, sum(counts) - counts[0], harmonics)),
         counts=counts,
     )
 

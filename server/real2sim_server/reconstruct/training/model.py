@@ -63,7 +63,12 @@ class SceneModel:
         self.scene = scene
         self.options = options
         self.backend = backend
-        self.gaussians = packing.from_scene(scene, options)
+        self.gaussians = packing.from_scene(
+            scene,
+            sh_degree=options.sh_degree,
+            harmonics=options.harmonics,
+            initial_opacity=options.initial_opacity,
+        )
         self.priors: Gaussians | None = None
         self.poses = ObjectPoses(scene, key_times_us if options.refine_poses else None)
         self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution))
@@ -193,7 +198,7 @@ class SceneModel:
         with torch.no_grad():
             clouds = gaussians.clouds(degree=self.options.sh_degree)
         clouds = [_own(cloud) for cloud in clouds]
-        parts = torch.split(gaussians.fourier.detach(), gaussians.counts[1:])
+        parts = torch.split(gaussians.fourier.detach(), list(gaussians.counts[1:]))
         objects = {}
         for index, (name, item) in enumerate(self.scene.objects.items()):
             varies = parts[index].numel() > 0

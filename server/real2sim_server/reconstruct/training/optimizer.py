@@ -45,15 +45,20 @@ class SelectiveAdam:
         self.steps += 1
         for name, parameter in parameters.items():
             if parameter.grad is not None and parameter.numel():
-                self._update(name, parameter, rates[name], seen.get(name))
+                self._update(name, parameter, parameter.grad, rates[name], seen.get(name))
 
     def _update(
-        self, name: str, parameter: Tensor, rate: float | Tensor, seen: Tensor | None
+        self,
+        name: str,
+        parameter: Tensor,
+        gradient: Tensor,
+        rate: float | Tensor,
+        seen: Tensor | None,
     ) -> None:
         rows = parameter.shape[0]
         views = [
             t.detach().reshape(rows, -1)
-            for t in (parameter, parameter.grad, self.first[name], self.second[name])
+            for t in (parameter, gradient, self.first[name], self.second[name])
         ]
         columns = torch.as_tensor(rate, dtype=torch.float32, device=parameter.device)
         columns = columns.expand(views[0].shape[1]) / (1 - 0.9**self.steps)
@@ -63,8 +68,12 @@ class SelectiveAdam:
         if parameter.device.type != "cpu":
             _update_plain(views, seen, columns, correction)
             return
+        values, by_values, first, second = (view.numpy() for view in views)
         optimizer_kernels.adam_rows(
-            *(view.numpy() for view in views),
+            values,
+            by_values,
+            first,
+            second,
             seen.numpy(),
             columns.contiguous().numpy(),
             np.float32(correction),

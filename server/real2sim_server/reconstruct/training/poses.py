@@ -68,7 +68,8 @@ class ObjectPoses:
         for item in scene.objects.values():
             times = _key_times(item.trajectory, key_times_us)
             poses = [item.trajectory.pose(int(t)) for t in times]
-            key = KeyPoses(times, *(np.array(part) for part in zip(*poses, strict=True)), row)
+            positions, quaternions = (np.array(part) for part in zip(*poses, strict=True))
+            key = KeyPoses(times, positions, quaternions, row)
             self.keys.append(key)
             row += len(times)
         self._given = [Trajectory(k.times_us, k.positions, k.quaternions) for k in self.keys]
@@ -96,7 +97,9 @@ class ObjectPoses:
     def roughness(self) -> Tensor:
         """Mean squared second differences of all refined trajectories [m, rad] at 10 Hz."""
         terms = [
-            second_differences(torch.cat(self._refined(key), dim=1), key.times_us * 1e-6)
+            second_differences(
+                torch.cat(self._refined(key), dim=1), (key.times_us * 1e-6).astype(np.float64)
+            )
             for key in self.keys
             if len(key.times_us) >= 3
         ]

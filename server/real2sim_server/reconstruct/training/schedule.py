@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ..options import InitialiseOptions, ReconstructError
+from .densify import STRATEGIES, DensifyOptions
 from .losses import LossWeights
 
-DENSIFY_METHODS = ("none", "gradient", "mcmc")
 COLOUR_BASES = ("cosine", "real_dft")
 HIGHER_HARMONICS_RATE = 1 / 20
 
@@ -45,76 +45,6 @@ class LearningRates:
     pose_yaw: tuple[float, float] = (1e-3, 1e-5)
     camera: float = 0.0
     exposure: float = 0.0
-
-
-@dataclass(frozen=True)
-class VisibilityLimits:
-    """Which Gaussians count as hidden: see :mod:`.visibility`.
-
-    Attributes:
-        fraction: visible fraction up to which all are.
-        occluded_fraction: visible fraction up to which those are that lie deep behind what is seen.
-        occluded_depth: how deep that is [m].
-    """
-
-    fraction: float = 0.005
-    occluded_fraction: float = 0.03
-    occluded_depth: float = 0.3
-
-
-@dataclass(frozen=True)
-class DensifyOptions:
-    """When and how Gaussians are added and removed.
-
-    Attributes:
-        method: ``gradient`` (Kerbl et al. 2023, absgrad of Ye et al. 2024), ``mcmc``
-            (Kheradmand et al. 2024) or ``none``.
-        start, stop: fraction of all iterations between which it happens.
-        every: iterations from one round to the next.
-        max_gaussians: never more than so many.
-        background_gradient: absgrad on the image above which background grows.
-        object_gradient: plain gradient above which objects grow.
-        split_scale: Gaussians larger than this are split, smaller ones cloned [m].
-        min_opacity: below it Gaussians are removed, or moved by ``mcmc``.
-        max_scale: larger ones near the drive are removed [m].
-        reset_every: iterations between resets of opacity; 0 for never.
-        noise: of ``mcmc``: factor on the learning rate of means.
-        growth: of ``mcmc``: fraction by which the number grows in a round.
-        hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
-        prior_round: fraction of all iterations at which they go once more, and priors of stage 0
-            take their places; what stands before these closes up in the rest.
-        background_limits: of what counts as hidden in the background.
-        object_limits: likewise in objects.
-        last_object_limits: likewise when priors take their places; what a window shows of an
-            object's inside is hardly ever learnt well, and is better drawn as the window's colour.
-    """
-
-    method: str = "gradient"
-    start: float = 0.02
-    stop: float = 0.5
-    every: int = 100
-    max_gaussians: int = 1_000_000
-    background_gradient: float = 6e-4
-    object_gradient: float = 2e-4
-    split_scale: float = 0.2
-    min_opacity: float = 0.005
-    max_scale: float = 4.0
-    reset_every: int = 3000
-    noise: float = 5e5
-    growth: float = 0.05
-    hidden_rounds: tuple[float, ...] = (0.35, 0.6)
-    prior_round: float = 0.85
-    background_limits: VisibilityLimits = field(default_factory=VisibilityLimits)
-    object_limits: VisibilityLimits = field(
-        default_factory=lambda: VisibilityLimits(
-            fraction=0.01, occluded_fraction=0.03, occluded_depth=0.3
-        )
-    )
-    last_object_limits: VisibilityLimits = field(
-        default_factory=lambda: VisibilityLimits(
-            fraction=0.03, occluded_fraction=0.3, occluded_depth=0.15
-        )
-    )
 
 
 @dataclass(frozen=True)
@@ -184,10 +114,9 @@ class TrainOptions:
         _check_range(self, "sky_resolution", 1, 4096)
         if self.hold_out != 0:
             _check_range(self, "hold_out", 2, 1_000_000)
-        if self.densify.method not in DENSIFY_METHODS:
+        if self.densify.method not in STRATEGIES:
             raise ReconstructError(
-                f"densify.method must be one of {list(DENSIFY_METHODS)}, "
-                f"not {self.densify.method!r}"
+                f"densify.method must be one of {list(STRATEGIES)}, not {self.densify.method!r}"
             )
         if self.harmonics_basis not in COLOUR_BASES:
             raise ReconstructError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +18,17 @@ from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .data import TrainingView, TrainingViews, held_out_frames, image_time
-from .densify import Densifier, ScreenSums, generator, reset_opacity
+from .densify import STRATEGIES, ScreenSums, TrainingStep
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
 from .model import RenderedView, SceneModel
 from .object_masks import box_mask
+from .operations import step_generator
 from .optimizer import SelectiveAdam
 from .progress import OnTraining, RateMeter, RunningMeans, StageTimer, TrainingProgress
-from .schedule import TrainOptions, VisibilityLimits, from_values, learning_rates_at
-from .visibility import Viewpoint, hidden_sky, occluded_priors, prune_hidden, visibility
+from .schedule import TrainOptions, from_values, learning_rates_at
+from .visibility import OcclusionPruning
 
-VISIBILITY_VIEWS = 64
-"""Views that decide which Gaussians are hidden."""
 CONSTANT_SH = (-0.55 / SH_C0, 0.55 / SH_C0)
 """Range of the constant coefficients: colours from -0.05 to 1.05."""
 CHECKPOINT = "checkpoint"
@@ -63,13 +62,16 @@ class Trainer:
         key_times = np.array(sorted(keys), dtype=np.int64)
         self.model = SceneModel(scene, options, key_times, backend=backend)
         self.optimizer = SelectiveAdam(self.model.parameters())
-        self.densifier = Densifier(
+        self.strategy = STRATEGIES[options.densify.method](
             options.densify,
             self.model.half_sizes,
             seed=options.seed,
             iterations=options.iterations,
         )
-        self.sums = ScreenSums.zeros(len(self.model.gaussians))
+        self.strategy.initialize_state(len(self.model.gaussians))
+        self.occlusion_pruning = OcclusionPruning(
+            options.densify, options.iterations, self.views.sample_viewpoints
+        )
         self.iteration = 0
         self.running = RunningMeans()
         self.metrics = MetricsFile(folder / "metrics.jsonl") if folder else None
@@ -105,7 +107,7 @@ class Trainer:
         i = self.iteration
         timed = StageTimer(self.running.stages)
         with timed("data"):
-            view = self.views.view(self.views.order(i), self.options.divisor(i))
+            view = self.views.view(self.views.index_at(i), self.options.divisor(i))
             self.views.prefetch(i)
         with timed("forward"):
             rendered = self.model.render(
@@ -116,18 +118,19 @@ class Trainer:
                 depth=len(view.pixels) > 0,
             )
         with timed("loss"):
-            terms, squared = self._terms(view, rendered)
+            terms, squared = self._loss_terms(view, rendered)
             total = torch.stack(list(terms.values())).sum()
         if not bool(torch.isfinite(total)):
             raise ReconstructError(
                 f"the loss is {float(total)} at iteration {i}; lower the learning rates"
             )
+        self.strategy.step_pre_backward(rendered.output)
         with timed("backward"):
             total.backward()
         with timed("optimiser"):
-            self._update(rendered)
+            taken = self._update(rendered)
         with timed("densify"):
-            self._change(i)
+            self._densify(taken)
         self.running.add(float(total.detach()), float(squared))
         self.iteration += 1
         return {name: float(value.detach()) for name, value in terms.items()}
@@ -137,12 +140,12 @@ class Trainer:
         vehicles = self.model.mirrored
         if not any(vehicles):
             return ()
-        drawn = generator(self.options.seed + 1, i).random(len(vehicles))
+        drawn = step_generator(self.options.seed + 1, i).random(len(vehicles))
         return tuple(
             bool(m and d < self.options.mirror) for m, d in zip(vehicles, drawn, strict=True)
         )
 
-    def _terms(
+    def _loss_terms(
         self, view: TrainingView, rendered: RenderedView
     ) -> tuple[dict[str, Tensor], Tensor]:
         """Weighted terms of the loss, and the mean squared error of the image."""
@@ -193,19 +196,17 @@ class Trainer:
         return terms
 
     @torch.no_grad()
-    def _update(self, rendered: RenderedView) -> None:
-        gaussians = self.model.gaussians
-        seen = torch.zeros(len(gaussians), dtype=torch.bool)
+    def _update(self, rendered: RenderedView) -> TrainingStep:
+        """Move every parameter along its gradient, those that were visible."""
+        gaussians, parameters = self.model.gaussians, self.model.parameters()
         rows = self._rows(rendered.drawn)
-        if rendered.output.screen is None:
-            raise ReconstructError("this renderer does not count what it draws; choose another")
+        assert rendered.output.screen is not None
         screen = rendered.output.screen.first(len(rows))
+        visible = torch.zeros(len(gaussians), dtype=torch.bool)
         for part, radii in zip(rows, screen.radii, strict=True):
-            seen[part] = (radii > 0).any(0)
-        self.sums.add(rows, screen)
-        parameters = self.model.parameters()
-        masks = {name: seen for name in FIELDS if name not in OBJECT_FIELDS}
-        masks |= dict.fromkeys(OBJECT_FIELDS, seen[gaussians.counts[0] :])
+            visible[part] = (radii > 0).any(0)
+        masks = {name: visible for name in FIELDS if name not in OBJECT_FIELDS}
+        masks |= dict.fromkeys(OBJECT_FIELDS, visible[gaussians.counts[0] :])
         for name in ("pose_translation", "pose_yaw", "exposure", "camera"):
             gradient = parameters[name].grad
             if gradient is not None:
@@ -215,60 +216,21 @@ class Trainer:
         self.optimizer.step(parameters, rates, masks)
         # A colour no surface has would make up for another one before it, and show when that goes.
         gaussians.sh[:, 0].clamp_(*CONSTANT_SH)
-        self.densifier.jitter(gaussians, float(rates["means"]), self.iteration)
         for parameter in parameters.values():
             parameter.grad = None
+        return TrainingStep(self.iteration, rows, screen, float(rates["means"]))
 
     def _rows(self, drawn: tuple[int, ...]) -> list[slice]:
         starts = self.model.gaussians.starts
         return [slice(starts[k], starts[k + 1]) for k in drawn]
 
-    def _change(self, i: int) -> None:
+    def _densify(self, step: TrainingStep) -> None:
         """Add, remove and reset Gaussians where it is time to."""
-        if self.densifier.is_due(i):
-            self.model.gaussians = self.densifier.round(
-                self.model.gaussians, self.optimizer, self.sums, i
-            )
-            self.sums = ScreenSums.zeros(len(self.model.gaussians))
-        limits = self.options.densify
-        if self.densifier.drops_hidden(i):
-            self._drop_hidden(self._sample_viewpoints(), limits.object_limits)
-        if self.densifier.inserts_priors(i):
-            viewpoints = self._sample_viewpoints()
-            # Priors first: they are to stand behind what is dropped then, too.
-            self._insert_priors(viewpoints)
-            self._drop_hidden(viewpoints, limits.last_object_limits)
-        if self.densifier.resets_opacity(i):
-            reset_opacity(self.model.gaussians, self.optimizer)
-
-    def _drop_hidden(self, viewpoints: list[Viewpoint], object_limits: VisibilityLimits) -> None:
-        self.model.gaussians = prune_hidden(
-            self.model.gaussians,
-            self.optimizer,
-            visibility(self.model, viewpoints),
-            background_limits=self.options.densify.background_limits,
-            object_limits=object_limits,
-        )
-        self.sums = ScreenSums.zeros(len(self.model.gaussians))
-
-    def _insert_priors(self, viewpoints: list[Viewpoint]) -> None:
-        """Stage 0's, as opaque as they were, for what images hardly show, and its sky likewise."""
-        model = self.model
-        opaque = replace(self.options, initial_opacity=0.99, refine_poses=False)
-        times = np.array([model.scene.start_us, model.scene.end_us])
-        first = SceneModel(model.scene, opaque, times, backend=model.backend)
-        hidden = hidden_sky(model, viewpoints)
-        model.sky.data[hidden] = first.sky.data[hidden]
-        self.optimizer.reset_moments("sky")
-        limit = self.options.densify.background_limits.fraction
-        model.priors = occluded_priors(model, first, viewpoints, limit=limit)
-
-    def _sample_viewpoints(self) -> list[Viewpoint]:
-        """Training views drawn at random, enough to tell what is hidden."""
-        viewpoints = self.views.viewpoints()
-        return [
-            viewpoints[self.views.order(k)] for k in range(min(VISIBILITY_VIEWS, len(viewpoints)))
-        ]
+        model, strategy, optimizer = self.model, self.strategy, self.optimizer
+        model.gaussians = strategy.step_post_backward(model.gaussians, optimizer, step)
+        if self.occlusion_pruning.step(model, optimizer, step.iteration):
+            strategy.initialize_state(len(model.gaussians))
+        strategy.step_end(model.gaussians, optimizer, step.iteration)
 
     def _report(
         self, terms: dict[str, float], clock: RateMeter, on_progress: OnTraining | None
@@ -297,7 +259,8 @@ class Trainer:
         if priors is not None:
             tensors |= {f"priors.{k}": v for k, v in priors.tensors().items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
-        tensors |= {"sums.gradients": self.sums.gradients, "sums.views": self.sums.views}
+        state = self.strategy.state
+        tensors |= {"sums.gradients": state.gradients, "sums.views": state.views}
         running = self.running
         checkpoint = Checkpoint(
             iteration=self.iteration,
@@ -336,9 +299,13 @@ class Trainer:
         if held.prior_counts:
             self.model.priors = Gaussians(**parts["priors"], counts=held.prior_counts)
         self.optimizer.restore(parts["adam"], held.optimizer_steps)
-        self.sums = ScreenSums(**parts["sums"])
+        self.strategy.state = ScreenSums(**parts["sums"])
         self.iteration = held.iteration
-        self.running = RunningMeans(**held.running)
+        self.running = RunningMeans(
+            loss=held.running["loss"],
+            squared=held.running["squared"],
+            weight=held.running["weight"],
+        )
         if self.metrics is not None:
             self.metrics.cut(held.iteration)
 

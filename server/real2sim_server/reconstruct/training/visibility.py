@@ -12,20 +12,21 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Sky
 from ...scene.spherical_harmonics import SH_C0
-from .densify import rearrange, rotations
+from .densify import DensifyOptions, VisibilityLimits
 from .gaussians import Gaussians, concatenate
 from .model import SceneModel
+from .operations import prune, rotation_matrices
 from .optimizer import SelectiveAdam
-from .schedule import VisibilityLimits
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
@@ -36,6 +37,8 @@ PRIOR_FRACTION = 0.01
 less leaves holes in sides that only a turned object shows."""
 SKY_FRACTION = 0.1
 """Visible fraction up to which a texel of the sky counts as hidden."""
+VISIBILITY_VIEWS = 64
+"""Views that decide which Gaussians are hidden."""
 EPS2D = RasterOptions().eps2d
 
 Viewpoint = tuple[Camera, int]
@@ -115,6 +118,7 @@ def blending_weights(
             options=RasterOptions(depth=True, instance=False),
             backend=model.backend,
         )
+        assert output.depth is not None
         depth = output.depth.detach()
         inverse = torch.where(depth > NEAR, 1 / depth, 0)
         (output.rgb[..., 0].sum() + (output.rgb[..., 1] * inverse).sum()).backward()
@@ -137,7 +141,7 @@ def unoccluded_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
     fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     u, v = fx * x / z + cx, fy * y / z + cy
     inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    axes = (turn @ rotations(cloud.quats)) * cloud.scales[:, None]
+    axes = (turn @ rotation_matrices(cloud.quats)) * cloud.scales[:, None]
     across = (fx / z)[:, None] * (axes[:, 0] - (x / z)[:, None] * axes[:, 2])
     down = (fy / z)[:, None] * (axes[:, 1] - (y / z)[:, None] * axes[:, 2])
     a, c = across.square().sum(-1) + EPS2D, down.square().sum(-1) + EPS2D
@@ -167,6 +171,7 @@ def hidden_sky(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Tensor:
                     options=RasterOptions(depth=False, instance=False),
                     backend=model.backend,
                 ).rgb.sum().backward()
+            assert faces.grad is not None
             total.add_(faces.grad)
     return visible.sum(-1) <= SKY_FRACTION * unoccluded.sum(-1)
 
@@ -197,8 +202,7 @@ def prune_hidden(
     hidden = torch.where(
         gaussians.owners > 0, seen.hidden(object_limits), seen.hidden(background_limits)
     )
-    kept = (~hidden).nonzero()[:, 0]
-    return rearrange(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
+    return prune(gaussians, optimizer, hidden)
 
 
 def occluded_priors(
@@ -218,10 +222,72 @@ def occluded_priors(
     """
     hidden = visibility(first, viewpoints).fractions <= limit
     offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
-    priors, trained = first.gaussians.take(offered), model.gaussians
+    priors, trained = first.gaussians.select(offered), model.gaussians
     # Faint, so that no prior occludes another: several may stand behind one gap of the surface.
     faint = replace(priors, logits=torch.full_like(priors.logits, FAINT_LOGIT))
     model.gaussians, is_prior = concatenate(trained, faint)
     behind = visibility(model, viewpoints).fractions[is_prior] <= PRIOR_FRACTION
     model.gaussians = trained
-    return priors.take(behind.nonzero()[:, 0])
+    return priors.select(behind.nonzero()[:, 0])
+
+
+class OcclusionPruning:
+    """Prunes hidden Gaussians in a few rounds, and inserts the priors of stage 0 in the last one.
+
+    Args:
+        options: when that is and what counts as hidden.
+        iterations: of the whole training.
+        sample: draws so many training views.
+    """
+
+    def __init__(
+        self,
+        options: DensifyOptions,
+        iterations: int,
+        sample: Callable[[int], list[Viewpoint]],
+    ) -> None:
+        self._options, self._sample = options, sample
+        self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
+        self._prior_round = round(options.prior_round * iterations)
+
+    def step(self, model: SceneModel, optimizer: SelectiveAdam, iteration: int) -> bool:
+        """Change ``model`` after the step ``iteration`` if a round is due; whether one was."""
+        hidden_round = iteration + 1 in self._hidden_rounds
+        prior_round = iteration + 1 == self._prior_round
+        if hidden_round:
+            viewpoints = self._sample(VISIBILITY_VIEWS)
+            self._prune(model, optimizer, viewpoints, self._options.object_limits)
+        if prior_round:
+            viewpoints = self._sample(VISIBILITY_VIEWS)
+            # Priors first: they are to stand behind what is pruned then, too.
+            self._insert_priors(model, optimizer, viewpoints)
+            self._prune(model, optimizer, viewpoints, self._options.last_object_limits)
+        return hidden_round or prior_round
+
+    def _prune(
+        self,
+        model: SceneModel,
+        optimizer: SelectiveAdam,
+        viewpoints: list[Viewpoint],
+        object_limits: VisibilityLimits,
+    ) -> None:
+        model.gaussians = prune_hidden(
+            model.gaussians,
+            optimizer,
+            visibility(model, viewpoints),
+            background_limits=self._options.background_limits,
+            object_limits=object_limits,
+        )
+
+    def _insert_priors(
+        self, model: SceneModel, optimizer: SelectiveAdam, viewpoints: list[Viewpoint]
+    ) -> None:
+        """Stage 0's, as opaque as they were, for hidden places, and its sky likewise."""
+        opaque = replace(model.options, initial_opacity=0.99, refine_poses=False)
+        times = np.array([model.scene.start_us, model.scene.end_us])
+        first = SceneModel(model.scene, opaque, times, backend=model.backend)
+        hidden = hidden_sky(model, viewpoints)
+        model.sky.data[hidden] = first.sky.data[hidden]
+        optimizer.reset_moments("sky")
+        limit = self._options.background_limits.fraction
+        model.priors = occluded_priors(model, first, viewpoints, limit=limit)

@@ -1,16 +1,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from real2sim_server.reconstruct.training.densify import Densifier, ScreenSums, rotations
+from real2sim_server.reconstruct import ReconstructError
+from real2sim_server.reconstruct.training.densify import (
+    STRATEGIES,
+    DensifyOptions,
+    ScreenSums,
+    Strategy,
+    TrainingStep,
+)
 from real2sim_server.reconstruct.training.gaussians import FIELDS, Gaussians, leaf
+from real2sim_server.reconstruct.training.operations import compute_relocation, rotation_matrices
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
-from real2sim_server.reconstruct.training.relocation import compute_relocation
-from real2sim_server.reconstruct.training.schedule import DensifyOptions
+from real2sim_server.render import ScreenStatistics
 
 COUNTS = (30, 10, 8)
 OPTIONS = DensifyOptions(every=1, start=0.0, stop=1.0, max_gaussians=1000, split_scale=0.3)
@@ -43,8 +51,22 @@ def marked(gaussians: Gaussians) -> SelectiveAdam:
     return optimizer
 
 
-def densifier(options: DensifyOptions = OPTIONS) -> Densifier:
-    return Densifier(options, torch.full((2, 3), 2.0), seed=4, iterations=100)
+def strategy_of(options: DensifyOptions = OPTIONS) -> Strategy:
+    kind = STRATEGIES[options.method]
+    return kind(options, torch.full((2, 3), 2.0), seed=4, iterations=100)
+
+
+def round_of(
+    options: DensifyOptions, gaussians: Gaussians, optimizer: SelectiveAdam, sums: ScreenSums
+) -> Gaussians:
+    """The Gaussians after a step in which a round is due and nothing was drawn."""
+    strategy = strategy_of(options)
+    strategy.state = sums
+    return strategy.step_post_backward(gaussians, optimizer, step_without_image(0.0))
+
+
+def step_without_image(means_rate: float) -> TrainingStep:
+    return TrainingStep(7, [], ScreenStatistics((), ()), means_rate)
 
 
 def sums_for(gaussians: Gaussians, growing: list[int]) -> ScreenSums:
@@ -66,7 +88,7 @@ def check_alignment(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
 def test_small_ones_are_cloned_and_moments_stay_with_their_rows():
     gaussians = some_gaussians()
     optimizer = marked(gaussians)
-    grown = densifier().round(gaussians, optimizer, sums_for(gaussians, [2, 33, 45]), 7)
+    grown = round_of(OPTIONS, gaussians, optimizer, sums_for(gaussians, [2, 33, 45]))
     assert grown.counts == (31, 11, 9)
     check_alignment(grown, optimizer)
     assert all(getattr(grown, name).requires_grad for name in FIELDS)
@@ -81,7 +103,7 @@ def test_large_ones_are_split_in_two_smaller_ones():
     with torch.no_grad():
         gaussians.log_scales[5] = 0.0
     optimizer = marked(gaussians)
-    grown = densifier().round(gaussians, optimizer, sums_for(gaussians, [5]), 7)
+    grown = round_of(OPTIONS, gaussians, optimizer, sums_for(gaussians, [5]))
     assert grown.counts == (31, 10, 8)
     new = (~optimizer.first["means"].any(1)).nonzero()[:, 0]
     assert len(new) == 2
@@ -95,7 +117,7 @@ def test_transparent_ones_and_those_outside_their_box_go():
         gaussians.logits[3] = -20
         gaussians.means[31] = 9.0
         gaussians.means[1] = 9.0
-    grown = densifier().round(gaussians, marked(gaussians), ScreenSums.zeros(48), 7)
+    grown = round_of(OPTIONS, gaussians, marked(gaussians), ScreenSums.zeros(48))
     assert grown.counts == (29, 9, 8)
 
 
@@ -104,7 +126,7 @@ def test_the_budget_holds_and_the_strongest_grow():
     sums = sums_for(gaussians, [1, 2, 3])
     sums.gradients[2] = 5.0
     options = replace(OPTIONS, max_gaussians=49)
-    grown = densifier(options).round(gaussians, marked(gaussians), sums, 7)
+    grown = round_of(options, gaussians, marked(gaussians), sums)
     assert len(grown) == 49
     assert int((grown.means == gaussians.means[2]).all(1).sum()) == 2
 
@@ -115,7 +137,7 @@ def test_mcmc_moves_dead_ones_to_live_ones_and_keeps_the_number():
         gaussians.logits[:6] = -20
     options = replace(OPTIONS, method="mcmc", max_gaussians=48)
     optimizer = marked(gaussians)
-    moved = densifier(options).round(gaussians, optimizer, ScreenSums.zeros(48), 7)
+    moved = round_of(options, gaussians, optimizer, ScreenSums.zeros(48))
     assert len(moved) == 48
     assert float(moved.logits.detach().min()) > -19
     assert optimizer.first["means"].shape == moved.means.shape
@@ -136,11 +158,13 @@ def test_mcmc_noise_leaves_solid_ones_and_spreads_along_the_shape():
         gaussians.logits[0] = -6
         gaussians.log_scales[0] = torch.tensor([0.0, -9.0, -9.0])
     before = gaussians.means.detach().clone()
-    densifier(replace(OPTIONS, method="mcmc", noise=1.0)).jitter(gaussians, 1e-2, 3)
+    options = replace(OPTIONS, method="mcmc", noise=1.0, every=100)
+    strategy = strategy_of(options)
+    strategy.step_post_backward(gaussians, marked(gaussians), step_without_image(1e-2))
     moved = (gaussians.means.detach() - before).norm(dim=1)
     assert float(moved[0]) > 1e-4
     assert float(moved[1:].max()) < 1e-6
-    axis = rotations(gaussians.quats)[0, :, 0].detach()
+    axis = rotation_matrices(gaussians.quats)[0, :, 0].detach()
     direction = (gaussians.means.detach() - before)[0] / moved[0]
     assert abs(float(direction @ axis)) == pytest.approx(1, abs=1e-4)
 
@@ -150,6 +174,29 @@ def test_the_same_seed_and_iteration_split_the_same_way():
         gaussians = some_gaussians()
         with torch.no_grad():
             gaussians.log_scales[5] = 0.0
-        return densifier().round(gaussians, marked(gaussians), sums_for(gaussians, [5]), 7).means
+        return round_of(OPTIONS, gaussians, marked(gaussians), sums_for(gaussians, [5])).means
 
     assert torch.equal(once(), once())
+
+
+def test_opacities_are_reset_by_the_gradient_strategy_alone():
+    options = replace(OPTIONS, reset_every=8)
+    for method in ("gradient", "mcmc", "none"):
+        gaussians = some_gaussians()
+        strategy_of(replace(options, method=method)).step_end(gaussians, marked(gaussians), 7)
+        lowered = float(gaussians.logits.detach().sigmoid().max()) <= 0.0101
+        assert lowered == (method == "gradient")
+
+
+def test_without_a_method_the_set_stays_as_it_is():
+    gaussians = some_gaussians()
+    options = replace(OPTIONS, method="none")
+    sums = sums_for(gaussians, [1, 2])
+    assert round_of(options, gaussians, marked(gaussians), sums) is gaussians
+
+
+def test_a_renderer_without_screen_statistics_is_refused():
+    output = SimpleNamespace(screen=None)
+    for method in STRATEGIES:
+        with pytest.raises(ReconstructError, match="does not count what it draws"):
+            strategy_of(replace(OPTIONS, method=method)).step_pre_backward(output)

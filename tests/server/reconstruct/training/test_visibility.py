@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from real2sim_server.reconstruct.training import SceneModel, Trainer
+from real2sim_server.reconstruct.training.densify import DensifyOptions, VisibilityLimits
 from real2sim_server.reconstruct.training.gaussians import Gaussians, concatenate
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
-from real2sim_server.reconstruct.training.schedule import DensifyOptions, VisibilityLimits
 from real2sim_server.reconstruct.training.visibility import (
     Visibility,
     hidden_sky,
@@ -187,8 +187,8 @@ def test_two_packs_are_joined_owner_by_owner():
     a, b = some_gaussians(), some_gaussians()
     both, of_b = concatenate(a, b)
     assert both.counts == tuple(2 * n for n in COUNTS)
-    torch.testing.assert_close(both.take((~of_b).nonzero()[:, 0]).fourier, a.fourier)
-    torch.testing.assert_close(both.take(of_b.nonzero()[:, 0]).means, b.means)
+    torch.testing.assert_close(both.select((~of_b).nonzero()[:, 0]).fourier, a.fourier)
+    torch.testing.assert_close(both.select(of_b.nonzero()[:, 0]).means, b.means)
 
 
 def test_priors_come_back_where_nothing_shows_them_and_nowhere_else(model, viewpoints):
