@@ -6,15 +6,14 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from .._numba import func
 from .noise import band, blend, hash01
 
 GLASS_GLOSS = 0.9
 PAINT_GLOSS = 0.55
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def body_surface(shape, roof, i, paint, p, number, x, y, z, nx, ny, f):
     """(r, g, b, gloss) of a body at a point in its own frame.
 
@@ -44,7 +43,7 @@ def body_surface(shape, roof, i, paint, p, number, x, y, z, nx, ny, f):
     return r, g, b, gloss
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _roof_at(roof, i, length, x):
     at = (x / length + 0.5) * (roof.shape[1] - 1)
     at = min(max(at, 0.0), roof.shape[1] - 1.001)
@@ -52,7 +51,7 @@ def _roof_at(roof, i, length, x):
     return blend(roof[i, j], roof[i, j + 1], at - j)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _side(shape, roof, i, r, g, b, gloss, x, z, f):
     length, height, belt = shape[i, 0], shape[i, 2], shape[i, 3]
     rear, front, pillars = shape[i, 4], shape[i, 5], int(shape[i, 14])
@@ -93,7 +92,7 @@ def _side(shape, roof, i, r, g, b, gloss, x, z, f):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _screens(shape, i, r, g, b, gloss, x, y, z, nx, f):
     width, height, belt = shape[i, 1], shape[i, 2], shape[i, 3]
     side = abs(y)
@@ -114,7 +113,7 @@ def _screens(shape, i, r, g, b, gloss, x, y, z, nx, f):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _nose(shape, i, number, r, g, b, gloss, y, z, f):
     width, height = shape[i, 1], shape[i, 2]
     big = height > 2.0
@@ -134,7 +133,7 @@ def _nose(shape, i, number, r, g, b, gloss, y, z, f):
     return r, g, b, blend(gloss, 0.3, grille)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _tail(shape, i, number, r, g, b, gloss, y, z, f):
     width, height, belt = shape[i, 1], shape[i, 2], shape[i, 3]
     side = abs(y)
@@ -158,7 +157,7 @@ def _tail(shape, i, number, r, g, b, gloss, y, z, f):
     return r, g, b, gloss
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _plate(r, g, b, y, z, number, f):
     """A number plate around (0, 0)."""
     plate = band(y, -0.26, 0.26, f) * band(z, -0.055, 0.055, f)
@@ -176,7 +175,7 @@ def _plate(r, g, b, y, z, number, f):
     return blend(r, shade, plate), blend(g, shade, plate), blend(b, shade * 0.97, plate)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def wheel_surface(u, v, f):
     """(r, g, b, gloss) of a wheel; u, v are relative to its radius, f a pixel in these units."""
     radius, angle = math.hypot(u, v), math.atan2(v, u)

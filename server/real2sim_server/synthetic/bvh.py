@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from .._numba import func, kernel
 from ..geometry.rotation import Float
 from .mesh import Mesh
 
@@ -76,7 +76,7 @@ def _arrange(mesh: Mesh, order: NDArray[np.int64]) -> tuple[NDArray[np.generic],
     )
 
 
-@njit(cache=True)
+@kernel
 def _build(low, high):
     n = len(low)
     order = np.arange(n)
@@ -112,7 +112,7 @@ def _build(low, high):
     return bounds[:used], child[:used], count[:used], order
 
 
-@njit(cache=True)
+@func
 def _partition(order, first, last, low, high, centre):
     best_axis, best_split, best_cost = -1, 0.0, np.inf
     for axis in range(3):
@@ -144,7 +144,7 @@ def _partition(order, first, last, low, high, centre):
     return i
 
 
-@njit(cache=True)
+@func
 def _fill_bins(order, first, last, low, high, centre, axis, start, scale):
     bin_low = np.full((BINS, 3), np.inf)
     bin_high = np.full((BINS, 3), -np.inf)
@@ -159,7 +159,7 @@ def _fill_bins(order, first, last, low, high, centre, axis, start, scale):
     return bin_low, bin_high, bin_count
 
 
-@njit(cache=True)
+@func
 def _area(bin_low, bin_high, bin_count, first, last):
     """Half surface area of bins first..last times their number of triangles."""
     total = 0

@@ -7,9 +7,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from .._numba import func
 from ..geometry.rotation import Float
 from .bvh import STACK_SIZE
 
@@ -38,13 +38,13 @@ class Instances(NamedTuple):
     half_size: Float
 
 
-@njit(cache=True)
+@func
 def new_stack():
     """Scratch memory of one thread for the functions below."""
     return np.empty(STACK_SIZE, np.uint32), np.empty(STACK_SIZE)
 
 
-@njit(cache=True, error_model="numpy")
+@func
 def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):
     """Distance at which a ray enters a node's box, infinity where it misses it."""
     a, b = (bounds[node, 0] - ox) * ix, (bounds[node, 3] - ox) * ix
@@ -58,14 +58,14 @@ def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):
     return near
 
 
-@njit(cache=True, error_model="numpy")
+@func
 def _inverse(x):
     if abs(x) < 1e-12:
         return 1e12 if x >= 0 else -1e12
     return 1.0 / x
 
 
-@njit(cache=True, error_model="numpy")
+@func
 def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per node
     bounds, children, counts, edges, root, ox, oy, oz, dx, dy, dz, limit, any_hit, stack
 ):
@@ -131,7 +131,7 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
         node = nodes[top]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@func(forceinline=True)
 def _near_instance(instances, i, ox, oy, oz, dx, dy, dz, limit):
     """Whether a ray comes close enough to instance i for its mesh to be looked at."""
     cx = instances.to_world[i, 0, 3] - ox
@@ -145,7 +145,7 @@ def _near_instance(instances, i, ox, oy, oz, dx, dy, dz, limit):
     return 0.0 < along < limit + instances.radius[i] and distance - along * along < square
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@func(forceinline=True)
 def rotate(m, i, x, y, z):
     """Rotation of transform ``m[i]`` applied to a vector."""
     return (
@@ -155,7 +155,7 @@ def rotate(m, i, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@func(forceinline=True)
 def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     """Nearest hit in the world: (distance, triangle, u, v, instance), instance -1 for static."""
     best, triangle, u, v = cast_mesh(
@@ -189,7 +189,7 @@ def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     return best, triangle, u, v, instance
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@func(forceinline=True)
 def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
     """Whether anything lies on a ray within ``limit``."""
     for i in range(len(instances.radius)):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -100,6 +102,19 @@ class SyntheticConfig:
         for camera in self.cameras:
             if not 0 < camera.fov < math.pi:
                 raise ValueError(f"fov of {camera.name!r} must be in (0, pi), not {camera.fov!r}")
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> SyntheticConfig:
+        """From the JSON values of ``dataclasses.asdict``, as a log's provenance holds them.
+
+        Raises:
+            KeyError, TypeError, ValueError: values of another version of this class.
+        """
+        cameras = tuple(
+            CameraSpec(**{**camera, "position": tuple(camera["position"])})
+            for camera in values["cameras"]
+        )
+        return cls(**{**values, "cameras": cameras})
 
     @property
     def frame_period_us(self) -> int:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from .._numba import func
 from .noise import blend, layered_noise, ramp
 
 SUN = (-0.52, 0.36, 0.775)
@@ -17,7 +16,7 @@ SUN_R, SUN_G, SUN_B = 2.55, 2.4, 2.1
 EXPOSURE = 0.72
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def sky_colour(x, y, z, seed):
     """Linear RGB of the sky in a direction: gradient, clouds, and the sun's glow."""
     z = max(z, 0.0)
@@ -33,7 +32,7 @@ def sky_colour(x, y, z, seed):
     return r + 0.6 * glow, g + 0.5 * glow, b + 0.35 * glow
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def ambient(nz, openness):
     """Light of sky and ground on a surface whose normal has the z component ``nz``."""
     up = 0.5 + 0.5 * nz
@@ -43,7 +42,7 @@ def ambient(nz, openness):
     return r, g, b
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def mirrored(x, y, z, seed):
     """What a glossy surface sees in a direction: sky above, house fronts, road below."""
     r, g, b = sky_colour(x, y, z, seed)
@@ -53,7 +52,7 @@ def mirrored(x, y, z, seed):
     return blend(r, 0.16, road), blend(g, 0.16, road), blend(b, 0.165, road)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def tone(c):
     """Display value in [0, 1] of a linear one: a soft shoulder, then the sRGB curve."""
     c = max(c, 0.0) * EXPOSURE

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from .._numba import func
 from .noise import band, blend, hash01, layered_noise, ramp, value_noise
 
 ROAD, KERB_STONE, PAVING, EARTH, WALL, WINDOW, DOOR, ROOF = range(8)
@@ -22,7 +21,7 @@ PARKING_BAY = 6.5
 """Distance of the marks between parking bays [m]."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def static_surface(  # noqa: PLR0911 - one return per material
     material, paint, p, u, v, fu, fv, seed
 ):
@@ -60,7 +59,7 @@ def static_surface(  # noqa: PLR0911 - one return per material
     return paint[p, 0], paint[p, 1], paint[p, 2], 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _road(paint, p, s, d, fs, fd, f, seed):
     crossing, lane, kerb = paint[p, 3], paint[p, 4], paint[p, 5]
     k = 1.0 + 0.22 * layered_noise(s * 0.3, d * 0.5, 3, f * 0.5, seed)
@@ -89,7 +88,7 @@ def _road(paint, p, s, d, fs, fd, f, seed):
     return r, g, b, 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _repairs(s, d, fs, fd, seed):
     """Factor for patches, cracks and manhole covers."""
     k = 1.0
@@ -122,7 +121,7 @@ def _repairs(s, d, fs, fd, seed):
     return k
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _markings(s, side, d, fs, fd, crossing, lane, kerb):
     """Fraction of white paint at a point of the road."""
     from_crossing = abs(s - crossing)
@@ -142,7 +141,7 @@ def _markings(s, side, d, fs, fd, crossing, lane, kerb):
     return max(white, band(bay, 0.0, 0.1, fs) * band(side, lane, kerb - 0.5, fd))
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _kerb(paint, p, s, fs, f, v, seed):
     stone = math.floor(s)
     k = (
@@ -154,7 +153,7 @@ def _kerb(paint, p, s, fs, f, v, seed):
     return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _paving(paint, p, s, d, fs, fd, f, seed):
     row = math.floor(d / 0.5)
     shift = 0.5 * (row - 2.0 * math.floor(row / 2.0))
@@ -169,7 +168,7 @@ def _paving(paint, p, s, d, fs, fd, f, seed):
     return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _wall(paint, p, u, z, fu, fv, f):
     seed = int(paint[p, 4])
     r, g, b = paint[p, 0], paint[p, 1], paint[p, 2]
@@ -199,7 +198,7 @@ def _wall(paint, p, u, z, fu, fv, f):
     return r * k, g * k, b * k, 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _window(paint, p, u, v, f):
     number = math.floor(u / 10.0)
     u -= number * 10.0
@@ -238,7 +237,7 @@ def _window(paint, p, u, v, f):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _door(paint, p, u, v, f):
     w, h = paint[p, 3], paint[p, 4]
     k = 0.9
@@ -252,7 +251,7 @@ def _door(paint, p, u, v, f):
     return blend(r, 0.5, knob), blend(g, 0.42, knob), blend(b, 0.2, knob), light * 0.7
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _tiles(paint, p, u, v, fu, fv, seed):
     row, column = math.floor(v / 0.34), math.floor(u / 0.24)
     fade = ramp(0.4 - math.sqrt(fu * fv), 0.0, 0.3)
@@ -263,7 +262,7 @@ def _tiles(paint, p, u, v, fu, fv, seed):
     return paint[p, 0] * k, paint[p, 1] * k, paint[p, 2] * k, 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _sign(paint, p, u, v, f):
     rim = 1.0 - band(max(abs(u), abs(v)), -1.0, 0.9, f * 3.0)
     bar = band(abs(u), -1.0, 0.5 - 0.35 * v, f * 3.0) * band(v, -0.6, 0.55, f * 3.0)

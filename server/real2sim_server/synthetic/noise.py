@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from .._numba import func
 
 _MASK = 0xFFFFFFFF
 _RNG = np.random.default_rng(20240229)
@@ -13,7 +14,7 @@ _ORDER = np.tile(_RNG.permutation(256), 3)[:514].astype(np.uint16)
 _VALUE = _RNG.permutation(256) / 255.0
 
 
-@njit(cache=True)
+@func
 def hash01(x, y, seed):
     """A number in [0, 1) from two integers and a seed (32-bit finaliser of MurmurHash3)."""
     h = (int(x) * 0x9E3779B1 + int(y) * 0x85EBCA77 + int(seed) * 0xC2B2AE3D) & _MASK
@@ -22,7 +23,7 @@ def hash01(x, y, seed):
     return (h ^ (h >> 16)) * (1.0 / 4294967296.0)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def value_noise(x, y, seed):
     """Smooth noise in [0, 1] with features of size 1, of period 256.
 
@@ -38,7 +39,7 @@ def value_noise(x, y, seed):
     return a + (b - a) * u + (c - a) * v + (a - b - c + d) * u * v
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def layered_noise(x, y, octaves, footprint, seed):
     """Sum of octaves of noise, about [-1, 1] around 0.
 
@@ -60,20 +61,20 @@ def layered_noise(x, y, octaves, footprint, seed):
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def band(x, low, high, footprint):
     """Fraction of a pixel of width ``footprint`` around x that lies in [low, high]."""
     half = 0.5 * max(footprint, 1e-6)
     return max(0.0, min(x + half, high) - max(x - half, low)) / (2.0 * half)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def blend(a, b, weight):
     """a for weight 0, b for weight 1."""
     return a + (b - a) * weight
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def ramp(x, low, high):
     """Smooth step from 0 at ``low`` to 1 at ``high``."""
     t = min(max((x - low) / (high - low), 0.0), 1.0)

@@ -8,9 +8,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from .._numba import func, kernel
 from ..geometry.rotation import Float
 from .casting import Instances, cast, new_stack
 from .light import tone
@@ -84,7 +85,7 @@ def _sheared_grid(samples: int) -> Float:
     return np.stack([x, y], axis=1) - 0.5
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def _shoot(world, instances, m, k, positions, size):
     """Fields of :class:`Samples` for rays through image positions [N, 2].
 
@@ -116,7 +117,7 @@ def _shoot(world, instances, m, k, positions, size):
     return colours, depth, instance, keys, planes
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _find_edges(keys, planes):
     """Which pixels [H, W] show another surface than one of their eight neighbours."""
     edges = np.zeros(keys.shape, np.bool_)
@@ -126,7 +127,7 @@ def _find_edges(keys, planes):
     return edges
 
 
-@njit(cache=True, error_model="numpy")
+@func
 def _is_edge(keys, planes, row, column):
     key = keys[row, column]
     if key < 0:
@@ -146,7 +147,7 @@ def _is_edge(keys, planes, row, column):
     return False
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def shoot_lidar(world, sweeps, origins, directions, limit):
     """Ranges [C, B], reflectivity [C, B] in [0, 1] of one turn; range 0 where nothing returns.
 

@@ -8,9 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from .._numba import func
 from ..geometry.rotation import Float
 from .bodywork import body_surface, wheel_surface
 from .casting import is_blocked, rotate
@@ -49,14 +49,14 @@ class RaycastWorld(NamedTuple):
     seed: int
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _mix3(values, row, offset, u, v):
     """Component of three corner values, interpolated at barycentric u, v."""
     a, b, c = values[row, offset], values[row, offset + 3], values[row, offset + 6]
     return a * (1.0 - u - v) + b * u + c * v
 
 
-@njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
+@func(fastmath=True, forceinline=True)
 def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     """Material and normal at a hit: (r, g, b, gloss, nx, ny, nz, gx, gy, gz).
 
@@ -122,13 +122,13 @@ def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     return r, gr, b, gloss, nx, ny, nz, gx, gy, gz
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _unit(x, y, z):
     s = 1.0 / math.sqrt(max(x * x + y * y + z * z, 1e-24))
     return x * s, y * s, z * s
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _footprint(f, dx, dy, dz, gx, gy, gz):
     """Size of a pixel along u and v: stretched along the view on slanted surfaces.
 
@@ -146,7 +146,7 @@ def _footprint(f, dx, dy, dz, gx, gy, gz):
     return f * slant, f
 
 
-@njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
+@func(fastmath=True, forceinline=True)
 def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     """A ray whose nearest hit is known: linear (r, g, b), key, normal and plane offset.
 
@@ -199,7 +199,7 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     return r, g, b, -1 if leaves else key, nx, ny, nz, px * gx + py * gy + pz * gz
 
 
-@njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
+@func(fastmath=True, forceinline=True)
 def _openness(instances, instance, x, y, z, nz):
     """Fraction of the sky's light that reaches a point: less beside and under vehicles."""
     fraction = 1.0
@@ -224,7 +224,7 @@ def _openness(instances, instance, x, y, z, nz):
     return fraction
 
 
-@njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
+@func(fastmath=True, forceinline=True)
 def _reflection(world, gloss, open_, lit, dx, dy, dz, nx, ny, nz):
     cos = max(-(dx * nx + dy * ny + dz * nz), 0.0)
     fresnel = gloss * (0.045 + 0.75 * (1.0 - cos) ** 5)
@@ -235,7 +235,7 @@ def _reflection(world, gloss, open_, lit, dx, dy, dz, nx, ny, nz):
     return fraction * (r + glint), fraction * (g + glint), fraction * (b + 0.9 * glint)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@func(fastmath=True)
 def _haze(t, r, g, b):
     clear = math.exp(-t / 900.0)
     return r * clear + 0.85 * (1 - clear), g * clear + 0.92 * (1 - clear), b * clear + (1 - clear)

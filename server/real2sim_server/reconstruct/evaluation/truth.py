@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from ...logs import DrivingLog
-from ...synthetic import CameraSpec, SyntheticConfig, SyntheticLog, generate_log
+from ...synthetic import SyntheticConfig, SyntheticLog, generate_log
 from .image_metrics import psnr
 
 SAME_DB = 30.0
@@ -41,7 +40,7 @@ def find_truth(log: DrivingLog) -> Truth:
     if log.provenance.get("dataset") != "synthetic street" or not isinstance(values, dict):
         return Truth(None, f"log {log.name!r} is no synthetic one, only its own images are known")
     try:
-        street = generate_log(_config(values))
+        street = generate_log(SyntheticConfig.from_values(values))
     except (TypeError, ValueError, KeyError) as error:
         return Truth(None, f"the config of log {log.name!r} is of no known street ({error})")
     camera, t_us = log.rig.cameras[0], log.image_time_us(log.rig.names[0], 0)
@@ -50,11 +49,3 @@ def find_truth(log: DrivingLog) -> Truth:
     if psnr(image, log.image(camera.name, 0)) < SAME_DB:
         return Truth(None, f"log {log.name!r} shows another street than its config gives today")
     return Truth(street)
-
-
-def _config(values: dict[str, Any]) -> SyntheticConfig:
-    cameras = tuple(
-        CameraSpec(**{**camera, "position": tuple(camera["position"])})
-        for camera in values["cameras"]
-    )
-    return SyntheticConfig(**{**values, "cameras": cameras})

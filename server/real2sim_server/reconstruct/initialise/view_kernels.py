@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from ..._numba import func, kernel
 
 NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
@@ -21,7 +22,7 @@ GRAZING = 0.15
 centimetres of error, and what it sees is the side next to it, a lamp on a wing for one."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def to_camera(means, normals, instance, transforms, present, in_camera, turned):
     """Write positions and normals in the camera frame; z = 0 for instances that are absent.
 
@@ -43,7 +44,7 @@ def to_camera(means, normals, instance, transforms, present, in_camera, turned):
             turned[i, row] = t[0] * normals[i, 0] + t[1] * normals[i, 1] + t[2] * normals[i, 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def splat_depth(in_camera, turned, radii, K, depth):
     """Lower ``depth`` [H, W] float32 [m] to the nearest disk in each pixel.
 
@@ -80,7 +81,7 @@ def splat_depth(in_camera, turned, radii, K, depth):
                     depth[py, px] = d
 
 
-@njit(cache=True, nogil=True)
+@func(nogil=True)
 def visible_weight(x, y, z, nx, ny, nz, px, py, K, depth):
     """0 where the disk through (x, y, z) is hidden, 0.15 at its own silhouette, else 1."""
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -110,7 +111,7 @@ def visible_weight(x, y, z, nx, ny, nz, px, py, K, depth):
     return weight
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def gather_samples(
     in_camera,
     turned,
@@ -180,7 +181,7 @@ def gather_samples(
             colours[i, worst, c] = sample(levels[level], u * scale, v * scale, c)
 
 
-@njit(cache=True, nogil=True)
+@func(nogil=True)
 def sample(image, u, v, channel):
     """Bilinear value of one channel at (u, v) [px], rounded; pixel centres lie at +0.5."""
     height, width = image.shape[0], image.shape[1]
@@ -194,7 +195,7 @@ def sample(image, u, v, channel):
     return np.uint8(top * (1 - fy) + bottom * fy + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def robust_mean(colours, weights, result, known):
     """Weighted mean of the samples that agree with their weighted median, channel by channel.
 
@@ -222,7 +223,7 @@ def robust_mean(colours, weights, result, known):
             result[i, c] = value / (fraction * np.float32(255.0))
 
 
-@njit(cache=True, nogil=True)
+@func(nogil=True)
 def weighted_median(values, weights, total):
     """The value below and above which lies half of the weight."""
     best = np.float32(0.0)

@@ -7,13 +7,15 @@ Every row is its own, so results do not depend on the number of threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from ..._numba import kernel
 
 CHUNK = 2048
 ONE = np.float32(1.0)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@kernel(nogil=True, parallel=True, fastmath={"contract"})
 def activate_rows(log_scales, logits, sh, fourier, tones, starts, scales, opacities, colours):
     """Write ``scales`` [N, 3], ``opacities`` [N] and ``colours`` [N, K, 3] float32.
 
@@ -45,7 +47,7 @@ def activate_rows(log_scales, logits, sh, fourier, tones, starts, scales, opacit
                         colours[i, 0, j] += tone * fourier[i - starts[1], f, j]
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@kernel(nogil=True, parallel=True, fastmath={"contract"})
 def activate_backward(
     by_scales,
     by_opacities,

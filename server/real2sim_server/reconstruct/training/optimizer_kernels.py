@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from ..._numba import kernel
 
 CHUNK = 2048
 BETA1 = np.float32(0.9)
 BETA2 = np.float32(0.999)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@kernel(nogil=True, parallel=True, fastmath={"contract"})
 def adam_rows(values, gradient, first, second, seen, rates, correction, epsilon):
     """Update ``values``, ``first`` and ``second`` [N, P] float32 in place.
 

@@ -8,7 +8,9 @@ Every kernel writes whole rows, so results do not depend on the number of thread
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from ..._numba import kernel
 
 TAPS = 11
 REACH = TAPS // 2
@@ -24,7 +26,7 @@ def gaussian_window() -> np.ndarray:
     return (window / window.sum()).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@kernel(nogil=True, parallel=True, fastmath={"contract"})
 def blur_rows(image, truth, window, blurred):
     """Blur x, y, xx, yy and xy along rows.
 
@@ -55,7 +57,7 @@ def blur_rows(image, truth, window, blurred):
                     out[i] += weight * source[i + 3 * k]
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@kernel(nogil=True, parallel=True, fastmath={"contract"})
 def compare(blurred, window, sums, slopes):
     """Blur along columns, compare, and differentiate by the blurred x, xx and xy.
 
@@ -96,7 +98,7 @@ def compare(blurred, window, sums, slopes):
         sums[row] = total
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@kernel(nogil=True, parallel=True, fastmath={"contract"})
 def gather_slopes(image, truth, slopes, window, factor, gradient):
     """Carry derivatives back through the blur; the window is symmetric, so it is its own transpose.
 

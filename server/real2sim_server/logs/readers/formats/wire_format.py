@@ -107,9 +107,9 @@ def _crc_table() -> NDArray[np.uint32]:
 @lru_cache(maxsize=1)
 def _crc_kernel() -> Any:
     """Compiled where it is used: a segment has a gigabyte to check, byte by byte."""
-    from numba import njit
+    from ...._numba import kernel
 
-    @njit(cache=True)
+    @kernel
     def crc32c(data: Any, table: Any) -> int:
         crc = np.uint32(0xFFFFFFFF)
         for byte in data:
