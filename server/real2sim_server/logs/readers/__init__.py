@@ -11,7 +11,7 @@ from .street_gaussians import StreetGaussiansReader
 from .waymo.v1 import WaymoV1Reader
 from .waymo.v2 import WaymoV2Reader
 
-READERS: tuple[LogReader, ...] = (
+READERS: list[LogReader] = [
     NativeReader(),
     KittiReader(),
     KittiRawReader(),
@@ -21,19 +21,22 @@ READERS: tuple[LogReader, ...] = (
     NuScenesReader(),
     StreetGaussiansReader(),
     DrivestudioReader(),
-)
-"""All known readers; the first that recognises a folder reads it."""
-
-__all__ = [
-    "READERS",
-    "Argoverse2Reader",
-    "DrivestudioReader",
-    "KittiRawReader",
-    "KittiReader",
-    "LogReader",
-    "NativeReader",
-    "NuScenesReader",
-    "StreetGaussiansReader",
-    "WaymoV1Reader",
-    "WaymoV2Reader",
 ]
+"""All registered readers; the first that recognises a folder reads it."""
+
+
+def register_reader(reader: LogReader) -> None:
+    """Let ``open_log`` know one more reader, from outside of this package.
+
+    Args:
+        reader: of a layout that no other reader recognises.
+
+    Raises:
+        ValueError: a reader of that name is registered.
+    """
+    if any(known.name == reader.name for known in READERS):
+        raise ValueError(f"a log reader named {reader.name!r} is registered already")
+    READERS.append(reader)
+
+
+__all__ = ["READERS", "LogReader", "register_reader"]

@@ -20,11 +20,8 @@ from ..formats.tables import (
     read_number_table,
 )
 
-IMU_HEIGHT = 0.93
-"""Height of the GPS/IMU unit above the road [m], from the KITTI sensor set-up drawing."""
-
 VELODYNE_HEIGHT = 1.73
-"""Height of the Velodyne above the road [m], from the same drawing."""
+"""Height of the Velodyne above the road [m], from the KITTI sensor set-up drawing."""
 
 FRAME_PERIOD_US = 100_000
 EARTH_RADIUS = 6378137.0

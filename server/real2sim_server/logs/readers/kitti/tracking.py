@@ -20,6 +20,7 @@ from ....scene import Camera, CameraRig, Trajectory
 from ...driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ...images import check_image_file, image_size, read_image
 from ..formats.tables import check_images
+from ..selection import select_sequence
 from ..sweep_motion import compensate_sweep
 from .files import (
     KittiCalibration,
@@ -66,7 +67,7 @@ class KittiReader:
             LogError: see :class:`LogReader`.
         """
         root = _training_folder(path)
-        sequence = _choose_sequence(root, sequence)
+        sequence = _select_sequence(root, sequence)
         calibration = read_calibration(root / "calib" / f"{sequence}.txt")
         images = _image_files(root, sequence)
         frame_count = len(images["image_02"])
@@ -99,17 +100,12 @@ def _training_folder(path: Path) -> Path:
     return path / "training" if (path / "training").is_dir() else path
 
 
-def _choose_sequence(root: Path, sequence: str | None) -> str:
+def _select_sequence(root: Path, sequence: str | None) -> str:
     folder = root / "image_02"
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; expected {KittiReader.expects}")
     known = sorted(p.name for p in folder.iterdir() if p.is_dir())
-    if sequence is None and len(known) == 1:
-        return known[0]
-    if sequence is None or sequence not in known:
-        asked = "name one with sequence" if sequence is None else f"there is no {sequence!r}"
-        raise LogError(f"{folder}: holds the sequences {known}; {asked}")
-    return sequence
+    return select_sequence(folder, known, sequence)
 
 
 def _image_files(root: Path, sequence: str) -> dict[str, list[Path]]:
