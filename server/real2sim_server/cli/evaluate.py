@@ -94,6 +94,7 @@ def _table(result: Evaluation) -> dict[str, object]:
         "ssim": result.ssim,
         "psnr_objects [dB]": result.psnr_objects,
         "depth_error_m [m]": result.depth_error_m,
+        "depth_error_p90_m [m]": result.depth_error_p90_m,
         "box_error_m [m]": result.box_error_m,
         "frames_per_second": result.frames_per_second,
     }

@@ -84,3 +84,14 @@ def median_error(errors: NDArray[np.float64]) -> float:
     """Median [m]; nan for no points, infinite where most are holes."""
     # The mean of a finite and an infinite middle value is infinite, as it should be.
     return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def error_p90(errors: NDArray[np.float64]) -> float:
+    """90th percentile [m]: the smallest error that nine of ten do not exceed.
+
+    Nan for no points, infinite where more than a tenth are holes.
+    """
+    if len(errors) == 0:
+        return float("nan")
+    # Between a finite and an infinite value there is nothing to interpolate.
+    return float(np.percentile(errors, 90, method="inverted_cdf"))

@@ -134,11 +134,12 @@ def _heading(evaluation: Evaluation) -> str:
 
 
 def _figures(evaluation: Evaluation) -> str:
-    head = ("camera", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]", "LiDAR depth error [m]")
+    head = ("camera", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
+            "LiDAR depth error, median [m]", "90th percentile [m]")  # fmt: skip
     scores: list[tuple[str, CameraScore | Evaluation]] = list(evaluation.by_camera.items())
     rows = [
         (name, _number(s.psnr), _number(s.ssim, 3), _number(s.psnr_objects),
-         _number(s.depth_error_m, 3))
+         _number(s.depth_error_m, 3), _number(s.depth_error_p90_m, 3))
         for name, s in (*scores, ("all", evaluation))
     ]  # fmt: skip
     rate = f"<p>Drawn at {evaluation.frames_per_second:.1f} images per second.</p>"
@@ -174,12 +175,13 @@ def _around_figures(evaluation: Evaluation) -> str:
 
 
 def _view_figures(evaluation: Evaluation) -> str:
-    head = ("view", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]", "LiDAR depth error [m]",
-            "LiDAR points", "of these missed [%]")  # fmt: skip
+    head = ("view", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
+            "LiDAR depth error, median [m]", "90th percentile [m]", "LiDAR points",
+            "of these missed [%]")  # fmt: skip
     rows = [
         (f"frame {v.frame}, {v.camera}", _number(v.psnr), _number(v.ssim, 3),
-         _number(v.psnr_objects), _number(v.depth_error_m, 3), str(v.lidar_points),
-         _number(100 * v.lidar_missed, 1))
+         _number(v.psnr_objects), _number(v.depth_error_m, 3), _number(v.depth_error_p90_m, 3),
+         str(v.lidar_points), _number(100 * v.lidar_missed, 1))
         for v in evaluation.views
     ]  # fmt: skip
     return "<h2>All views</h2>" + _table(head, rows)

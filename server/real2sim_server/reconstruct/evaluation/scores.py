@@ -18,7 +18,7 @@ from ..training.data import image_time, resized
 from .around import AroundScore, evaluate_around
 from .box_error import box_error
 from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
-from .lidar_depth import depth_errors, median_error, points_in_camera
+from .lidar_depth import depth_errors, error_p90, median_error, points_in_camera
 from .object_regions import moving_mask, moving_tracks
 from .rendering import measure_rate, render_view
 from .selection import select_cameras, select_frames
@@ -76,6 +76,7 @@ class LoggedViewScore:
         depth_error_m: median absolute error of the rendered depth at the LiDAR points of the
             same sweep that the camera can see [m]; infinite where most hit nothing, nan without
             points.
+        depth_error_p90_m: 90th percentile of the same errors [m].
         lidar_points: how many these are.
         lidar_missed: fraction of them at which nothing is rendered, 0 to 1.
     """
@@ -87,6 +88,7 @@ class LoggedViewScore:
     psnr_objects: float
     object_pixels: int
     depth_error_m: float
+    depth_error_p90_m: float
     lidar_points: int
     lidar_missed: float
 
@@ -99,6 +101,7 @@ class CameraScore:
     ssim: float
     psnr_objects: float
     depth_error_m: float
+    depth_error_p90_m: float
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,7 @@ class Evaluation:
         psnr, ssim: means over views, all pixels [dB], [1].
         psnr_objects: mean over the views that show moving objects, within their boxes [dB].
         depth_error_m: median over all compared LiDAR points of all views [m].
+        depth_error_p90_m: 90th percentile over the same points [m].
         box_error_m: median over moving objects and their times of how far their centres are from
             those of the log's boxes [m]; nan where the log has none of the scene's objects.
         frames_per_second: camera images drawn per second, see :class:`.rendering.RenderRate`.
@@ -133,6 +137,7 @@ class Evaluation:
     ssim: float
     psnr_objects: float
     depth_error_m: float
+    depth_error_p90_m: float
     box_error_m: float
     frames_per_second: float
     width: int
@@ -249,6 +254,7 @@ def _score(
         psnr_objects=psnr(rendered.rgb, image, mask) if enough else float("nan"),
         object_pixels=int(mask.sum()),
         depth_error_m=median_error(errors),
+        depth_error_p90_m=error_p90(errors),
         lidar_points=len(errors),
         lidar_missed=float(np.isinf(errors).mean()) if len(errors) else float("nan"),
     )
@@ -302,11 +308,13 @@ def _by_camera(
 def _summary(
     views: Sequence[LoggedViewScore], errors: Sequence[NDArray[np.float64]]
 ) -> CameraScore:
+    all_errors = np.concatenate(errors)
     return CameraScore(
         psnr=mean_psnr(view.psnr for view in views),
         ssim=float(np.mean([view.ssim for view in views])),
         psnr_objects=mean_psnr(view.psnr_objects for view in views),
-        depth_error_m=median_error(np.concatenate(errors)),
+        depth_error_m=median_error(all_errors),
+        depth_error_p90_m=error_p90(all_errors),
     )
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from real2sim_server.reconstruct.evaluation.lidar_depth import (
     depth_errors,
+    error_p90,
     median_error,
     points_in_camera,
     seen_points,
@@ -79,3 +80,17 @@ def test_a_sweep_is_brought_into_the_camera_frame():
     points = points_in_camera(log, log.rig["front"], 1, int(log.frame_times_us[1]))
     assert points[:, 2].max() == pytest.approx(WALL_X)
     assert points[:, 1].max() == pytest.approx(1.6, abs=1e-5)
+
+
+def test_nine_of_ten_errors_do_not_exceed_the_percentile():
+    errors = np.arange(1.0, 101.0)
+    assert error_p90(errors) == 90
+    assert error_p90(np.append(np.zeros(9), 5.0)) == 0
+
+
+def test_more_holes_than_a_tenth_make_the_percentile_infinite():
+    few, many = np.zeros(100), np.zeros(100)
+    few[:10] = many[:11] = np.inf
+    assert error_p90(few) == 0
+    assert error_p90(many) == np.inf
+    assert np.isnan(error_p90(np.zeros(0)))

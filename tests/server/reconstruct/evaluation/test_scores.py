@@ -102,6 +102,7 @@ def test_a_scene_of_a_flat_wall_and_box_has_small_depth_errors():
     )
     result = evaluate_scene(initialise_scene(log, options=options), log, options=ONCE)
     assert result.depth_error_m < 0.1
+    assert result.depth_error_m <= result.depth_error_p90_m < 0.5
     assert result.psnr > 20
     assert result.psnr_objects > 15
     assert result.views[0].lidar_missed < 0.05
@@ -167,6 +168,8 @@ def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
     values = json.loads(figures.read_text())
     for key in ("psnr", "ssim", "psnr_objects", "depth_error_m", "frames_per_second"):
         assert values[key] > 0, key
+    assert values["depth_error_p90_m"] >= values["depth_error_m"]
+    assert "depth_error_p90_m" in result.output
     assert [v["frame"] for v in values["views"]] == values["frames"] == [2, 3]
     assert [s["shift_m"] for s in values["shifted"]] == [1.0]
     assert "no_shifted" not in values
@@ -174,6 +177,8 @@ def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
     assert html.count("data:image/jpeg;base64,") >= 8
     assert not re.search(r"https?://|<script|<link", html)
     assert f"{values['psnr']:.2f}" in html
+    assert html.count("90th percentile [m]") == 2
+    assert f"<td>{values['depth_error_p90_m']:.3f}</td>" in html
 
 
 def test_the_command_says_what_frames_may_be(on_disk):
