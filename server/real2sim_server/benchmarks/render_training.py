@@ -143,7 +143,8 @@ def _measure(case: TrainingCase, backend: Backend) -> _PassTiming:
     drawn = time.perf_counter()
     losses = _loss_gradients(output)
     ready = time.perf_counter()
-    torch.autograd.backward([output.rgb, output.alpha, output.depth], losses)
+    images = [image for image in (output.rgb, output.alpha, output.depth) if image is not None]
+    torch.autograd.backward(images, losses)
     _wait(case.leaves[-1].grad)
     done = time.perf_counter()
     return _PassTiming(

@@ -159,7 +159,8 @@ def fill_ground(
         return np.where(known[:, None], colours, GREY)
     shape = surface.heights.shape
     cell = np.floor((points[:, :2] - surface.origin) / surface.cell).astype(np.int64)
-    flat = np.ravel_multi_index(np.clip(cell, 0, np.array(shape) - 1).T, shape)
+    rows, columns = np.clip(cell, 0, np.array(shape) - 1).T
+    flat = np.asarray(np.ravel_multi_index((rows, columns), shape))
     counts = np.bincount(flat[known], minlength=shape[0] * shape[1])
     sums = np.stack(
         [np.bincount(flat[known], colours[known, c], shape[0] * shape[1]) for c in range(3)], -1

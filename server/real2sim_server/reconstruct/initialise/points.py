@@ -121,7 +121,7 @@ def path_distance(points: NDArray[np.float32], path: Float) -> NDArray[np.float3
 
     cells, inverse = _unique_cells(points)
     distance, _ = cKDTree(path).query(cells + 0.5, workers=-1)
-    return distance.astype(np.float32)[inverse]
+    return np.asarray(distance.astype(np.float32)[inverse])
 
 
 def _unique_cells(points: NDArray[np.float32]) -> tuple[Float, NDArray[np.int64]]:
@@ -135,7 +135,7 @@ def _unique_cells(points: NDArray[np.float32]) -> tuple[Float, NDArray[np.int64]
 def voxel_levels(distance: NDArray[np.float32], voxel: float, growth: float) -> NDArray[np.int64]:
     """Levels [N] for :func:`thin`: the voxel nearest below ``max(voxel, growth * distance)``."""
     ratio = np.maximum(distance * (growth / voxel), 1.0)
-    return np.clip(np.floor(np.log2(ratio)), 0, MAX_LEVEL).astype(np.int64)
+    return np.asarray(np.clip(np.floor(np.log2(ratio)), 0, MAX_LEVEL), dtype=np.int64)
 
 
 def well_supported(points: NDArray[np.float32], reach: NDArray[np.float32]) -> NDArray[np.bool_]:

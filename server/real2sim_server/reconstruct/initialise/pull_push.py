@@ -48,7 +48,8 @@ def _double(coarse: NDArray[np.float32], height: int, width: int) -> NDArray[np.
     r0, r1, fr = rows
     c0, c1, fc = columns
     wide = coarse[:, c0] * (1 - fc)[None, :, None] + coarse[:, c1] * fc[None, :, None]
-    return wide[r0] * (1 - fr)[:, None, None] + wide[r1] * fr[:, None, None]
+    tall = wide[r0] * (1 - fr)[:, None, None] + wide[r1] * fr[:, None, None]
+    return np.asarray(tall, dtype=np.float32)
 
 
 def _linear(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,6 +11,8 @@ from numpy.typing import NDArray
 from ...scene import Sky
 from ...scene.sky import face_directions
 from .views import DEPTH_DOWNSCALE, ProjectedView
+
+Coordinates = NDArray[np.floating[Any]]
 
 SLOTS = 15
 """Samples of which the median is taken for a direction."""
@@ -46,7 +50,7 @@ class SkySamples:
             self._slots[s][texels[mine]] = colours[mine]
         self._counts[texels] += 1
 
-    def _texels_in(self, view: ProjectedView) -> tuple[NDArray[np.int64], ...]:
+    def _texels_in(self, view: ProjectedView) -> tuple[NDArray[np.int64], Coordinates, Coordinates]:
         """Texels inside the image and their pixel coordinates u, v."""
         camera = view.camera
         rotation = view.T_camera_world[:3, :3].astype(np.float32)
@@ -73,7 +77,7 @@ class SkySamples:
         stack.sort(axis=0)
         middle = (self._counts[known].astype(np.int64) - 1) // 2
         chosen = np.take_along_axis(stack, middle[None, :, None], axis=0)[0]
-        return chosen.astype(np.float32) / 255
+        return np.asarray(chosen.astype(np.float32) / 255)
 
 
 def uncovered(view: ProjectedView) -> NDArray[np.bool_]:
@@ -85,17 +89,24 @@ def uncovered(view: ProjectedView) -> NDArray[np.bool_]:
     return np.asarray(closed == 0)
 
 
-def _bilinear(image: NDArray[np.uint8], u: NDArray, v: NDArray) -> NDArray[np.uint8]:
-    import cv2
-
+def _bilinear(image: NDArray[np.uint8], u: Coordinates, v: Coordinates) -> NDArray[np.uint8]:
     if len(u) == 0:
         return np.zeros((0, 3), dtype=np.uint8)
+    return np.asarray(_remap(image, u - 0.5, v - 0.5), dtype=np.uint8)
+
+
+def _remap(image: NDArray[Any], columns: Coordinates, rows: Coordinates) -> NDArray[Any]:
+    """Bilinear values [N, 3] of an image [H, W, 3] at ``columns`` and ``rows`` [N]."""
+    import cv2
+
+    # OpenCV bounds the width of a map, so that a long list of places takes several rows.
     side = 1 << 14
-    rows = -(-len(u) // side)
-    maps = [np.zeros(rows * side, dtype=np.float32) for _ in range(2)]
-    maps[0][: len(u)], maps[1][: len(v)] = u - 0.5, v - 0.5
-    flat = cv2.remap(image, *(m.reshape(rows, side) for m in maps), cv2.INTER_LINEAR)
-    return flat.reshape(-1, 3)[: len(u)]
+    shape = -(-len(columns) // side), side
+    maps = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
+    for given, values in zip(maps, (columns, rows), strict=True):
+        given.reshape(-1)[: len(values)] = values
+    flat = np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR))
+    return flat.reshape(-1, 3)[: len(columns)]
 
 
 def _panorama(
@@ -131,7 +142,8 @@ def _around(row: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.fl
     gap = np.abs(np.arange(width)[:, None] - place)
     gap = np.minimum(gap, width - gap)
     trust = np.exp(-gap.min(axis=1) / (FADE * width))[:, None]
-    return trust * row[place[gap.argmin(axis=1)]] + (1 - trust) * row[place].mean(axis=0)
+    nearest = row[place[gap.argmin(axis=1)]]
+    return np.asarray(trust * nearest + (1 - trust) * row[place].mean(axis=0))
 
 
 def _softened(panorama: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -140,10 +152,10 @@ def _softened(panorama: NDArray[np.float64]) -> NDArray[np.float32]:
     width = panorama.shape[1]
     # Three turns side by side, so that there is no seam at the back.
     blurred = cv2.GaussianBlur(np.tile(panorama, (1, 3, 1)).astype(np.float32), (0, 0), 2)
-    return blurred[:, width : 2 * width]
+    return np.asarray(blurred, dtype=np.float32)[:, width : 2 * width]
 
 
-def _panorama_place(directions: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
+def _panorama_place(directions: NDArray[np.float32]) -> tuple[Coordinates, Coordinates]:
     height, width = PANORAMA
     elevation = np.arcsin(np.clip(directions[:, 2], -1, 1))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
@@ -152,13 +164,7 @@ def _panorama_place(directions: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
 
 
 def _look_up(panorama: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
-    import cv2
-
     row, column = _panorama_place(directions)
     wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    side = 1 << 14
-    rows = -(-len(row) // side)
-    maps = [np.zeros(rows * side, dtype=np.float32) for _ in range(2)]
-    maps[0][: len(row)], maps[1][: len(row)] = column + 0.5, np.maximum(row - 0.5, 0)
-    flat = cv2.remap(wrapped, *(m.reshape(rows, side) for m in maps), cv2.INTER_LINEAR)
-    return flat.reshape(-1, 3)[: len(row)]
+    values = _remap(wrapped, column + 0.5, np.maximum(row - 0.5, 0))
+    return np.asarray(values, dtype=np.float32)

@@ -124,4 +124,5 @@ def _gap(local: Float, axis: int) -> Float:
     # At the rim of a surface one side is empty; there the other side alone counts.
     ahead, behind = np.minimum(ahead, 1.5 * behind), np.minimum(behind, 1.5 * ahead)
     mean = (ahead + behind) / 2
-    return np.where(np.isfinite(mean), mean, length[:, : min(4, length.shape[1])].mean(axis=1))
+    nearest = length[:, : min(4, length.shape[1])].mean(axis=1)
+    return np.asarray(np.where(np.isfinite(mean), mean, nearest))

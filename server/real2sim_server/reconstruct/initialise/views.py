@@ -119,7 +119,7 @@ class ColourSamples:
         brightness = self._colours.mean(axis=2, dtype=np.float32) * used
         mean = brightness.sum(axis=1) / count
         variance = (brightness**2).sum(axis=1) / count - mean**2
-        return np.sqrt(np.maximum(variance, 0)).astype(np.float32)
+        return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
 
     def _project(self, transforms: Float, present: NDArray[np.bool_]) -> None:
         matrices = np.ascontiguousarray(transforms[:, :3], dtype=np.float32)
@@ -275,5 +275,6 @@ def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     while len(levels) < PYRAMID:
         height, width = levels[-1].shape[:2]
         size = (max(1, width // 2), max(1, height // 2))
-        levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))
+        smaller = cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(smaller, dtype=np.uint8))
     return tuple(levels)

@@ -132,4 +132,4 @@ def real_walls(
     red, blue = colours[:, 0], colours[:, 2]
     blown_out = colours.min(axis=1) > 0.9
     bluish = (blue > red + 0.02) & (blue > 0.45)
-    return known & (deviation < MAX_DEVIATION) & ~blown_out & ~bluish
+    return np.asarray(known & (deviation < MAX_DEVIATION) & ~blown_out & ~bluish)

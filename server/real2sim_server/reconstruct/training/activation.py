@@ -57,8 +57,10 @@ def activated(
     parts = (log_scales, logits, sh, fourier)
     if any(part.device.type != "cpu" for part in parts):
         return activated_plain(*parts, tones=tones, counts=counts, functions=functions)
-    packed = _Activate.apply(*parts, tones, tuple(counts), functions)
-    return Activated(*(tensor.split(list(counts)) for tensor in packed))
+    packed = _Activate.apply(  # type: ignore[no-untyped-call]
+        *parts, tones, tuple(counts), functions
+    )
+    return Activated(*(torch.split(tensor, list(counts)) for tensor in packed))
 
 
 def first_rows(counts: Sequence[int]) -> list[int]:
@@ -77,7 +79,7 @@ def activated_plain(
     functions: int,
 ) -> Activated:
     """:func:`activated` in plain torch, for every device and data type."""
-    background, objects = sh[:, :functions].split([counts[0], len(sh) - counts[0]])
+    background, objects = torch.split(sh[:, :functions], [counts[0], len(sh) - counts[0]])
     if tones.shape[1]:
         many = torch.tensor(counts[1:], device=tones.device)
         weights = torch.repeat_interleave(tones, many, dim=0)
@@ -85,9 +87,9 @@ def activated_plain(
         objects = torch.cat([objects[:, :1] + change[:, None], objects[:, 1:]], dim=1)
     sizes = list(counts)
     return Activated(
-        log_scales.exp().split(sizes),
-        logits.sigmoid().split(sizes),
-        (background, *objects.split(sizes[1:])),
+        torch.split(log_scales.exp(), sizes),
+        torch.split(logits.sigmoid(), sizes),
+        (background, *torch.split(objects, sizes[1:])),
     )
 
 

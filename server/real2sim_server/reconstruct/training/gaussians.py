@@ -91,7 +91,7 @@ class Gaussians:
             counts=self.counts,
             functions=(degree + 1) ** 2,
         )
-        placed = self.means.split(self.counts), self.quats.split(self.counts)
+        placed = (torch.split(part, list(self.counts)) for part in (self.means, self.quats))
         clouds = [GaussianCloud(*columns) for columns in zip(*placed, *drawn, strict=True)]
         for index, flip in enumerate(mirrored):
             if flip:
@@ -104,7 +104,9 @@ def concatenate(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]
     fields = {}
     for name in FIELDS:
         start = 1 if name in OBJECT_FIELDS else 0
-        parts = [g.tensors()[name].detach().split(g.counts[start:]) for g in (first, second)]
+        parts = [
+            torch.split(g.tensors()[name].detach(), list(g.counts[start:])) for g in (first, second)
+        ]
         pieces = [part for pair in zip(*parts, strict=True) for part in pair]
         fields[name] = leaf(torch.cat(pieces) if pieces else first.tensors()[name])
     pairs = list(zip(first.counts, second.counts, strict=True))

@@ -87,7 +87,9 @@ def photometric(
     """
     if image.device.type != "cpu":
         return _photometric_plain(image, truth, ssim_weight)
-    loss, l1, similarity, squared = _Photometric.apply(image, truth, ssim_weight)
+    loss, l1, similarity, squared = _Photometric.apply(  # type: ignore[no-untyped-call]
+        image, truth, ssim_weight
+    )
     return loss, l1, similarity, squared
 
 

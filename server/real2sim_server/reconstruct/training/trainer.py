@@ -126,7 +126,7 @@ class Trainer:
             )
         self.strategy.step_pre_backward(rendered.output)
         with timed("backward"):
-            total.backward()
+            torch.autograd.backward(total)
         with timed("optimiser"):
             taken = self._update(rendered)
         with timed("densify"):

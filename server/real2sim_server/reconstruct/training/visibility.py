@@ -121,7 +121,7 @@ def blending_weights(
         assert output.depth is not None
         depth = output.depth.detach()
         inverse = torch.where(depth > NEAR, 1 / depth, 0)
-        (output.rgb[..., 0].sum() + (output.rgb[..., 1] * inverse).sum()).backward()
+        torch.autograd.backward(output.rgb[..., 0].sum() + (output.rgb[..., 1] * inverse).sum())
     sums = [
         torch.zeros(len(c), 3) if c.grad is None else c.grad[:, 0].cpu() / SH_C0 for c in colours
     ]
@@ -161,7 +161,7 @@ def hidden_sky(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Tensor:
         for drawn, total in ((instances, visible), ([], unoccluded)):
             faces = torch.zeros_like(model.sky).requires_grad_()
             with torch.enable_grad():
-                rasterize(
+                image = rasterize(
                     drawn,
                     viewmat[None],
                     camera.K[None],
@@ -170,7 +170,8 @@ def hidden_sky(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Tensor:
                     sky=Sky(faces),
                     options=RasterOptions(depth=False, instance=False),
                     backend=model.backend,
-                ).rgb.sum().backward()
+                ).rgb
+                torch.autograd.backward(image.sum())
             assert faces.grad is not None
             total.add_(faces.grad)
     return visible.sum(-1) <= SKY_FRACTION * unoccluded.sum(-1)
