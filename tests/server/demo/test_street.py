@@ -1,10 +1,15 @@
 """The street that ships with the demo."""
 
+import numpy as np
 import pytest
 
 from real2sim_server.demo.run import CAMERAS, SCENE, STEP_US
 from real2sim_server.demo.street import DURATION_S, SHIPPED, unpack_street
+from real2sim_server.reconstruct.evaluation import mean_psnr, psnr, render_logged_view
 from real2sim_server.scene.io import load_scene
+from real2sim_server.synthetic import SyntheticConfig, generate_log
+
+COMPARED_FRAMES = (3, 20, 37, 50)
 
 
 @pytest.fixture(scope="module")
@@ -32,3 +37,27 @@ def test_it_was_trained_and_says_how_well(street):
 
 def test_cars_in_it_are_objects(street):
     assert sum(item.category in ("car", "van", "truck") for item in street.objects.values()) >= 8
+
+
+@pytest.fixture(scope="module")
+def views_and_truth(street):
+    """(rendered, true, sky) images of every camera in a few frames of the drive."""
+    truth = generate_log(SyntheticConfig.from_values(street.provenance["config"]))
+    views = []
+    for frame in COMPARED_FRAMES:
+        t_us = int(truth.frame_times_us[frame])
+        for camera in street.rig:
+            pose = camera.pose(truth.ego.transform(t_us))
+            image, depth, _ = truth.render(pose, camera.K, camera.width, camera.height, t_us)
+            views.append((render_logged_view(street, camera, t_us), image, depth == 0))
+    return views
+
+
+def test_it_looks_like_the_drive_of_its_provenance(views_and_truth):
+    assert mean_psnr(psnr(view, image) for view, image, _ in views_and_truth) >= 30
+
+
+def test_its_sky_is_that_of_its_provenance(views_and_truth):
+    skies = [(view, image, sky) for view, image, sky in views_and_truth if np.mean(sky) > 0.02]
+    assert len(skies) >= len(COMPARED_FRAMES)
+    assert mean_psnr(psnr(*item) for item in skies) >= 28
