@@ -53,10 +53,10 @@ def run(*, rounds: int = 4, gaussians: int = GAUSSIANS) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder, one_torch_thread():
         trainer = Trainer(log, scene, options, folder=Path(folder))
         trainer.run(until=WARM_UP)
-        for turn in range(rounds):
+        for index in range(rounds):
             trainer.running.stages.clear()
             start = time.perf_counter()
-            trainer.run(until=WARM_UP + ROUND * (turn + 1))
+            trainer.run(until=WARM_UP + ROUND * (index + 1))
             best_s = min(best_s, (time.perf_counter() - start) / ROUND)
             for name, spent in trainer.running.stages.items():
                 stages[name] = min(stages.get(name, math.inf), 1e3 * spent / ROUND)

@@ -19,7 +19,7 @@ class LogError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class LidarSweep:
-    """One turn of all LiDARs, brought to one instant.
+    """One sweep of all LiDARs, brought to one instant.
 
     Attributes:
         points: [N, 3] float32, vehicle frame at the frame's time stamp [m]; the motion of the

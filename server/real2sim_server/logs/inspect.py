@@ -1,4 +1,4 @@
-"""Says what a log holds and draws it, so that one look tells whether its calibration is right."""
+"""Reports what a log holds and draws it: a wrong calibration shows at once."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class LogReport:
         duration: from the first to the last frame [s].
         rate: frames per second, 0 for a single frame.
         gaps: (frame before the gap, its length [s]).
-        lidar_points: of the sweeps that were looked at, least, median and most.
+        lidar_points: of the inspected sweeps, least, median and most.
         lidar_range: 99th percentile of distances [m].
         tracks: number of objects by category.
         moving: number of moving objects by category.
@@ -109,7 +109,7 @@ class LogReport:
 
 
 def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
-    """Look through a log; a few of its frames are read.
+    """Inspect a log; a few of its frames are read.
 
     Args:
         log: any log.
@@ -118,7 +118,7 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
             above. None draws nothing.
 
     Raises:
-        LogError: a frame that is looked at cannot be read.
+        LogError: an inspected frame cannot be read.
     """
     chosen = sorted(
         {round(i) for i in np.linspace(0, log.frame_count - 1, INSPECTED_FRAMES).tolist()}

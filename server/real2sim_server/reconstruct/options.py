@@ -1,4 +1,4 @@
-"""Options of stage 0, and the error of this room."""
+"""Options of stage 0, and the error of this package."""
 
 from __future__ import annotations
 

@@ -116,8 +116,8 @@ def reconstruct(
             ``with_box_noise``.
         log_format, sequence: passed to ``open_log``.
         overwrite: replace an existing bundle.
-        on_progress: told the stage and how far it is.
-        on_training: told figures of training as it goes on.
+        on_progress: called with the stage, steps done and steps in all.
+        on_training: called with figures of training as it goes on.
 
     Raises:
         ReconstructError: the log has nothing to build from, or there is nothing to resume.
@@ -171,7 +171,7 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class _Callbacks:
-    """Who is told of progress."""
+    """Callbacks of progress, and where times are collected."""
 
     on_progress: OnProgress | None
     on_training: OnTraining | None

@@ -55,7 +55,7 @@ class RangeGrid:
 
     Attributes:
         inclinations: [H] float64 [rad], ascending.
-        columns: azimuth steps W per turn; column i looks at pi - 2 pi (i + 0.5) / W.
+        columns: azimuth steps W per sweep; column i looks at pi - 2 pi (i + 0.5) / W.
     """
 
     inclinations: Float

@@ -38,7 +38,7 @@ def exact_log() -> SyntheticLog:
     return generate_log(replace(SMALL, lidar_noise=0.0))
 
 
-def _look(
+def _render(
     log: SyntheticLog, frame: int, camera: str = "front"
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
     lens, t_us = log.rig[camera], int(log.frame_times_us[frame])
@@ -65,7 +65,7 @@ def test_other_seed_gives_another_street(log: SyntheticLog) -> None:
 
 
 def test_images_are_the_truth_from_the_camera(log: SyntheticLog) -> None:
-    assert (_look(log, 1, "front_right")[0] == log.image("front_right", 1)).all()
+    assert (_render(log, 1, "front_right")[0] == log.image("front_right", 1)).all()
 
 
 def test_pictures_hold_light_and_shade_and_colour(log: SyntheticLog) -> None:
@@ -80,12 +80,12 @@ def test_pictures_hold_light_and_shade_and_colour(log: SyntheticLog) -> None:
 
 def test_every_ray_below_the_horizon_hits_something(log: SyntheticLog) -> None:
     for camera in log.rig.names:
-        depth = _look(log, 0, camera)[1]
+        depth = _render(log, 0, camera)[1]
         assert (depth[depth.shape[0] // 2 :] > 0).all()
 
 
 def test_road_lies_at_height_zero(log: SyntheticLog) -> None:
-    _, depth, instance = _look(log, 0)
+    _, depth, instance = _render(log, 0)
     points = _lift(log.rig["front"], depth)
     road = points[(instance == 0) & (points[..., 0] < 15) & (np.abs(points[..., 1]) < 1.5)]
     ground = road[(road[:, 2] < 0.5)]
@@ -107,7 +107,7 @@ def test_boxes_contain_exactly_the_pixels_of_their_vehicles(log: SyntheticLog) -
     for frame in (0, 3):
         t_us = int(log.frame_times_us[frame])
         for camera in log.rig.names:
-            _, depth, instance = _look(log, frame, camera)
+            _, depth, instance = _render(log, frame, camera)
             points = _lift(log.rig[camera], depth)
             for index, track in enumerate(log.tracks):
                 local = _in_box(log, track, t_us, points.reshape(-1, 3))
@@ -282,7 +282,7 @@ def test_street_without_vehicles_or_lidar() -> None:
 def test_shifted_lane_shows_the_same_street(log: SyntheticLog) -> None:
     """Depth from two metres to the left agrees with the points seen from the lane."""
     lens = log.rig["front"]
-    _, depth, instance = _look(log, 0)
+    _, depth, instance = _render(log, 0)
     points = _lift(lens, depth)
     _, other, _ = log.render(_shifted(lens), lens.K, lens.width, lens.height, 0)
     wanted = (instance == 0) & (depth > 0) & (depth < 25)

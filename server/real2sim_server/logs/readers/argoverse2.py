@@ -1,7 +1,7 @@
 """Argoverse 2, sensor data set.
 
 Source: the user guide and ``av2`` package of the data set (Wilson et al. 2021). Points are
-egomotion-compensated to the time stamp of their sweep, which is the start of the turn; boxes hold
+egomotion-compensated to the time stamp of their sweep, which is its start; boxes hold
 for the same instant. The ego frame lies on the rear axle, here it is put on the ground. Cameras run
 at 20 Hz by their own clock; a frame has the image that is nearest in time. Pixel centres are taken
 to lie on whole numbers, as with OpenCV's calibrations.

@@ -2,7 +2,7 @@
 
 Source: ``datasets/waymo`` of the released program and its documentation. Unlike those of Street
 Gaussians, extrinsics are in Waymo's own axes. There are no time stamps: frames are 0.1 s apart.
-The other data sets it can prepare differ in ways that their folders do not tell, and are better
+The other data sets it can prepare differ in ways that their folders do not show, and are better
 read from their own files.
 """
 

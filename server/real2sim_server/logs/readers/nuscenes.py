@@ -2,7 +2,7 @@
 
 Source: ``docs/schema_nuscenes.md`` of the data set's development kit. Cameras run at 12 Hz and the
 LiDAR at 20 Hz; a frame is an image of CAM_FRONT with the images and the sweep nearest in time.
-Sweeps are motion-compensated to their time stamp, which is the end of a turn. Boxes exist at 2 Hz
+Sweeps are motion-compensated to their time stamp, which is its end. Boxes exist at 2 Hz
 and are interpolated by the tracks. Pixel centres are taken to lie on whole numbers.
 """
 

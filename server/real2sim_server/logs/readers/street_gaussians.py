@@ -38,7 +38,7 @@ from .waymo.segment import (
 
 TYPES = {"vehicle": 1, "pedestrian": 2, "sign": 3, "cyclist": 4, "misc": 0}
 LASER = (1.43, 0.0, 2.184)
-"""Where Waymo's TOP laser sits on the vehicle [m]; the folder does not tell."""
+"""Where Waymo's TOP laser sits on the vehicle [m]; the folder does not say."""
 
 
 class StreetGaussiansReader:

@@ -1,4 +1,4 @@
-"""Brings the points of one LiDAR turn to one instant, by the vehicle's own motion."""
+"""Brings the points of one LiDAR sweep to one instant, by the vehicle's own motion."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def track_moving_objects(
     object has left are free space afterwards.
 
     Args:
-        log: with LiDAR; its tracks are not looked at.
+        log: with LiDAR; its tracks are ignored.
         options: see there.
         on_progress: called with (done, total) after each sweep.
 
@@ -225,14 +225,16 @@ def _vacates_positions(
     The visible part of a wall moves along as the vehicle drives by, but the wall stays.
     """
     frames = sorted(clusters)
-    looked = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, TESTED_FRAMES).tolist()]
+    tested_frames = [
+        frames[round(i)] for i in np.linspace(0, len(frames) - 1, TESTED_FRAMES).tolist()
+    ]
     free = occupied = 0
-    for there, rays in rays_by_frame.items():
-        index = there - int(box.frames[0])
+    for frame, rays in rays_by_frame.items():
+        index = frame - int(box.frames[0])
         if not 0 <= index < len(box.frames):
             continue
-        for here in looked:
-            points = clusters[here].points
+        for tested in tested_frames:
+            points = clusters[tested].points
             left = points[~_inside(box, index, points)]
             if len(left):
                 found = rays.count(left[:: max(1, len(left) // MAX_TESTED_POINTS)])

@@ -1,7 +1,7 @@
 """How complete vehicles are: views from all around each of them against the truth.
 
-An edited vehicle is seen from where no camera of the log ever was. What it looks like there was
-never measured; it comes from the mirrored side and from its own frames over time.
+An edited vehicle is seen from where no camera of the log ever was. Its appearance there was never
+measured; it comes from the mirrored side and from its own frames over time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 320, 240
 HALF_VIEW = np.deg2rad(25.0)
 ELEVATION = np.deg2rad(12.0)
 SEEN_WITHIN = np.deg2rad(40.0)
-"""A side counts as seen when a camera of the log looked at it from no further round than this."""
+"""A side counts as seen when the azimuth of a logged camera differs by no more than this."""
 MIN_PIXELS = 500
 """Views that show fewer pixels of the vehicle, as other things hide it, do not count."""
 
@@ -37,7 +37,7 @@ class SideScore:
 
     Attributes:
         object_id: of the vehicle.
-        azimuth: where it was looked at from [rad], 0 from ahead, pi from behind.
+        azimuth: of the camera about the vehicle [rad], 0 from ahead, pi from behind.
         seen: whether a camera of the log saw this side.
         psnr: [dB]; what is missing counts as black.
         coverage: fraction of the pixels where anything of the vehicle is drawn.
@@ -70,15 +70,15 @@ class AroundScore:
 def evaluate_around(
     scene: Scene, truth: SyntheticLog, *, least_views: int = 5, backend: str = "auto"
 ) -> AroundScore:
-    """Look at every vehicle that the log shows in ``least_views`` images from all around.
+    """Render every vehicle that the log shows in ``least_views`` images from all around.
 
-    Each is looked at at the middle of its time, alone, from eight azimuths.
+    Each is rendered at the middle of its time, alone, from eight azimuths.
     """
     sides: list[SideScore] = []
     for index, track in enumerate(truth.tracks):
-        looked_from = logged_azimuths(truth, track)
-        if track.object_id in scene.objects and len(looked_from) >= least_views:
-            sides += _sides(scene, truth, index, looked_from, backend)
+        logged_from = logged_azimuths(truth, track)
+        if track.object_id in scene.objects and len(logged_from) >= least_views:
+            sides += _sides(scene, truth, index, logged_from, backend)
     return AroundScore(
         psnr_seen=mean_psnr(s.psnr for s in sides if s.seen),
         psnr_unseen=mean_psnr(s.psnr for s in sides if not s.seen),
@@ -106,7 +106,7 @@ def logged_azimuths(log: SyntheticLog, track: ObjectTrack) -> list[float]:
 
 
 def view_from(track: ObjectTrack, t_us: int, azimuth: float) -> tuple[Camera, Float]:
-    """A camera that looks at the middle of an object, and its ``T_world_camera`` [4, 4]."""
+    """A camera aimed at the middle of an object, and its ``T_world_camera`` [4, 4]."""
     focal = WIDTH / 2 / np.tan(HALF_VIEW)
     K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
     distance = 0.62 * np.linalg.norm(track.size) / np.tan(HALF_VIEW)
@@ -122,7 +122,7 @@ def view_from(track: ObjectTrack, t_us: int, azimuth: float) -> tuple[Camera, Fl
 
 
 def _sides(
-    scene: Scene, truth: SyntheticLog, index: int, looked_from: Sequence[float], backend: str
+    scene: Scene, truth: SyntheticLog, index: int, logged_from: Sequence[float], backend: str
 ) -> list[SideScore]:
     track = truth.tracks[index]
     item = scene.objects[track.object_id]
@@ -147,12 +147,12 @@ def _sides(
         )
         rgb = (drawn.rgb[0].clamp(0, 1).cpu().numpy() * 255).round().astype(np.uint8)
         covered = drawn.alpha[0].cpu().numpy()[mask] > 0.5
-        turns = np.abs(_wrapped(np.array(looked_from) - azimuth))
+        offsets = np.abs(_wrapped(np.array(logged_from) - azimuth))
         sides.append(
             SideScore(
                 object_id=track.object_id,
                 azimuth=float(azimuth),
-                seen=bool((turns <= SEEN_WITHIN).any()),
+                seen=bool((offsets <= SEEN_WITHIN).any()),
                 psnr=psnr(rgb, image, mask),
                 coverage=float(covered.mean()),
             )

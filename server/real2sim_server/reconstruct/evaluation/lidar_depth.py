@@ -15,7 +15,7 @@ NEAR, FAR = 0.5, 80.0
 HIDDEN_BEHIND = 0.3
 """What lies so much nearer hides a point, unless the road alone recedes as quickly [m]."""
 REACH = 0.006
-"""Up to how far away on the image it is looked for [rad]; about the distance of two beams."""
+"""Radius on the image within which an occluder is searched [rad]; about two beams apart."""
 ROAD_BELOW = 1.2
 """The road is at least so far below the cameras [m]."""
 

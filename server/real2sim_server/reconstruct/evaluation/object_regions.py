@@ -27,7 +27,7 @@ def moving_mask(
 ) -> NDArray[np.bool_]:
     """[H, W] bool, pixels whose centre lies within the outline of any box.
 
-    What hides a box from the camera is not looked at.
+    Occlusion by other things is ignored.
 
     Args:
         tracks: whose boxes count.

@@ -34,10 +34,10 @@ class EvaluateOptions:
         frames: ``held-out``, ``all`` or indices; see :func:`.selection.select_frames`.
         width: of the compared images [px]; as logged by default.
         shifts: distances beside the recorded path [m], where truth exists.
-        shifted_frames: at most so many frames, evenly spread, are looked at from there.
+        shifted_frames: at most so many frames, evenly spread, are rendered from there.
         repeats: timed renders.
         backend: of the renderer.
-        around: whether vehicles are looked at from all around, where truth exists.
+        around: whether vehicles are rendered from all around, where truth exists.
 
     Raises:
         ReconstructError: a value out of range.
@@ -166,7 +166,7 @@ def evaluate_scene(
     options: EvaluateOptions | None = None,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
-    """Render logged views and compare them with images and LiDAR; time it; look from beside.
+    """Render logged views, compare them with images and LiDAR, time it, render shifted views.
 
     Every view is rendered when its image was taken, by the scene's own calibration and objects'
     poses, which training may have refined. Where moving objects are is taken from the log.
@@ -201,7 +201,7 @@ def evaluate_scene(
         scene=scene.name,
         log=log.name,
         frames=chosen.frames,
-        frames_unseen=chosen.unseen,
+        frames_unseen=chosen.held_out,
         gaussians=scene.gaussian_count,
         box_error_m=box_error(scene, log),
         frames_per_second=rate.frames_per_second,
@@ -276,12 +276,12 @@ def _shifted(
     if truth.log is None:
         return (), f"no truth exists beside the recorded path: {truth.missing}"
     count = min(options.shifted_frames, len(times_us))
-    spread = sorted({round(i) for i in np.linspace(0, len(times_us) - 1, count)})
+    chosen_times = sorted({round(i) for i in np.linspace(0, len(times_us) - 1, count)})
     scores = evaluate_shifts(
         scene,
         truth.log,
         cameras,
-        [times_us[i] for i in spread],
+        [times_us[i] for i in chosen_times],
         options.shifts,
         backend=options.backend,
         on_view=report_step,

@@ -20,11 +20,11 @@ class SelectedFrames:
 
     Attributes:
         frames: indices, increasing.
-        unseen: whether the scene says that none of them was used to make it.
+        held_out: whether the scene says that none of them was used to make it.
     """
 
     frames: tuple[int, ...]
-    unseen: bool
+    held_out: bool
 
 
 def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) -> SelectedFrames:
@@ -32,7 +32,7 @@ def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) ->
 
     ``held-out`` means those that training kept back, as the scene's provenance lists them. A
     scene that lists none (made without training, or on all frames, or elsewhere) is compared at
-    every fourth frame by the same rule, 2, 6, 10 ..., and they do not count as unseen.
+    every fourth frame by the same rule, 2, 6, 10 ..., and they do not count as held out.
 
     Args:
         frames: ``held-out``, ``all``, or indices.

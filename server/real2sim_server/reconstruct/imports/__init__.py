@@ -22,7 +22,7 @@ __all__ = [
 def import_checkpoint(
     path: str | PathLike[str], options: CheckpointOptions | None = None
 ) -> ImportedScene:
-    """Read a checkpoint of Street Gaussians or drivestudio; which, its keys tell.
+    """Read a checkpoint of Street Gaussians or drivestudio; its keys say which.
 
     Raises:
         CheckpointError: neither of them, parts that are missing or do not fit, or a file that

@@ -80,7 +80,7 @@ def initialise_scene(
     Args:
         log: a drive with LiDAR and at least one camera; boxes may be missing.
         options: see InitialiseOptions.
-        on_progress: told the stage and how far it is.
+        on_progress: called with the stage, steps done and steps in all.
         timing_s: filled with the seconds of each stage.
 
     Returns:
@@ -190,7 +190,7 @@ def _keep_real_walls(
     options: InitialiseOptions,
     report_step: Callable[[int, int], None],
 ) -> _SurfelSet:
-    """Drop continued walls that look like sky, or different from every view."""
+    """Drop continued walls coloured like the sky, or differently in every view."""
     if parts.walls.start == parts.walls.stop:
         return parts
     frames = chosen_frames(log, WALL_FRAMES)

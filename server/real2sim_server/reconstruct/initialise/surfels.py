@@ -11,7 +11,7 @@ from ...geometry.rotation import Float, matrix_to_quaternion
 
 NEIGHBOURS = 20
 CHUNK = 50_000
-"""Points whose neighbourhoods are looked at together; bounds the memory."""
+"""Points whose neighbourhoods are fitted together; bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)

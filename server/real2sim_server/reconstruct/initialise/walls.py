@@ -1,7 +1,7 @@
 """Walls above the LiDAR's field of view.
 
 A spinning LiDAR sees a few degrees upwards, a house is higher. Where a wall reaches the upper
-limit of the scanner it is continued straight up; images then tell which part of that is real.
+limit of the scanner it is continued straight up; images then decide which part of that is real.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Training: from a first scene to one that looks like the log."""
+"""Training: from the scene of stage 0 to one that renders like the log."""
 
 from .boxes import smoothed_boxes, with_box_noise
 from .data import held_out_frames, training_log

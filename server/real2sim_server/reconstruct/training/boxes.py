@@ -37,11 +37,11 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
         given = track.trajectory
         count = len(given.times_us)
         shift = rng.standard_normal((count, 3)) * (fraction * np.array(track.size))
-        turn = quaternion_to_matrix(given.quaternions)
+        rotations = quaternion_to_matrix(given.quaternions)
         tracks.append(
             _with_poses(
                 track,
-                given.positions + np.einsum("tij,tj->ti", turn, shift),
+                given.positions + np.einsum("tij,tj->ti", rotations, shift),
                 rng.standard_normal(count) * fraction,
             )
         )
@@ -51,7 +51,7 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
 def smoothed_boxes(log: DrivingLog) -> DrivingLog:
     """``log`` with the scatter of its boxes taken out, as far as vehicles cannot move like that.
 
-    The variance of second differences tells how much boxes scatter; where that is more than
+    The variance of second differences shows how much boxes scatter; where that is more than
     driving explains, positions and headings are smoothed with the weight that follows from both
     (Whittaker 1923). Boxes that do not scatter stay as they are, to the bit.
     """
@@ -79,8 +79,8 @@ def _whittaker(values: Float, driving: float, least: float) -> Float:
     """
     second = np.diff(values, n=2, axis=0)
     # Robust against the few steps at which a driver brakes hard.
-    spread = 1.4826 * np.median(np.abs(second), axis=0)
-    variance = max(0.0, float((spread**2).mean()) - driving**2) / 6
+    deviation = 1.4826 * np.median(np.abs(second), axis=0)
+    variance = max(0.0, float((deviation**2).mean()) - driving**2) / 6
     if variance < least**2:
         return values
     difference: NDArray[np.float64] = np.diff(np.eye(len(values)), n=2, axis=0)
@@ -89,7 +89,7 @@ def _whittaker(values: Float, driving: float, least: float) -> Float:
     return np.asarray(np.linalg.solve(system, values))
 
 
-def _with_poses(track: ObjectTrack, positions: Float, turn: Float) -> ObjectTrack:
+def _with_poses(track: ObjectTrack, positions: Float, yaws: Float) -> ObjectTrack:
     given = track.trajectory
-    quaternions = multiply_quaternions(yaw_quaternion(turn), given.quaternions)
+    quaternions = multiply_quaternions(yaw_quaternion(yaws), given.quaternions)
     return replace(track, trajectory=Trajectory(given.times_us, positions, quaternions))

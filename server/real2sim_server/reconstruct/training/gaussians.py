@@ -116,7 +116,7 @@ def concatenate(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]
 
 
 def mirror(cloud: GaussianCloud) -> GaussianCloud:
-    """The cloud reflected at its x z plane, as a vehicle looks from its other side."""
+    """The cloud reflected at its x z plane, as a vehicle appears from its other side."""
     sign = cloud.means.new_tensor
     k = int(cloud.sh.shape[1])
     return replace(

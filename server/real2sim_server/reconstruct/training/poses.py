@@ -107,10 +107,10 @@ class ObjectPoses:
 
     def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor]:
         """World positions [T, 3] about their mean and unwrapped yaws [T, 1], float32."""
-        turn = torch.from_numpy(quaternion_to_matrix(key.quaternions)).float()
+        rotations = torch.from_numpy(quaternion_to_matrix(key.quaternions)).float()
         base = torch.from_numpy(key.positions - key.positions.mean(0)).float()
-        positions = base + torch.einsum("tij,tj->ti", turn, self.shifts[key.rows])
-        heading = np.unwrap(np.arctan2(turn[:, 1, 0].numpy(), turn[:, 0, 0].numpy()))
+        positions = base + torch.einsum("tij,tj->ti", rotations, self.shifts[key.rows])
+        heading = np.unwrap(np.arctan2(rotations[:, 1, 0].numpy(), rotations[:, 0, 0].numpy()))
         yaws = torch.from_numpy(heading.astype(np.float32))[:, None] + self.yaws[key.rows]
         return positions, yaws
 
@@ -119,8 +119,8 @@ class ObjectPoses:
         key = self.keys[index]
         shift = self.shifts.detach()[key.rows].double().numpy()
         yaw = self.yaws.detach()[key.rows, 0].double().numpy()
-        turn = quaternion_to_matrix(key.quaternions)
-        positions = key.positions + np.einsum("tij,tj->ti", turn, shift)
+        rotations = quaternion_to_matrix(key.quaternions)
+        positions = key.positions + np.einsum("tij,tj->ti", rotations, shift)
         quaternions = multiply_quaternions(key.quaternions, yaw_quaternion(yaw))
         return Trajectory(key.times_us, positions, quaternions)
 

@@ -1,4 +1,4 @@
-"""How far a training run is and how fast it goes."""
+"""Progress and rate of a training run."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class RunningMeans:
 
 
 class RateMeter:
-    """Steps per second since the last look."""
+    """Steps per second since the last call."""
 
     def __init__(self, iteration: int) -> None:
         self._iteration, self._time = iteration, time.perf_counter()

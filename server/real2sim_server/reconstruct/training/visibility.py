@@ -101,7 +101,7 @@ def blending_weights(
     """By instance: sums [N] over pixels of each Gaussian's blending weight, and of weight by depth.
 
     In [px] and [px/m]; a pixel's depth is that of the surface it shows. An image is linear in the
-    constant colours, so that the gradients of two channels' sums by them are what is looked for.
+    constant colours, so that the gradients of two channels' sums by them are these sums.
     """
     colours, coloured = [], []
     for item in instances:
@@ -134,14 +134,14 @@ def unoccluded_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
     0 for Gaussians whose centre is not on the image.
     """
     to_camera = _to_camera(instance, viewmat)
-    turn, cloud = to_camera[:3, :3], instance.cloud
-    x, y, z = (cloud.means @ turn.T + to_camera[:3, 3]).unbind(-1)
+    rotation, cloud = to_camera[:3, :3], instance.cloud
+    x, y, z = (cloud.means @ rotation.T + to_camera[:3, 3]).unbind(-1)
     ahead = z > NEAR
     z = z.clamp(min=NEAR)
     fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     u, v = fx * x / z + cx, fy * y / z + cy
     inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    axes = (turn @ rotation_matrices(cloud.quats)) * cloud.scales[:, None]
+    axes = (rotation @ rotation_matrices(cloud.quats)) * cloud.scales[:, None]
     across = (fx / z)[:, None] * (axes[:, 0] - (x / z)[:, None] * axes[:, 2])
     down = (fy / z)[:, None] * (axes[:, 1] - (y / z)[:, None] * axes[:, 2])
     a, c = across.square().sum(-1) + EPS2D, down.square().sum(-1) + EPS2D

@@ -71,13 +71,13 @@ def test_frames_that_training_kept_back_are_compared_and_count_as_unseen(street,
     trained = with_provenance(street_scene, stage=1, held_out_frames=[1, 4])
     assert select_frames(trained, street, "held-out") == select_frames(trained, street, [4, 1])
     assert select_frames(trained, street, "held-out").frames == (1, 4)
-    assert select_frames(trained, street, "held-out").unseen
-    assert not select_frames(trained, street, [1, 2]).unseen
+    assert select_frames(trained, street, "held-out").held_out
+    assert not select_frames(trained, street, [1, 2]).held_out
 
 
 def test_without_training_every_fourth_frame_is_compared_and_counts_as_seen(street, street_scene):
     chosen = select_frames(street_scene, street, "held-out")
-    assert (chosen.frames, chosen.unseen) == ((2,), False)
+    assert (chosen.frames, chosen.held_out) == ((2,), False)
     assert select_frames(street_scene, street, "all").frames == tuple(range(6))
 
 

@@ -95,7 +95,7 @@ def test_balls_and_discs_get_three_scales(tmp_path, columns):
         assert (cloud.scales[:, 2] < 1e-3 * given.amin(1)).all()
 
 
-def looks(sky, directions):
+def view_directions(sky, directions):
     return torch.nn.functional.normalize(sky.sample(directions) * 2 - 1)
 
 
@@ -110,7 +110,7 @@ def test_the_sky_is_looked_up_in_its_own_axes(tmp_path, directions):
     x, y, z = directions.unbind(1)
     # Its shader turns view directions (x, y, z) to (x, z, -y) first.
     expected = torch.stack([x, z, -y], dim=1)
-    assert (looks(sky, directions) * expected).sum(1).min() > np.cos(0.2)
+    assert (view_directions(sky, directions) * expected).sum(1).min() > np.cos(0.2)
 
 
 def test_a_world_of_the_front_camera_is_turned_upright(tmp_path, directions):

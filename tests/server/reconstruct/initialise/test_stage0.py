@@ -152,17 +152,17 @@ def test_a_log_without_cameras_is_refused():
 
 
 def test_progress_names_the_stages_and_ends_each():
-    told: list[tuple[str, int, int]] = []
+    reported: list[tuple[str, int, int]] = []
     timing: dict[str, float] = {}
     initialise_scene(
         painted_log(frames=2),
         options=SMALL,
-        on_progress=lambda *args: told.append(args),
+        on_progress=lambda *args: reported.append(args),
         timing_s=timing,
     )
     assert list(timing) == ["accumulate", "shape", "walls", "colour", "fill"]
     for stage in timing:
-        last = [(done, total) for name, done, total in told if name == stage][-1]
+        last = [(done, total) for name, done, total in reported if name == stage][-1]
         assert last[0] == last[1]
 
 

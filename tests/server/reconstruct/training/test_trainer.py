@@ -24,7 +24,7 @@ from .conftest import TINY
 
 
 @pytest.fixture(autouse=True)
-def calm():
+def one_thread():
     with one_torch_thread():
         yield
 

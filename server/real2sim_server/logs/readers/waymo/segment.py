@@ -1,7 +1,7 @@
 """What both editions of the Waymo Open Dataset have in common, and the log they become.
 
-A frame's time stamp in the files is the start of a turn of the TOP laser. Its pose, its boxes and
-its points hold for the middle of the turn, which is when the FRONT camera is triggered: the pose
+A frame's time stamp in the files is the start of a sweep of the TOP laser. Its pose, its boxes and
+its points hold for the middle of the sweep, which is when the FRONT camera is triggered: the pose
 of the frame is that of the FRONT image (github.com/waymo-research/waymo-open-dataset, issue 464).
 That instant is the frame's time in the log. Pixel centres lie at +0.5, as in a Camera.
 """
