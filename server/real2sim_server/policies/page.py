@@ -6,7 +6,7 @@ import base64
 from collections.abc import Sequence
 from html import escape
 
-from ..world.scoring import VERSIONS
+from ..world.scoring import METRICS, metric_versions
 from .episodes import EpisodeResult
 from .plots import plot_curves, plot_paths
 from .summary import ScoreGroup, ScoreStatistics, group_scores
@@ -76,7 +76,7 @@ def _head(
 def _table(groups: Sequence[ScoreGroup]) -> str:
     names = "".join(
         f"<th>{name.replace('_', ' ')}<small>v{version} {SCORE_NOTES.get(name, '')}</small></th>"
-        for name, version in VERSIONS.items()
+        for name, version in metric_versions().items()
     )
     rows = [
         f"<th>planner</th>{names}<th>collisions<small>at fault</small></th><th>ended by</th>",
@@ -86,7 +86,7 @@ def _table(groups: Sequence[ScoreGroup]) -> str:
 
 
 def _row(group: ScoreGroup) -> str:
-    cells = "".join(f"<td>{_score(group.scores[name])}</td>" for name in VERSIONS)
+    cells = "".join(f"<td>{_score(group.scores[name])}</td>" for name in METRICS)
     hits = f"{group.collisions} <small>{group.at_fault}</small>"
     if group.at_fault:
         hits = f'<span class="bad">{hits}</span>'

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..world.recording.recording import load_recording
-from ..world.scoring import VERSIONS
+from ..world.scoring import METRICS, metric_versions
 from .episodes import EpisodeResult
 
 
@@ -58,7 +58,7 @@ class ScoreGroup:
         failed = sum(one.error is not None for one in results)
         found = [one.scores() for one in results]
         scores: dict[str, ScoreStatistics | None] = {}
-        for name in VERSIONS:
+        for name in METRICS:
             values = [s[name]["value"] for s in found if name in s]
             defined = [v for v in values if v is not None]
             scores[name] = None if failed else ScoreStatistics.of(defined)
@@ -88,7 +88,7 @@ def group_scores(results: Sequence[EpisodeResult]) -> list[ScoreGroup]:
 def report_figures(results: Sequence[EpisodeResult], folder: Path) -> dict[str, Any]:
     """Everything for JSON; files relative to ``folder``."""
     return {
-        "metrics": dict(VERSIONS),
+        "metrics": metric_versions(),
         "groups": [asdict(group) for group in group_scores(results)],
         "episodes": [
             {

@@ -15,7 +15,7 @@ from real2sim_server.policies.summary import (
     unconfirmed_scores,
 )
 from real2sim_server.world.recording.recording import load_recording
-from real2sim_server.world.scoring import VERSIONS
+from real2sim_server.world.scoring import METRICS
 
 pytestmark = pytest.mark.network
 
@@ -47,7 +47,7 @@ def test_scores_of_the_report_are_those_of_the_recordings(results, folder):
     for episode in figures["episodes"]:
         if episode["error"] is None:
             again = load_recording(folder / episode["recording"]).rescore()
-            assert {s["name"] for s in episode["scores"]} == set(VERSIONS)
+            assert {s["name"] for s in episode["scores"]} == set(METRICS)
             assert [s.value for s in again] == [s["value"] for s in episode["scores"]]
 
 
@@ -92,7 +92,7 @@ def test_the_page_holds_everything_and_loads_nothing(results):
     assert all(link.startswith(("data:image/", "recordings/")) for link in loaded)
     assert text.count("data:image/png") == 2 * 2
     assert text.count("data:image/jpeg") >= 2 * 2 * 4
-    for name in VERSIONS:
+    for name in METRICS:
         assert name.replace("_", " ") in text
 
 

@@ -32,7 +32,7 @@ from real2sim_server.world.driving import (
     vehicle_parameters,
 )
 from real2sim_server.world.driving.curve import PlanCurve
-from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS, scheduled
+from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS, solve_schedule
 from real2sim_server.world.driving.lqr import HEADWAY, TIME
 from real2sim_server.world.driving.tyres import integrate
 from real2sim_server.world.ego.motion import Motion
@@ -225,7 +225,7 @@ def cost_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> float
 def test_ilqr_finds_the_commands_that_a_general_optimiser_finds(y, speed):
     start = state_of(x=3.0, y=y, speed=speed)
     knots, turn_rate = straight_plan(10.0)
-    states, inputs = scheduled(start, PlanCurve(knots, turn_rate), 0.3, VEHICLE)
+    states, inputs = solve_schedule(start, PlanCurve(knots, turn_rate), 0.3, VEHICLE)
     wanted = np.zeros((STEPS + 1, 5))
     wanted[:, 0], wanted[:, 3] = 10.0 * (0.3 + STEP * np.arange(STEPS + 1)), 10.0
 

@@ -1,33 +1,28 @@
 """How the controlled vehicle moves and steers: plain functions, compiled.
 
-Everything here takes and gives floats, tuples and arrays. :mod:`.entries` is what Python calls; the
-other files hold what that is made of.
+Everything here takes and gives floats, tuples and arrays. :mod:`.entries` is what Python calls;
+:mod:`.vehicle_models` and :mod:`.trackers` are the families that it chooses from.
 """
 
 from .curve import MOVING
-from .entries import (
-    HOLD,
-    ILQR,
-    LQR,
-    PURSUIT,
-    advance_vehicle,
-    curve_at,
-    driver_command,
-    plan_curve,
-    world_poses,
-)
+from .entries import advance_vehicle, curve_at, driver_command, plan_curve, world_poses
 from .state import Command, PlanarState
-from .vehicle import GRAVITY, VehicleParameters, vehicle_parameters
+from .trackers import HOLD, ILQR, KINDS, LQR, PURSUIT
+from .vehicle import GRAVITY, VehicleParameters
+from .vehicle_models import VEHICLE_MODELS, VehicleModel, vehicle_parameters
 
 __all__ = [
     "GRAVITY",
     "HOLD",
     "ILQR",
+    "KINDS",
     "LQR",
     "MOVING",
     "PURSUIT",
+    "VEHICLE_MODELS",
     "Command",
     "PlanarState",
+    "VehicleModel",
     "VehicleParameters",
     "advance_vehicle",
     "curve_at",

@@ -11,8 +11,8 @@ from .state import Command, clamped
 
 
 @func
-def begun(pending, vehicle, h):
-    """Room for the commands that are on their way in substeps of ``h`` seconds, and one more.
+def delay_line(pending, vehicle, h):
+    """The line of delayed commands in substeps of ``h`` seconds, and one more.
 
     Args:
         pending: [W, 2] float64, on their way, newest first.
@@ -22,7 +22,9 @@ def begun(pending, vehicle, h):
     Returns:
         Line [D + 1, 2] float64 for delays of D substeps, and how many of its rows are in use.
     """
-    longest = max(_waits(vehicle.drive_delay, h), _waits(vehicle.steering_delay, h))
+    longest = max(
+        _delay_substeps(vehicle.drive_delay, h), _delay_substeps(vehicle.steering_delay, h)
+    )
     line = np.empty((longest + 1, 2))
     waiting = min(len(pending), longest)
     for k in range(waiting):
@@ -31,7 +33,7 @@ def begun(pending, vehicle, h):
 
 
 @func
-def left(line, waiting):
+def delayed_commands(line, waiting):
     """The commands still on their way: [W, 2] float64, newest first."""
     pending = np.empty((min(waiting, len(line) - 1), 2))
     for k in range(len(pending)):
@@ -40,13 +42,13 @@ def left(line, waiting):
 
 
 @func
-def sent(line, waiting, asked):
+def push_command(line, waiting, asked):
     """Puts a command at the head of those on their way; how many they are now.
 
     Args:
         line: [W, 2] float64, commands newest first; the last drops out where it is full.
         waiting: rows of it in use.
-        asked: by the driver, now.
+        asked: the command now.
     """
     waiting = min(waiting + 1, len(line))
     for k in range(waiting - 1, 0, -1):
@@ -56,31 +58,31 @@ def sent(line, waiting, asked):
 
 
 @func
-def at_wheels(line, waiting, state, vehicle, h):
+def actuator_outputs(line, waiting, state, vehicle, h):
     """What engine, brakes and steering gear aim at in this substep of ``h`` seconds.
 
     Until the first command arrives they keep what they do.
     """
     drive, steering = state.drive, state.steering
-    k = _waits(vehicle.drive_delay, h)
+    k = _delay_substeps(vehicle.drive_delay, h)
     if k < waiting:
         drive = clamped(line[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
-    k = _waits(vehicle.steering_delay, h)
+    k = _delay_substeps(vehicle.steering_delay, h)
     if k < waiting:
         steering = line[k, 1]
     return Command(
-        _approached(state.drive, drive, h, vehicle.drive_lag),
-        _approached(state.steering, steering, h, vehicle.steering_lag),
+        _first_order_lag(state.drive, drive, h, vehicle.drive_lag),
+        _first_order_lag(state.steering, steering, h, vehicle.steering_lag),
     )
 
 
 @func
-def _waits(delay, h):
+def _delay_substeps(delay, h):
     return math.floor(delay / h + 0.5)
 
 
 @func
-def _approached(value, wanted, h, lag):
+def _first_order_lag(value, wanted, h, lag):
     """Where a first-order lag is ``h`` seconds later."""
     if lag == 0.0:
         return wanted

@@ -90,7 +90,7 @@ def at(curve, t):
 
 
 @func
-def planned(curve, t):
+def planned_at(curve, t):
     """Like :func:`at`, but where the plan itself would be before its first pose: on the arc that
     leads there. The vehicle's distance from it is its error, which :func:`at` hides.
 
@@ -146,8 +146,8 @@ def _mean_slope(knots, i):
     """Velocity [m/s] at pose ``i`` of the parabola through it and its two neighbours."""
     (ax, ay), (bx, by) = _chord(knots, i - 1), _chord(knots, i)
     before, after = knots[i, T] - knots[i - 1, T], knots[i + 1, T] - knots[i, T]
-    share = before / (before + after)
-    return ax + share * (bx - ax), ay + share * (by - ay)
+    fraction = before / (before + after)
+    return ax + fraction * (bx - ax), ay + fraction * (by - ay)
 
 
 @func
@@ -170,8 +170,8 @@ def _arrival(knots, speed, vehicle):
         -vehicle.max_braking * seconds,
         vehicle.max_acceleration * seconds,
     )
-    share = max(speed + change, 0.0) / max(length, 1e-9)
-    return dx * share, dy * share
+    fraction = max(speed + change, 0.0) / max(length, 1e-9)
+    return dx * fraction, dy * fraction
 
 
 @func

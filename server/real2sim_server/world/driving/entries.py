@@ -7,17 +7,12 @@ import math
 import numpy as np
 
 from ..._numba import func, kernel
-from .actuators import at_wheels, begun, left, sent
-from .bicycle import moved_on
-from .curve import PlanCurve, at, curve_through, end_of, heading
-from .ilqr import played, scheduled
-from .lqr import regulate
-from .pursuit import pursue
+from .actuators import actuator_outputs, delay_line, delayed_commands, push_command
+from .curve import PlanCurve, at, curve_through, heading
 from .state import Command, PlanarState
+from .trackers import HOLD, prepare_tracker, tracker_command
 from .vehicle import VehicleParameters
-
-HOLD, PURSUIT, LQR, ILQR = range(4)
-"""Kinds of drivers: one command all the time, or trackers of a plan."""
+from .vehicle_models import step_vehicle
 
 SUBSTEP_US = 10_000
 
@@ -71,62 +66,58 @@ def curve_at(curve, t):
 
 
 @kernel
-def advance_vehicle(state, pending, driver, vehicle, dt_us):
+def advance_vehicle(state, pending, law, vehicle, dt_us):
     """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
 
     Within a substep the steering angle moves at most at its rate limit. The kinematic bicycle
-    follows the arc of its mean exactly; speed changes linearly until it meets 0 or the greatest
+    follows the arc of its mean exactly; speed changes linearly until it reaches 0 or the greatest
     speed. The dynamic bicycle does the same at walking pace and slips on its tyres above, see
     :mod:`.tyres`. Braking never ends in reversing.
 
     Args:
         state: nine floats of a :class:`.state.PlanarState`.
         pending: [W, 2] float64, commands on their way to the wheels, newest first.
-        driver: kind, knots and turn rate of its plan, seconds since that began, and the command
-            to hold, which trackers do not look at.
+        law: kind, knots and turn rate of its plan, seconds since that began, and the command to
+            hold, which trackers do not look at.
         vehicle: the members of a :class:`.vehicle.Vehicle`.
 
     Returns:
         State and commands on their way, in the form in which they came.
     """
-    kind, knots, turn_rate, since, _ = driver
+    kind, knots, turn_rate, since, _ = law
     substeps = -(-dt_us // SUBSTEP_US)
     h = dt_us * 1e-6 / substeps
-    curve = PlanCurve(knots, turn_rate)
-    start, car = PlanarState(*state), VehicleParameters(*vehicle)
-    line, waiting = begun(pending, car, h)
-    planning = kind == ILQR and since < end_of(curve)
-    if planning:
-        schedule = scheduled(start, curve, since, car)
-    else:
+    start, parameters = PlanarState(*state), VehicleParameters(*vehicle)
+    line, waiting = delay_line(pending, parameters, h)
+    if kind == HOLD:
         schedule = np.empty((0, 0)), np.empty((0, 0))
+    else:
+        schedule = prepare_tracker(kind - 1, start, PlanCurve(knots, turn_rate), since, parameters)
     now = start
     for k in range(substeps):
-        if planning:
-            asked = played(schedule, now, k * h, car)
-        else:
-            asked = _asked(driver, now, since + k * h, car)
-        waiting = sent(line, waiting, asked)
-        now = moved_on(now, at_wheels(line, waiting, now, car, h), car, h)
-    return _numbers(now, start.speed, substeps * h), left(line, waiting)
+        asked = _command(law, now, since + k * h, parameters, (*schedule, k * h))
+        waiting = push_command(line, waiting, asked)
+        outputs = actuator_outputs(line, waiting, now, parameters, h)
+        now = step_vehicle(parameters.model, now, outputs, parameters, h)
+    return _numbers(now, start.speed, substeps * h), delayed_commands(line, waiting)
 
 
 @kernel
-def driver_command(state, driver, vehicle):
-    """What a driver asks for: acceleration [m/s^2] and road-wheel angle [rad]; arguments as in
-    :func:`advance_vehicle`. Who plans ahead does here what the plain LQR would."""
-    command = _asked(driver, PlanarState(*state), driver[3], VehicleParameters(*vehicle))
+def driver_command(state, law, vehicle):
+    """The command of a law: acceleration [m/s^2] and road-wheel angle [rad]; arguments as in
+    :func:`advance_vehicle`. Trackers that plan ahead do here what the plain LQR would."""
+    schedule = np.empty((0, 0)), np.empty((0, 0)), 0.0
+    command = _command(law, PlanarState(*state), law[3], VehicleParameters(*vehicle), schedule)
     return command.acceleration, command.steering
 
 
 @func
-def _asked(driver, state, t, vehicle):
-    kind, knots, turn_rate, _, (acceleration, steering) = driver
+def _command(law, state, t, vehicle, schedule):
+    kind, knots, turn_rate, _, (acceleration, steering) = law
     if kind == HOLD:
         return Command(acceleration, steering)
-    if kind == PURSUIT:
-        return pursue(state, PlanCurve(knots, turn_rate), t, vehicle)
-    return regulate(state, PlanCurve(knots, turn_rate), t, vehicle)
+    curve = PlanCurve(knots, turn_rate)
+    return tracker_command(kind - 1, state, curve, t, vehicle, schedule)
 
 
 @func

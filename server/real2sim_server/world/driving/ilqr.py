@@ -13,17 +13,19 @@ import math
 import numpy as np
 
 from ..._numba import func
-from .lqr import point_at
+from .curve import end_of
+from .lqr import point_at, regulate
 from .state import Command, clamped, wrapped
+from .vehicle_models import steady_steering
 
 STEP = 0.1
 STEPS = 15
 ITERATIONS = 5
 GAINS = (1.0, 0.5, 0.2, 0.05)
-"""Shares of the step that the line search tries."""
+"""Fractions of the step that the line search tries."""
 
 ENOUGH = 1e-4
-"""Iterations end where one gains less than this share of the cost."""
+"""Iterations end where one gains less than this fraction of the cost."""
 
 STATE_COST = np.array([4.0, 4.0, 10.0, 1.0, 0.0])
 """Per squared error of x, y [m], yaw [rad], speed [m/s], road-wheel angle [rad]."""
@@ -34,24 +36,33 @@ NX, NU = 5, 2
 
 
 @func
-def played(schedule, state, t, vehicle):
-    """What to do, ``t`` seconds after the schedule was made."""
-    states, inputs = schedule
-    k = min(int(t / STEP + 1e-9), STEPS - 1)
-    share = t / STEP - k
-    steering = (1 - share) * states[k, 4] + share * states[k + 1, 4]
+def prepare(state, curve, since, vehicle):
+    """The schedule of a vehicle that is ``since`` seconds into its plan; empty after its end."""
+    if since >= end_of(curve):
+        return np.empty((0, 0)), np.empty((0, 0))
+    return solve_schedule(state, curve, since, vehicle)
+
+
+@func
+def follow_schedule(state, curve, t, vehicle, schedule):
+    """What the schedule says for now; what the plain LQR would where it is empty."""
+    states, inputs, elapsed = schedule
+    if len(states) == 0:
+        return regulate(state, curve, t, vehicle, schedule)
+    k = min(int(elapsed / STEP + 1e-9), STEPS - 1)
+    fraction = elapsed / STEP - k
+    steering = (1 - fraction) * states[k, 4] + fraction * states[k + 1, 4]
     # The angle at the end of the substep is what its mean must lead to.
-    ahead = steering + 0.01 * inputs[k, 1]
-    if vehicle.slips:
-        curvature = math.tan(ahead) / vehicle.wheelbase
-        ahead += vehicle.understeer * state.speed**2 * curvature
+    rolling = steering + 0.01 * inputs[k, 1]
+    curvature = math.tan(rolling) / vehicle.wheelbase
+    ahead = steady_steering(vehicle.model, rolling, curvature, state.speed, vehicle)
     return Command(inputs[k, 0], ahead)
 
 
 @func
-def scheduled(state, curve, since, vehicle):
+def solve_schedule(state, curve, since, vehicle):
     """The schedule of a vehicle that is ``since`` seconds into its plan."""
-    wanted = _wanted(state, curve, since)
+    wanted = _reference_states(state, curve, since)
     states, inputs = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
     tried = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
     for first in (states[0], tried[0][0]):
@@ -79,7 +90,7 @@ def scheduled(state, curve, since, vehicle):
 
 
 @func
-def _wanted(state, curve, since):
+def _reference_states(state, curve, since):
     """Wanted states [STEPS + 1, 5]; yaws continuous from the vehicle's."""
     wanted = np.zeros((STEPS + 1, NX))
     yaw = state.yaw
@@ -93,16 +104,16 @@ def _wanted(state, curve, since):
 
 @func
 def _rollout(tried, schedule, change, vehicle):
-    """Writes to ``tried`` the schedule that a share of the change of the inputs leads to, within
+    """Writes to ``tried`` the schedule that a fraction of the change of the inputs leads to, within
     limits."""
     (tried_states, tried_inputs), (states, inputs) = tried, schedule
     gain, forward, feedback = change
     for k in range(STEPS):
         for i in range(NU):
-            asked = inputs[k, i] + gain * forward[k, i]
+            command = inputs[k, i] + gain * forward[k, i]
             for j in range(NX):
-                asked += feedback[k, i, j] * (tried_states[k, j] - states[k, j])
-            tried_inputs[k, i] = asked
+                command += feedback[k, i, j] * (tried_states[k, j] - states[k, j])
+            tried_inputs[k, i] = command
         _step(tried_states, tried_inputs, k, vehicle)
 
 
@@ -147,7 +158,11 @@ def _backward(states, inputs, wanted, wheelbase):
     for k in range(STEPS - 1, -1, -1):
         A, B = _linearised(states[k], states[k + 1], wheelbase)
         VA, VB = _product(V, A), _product(V, B)
-        Hxx, Hux, Huu = _dual(A, VA), _dual(B, VA), _dual(B, VB)
+        Hxx, Hux, Huu = (
+            _transposed(A, VA),
+            _transposed(B, VA),
+            _transposed(B, VB),
+        )
         hx, hu = np.empty(NX), np.empty(NU)
         for i in range(NX):
             Hxx[i, i] += STATE_COST[i]
@@ -213,7 +228,7 @@ def _product(M, N):
 
 
 @func
-def _dual(M, N):
+def _transposed(M, N):
     """M^T N."""
     result = np.zeros((M.shape[1], N.shape[1]))
     for i in range(M.shape[1]):

@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple
 
 from ..._numba import func
-from .curve import MOVING, YAW, X, Y, end_of, heading, planned
+from .curve import MOVING, YAW, X, Y, end_of, heading, planned_at
 from .state import GENTLE_BRAKING, Command, wrapped
+from .vehicle_models import steady_steering
 
 TIME = 0.6
 """Time scale of the regulator along the plan [s]: (r/q)^(1/4) of its weights."""
@@ -19,7 +20,7 @@ DIFFERENCE = 0.05
 """Acceleration and curvature of the plan are taken over this time [s]."""
 
 
-class Point(NamedTuple):
+class PlanPoint(NamedTuple):
     """A plan at one time: pose [m], [rad], speed [m/s], acceleration, curvature [1/m]."""
 
     x: float
@@ -31,7 +32,7 @@ class Point(NamedTuple):
 
 
 @func
-def regulate(state, curve, t, vehicle):
+def regulate(state, curve, t, vehicle, _schedule):
     """What to do, ``t`` seconds after the plan's start.
 
     Two decoupled regulators, with the plan's own acceleration and curvature fed forward. Along
@@ -42,7 +43,7 @@ def regulate(state, curve, t, vehicle):
     """
     if t >= end_of(curve):
         last = curve.knots[len(curve.knots) - 1]
-        point = Point(last[X], last[Y], last[YAW], 0.0, 0.0, 0.0)
+        point = PlanPoint(last[X], last[Y], last[YAW], 0.0, 0.0, 0.0)
         return Command(-GENTLE_BRAKING, _steering_onto(point, state, vehicle))
     point = point_at(curve, t)
     along = (point.x - state.x) * math.cos(point.yaw) + (point.y - state.y) * math.sin(point.yaw)
@@ -56,15 +57,15 @@ def regulate(state, curve, t, vehicle):
 @func
 def point_at(curve, t):
     """The plan ``t`` seconds after its start, with derivatives."""
-    x, y, vx, vy = planned(curve, t)
-    _, _, wx, wy = planned(curve, t + DIFFERENCE)
+    x, y, vx, vy = planned_at(curve, t)
+    _, _, wx, wy = planned_at(curve, t + DIFFERENCE)
     speed, later = math.hypot(vx, vy), math.hypot(wx, wy)
     acceleration = (later - speed) / DIFFERENCE
     if speed < MOVING:
-        return Point(x, y, heading(curve, t), speed, acceleration, 0.0)
+        return PlanPoint(x, y, heading(curve, t), speed, acceleration, 0.0)
     yaw = math.atan2(vy, vx)
     turn = wrapped(math.atan2(wy, wx) - yaw) if later > MOVING else 0.0
-    return Point(x, y, yaw, speed, acceleration, turn / (speed * DIFFERENCE))
+    return PlanPoint(x, y, yaw, speed, acceleration, turn / (speed * DIFFERENCE))
 
 
 @func
@@ -78,6 +79,4 @@ def _steering_onto(point, state, vehicle):
     scale = max(HEADWAY * state.speed, SHORTEST)
     curvature = point.curvature - across / scale**2 - math.sqrt(2.0) * off / scale
     rolling = math.atan(vehicle.wheelbase * curvature)
-    if not vehicle.slips:
-        return rolling
-    return rolling + vehicle.understeer * state.speed**2 * curvature
+    return steady_steering(vehicle.model, rolling, curvature, state.speed, vehicle)

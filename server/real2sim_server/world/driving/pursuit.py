@@ -7,6 +7,7 @@ import math
 from ..._numba import func
 from .curve import YAW, X, Y, at, end_of, heading
 from .state import GENTLE_BRAKING, Command, clamped
+from .vehicle_models import steady_steering
 
 LOOKAHEAD = 0.4
 """The controller aims at where the plan is this much later [s]."""
@@ -20,7 +21,7 @@ MAX_LAG = 2.0
 
 
 @func
-def pursue(state, curve, t, vehicle):
+def pursue(state, curve, t, vehicle, _schedule):
     """What to do, ``t`` seconds after the plan's start.
 
     Steering is pure pursuit (Coulter 1992, CMU-RI-TR-92-01): the arc that ends at the aim. The
@@ -46,9 +47,7 @@ def _steering(state, x, y, vehicle):
     left = math.cos(state.yaw) * dy - math.sin(state.yaw) * dx
     curvature = 2 * left / (dx * dx + dy * dy)
     rolling = math.atan(vehicle.wheelbase * curvature)
-    if not vehicle.slips:
-        return rolling
-    return rolling + vehicle.understeer * state.speed**2 * curvature
+    return steady_steering(vehicle.model, rolling, curvature, state.speed, vehicle)
 
 
 @func

@@ -14,8 +14,8 @@ its lateral motion fades into that of the tyres [m/s]."""
 
 
 @func
-def tyre_share(speed):
-    """How much of the lateral motion is that of the tyres, 0 to 1; the rest is rolling."""
+def tyre_weight(speed):
+    """Weight of the tyres' lateral motion, 0 to 1; the rest is rolling."""
     return clamped((speed - SLOWEST) / (FASTER - SLOWEST), 0.0, 1.0)
 
 
@@ -33,9 +33,9 @@ def integrate(vehicle, state, steering, acceleration, h):
     begin, end = steering
     middle = (begin + end) / 2
     a = rates(vehicle, state, begin, acceleration)
-    b = rates(vehicle, _moved(state, a, h / 2), middle, acceleration)
-    c = rates(vehicle, _moved(state, b, h / 2), middle, acceleration)
-    d = rates(vehicle, _moved(state, c, h), end, acceleration)
+    b = rates(vehicle, _integrated(state, a, h / 2), middle, acceleration)
+    c = rates(vehicle, _integrated(state, b, h / 2), middle, acceleration)
+    d = rates(vehicle, _integrated(state, c, h), end, acceleration)
     mean = (
         (a[0] + 2 * b[0] + 2 * c[0] + d[0]) / 6,
         (a[1] + 2 * b[1] + 2 * c[1] + d[1]) / 6,
@@ -44,7 +44,7 @@ def integrate(vehicle, state, steering, acceleration, h):
         (a[4] + 2 * b[4] + 2 * c[4] + d[4]) / 6,
         (a[5] + 2 * b[5] + 2 * c[5] + d[5]) / 6,
     )
-    return _moved(state, mean, h)
+    return _integrated(state, mean, h)
 
 
 @func
@@ -109,12 +109,12 @@ def fiala(slip, stiffness, limit):
         return 0.0
     if abs(slip) >= math.atan(3 * limit / stiffness):
         return math.copysign(limit, slip)
-    share = stiffness * math.tan(slip) / (3 * limit)
-    return 3 * limit * share * (1 - abs(share) + share * share / 3)
+    sliding = stiffness * math.tan(slip) / (3 * limit)
+    return 3 * limit * sliding * (1 - abs(sliding) + sliding * sliding / 3)
 
 
 @func
-def _moved(state, rate, h):
+def _integrated(state, rate, h):
     x, y, yaw, vx, vy, turn = state
     return (
         x + h * rate[0],

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 from real2sim_proto.episode import EgoSpec
 
-from ..driving import ILQR, LQR, MOVING, PURSUIT, Command
+from ..driving import KINDS, LQR, MOVING, Command
 from .motion import Motion, advance_motion, commanded, teleported
 from .reference import ReferenceTrajectory
-
-KINDS = {"pursuit": PURSUIT, "lqr": LQR, "ilqr": ILQR}
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +18,7 @@ class ControlledTracker:
     that a copied world goes on alike.
 
     Attributes:
-        kind: PURSUIT, LQR or ILQR; see the files of :mod:`.driving` of these names.
+        kind: number of the tracker, see :mod:`.driving.trackers`.
         reference: what is followed.
         spec: of the vehicle.
     """

@@ -1,19 +1,37 @@
-"""Versioned scores of episodes: the same code for a running episode and for a recording."""
+"""Versioned metrics of episodes: the same code for a running episode and for a recording.
 
-from .accumulator import MetricAccumulator, begin_accumulator, update_accumulator
+:mod:`.metric` is the family, :mod:`.metrics` its members.
+"""
+
+from .accumulator import MetricAccumulator
 from .instant import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
-from .metrics import VERSIONS, Score, metrics_version, running_metrics, scores_of
+from .metric import (
+    METRICS,
+    Metric,
+    MetricValue,
+    Score,
+    metric,
+    metric_versions,
+    metrics_version,
+    scores_of,
+)
+from .metrics import running_metrics
+from .update import begin_accumulator, update_accumulator
 
 __all__ = [
-    "VERSIONS",
+    "METRICS",
     "ContactRecord",
     "EgoSample",
     "Instant",
+    "Metric",
     "MetricAccumulator",
+    "MetricValue",
     "ObjectSamples",
     "Score",
     "ScoringContext",
     "begin_accumulator",
+    "metric",
+    "metric_versions",
     "metrics_version",
     "running_metrics",
     "scores_of",

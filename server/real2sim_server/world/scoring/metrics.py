@@ -1,13 +1,13 @@
-"""Scores of an episode. Each has a version; a change of its formula changes that."""
+"""The metrics of the field: NAVSIM, nuPlan, HUGSIM, NeuroNCAP, CARLA, AlpaSim, Waymax."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
-from .accumulator import MetricAccumulator, fault_class
+from .accumulator import MetricAccumulator
+from .fault import fault_class
 from .instant import ScoringContext
+from .metric import METRICS, MetricValue, metric
 
 TTC_BOUND = 0.95
 """nuPlan; NAVSIM's projections at 0, 0.3, 0.6, 0.9 s ask the same on a grid of 0.1 s [s]."""
@@ -17,38 +17,6 @@ SHORT_ROUTE = 5.0
 
 CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
 NO_MAP = "no map: corridor and lanes come from the recorded drive"
-
-
-class Score(NamedTuple):
-    """One score; the fields of the wire's Score."""
-
-    name: str
-    version: str
-    value: float | None
-    terms: dict[str, float]
-    assumed: tuple[str, ...]
-    missing: tuple[str, ...]
-
-    def fields(self) -> dict[str, Any]:
-        """As a plain map."""
-        return {
-            "name": self.name,
-            "version": self.version,
-            "value": self.value,
-            "terms": dict(self.terms),
-            "assumed": list(self.assumed),
-            "missing": list(self.missing),
-        }
-
-
-def scores_of(accumulator: MetricAccumulator, context: ScoringContext) -> list[Score]:
-    """All scores of an episode so far."""
-    return [metric(accumulator, context) for metric in METRICS]
-
-
-def metrics_version() -> str:
-    """Versions of all scores in one string; published to clients and in recordings."""
-    return " ".join(f"{name}@{version}" for name, version in VERSIONS.items())
 
 
 # --- terms ------------------------------------------------------------------------------------
@@ -108,7 +76,8 @@ def ttc_within_bound(accumulator: MetricAccumulator) -> float:
 # --- scores -----------------------------------------------------------------------------------
 
 
-def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("pdms", version="2", streamed=True)
+def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven."""
     terms = {
         "NC": no_collision(accumulator),
@@ -119,14 +88,15 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     }
     weighted = 5 * terms["EP"] + 5 * terms["TTC"] + 2 * terms["C"]
     value = terms["NC"] * terms["DAC"] * weighted / 12
-    return _score("pdms", value, terms, assumed=(NO_MAP,))
+    return MetricValue(value, terms, assumed=(NO_MAP,))
 
 
-def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("epdms", version="2")
+def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
     without the penalty filter by the human drive."""
     if not accumulator.plans_compared:
-        return _score("epdms", None, {}, missing=("successive trajectory plans (EC)",))
+        return MetricValue(None, {}, missing=("successive trajectory plans (EC)",))
     terms = {
         "NC": no_collision(accumulator),
         "DAC": float(not accumulator.off_road),
@@ -140,10 +110,11 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 2 * (terms["LK"] + terms["HC"] + terms["EC"])
     value = terms["NC"] * terms["DAC"] * terms["DDC"] * terms["TLC"] * weighted / 16
-    return _score("epdms", value, terms, assumed=("TLC: no traffic lights", NO_MAP))
+    return MetricValue(value, terms, assumed=("TLC: no traffic lights", NO_MAP))
 
 
-def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("nuplan_cls", version="2", streamed=True)
+def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
     way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
     limit, seconds = context.speed_limit, max(accumulator.steps * context.dt, context.dt)
@@ -160,35 +131,38 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     makes_progress = float(terms["EP"] >= 0.2)
     value = terms["NC"] * terms["DAC"] * terms["DDC"] * makes_progress * weighted / 16
     assumed = (NO_MAP,) if limit is not None else ("SL: no speed limit known", NO_MAP)
-    return _score("nuplan_cls", value, terms, assumed=assumed)
+    return MetricValue(value, terms, assumed=assumed)
 
 
-def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("hugsim_hd", version="2", streamed=True)
+def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
     whole = context.route_end_s - context.start_s
     reached = max(accumulator.furthest - context.start_s, 0.0)
     route = 1.0 if whole <= 0 else min(reached / (0.9 * whole), 1.0)
     mean = accumulator.hugsim / accumulator.steps if accumulator.steps else 1.0
-    return _score("hugsim_hd", route * mean, {"RC": route, "mean": mean}, assumed=(NO_MAP,))
+    return MetricValue(route * mean, {"RC": route, "mean": mean}, assumed=(NO_MAP,))
 
 
-def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("neuroncap", version="1")
+def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """5 without collision, else 4 max(0, 1 - v_i/v_r) (Ljungbergh et al. 2024, NeuroNCAP).
 
     v_i is the relative speed at first contact, v_r that of a run in which the ego keeps to the
     recorded drive whatever happens.
     """
     if accumulator.first_impact is None:
-        return _score("neuroncap", 5.0, {})
+        return MetricValue(5.0, {})
     reference = context.no_action_impact
     if reference is None:
-        return _score("neuroncap", None, {"v_i": accumulator.first_impact}, missing=("v_r",))
+        return MetricValue(None, {"v_i": accumulator.first_impact}, missing=("v_r",))
     ratio = accumulator.first_impact / reference if reference > 0 else math.inf
     terms = {"v_i": accumulator.first_impact, "v_r": reference}
-    return _score("neuroncap", 4 * max(0.0, 1 - ratio), terms)
+    return MetricValue(4 * max(0.0, 1 - ratio), terms)
 
 
-def carla(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("carla_ds", version="1", streamed=True)
+def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """Route completion in percent times the product of penalties (CARLA leaderboard), with those
     infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65."""
     counts = {"vru": 0, "vehicle": 0, "object": 0}
@@ -200,24 +174,29 @@ def carla(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     if accumulator.distance > 0:
         terms["infractions_per_km"] = sum(counts.values()) / (accumulator.distance * 1e-3)
     assumed = ("no red lights, stop signs, yielding, timeouts",)
-    return _score("carla_ds", 100 * completion * penalty, terms, assumed=assumed)
+    return MetricValue(100 * completion * penalty, terms, assumed=assumed)
 
 
-def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("alpasim", version="2")
+def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """0 if at fault or off the road, else min(progress / 0.8, 1) (AlpaSim scene score)."""
     way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
     progress = 1.0 if expert < SHORT_ROUTE else min(way / expert, 1.0)
     clear = not accumulator.at_fault and not accumulator.off_road
     value = min(progress / 0.8, 1.0) if clear else 0.0
-    return _score("alpasim", value, {"progress": progress}, assumed=(NO_MAP,))
+    return MetricValue(value, {"progress": progress}, assumed=(NO_MAP,))
 
 
-def feasible(accumulator: MetricAccumulator, _context: ScoringContext) -> Score:
+@metric("kinematic_infeasibility", version="1")
+def kinematic_infeasibility(
+    accumulator: MetricAccumulator, _context: ScoringContext
+) -> MetricValue:
     """1 if any step has |a| > 10.4 m/s^2 or |curvature| > 0.3 1/m, else 0 (Waymax)."""
-    return _score("kinematic_infeasibility", float(accumulator.infeasible), {})
+    return MetricValue(float(accumulator.infeasible), {})
 
 
-def crash(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+@metric("delta_v", version="1")
+def delta_v(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """Greatest change of the ego's velocity by one object [m/s], with what else physics says."""
     strongest = max((math.hypot(*j) for j in accumulator.impulses.values()), default=0.0)
     terms = {
@@ -227,44 +206,10 @@ def crash(accumulator: MetricAccumulator, context: ScoringContext) -> Score:
     if accumulator.impact_position is not None and accumulator.ego is not None:
         x, y = accumulator.impact_position
         terms["post_impact_displacement"] = math.hypot(accumulator.ego.x - x, accumulator.ego.y - y)
-    return _score("delta_v", strongest / context.ego_mass, terms)
+    return MetricValue(strongest / context.ego_mass, terms)
 
 
-METRICS: tuple[Callable[[MetricAccumulator, ScoringContext], Score], ...] = (
-    pdms,
-    epdms,
-    nuplan,
-    hugsim,
-    neuroncap,
-    carla,
-    alpasim,
-    feasible,
-    crash,
-)
-
-VERSIONS = {
-    "pdms": "2",
-    "epdms": "2",
-    "nuplan_cls": "2",
-    "hugsim_hd": "2",
-    "neuroncap": "1",
-    "carla_ds": "1",
-    "alpasim": "2",
-    "kinematic_infeasibility": "1",
-    "delta_v": "1",
-}
-"""Version of each metric; raised when a value may change for the same episode."""
-
-
-def _score(
-    name: str,
-    value: float | None,
-    terms: dict[str, float],
-    *,
-    assumed: tuple[str, ...] = (),
-    missing: tuple[str, ...] = (),
-) -> Score:
-    return Score(name, VERSIONS[name], value, terms, assumed, missing)
+# --- streamed ---------------------------------------------------------------------------------
 
 
 def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> dict[str, float]:
@@ -281,11 +226,9 @@ def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> 
     }
     if math.isfinite(accumulator.ttc):
         found["ttc"] = accumulator.ttc
-    for metric in (pdms, nuplan, hugsim, carla):
-        score = metric(accumulator, context)
-        if score.value is not None:
-            found[score.name] = score.value
+    for streamed in METRICS.values():
+        if streamed.streamed:
+            value = streamed.formula(accumulator, context).value
+            if value is not None:
+                found[streamed.name] = value
     return found
-
-
-__all__ = ["METRICS", "VERSIONS", "Score", "metrics_version", "running_metrics", "scores_of"]

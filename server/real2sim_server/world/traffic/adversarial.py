@@ -101,9 +101,11 @@ class HardBrake:
     present: bool = True
 
     @classmethod
-    def begin(cls, subject: ObjectState, t_us: int, spec: HardBrakeDriver) -> HardBrake:
-        """From where and how the object moves at ``t_us``."""
-        path, now = LoggedPath(subject.trajectory), recorded_pose(subject, t_us)
+    def begin(
+        cls, subject: ObjectState, spec: HardBrakeDriver, surroundings: Surroundings
+    ) -> HardBrake:
+        """From where and how the object moves now."""
+        path, now = LoggedPath(subject.trajectory), recorded_pose(subject, surroundings.t_us)
         near = path.nearest(now.position[0], now.position[1])
         speed = math.hypot(now.velocity[0], now.velocity[1])
         return cls(subject, spec, path, near.s, speed, now)

@@ -9,6 +9,8 @@ from typing import Self
 
 import numpy as np
 
+from real2sim_proto.episode import ExternalDriver
+
 from ...edit import ObjectState
 from .driver import AgentPose, Surroundings, level_quaternion
 from .replay import recorded_pose
@@ -32,9 +34,11 @@ class External:
     present: bool = True
 
     @classmethod
-    def begin(cls, subject: ObjectState, t_us: int) -> External:
-        """From how the object moves at ``t_us``."""
-        return cls(subject, recorded_pose(subject, t_us))
+    def begin(
+        cls, subject: ObjectState, _spec: ExternalDriver, surroundings: Surroundings
+    ) -> External:
+        """From how the object moves now."""
+        return cls(subject, recorded_pose(subject, surroundings.t_us))
 
     def with_plan(
         self, t_us: int, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]

@@ -54,10 +54,10 @@ class Idm:
     present: bool = True
 
     @classmethod
-    def begin(cls, subject: ObjectState, t_us: int, spec: IdmDriver) -> Idm:
-        """From where and how the object moves at ``t_us``."""
+    def begin(cls, subject: ObjectState, spec: IdmDriver, surroundings: Surroundings) -> Idm:
+        """From where and how the object moves now."""
         path = LoggedPath(subject.trajectory)
-        now = recorded_pose(subject, t_us)
+        now = recorded_pose(subject, surroundings.t_us)
         return cls.from_pose(subject, now, spec, path)
 
     @classmethod

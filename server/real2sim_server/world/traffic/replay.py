@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Self
 
+from real2sim_proto.episode import ConstantVelocityDriver, ReplayDriver
+
 from ...edit import ObjectState
 from ...geometry.rotation import quaternion_yaw
 from .driver import AgentPose, Surroundings
@@ -19,9 +21,9 @@ class Replay:
     present: bool = True
 
     @classmethod
-    def begin(cls, subject: ObjectState, t_us: int) -> Replay:
-        """From where the trajectory is at ``t_us``, which it must cover."""
-        return cls(subject, recorded_pose(subject, t_us))
+    def begin(cls, subject: ObjectState, _spec: ReplayDriver, surroundings: Surroundings) -> Replay:
+        """From where the trajectory is now, which it must cover."""
+        return cls(subject, recorded_pose(subject, surroundings.t_us))
 
     def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
@@ -40,9 +42,11 @@ class ConstantVelocity:
     present: bool = True
 
     @classmethod
-    def begin(cls, subject: ObjectState, t_us: int) -> ConstantVelocity:
-        """From how the object moves at ``t_us``."""
-        pose = recorded_pose(subject, t_us)
+    def begin(
+        cls, subject: ObjectState, _spec: ConstantVelocityDriver, surroundings: Surroundings
+    ) -> ConstantVelocity:
+        """From how the object moves now."""
+        pose = recorded_pose(subject, surroundings.t_us)
         vx, vy, _ = pose.velocity
         return cls(subject, pose._replace(velocity=(vx, vy, 0.0)))
 

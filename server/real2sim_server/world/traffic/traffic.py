@@ -5,35 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import assert_never
 
 import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.episode import (
-    AgentDriver as DriverSpec,
-)
-from real2sim_proto.episode import (
-    AgentsSpec,
-    ConstantVelocityDriver,
-    CutInDriver,
-    ExternalDriver,
-    HardBrakeDriver,
-    IdmDriver,
-    JunctionCrossingDriver,
-    ReplayDriver,
-)
+from real2sim_proto.episode import AgentDriver as DriverSpec
+from real2sim_proto.episode import AgentsSpec, ConstantVelocityDriver, IdmDriver
 
 from ...edit import ObjectState, ScenarioState
 from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
 from ..errors import WorldError
 from ..path import Float
-from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import AgentDriver, Surroundings
+from .drivers import begin_driver
 from .external import External
-from .idm import Idm
-from .replay import ConstantVelocity, Replay
 
 MOVING = 2.0
 """Objects that cover less than this in the recording stand; nobody drives them [m]."""
@@ -188,29 +174,6 @@ class Traffic:
         if kind == "log" or subject.category not in DRIVEN or not _moves(subject):
             return None
         return IdmDriver() if kind == "idm" else ConstantVelocityDriver()
-
-
-def begin_driver(subject: ObjectState, spec: DriverSpec, surroundings: Surroundings) -> AgentDriver:
-    """The driver that a spec names, beginning at the instant ``surroundings``."""
-    driver: AgentDriver
-    match spec:
-        case ReplayDriver():
-            driver = Replay.begin(subject, surroundings.t_us)
-        case ConstantVelocityDriver():
-            driver = ConstantVelocity.begin(subject, surroundings.t_us)
-        case IdmDriver():
-            driver = Idm.begin(subject, surroundings.t_us, spec)
-        case CutInDriver():
-            driver = CutIn.begin(subject, spec, surroundings)
-        case HardBrakeDriver():
-            driver = HardBrake.begin(subject, surroundings.t_us, spec)
-        case JunctionCrossingDriver():
-            driver = JunctionCrossing.begin(subject, spec, surroundings)
-        case ExternalDriver():
-            driver = External.begin(subject, surroundings.t_us)
-        case _:
-            assert_never(spec)
-    return driver
 
 
 def _moves(subject: ObjectState) -> bool:

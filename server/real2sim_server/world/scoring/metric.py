@@ -1,0 +1,125 @@
+"""The family of metrics: each a function of the accumulator, registered under name and version."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from .accumulator import MetricAccumulator
+from .instant import Instant, ScoringContext
+
+
+class Score(NamedTuple):
+    """One score; the fields of the wire's Score."""
+
+    name: str
+    version: str
+    value: float | None
+    terms: dict[str, float]
+    assumed: tuple[str, ...]
+    missing: tuple[str, ...]
+
+    def fields(self) -> dict[str, Any]:
+        """As a plain map."""
+        return {
+            "name": self.name,
+            "version": self.version,
+            "value": self.value,
+            "terms": dict(self.terms),
+            "assumed": list(self.assumed),
+            "missing": list(self.missing),
+        }
+
+
+@dataclass(frozen=True)
+class MetricValue:
+    """What a metric is worth.
+
+    Attributes:
+        value: None where ``missing`` says what it would take.
+        terms: that it is made of, by name.
+        assumed: what is taken for granted.
+        missing: what is not known.
+    """
+
+    value: float | None
+    terms: dict[str, float] = field(default_factory=dict)
+    assumed: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+Formula = Callable[[MetricAccumulator, ScoringContext], MetricValue]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One member of the family.
+
+    Attributes:
+        name: on the wire and in recordings.
+        version: raised when a value may change for the same episode.
+        formula: of the accumulator; must not depend on anything else.
+        streamed: whether its value is part of every observation.
+        begin, update: where the accumulator lacks something: ``begin(instant, context)`` makes
+            state of the metric's own at step 0, ``update(state, instant, context)`` a new state
+            one step later; ``accumulator.states[name]`` has it. Both or neither.
+    """
+
+    name: str
+    version: str
+    formula: Formula
+    streamed: bool = False
+    begin: Callable[[Instant, ScoringContext], Any] | None = None
+    update: Callable[[Any, Instant, ScoringContext], Any] | None = None
+
+    def score(self, accumulator: MetricAccumulator, context: ScoringContext) -> Score:
+        """The score of an episode so far."""
+        found = self.formula(accumulator, context)
+        return Score(
+            self.name, self.version, found.value, found.terms, found.assumed, found.missing
+        )
+
+
+METRICS: dict[str, Metric] = {}
+"""All metrics by name, in the order in which they are reported."""
+
+
+def metric(
+    name: str,
+    *,
+    version: str,
+    streamed: bool = False,
+    begin: Callable[[Instant, ScoringContext], Any] | None = None,
+    update: Callable[[Any, Instant, ScoringContext], Any] | None = None,
+) -> Callable[[Formula], Formula]:
+    """Register a formula as a metric; see :class:`Metric` for the arguments.
+
+    Raises:
+        ValueError: the name is taken, or only one of ``begin`` and ``update`` is given.
+    """
+    if (begin is None) != (update is None):
+        raise ValueError(f"metric {name!r} needs both begin and update, or neither")
+
+    def register(formula: Formula) -> Formula:
+        if name in METRICS:
+            raise ValueError(f"there is a metric {name!r} already")
+        METRICS[name] = Metric(name, version, formula, streamed, begin, update)
+        return formula
+
+    return register
+
+
+def scores_of(accumulator: MetricAccumulator, context: ScoringContext) -> list[Score]:
+    """All scores of an episode so far."""
+    return [m.score(accumulator, context) for m in METRICS.values()]
+
+
+def metric_versions() -> dict[str, str]:
+    """Version of each metric by its name."""
+    return {m.name: m.version for m in METRICS.values()}
+
+
+def metrics_version() -> str:
+    """Versions of all metrics in one string; published to clients and in recordings."""
+    return " ".join(f"{name}@{version}" for name, version in metric_versions().items())
