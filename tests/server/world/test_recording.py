@@ -167,4 +167,4 @@ def test_without_action_the_ego_hits_what_stands_in_its_lane(make_scene, moving)
 
 def test_a_log_cannot_begin_without_a_reset(scene):
     with pytest.raises(ValueError, match="a reset comes first"):
-        fresh(scene).tell(Entry("action", 0, action_payload(None)))
+        fresh(scene).apply(Entry("action", 0, action_payload(None)))

@@ -1,0 +1,90 @@
+"""The contract of metrics, for all members of the family and for one that is registered here."""
+
+import json
+import math
+
+import pytest
+
+from real2sim_proto.plans import TrajectoryPlan
+from real2sim_server.world.scoring import METRICS, MetricValue, metric, scores_of
+
+NAME = "mean_headway"
+
+
+@pytest.fixture
+def headway():
+    """Mean time gap to the object ahead: a metric with state of its own, sum and count."""
+
+    def begin(_instant, _context):
+        return 0.0, 0
+
+    def update(state, instant, context):
+        total, count = state
+        ahead = instant.others.centres[:, 0] - instant.ego.x - context.centre_ahead
+        if instant.ego.speed < 0.1 or not (ahead > 0).any():
+            return state
+        return total + float(ahead[ahead > 0].min()) / instant.ego.speed, count + 1
+
+    def formula(accumulator, _context):
+        total, count = accumulator.states[NAME]
+        return MetricValue(total / count if count else None, missing=() if count else ("a leader",))
+
+    metric(NAME, version="1", streamed=True, begin=begin, update=update)(formula)
+    yield
+    del METRICS[NAME]
+
+
+@pytest.fixture
+def driven(headway, make_world, moving):
+    """A world after ten steps behind a car that keeps 30 m ahead."""
+    world = make_world(car=moving(30, 0, z=0.8, speed=10.0))
+    for _ in range(10):
+        times = [world.t_us + 100_000 * k for k in range(1, 6)]
+        poses = [(1.0 * k, 0.0, 0.0) for k in range(1, 6)]
+        world.step(TrajectoryPlan(times_us=times, poses=poses, frame="vehicle"))
+    return world
+
+
+def test_every_metric_gives_a_score_or_says_what_is_missing(driven):
+    for score in driven.scores():
+        assert (score.value is None) == bool(score.missing), score.name
+        assert score.value is None or math.isfinite(score.value), score.name
+
+
+def test_every_score_can_be_written_as_json(driven):
+    fields = [score.fields() for score in driven.scores()]
+
+    assert json.loads(json.dumps(fields, allow_nan=False)) == fields
+
+
+def test_metrics_depend_on_the_accumulator_and_context_alone(driven):
+    assert scores_of(driven.accumulator, driven.context) == driven.scores()
+
+
+def test_streamed_metrics_are_part_of_every_observation(driven):
+    streamed = {m.name for m in METRICS.values() if m.streamed}
+
+    assert streamed <= driven.metrics().keys()
+
+
+def test_a_metric_accumulates_state_of_its_own(driven):
+    found = {s.name: s for s in driven.scores()}[NAME]
+
+    assert found.value == pytest.approx((30.0 - driven.context.centre_ahead) / 10.0, rel=1e-3)
+
+
+def test_a_fork_accumulates_on_its_own(driven):
+    before = driven.accumulator.states[NAME]
+    driven.fork().step()
+
+    assert driven.accumulator.states[NAME] == before
+
+
+def test_a_name_is_registered_once():
+    with pytest.raises(ValueError, match="pdms"):
+        metric("pdms", version="3")(METRICS["pdms"].formula)
+
+
+def test_state_needs_both_its_beginning_and_its_update():
+    with pytest.raises(ValueError, match="both begin and update"):
+        metric("half", version="1", begin=lambda instant, context: 0)
