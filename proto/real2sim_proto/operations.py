@@ -309,12 +309,8 @@ OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 
 def subject_of(operation: Operation) -> str | None:
     """Id that an operation names; None where it leaves the choice of a new one open."""
-    match operation:
-        case EraseRegion():
-            return operation.region_id
-        case AddCollider():
-            return operation.collider_id
-        case SetTime():
-            return None
-        case _:
-            return operation.object_id
+    for field in ("object_id", "region_id", "collider_id"):
+        if field in type(operation).model_fields:
+            subject: str | None = getattr(operation, field)
+            return subject
+    return None

@@ -1,41 +1,23 @@
-"""Operations onto a state: pure, atomic, each with its inverse."""
+"""Batches of operations onto a state: pure, atomic, with their inverse."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import assert_never
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.operations import (
-    AddCollider,
-    Delete,
-    Duplicate,
-    EraseRegion,
-    Insert,
-    Operation,
-    Replace,
-    Restore,
-    Retime,
-    Rotate,
-    Scale,
-    SetPhysics,
-    SetPose,
-    SetTime,
-    SetTrajectory,
-    SetVelocity,
-    Translate,
-    subject_of,
-)
+from real2sim_proto.operations import Operation, subject_of
 from real2sim_proto.scenarios import EditWarning
 
 from ..scene import SceneError
-from . import lifecycle as presence
-from . import motion, properties
-from .change import AppliedOperation, require_object
+from . import lifecycle, motion, properties
 from .errors import EditError
+from .operation import AppliedOperation, apply_operation
 from .state import ScenarioState
 from .validation import GroundHeight, validate_edit
+
+OPERATION_MODULES = (lifecycle, motion, properties)
+"""Importing them registers their operations, see :mod:`.operation`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +76,7 @@ def replay_operations(state: ScenarioState, operations: Sequence[Operation]) -> 
 
 def _apply_one(state: ScenarioState, operation: Operation, index: int) -> AppliedOperation:
     try:
-        return _change(state, operation)
+        return apply_operation(state, operation)
     except EditError as error:
         where = f"operation {index} ({_named(operation)}): {error}"
         raise EditError(error.code, where, hint=error.hint, index=index) from None
@@ -106,66 +88,3 @@ def _apply_one(state: ScenarioState, operation: Operation, index: int) -> Applie
 def _named(operation: Operation) -> str:
     subject = subject_of(operation)
     return f"{operation.op} of {subject!r}" if subject is not None else operation.op
-
-
-def _change(  # noqa: PLR0911, one per kind
-    state: ScenarioState, operation: Operation
-) -> AppliedOperation:
-    match operation:
-        case Insert():
-            return presence.insert(state, operation)
-        case Delete():
-            return presence.delete(state, operation)
-        case Restore():
-            return presence.restore(state, operation)
-        case EraseRegion():
-            return properties.erase_region(state, operation)
-        case AddCollider():
-            return properties.add_collider(state, operation)
-        case SetTime():
-            return properties.set_time(state, operation)
-        case _:
-            return _change_object(state, operation)
-
-
-ObjectOperation = (
-    Translate
-    | Rotate
-    | Scale
-    | SetPose
-    | SetTrajectory
-    | Retime
-    | Duplicate
-    | Replace
-    | SetPhysics
-    | SetVelocity
-)
-
-
-def _change_object(  # noqa: PLR0911, one per kind
-    state: ScenarioState, operation: ObjectOperation
-) -> AppliedOperation:
-    subject = require_object(state, operation.object_id)
-    match operation:
-        case Translate():
-            return motion.translate(state, subject, operation)
-        case Rotate():
-            return motion.rotate(state, subject, operation)
-        case Scale():
-            return motion.scale(state, subject, operation)
-        case SetPose():
-            return motion.set_pose(state, subject, operation)
-        case SetTrajectory():
-            return motion.set_trajectory(state, subject, operation)
-        case Retime():
-            return motion.retime(state, subject, operation)
-        case Duplicate():
-            return presence.duplicate(state, subject, operation)
-        case Replace():
-            return presence.replace_appearance(state, subject, operation)
-        case SetPhysics():
-            return properties.set_physics(state, subject, operation)
-        case SetVelocity():
-            return properties.set_velocity(state, subject, operation)
-        case _:
-            assert_never(operation)

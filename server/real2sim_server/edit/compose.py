@@ -58,7 +58,7 @@ def compose(
     edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         instances.append(_standing(scene, subject, transform, t_us))
-        if subject.placed:
+        if subject.edited:
             edited.append((subject, transform))
     return instances + contact_shadows(scene, edited, t_us)
 

@@ -1,4 +1,4 @@
-"""Operations on what there is: copies, assets, tombstones, looks."""
+"""Operations on what exists: copies, assets, tombstones, appearance."""
 
 from __future__ import annotations
 
@@ -10,22 +10,25 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Delete, Duplicate, Insert, Replace, Restore
 
 from ..scene.scene import MAX_OBJECTS
-from .change import (
+from .errors import EditError
+from .motion import rescaled, shifted, snap_to_ground, stationary_track
+from .operation import (
     AppliedOperation,
     invalid_operation,
     new_id,
     object_changed,
+    object_operation,
+    operation,
     require_object,
     trajectory_of,
 )
-from .errors import EditError
-from .motion import rescaled, shifted, snap_to_ground, stationary_track
 from .state import AssetSource, ObjectState, ScenarioState
 
 
+@object_operation(Duplicate)
 def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) -> AppliedOperation:
     """Add a copy, shifted."""
-    _require_room(state)
+    _require_free_instance_id(state)
     shift = (operation.x, operation.y, operation.z)
     trajectory = shifted(subject.trajectory, shift, operation.frame)
     if operation.snap:
@@ -35,14 +38,15 @@ def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) 
         object_id=new_id(state, operation.new_id, f"{subject.object_id}_copy"),
         instance_id=state.next_instance_id,
         trajectory=trajectory,
-        placed=True,
+        edited=True,
     )
     return _added(state, copy)
 
 
+@operation(Insert)
 def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
     """Add an object that shows an asset."""
-    _require_room(state)
+    _require_free_instance_id(state)
     asset = _asset(state, operation.asset_id)
     if operation.trajectory is not None:
         track = operation.trajectory
@@ -58,7 +62,7 @@ def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
         trajectory=trajectory_of(track),
         instance_id=state.next_instance_id,
         asset=asset,
-        placed=True,
+        edited=True,
     )
     if operation.size is not None:
         added = rescaled(added, _fitting(operation.size, asset.size), keep_bottom=False)
@@ -68,52 +72,55 @@ def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
     return _added(state, added)
 
 
+@object_operation(Replace)
 def replace_appearance(
     state: ScenarioState, subject: ObjectState, operation: Replace
 ) -> AppliedOperation:
     """Show something else in the box; the centre of its bottom stays where it is."""
-    look = _look(state, operation)
+    appearance = _appearance(state, operation)
     box = operation.size or subject.scaled_size
-    factors = _fitting(box, look.size)
+    factors = _fitting(box, appearance.size)
     if operation.fit == "length":
         factors = (factors[0],) * 3
     old_size = subject.scaled_size
-    dressed = replace(
+    replaced = replace(
         subject,
-        source_id=look.source_id,
-        asset=look.asset,
-        category=look.category,
-        size=look.size,
-        scale=tuple(o / n for o, n in zip(old_size, look.size, strict=True)),
-        placed=True,
+        source_id=appearance.source_id,
+        asset=appearance.asset,
+        category=appearance.category,
+        size=appearance.size,
+        scale=_fitting(old_size, appearance.size),
+        edited=True,
     )
-    dressed = rescaled(dressed, factors, keep_bottom=True)
+    replaced = rescaled(replaced, factors, keep_bottom=True)
     inverse = Replace(
         object_id=subject.object_id,
         asset_id=subject.asset.asset_id if subject.asset else None,
         recorded_id=None if subject.asset else subject.source_id,
         size=old_size,
     )
-    return object_changed(state, dressed, inverse)
+    return object_changed(state, replaced, inverse)
 
 
+@operation(Delete)
 def delete(state: ScenarioState, operation: Delete) -> AppliedOperation:
     """Leave a tombstone."""
     thing, inverse = operation.object_id, Restore(object_id=operation.object_id)
     if thing in state.regions or thing in state.colliders:
-        if thing in state.gone:
+        if thing in state.tombstones:
             raise invalid_operation(f"{thing!r} is deleted already", hint="leave the delete out")
-        return AppliedOperation(replace(state, gone=state.gone | {thing}), inverse)
+        return AppliedOperation(replace(state, tombstones=state.tombstones | {thing}), inverse)
     return object_changed(state, replace(require_object(state, thing), deleted=True), inverse)
 
 
+@operation(Restore)
 def restore(state: ScenarioState, operation: Restore) -> AppliedOperation:
     """Take a tombstone away."""
     thing, inverse = operation.object_id, Delete(object_id=operation.object_id)
-    if thing in state.gone:
-        return AppliedOperation(replace(state, gone=state.gone - {thing}), inverse)
+    if thing in state.tombstones:
+        return AppliedOperation(replace(state, tombstones=state.tombstones - {thing}), inverse)
     found = state.objects.get(thing)
-    if found is None and not state.knows(thing):
+    if found is None and not state.has_id(thing):
         require_object(state, thing)
     if found is None or not found.deleted:
         raise invalid_operation(f"{thing!r} is not deleted", hint="leave the restore out")
@@ -129,7 +136,7 @@ def _added(state: ScenarioState, added: ObjectState) -> AppliedOperation:
     )
 
 
-def _require_room(state: ScenarioState) -> None:
+def _require_free_instance_id(state: ScenarioState) -> None:
     if state.next_instance_id > MAX_OBJECTS:
         raise invalid_operation(
             f"the scenario has {len(state.objects)} objects, deleted ones included, the most "
@@ -150,17 +157,17 @@ def _asset(state: ScenarioState, asset_id: str) -> AssetSource:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _Appearance:
     source_id: str
     category: str
     size: tuple[float, float, float]
     asset: AssetSource | None = None
 
 
-def _look(state: ScenarioState, operation: Replace) -> _Look:
+def _appearance(state: ScenarioState, operation: Replace) -> _Appearance:
     if operation.asset_id is not None:
         asset = _asset(state, operation.asset_id)
-        return _Look("", asset.category, asset.size, asset)
+        return _Appearance("", asset.category, asset.size, asset)
     recorded: Mapping[str, Any] = state.recorded
     found = recorded.get(operation.recorded_id or "")
     if found is None:
@@ -169,7 +176,7 @@ def _look(state: ScenarioState, operation: Replace) -> _Look:
             f"the recording has no object {operation.recorded_id!r}",
             hint=f"it has: {', '.join(recorded) or 'none'}",
         )
-    return _Look(found.source_id, found.category, found.size)
+    return _Appearance(found.source_id, found.category, found.size)
 
 
 def _fitting(

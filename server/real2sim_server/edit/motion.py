@@ -23,8 +23,15 @@ from real2sim_proto.operations import (
 from ..geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix
 from ..geometry.transform import transform_from
 from ..scene import Trajectory
-from .change import AppliedOperation, invalid_operation, object_changed, trajectory_of, wire_track
 from .ground import RecordedGround, bottoms_of
+from .operation import (
+    AppliedOperation,
+    invalid_operation,
+    object_changed,
+    object_operation,
+    trajectory_of,
+    wire_track,
+)
 from .state import ObjectState, ScenarioState
 from .tracks import sample_poses
 
@@ -40,6 +47,7 @@ BLEND_STEP_US = 50_000
 """Spacing of the poses in which an edit grows or fades."""
 
 
+@object_operation(Translate)
 def translate(state: ScenarioState, subject: ObjectState, operation: Translate) -> AppliedOperation:
     """Shift it, at all times or in a time range."""
     shift = (operation.x, operation.y, operation.z)
@@ -51,6 +59,7 @@ def translate(state: ScenarioState, subject: ObjectState, operation: Translate) 
     return _follow(state, subject, moved, snap=operation.snap)
 
 
+@object_operation(Rotate)
 def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> AppliedOperation:
     """Turn it about its own centre, at all times or in a time range."""
     axis = np.array(operation.axis) / np.linalg.norm(operation.axis)
@@ -68,6 +77,7 @@ def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> App
     return _follow(state, subject, turned, snap=operation.snap)
 
 
+@object_operation(Scale)
 def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> AppliedOperation:
     """Multiply its size; what the anchor names stays where it is."""
     factors = (operation.x, operation.y, operation.z)
@@ -81,12 +91,14 @@ def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> Appli
     return object_changed(state, scaled, inverse)
 
 
+@object_operation(SetPose)
 def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> AppliedOperation:
     """Let it stand for the whole time range of the scene."""
     stood = trajectory_of(stationary_track(operation.pose, state.time_range))
     return _follow(state, subject, stood, snap=operation.snap)
 
 
+@object_operation(SetTrajectory)
 def set_trajectory(
     state: ScenarioState, subject: ObjectState, operation: SetTrajectory
 ) -> AppliedOperation:
@@ -94,6 +106,7 @@ def set_trajectory(
     return _follow(state, subject, trajectory_of(operation.trajectory), snap=operation.snap)
 
 
+@object_operation(Retime)
 def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> AppliedOperation:
     """Let it do the same at other times."""
     old = subject.trajectory
@@ -201,7 +214,7 @@ def _follow(
 def _moved(
     state: ScenarioState, subject: ObjectState, trajectory: Trajectory, inverse: Operation
 ) -> AppliedOperation:
-    return object_changed(state, replace(subject, trajectory=trajectory, placed=True), inverse)
+    return object_changed(state, replace(subject, trajectory=trajectory, edited=True), inverse)
 
 
 def _weighted(

@@ -14,10 +14,18 @@ from real2sim_proto.operations import (
     SetVelocity,
 )
 
-from .change import AppliedOperation, invalid_operation, new_id, object_changed
+from .operation import (
+    AppliedOperation,
+    invalid_operation,
+    new_id,
+    object_changed,
+    object_operation,
+    operation,
+)
 from .state import ObjectState, ScenarioState
 
 
+@object_operation(SetPhysics)
 def set_physics(
     state: ScenarioState, subject: ObjectState, operation: SetPhysics
 ) -> AppliedOperation:
@@ -30,6 +38,7 @@ def set_physics(
     )
 
 
+@object_operation(SetVelocity)
 def set_velocity(
     state: ScenarioState, subject: ObjectState, operation: SetVelocity
 ) -> AppliedOperation:
@@ -42,6 +51,7 @@ def set_velocity(
     )
 
 
+@operation(EraseRegion)
 def erase_region(state: ScenarioState, operation: EraseRegion) -> AppliedOperation:
     """Hide what the background shows in a box."""
     region_id = new_id(state, operation.region_id, "region_")
@@ -51,6 +61,7 @@ def erase_region(state: ScenarioState, operation: EraseRegion) -> AppliedOperati
     return AppliedOperation(after, Delete(object_id=region_id), created=region_id)
 
 
+@operation(AddCollider)
 def add_collider(state: ScenarioState, operation: AddCollider) -> AppliedOperation:
     """Add what does not yield."""
     collider_id = new_id(state, operation.collider_id, "collider_")
@@ -60,6 +71,7 @@ def add_collider(state: ScenarioState, operation: AddCollider) -> AppliedOperati
     return AppliedOperation(after, Delete(object_id=collider_id), created=collider_id)
 
 
+@operation(SetTime)
 def set_time(state: ScenarioState, operation: SetTime) -> AppliedOperation:
     """Set the span in which the scenario plays."""
     first, last = state.time_range

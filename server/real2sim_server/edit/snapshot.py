@@ -26,7 +26,7 @@ def pack_state(state: ScenarioState) -> bytes:
             "clock": list(state.clock),
             "regions": [r.model_dump(mode="json") for r in state.regions.values()],
             "colliders": [c.model_dump(mode="json") for c in state.colliders.values()],
-            "gone": sorted(state.gone),
+            "gone": sorted(state.tombstones),
         }
     )
 
@@ -48,7 +48,7 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         first, last = document["clock"]
         regions = [EraseRegion.model_validate(r) for r in document["regions"]]
         colliders = [AddCollider.model_validate(c) for c in document["colliders"]]
-        gone, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
+        tombstones, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
     except (CodecError, KeyError, TypeError, ValueError) as error:
         raise EditError(
             ErrorCode.INVALID_OPERATION,
@@ -62,26 +62,26 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         clock=(first, last),
         regions=MappingProxyType({str(r.region_id): r for r in regions}),
         colliders=MappingProxyType({str(c.collider_id): c for c in colliders}),
-        gone=gone,
+        tombstones=tombstones,
     )
 
 
-def _packed_object(thing: ObjectState) -> dict[str, Any]:
+def _packed_object(subject: ObjectState) -> dict[str, Any]:
     return {
-        "object_id": thing.object_id,
-        "source_id": thing.source_id,
-        "category": thing.category,
-        "size": list(thing.size),
-        "scale": list(thing.scale),
-        "times_us": thing.trajectory.times_us,
-        "positions": thing.trajectory.positions,
-        "quaternions": thing.trajectory.quaternions,
-        "instance_id": thing.instance_id,
-        "deleted": thing.deleted,
-        "asset_id": thing.asset.asset_id if thing.asset else None,
-        "physics": thing.physics.model_dump(mode="json") if thing.physics else None,
-        "velocity": thing.velocity.model_dump(mode="json") if thing.velocity else None,
-        "placed": thing.placed,
+        "object_id": subject.object_id,
+        "source_id": subject.source_id,
+        "category": subject.category,
+        "size": list(subject.size),
+        "scale": list(subject.scale),
+        "times_us": subject.trajectory.times_us,
+        "positions": subject.trajectory.positions,
+        "quaternions": subject.trajectory.quaternions,
+        "instance_id": subject.instance_id,
+        "deleted": subject.deleted,
+        "asset_id": subject.asset.asset_id if subject.asset else None,
+        "physics": subject.physics.model_dump(mode="json") if subject.physics else None,
+        "velocity": subject.velocity.model_dump(mode="json") if subject.velocity else None,
+        "placed": subject.edited,
     }
 
 
@@ -109,5 +109,5 @@ def _unpacked_object(packed: dict[str, Any], assets: AssetLookup | None) -> Obje
         asset=asset,
         physics=SetPhysics.model_validate(physics) if physics else None,
         velocity=SetVelocity.model_validate(velocity) if velocity else None,
-        placed=packed["placed"],
+        edited=packed["placed"],
     )

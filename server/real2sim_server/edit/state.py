@@ -77,7 +77,7 @@ class ObjectState:
         asset: what it shows instead of an object of the scene.
         physics: what it is for the physics; None for defaults throughout.
         velocity: with which it enters the physics; None for that of its trajectory.
-        placed: whether an edit gave it its trajectory or its look.
+        edited: whether an edit gave it its trajectory or its appearance.
     """
 
     object_id: str
@@ -91,7 +91,7 @@ class ObjectState:
     asset: AssetSource | None = None
     physics: SetPhysics | None = None
     velocity: SetVelocity | None = None
-    placed: bool = False
+    edited: bool = False
 
     @property
     def scaled_size(self) -> tuple[float, float, float]:
@@ -102,7 +102,8 @@ class ObjectState:
     @cached_property
     def radius(self) -> float:
         """Half the diagonal of the box [m]."""
-        return sum(side * side for side in self.scaled_size) ** 0.5 / 2
+        diagonal: float = sum(side * side for side in self.scaled_size) ** 0.5
+        return diagonal / 2
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -129,7 +130,7 @@ class ScenarioState:
         clock: first and last time at which the scenario plays, within ``time_range`` [us].
         regions: boxes erased from the background, by id, deleted ones too.
         colliders: by id, deleted ones too.
-        gone: ids of deleted regions and colliders.
+        tombstones: ids of deleted regions and colliders.
         recorded: the objects as the scene has them, by id.
         ground: as the recording knows it.
         assets: the asset library, or None where there is none.
@@ -146,7 +147,7 @@ class ScenarioState:
     assets: AssetLookup | None = field(default=None, repr=False)
     regions: Mapping[str, EraseRegion] = field(default_factory=dict)
     colliders: Mapping[str, AddCollider] = field(default_factory=dict)
-    gone: frozenset[str] = frozenset()
+    tombstones: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, scene: SceneSource, *, assets: AssetLookup | None = None) -> ScenarioState:
@@ -188,19 +189,19 @@ class ScenarioState:
             next_instance_id=max(self.next_instance_id, changed.instance_id + 1),
         )
 
-    def knows(self, thing_id: str) -> bool:
+    def has_id(self, wanted: str) -> bool:
         """Whether an object, region or collider has this id, deleted ones included."""
-        return thing_id in self.objects or thing_id in self.regions or thing_id in self.colliders
+        return wanted in self.objects or wanted in self.regions or wanted in self.colliders
 
     @property
     def erased(self) -> tuple[EraseRegion, ...]:
         """Regions in effect, in order."""
-        return tuple(r for i, r in self.regions.items() if i not in self.gone)
+        return tuple(r for i, r in self.regions.items() if i not in self.tombstones)
 
     @property
     def standing_colliders(self) -> tuple[AddCollider, ...]:
         """Colliders in effect, in order."""
-        return tuple(c for i, c in self.colliders.items() if i not in self.gone)
+        return tuple(c for i, c in self.colliders.items() if i not in self.tombstones)
 
     @property
     def visible(self) -> tuple[ObjectState, ...]:

@@ -164,7 +164,7 @@ def possible(state: ScenarioState, operations: list[Operation]) -> list[Operatio
 def same_bits(a: ScenarioState, b: ScenarioState) -> bool:
     return (
         list(a.objects) == list(b.objects)
-        and (a.regions, a.colliders, a.gone) == (b.regions, b.colliders, b.gone)
+        and (a.regions, a.colliders, a.tombstones) == (b.regions, b.colliders, b.tombstones)
         and a.clock == b.clock
         and a.next_instance_id == b.next_instance_id
         and all(
@@ -192,7 +192,7 @@ def assert_close(a: ObjectState, b: ObjectState, tolerance: float = 1e-9) -> Non
 
 
 def _identity(o: ObjectState) -> tuple[object, ...]:
-    look = (o.source_id, o.asset, o.category, o.size, o.scale, o.placed)
+    look = (o.source_id, o.asset, o.category, o.size, o.scale, o.edited)
     return (o.object_id, look, o.instance_id, o.deleted, o.physics, o.velocity)
 
 
@@ -225,7 +225,7 @@ def test_inverse_operations_bring_every_object_back(
 
     for object_id, before in state.objects.items():
         assert_close(restored.objects[object_id], before)
-    assert all(i in restored.gone or restored.objects[i].deleted for i in outcome.created)
+    assert all(i in restored.tombstones or restored.objects[i].deleted for i in outcome.created)
     assert (restored.erased, restored.standing_colliders) == ((), ())
     assert restored.clock == state.clock
 

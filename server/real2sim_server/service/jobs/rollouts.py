@@ -169,7 +169,7 @@ class Show:
         placed = [
             (subject, pose)
             for subject, pose in standing
-            if subject.placed or subject.object_id in self._result.objects
+            if subject.edited or subject.object_id in self._result.objects
         ]
         return [background, *objects, *contact_shadows(self._scene, placed, t_us)]
 

@@ -1,8 +1,10 @@
-"""What one operation does, and what operations ask of the state first."""
+"""The family of edit operations: how each is applied, registered for its model of the wire."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +21,11 @@ MAX_ID_LENGTH = 80
 
 @dataclass(frozen=True, eq=False)
 class AppliedOperation:
-    """One operation's doing.
+    """What one operation leads to.
 
     Attributes:
         state: after it.
-        inverse: what takes it back.
+        inverse: takes it back.
         touched: id of the object that a person should look at; None where there is none.
         created: id of what is new; None where nothing is.
     """
@@ -32,6 +34,47 @@ class AppliedOperation:
     inverse: Operation
     touched: str | None = None
     created: str | None = None
+
+
+Apply = Callable[[ScenarioState, Any], AppliedOperation]
+"""``apply(state, operation)``: pure; raises EditError or SceneError where it cannot be done."""
+
+ApplyToObject = Callable[[ScenarioState, ObjectState, Any], AppliedOperation]
+"""``apply(state, subject, operation)``, for the object that ``operation.object_id`` names."""
+
+APPLY: dict[type[Any], Apply] = {}
+"""By the model of the wire, see :mod:`real2sim_proto.operations`."""
+
+
+def operation(model: type[Any]) -> Callable[[Apply], Apply]:
+    """Register how operations of a model are applied."""
+
+    def register(apply: Apply) -> Apply:
+        APPLY[model] = apply
+        return apply
+
+    return register
+
+
+def object_operation(model: type[Any]) -> Callable[[ApplyToObject], ApplyToObject]:
+    """Register how operations of a model are applied to the object that they name.
+
+    The object exists and is not deleted; else the operation raises as :func:`require_object`.
+    """
+
+    def register(apply: ApplyToObject) -> ApplyToObject:
+        def to_object(state: ScenarioState, operation: Any) -> AppliedOperation:
+            return apply(state, require_object(state, operation.object_id), operation)
+
+        APPLY[model] = to_object
+        return apply
+
+    return register
+
+
+def apply_operation(state: ScenarioState, operation: Operation) -> AppliedOperation:
+    """The state after one operation. Raises EditError or SceneError as the operation does."""
+    return APPLY[type(operation)](state, operation)
 
 
 def object_changed(
@@ -71,18 +114,18 @@ def new_id(state: ScenarioState, wanted: str | None, stem: str) -> str:
         EditError: INVALID_OPERATION when it is taken, or would be too long.
     """
     if wanted is not None:
-        if state.knows(wanted):
-            gone = wanted in state.gone or (
+        if state.has_id(wanted):
+            reserved = wanted in state.tombstones or (
                 wanted in state.objects and state.objects[wanted].deleted
             )
-            deleted = " (deleted; its id stays reserved)" if gone else ""
+            deleted = " (deleted; its id stays reserved)" if reserved else ""
             raise invalid_operation(
                 f"the id {wanted!r} is taken{deleted}",
                 hint="give another id, or none to get the next free one",
             )
         return wanted
     n = 1
-    while state.knows(free := f"{stem}{n}"):
+    while state.has_id(free := f"{stem}{n}"):
         n += 1
     if len(free) > MAX_ID_LENGTH:
         raise invalid_operation(
