@@ -1,4 +1,4 @@
-"""REST models of the asset library: things to insert into scenarios."""
+"""REST models of the asset library: objects to insert into scenarios."""
 
 from __future__ import annotations
 

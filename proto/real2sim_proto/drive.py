@@ -39,20 +39,20 @@ class Envelope(Model):
     id: int = Field(default=0, ge=0, le=2**53)
 
 
-class Told(Model):
+class ServerModel(Model):
     """Base of what a worker says. Readers ignore unknown members: newer workers may add some."""
 
     model_config = ConfigDict(extra="ignore")
 
 
-class Answer(Envelope, Told):
+class ServerEnvelope(Envelope, ServerModel):
     """What every message from the worker has."""
 
 
 # --- shared by socket and REST sessions -------------------------------------------------------
 
 
-class EgoState(Told):
+class EgoState(ServerModel):
     """The controlled vehicle at one instant; frames as in `conventions`."""
 
     position: Vector3
@@ -66,7 +66,7 @@ class EgoState(Told):
     size: Vector3 = Field(description="box length, width, height [m]")
 
 
-class AgentState(Told):
+class AgentState(ServerModel):
     """Another road user at one instant."""
 
     object_id: str
@@ -77,7 +77,7 @@ class AgentState(Told):
     size: Vector3
 
 
-class Event(Told):
+class Event(ServerModel):
     """Something that happened in this step."""
 
     type: Literal[
@@ -96,7 +96,7 @@ class Event(Told):
     data: dict[str, float] = Field(default_factory=dict)
 
 
-class Score(Told):
+class Score(ServerModel):
     """One score of an episode, with the version of its formula.
 
     Scores of different versions must not be compared.
@@ -215,7 +215,7 @@ CLIENT_MESSAGE: TypeAdapter[ClientMessage] = TypeAdapter(ClientMessage)
 # --- server to client -------------------------------------------------------------------------
 
 
-class Frame(Told):
+class Frame(ServerModel):
     """One image of one sensor."""
 
     sensor: str
@@ -229,7 +229,7 @@ class Frame(Told):
     data: bytes
 
 
-class Welcome(Answer):
+class Welcome(ServerEnvelope):
     """Answer to hello. Loading, compilation and the first render are over by now."""
 
     type: Literal["welcome"] = "welcome"
@@ -249,7 +249,7 @@ class Welcome(Answer):
     )
 
 
-class Obs(Answer):
+class Obs(ServerEnvelope):
     """What the vehicle perceives at one committed instant."""
 
     type: Literal["obs"] = "obs"
@@ -270,7 +270,7 @@ class Obs(Answer):
     timing: dict[str, float] = Field(default_factory=dict, description="milliseconds by stage")
 
 
-class Edited(Answer):
+class Edited(ServerEnvelope):
     """Answer to edit."""
 
     type: Literal["edited"] = "edited"
@@ -279,7 +279,7 @@ class Edited(Answer):
     warnings: list[EditWarning] = Field(default_factory=list)
 
 
-class View(Answer):
+class View(ServerEnvelope):
     """Answer to render."""
 
     type: Literal["view"] = "view"
@@ -289,7 +289,7 @@ class View(Answer):
     timing: dict[str, float] = Field(default_factory=dict)
 
 
-class Driven(Answer):
+class Driven(ServerEnvelope):
     """Answer to agent."""
 
     type: Literal["driven"] = "driven"
@@ -297,7 +297,7 @@ class Driven(Answer):
     step: int = Field(description="the plan holds from this step on")
 
 
-class Kept(Answer):
+class Kept(ServerEnvelope):
     """Answer to snapshot."""
 
     type: Literal["kept"] = "kept"
@@ -306,7 +306,7 @@ class Kept(Answer):
     t_us: Microseconds
 
 
-class Forked(Answer):
+class Forked(ServerEnvelope):
     """Answer to fork: another session at the same instant."""
 
     type: Literal["forked"] = "forked"
@@ -316,7 +316,7 @@ class Forked(Answer):
     step: int
 
 
-class Progress(Answer):
+class Progress(ServerEnvelope):
     """Long work before welcome or obs is under way."""
 
     type: Literal["progress"] = "progress"
@@ -324,7 +324,7 @@ class Progress(Answer):
     eta_s: float | None = None
 
 
-class Error(Answer):
+class Error(ServerEnvelope):
     """A message was refused. The session goes on unless `fatal`."""
 
     type: Literal["error"] = "error"
@@ -336,7 +336,7 @@ class Error(Answer):
     step: int | None = Field(default=None, description="step the session is at")
 
 
-class Result(Answer):
+class Result(ServerEnvelope):
     """The session is over."""
 
     type: Literal["result"] = "result"

@@ -48,7 +48,7 @@ class VehicleSpec(Model):
         default=None, description="[kg m^2]; default: mass x front x rear distance of the centre"
     )
     front_load: Annotated[float, Field(gt=0.1, lt=0.9)] = Field(
-        default=0.56, description="share of the weight on the front axle at rest"
+        default=0.56, description="fraction of the weight on the front axle at rest"
     )
     centre_height: Annotated[float, Field(ge=0, le=4)] = Field(
         default=0.55, description="of the centre of mass above the ground [m]"
@@ -172,7 +172,7 @@ class JunctionCrossingDriver(Model):
     )
     max_speed: Annotated[float, Field(gt=0, le=60)] = Field(default=15.0, description="[m/s]")
     acceleration: Annotated[float, Field(gt=0, le=10)] = Field(
-        default=3.0, description="to meet the ego; either way [m/s^2]"
+        default=3.0, description="to arrive with the ego; either way [m/s^2]"
     )
     commit: Seconds = Field(
         default=1.0, description="before the crossing it no longer reacts to the ego [s]"
@@ -241,7 +241,8 @@ class ContactSpec(Model):
         default_factory=dict, description="[kg] by object; default: by category and box"
     )
     dents: bool = Field(
-        default=True, description="images show what was struck deformed, by matter of particles"
+        default=True,
+        description="images show struck objects deformed, by the material point method",
     )
 
 

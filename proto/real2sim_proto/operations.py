@@ -1,7 +1,7 @@
 """Edits of a scenario, as a discriminated union on ``op``.
 
-Every operation names things by id, never carries them, and has an inverse. Ids of objects, erased
-regions and colliders share one name space.
+Every operation names what it changes by id, never carries it, and has an inverse. Ids of objects,
+erased regions and colliders share one name space.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ class SetPhysics(Model):
     material: MaterialName | None = Field(default=None, description="default: by category")
     friction: Friction | None = Field(default=None, description="Coulomb coefficient")
     restitution: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        default=None, description="share of the approach speed that is left after a bounce"
+        default=None, description="fraction of the approach speed that is left after a bounce"
     )
 
 
@@ -226,7 +226,7 @@ class SetVelocity(Model):
 
 
 class PlaneShape(Model):
-    """A half-space; things stay on the side that the normal points to."""
+    """A half-space; objects stay on the side that the normal points to."""
 
     kind: Literal["plane"] = "plane"
     point: Vector3 = Field(description="on the plane [m]")

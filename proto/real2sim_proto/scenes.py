@@ -37,7 +37,7 @@ class CameraInfo(Reply):
 
 
 class ObjectInfo(Reply):
-    """A movable thing of a scene or a scenario."""
+    """A movable object of a scene or a scenario."""
 
     object_id: str
     category: str

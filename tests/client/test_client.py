@@ -129,7 +129,7 @@ def test_an_answer_of_another_shape_is_malformed(content):
 
 
 def test_members_of_a_newer_worker_are_ignored():
-    newer = {"scenes": [{"scene": "street", "state": "resident", "mood": "sunny"}], "more": 1}
+    newer = {"scenes": [{"scene": "street", "state": "resident", "extra": "sunny"}], "more": 1}
     with client_of(Script(httpx2.Response(200, json=newer))) as client:
         assert [s.scene for s in client.scenes.list()] == ["street"]
 

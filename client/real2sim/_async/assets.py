@@ -16,7 +16,7 @@ from .transport import AsyncTransport
 
 
 class AsyncAssets:
-    """``client.assets``: things to insert into scenarios.
+    """``client.assets``: objects to insert into scenarios.
 
     Examples:
         >>> client = real2sim.connect_async()

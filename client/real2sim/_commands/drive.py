@@ -76,7 +76,7 @@ def drive(
                 seed=seed,
                 dt_us=dt_us,
                 action=needs.action,
-                # A planner that does not say what it needs is told everything.
+                # A planner that does not say what it needs is shown everything.
                 privileged=needs.privileged or not hasattr(driver, "needs"),
             )
     _report(summary, out=out, json_file=json_file)

@@ -17,7 +17,7 @@ from .transport import Transport
 
 
 class Assets:
-    """``client.assets``: things to insert into scenarios.
+    """``client.assets``: objects to insert into scenarios.
 
     Examples:
         >>> client = real2sim.connect()

@@ -46,7 +46,7 @@ class AlpasimDriver:
             target: host and port.
             timeout: [s].
             step_us: when it will be asked again [us].
-            seed: that it is told.
+            seed: of the session; sent to the driver.
 
         Raises:
             PeerError: it does not come up, or the ``alpasim`` extra is not installed.

@@ -30,7 +30,7 @@ REAR = 0.25
 
 @dataclass(frozen=True)
 class Lattice:
-    """Which drives are tried, and how they are judged; SI units.
+    """Which drives are tried, and what they cost; SI units.
 
     Attributes:
         offsets: from the route at the end of the lane change [m].
@@ -67,9 +67,9 @@ class DepthSampling:
     Points of the depth images that stand above the road are obstacles where they are now. A drive
     is admissible when the vehicle can go on with it for a moment and then stop without touching
     any (after the dynamic window of Fox, Burgard, Thrun 1997); of the admissible ones the best by
-    progress, comfort and nearness to the route is driven. What moves is not told from what stands,
-    so that it keeps a stopping distance behind a car rather than a time, and crossing traffic is
-    only seen where it is.
+    progress, comfort and nearness to the route is driven. What moves is taken for what stands, so
+    that it keeps a stopping distance behind a car rather than a time, and crossing traffic is only
+    seen where it is.
 
     Examples:
         >>> planner = DepthSampling(speed=6.0)

@@ -91,8 +91,8 @@ class FollowRoute:
         """Poses over the next seconds in the vehicle frame of ``obs``."""
         path = Path.along(obs.route)
         limits = speed_limits(path, cruise=self.speed, comfort=self.comfort)
-        for hindrance in hindrances(path, obs.ego, obs.agents, clearance=self.comfort.clearance):
-            limits = np.minimum(limits, behind(hindrance, path.arc, self.comfort))
+        for obstacle in obstacles_on(path, obs.ego, obs.agents, clearance=self.comfort.clearance):
+            limits = np.minimum(limits, behind(obstacle, path.arc, self.comfort))
         travelled = drive_profile(
             path.arc, limits, speed=obs.ego.speed, delays=self._delays, comfort=self.comfort
         )
@@ -164,7 +164,7 @@ class Path:
         direction = ahead - here
         moving = np.linalg.norm(direction, axis=1) > 1e-6
         yaw = np.where(moving, np.arctan2(direction[:, 1], direction[:, 0]), 0.0)
-        # A vehicle that stands cannot turn; its heading meets the path's within a metre or two.
+        # A vehicle that stands cannot turn; its heading reaches the path's within a metre or two.
         turned = np.unwrap(yaw) * (1.0 - np.exp(-travelled))
         return np.concatenate([here, turned[:, None]], axis=1)
 
@@ -185,7 +185,7 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Hindrance:
+class Obstacle:
     """Something in the way: where it begins along the path [m], and its speed along it [m/s]."""
 
     arc: float
@@ -210,14 +210,14 @@ def brake_ahead(arc: Array, limits: Array, *, braking: float) -> Array:
     return lowered
 
 
-def hindrances(
+def obstacles_on(
     path: Path, ego: EgoState, agents: Sequence[AgentState], *, clearance: float
-) -> list[Hindrance]:
+) -> list[Obstacle]:
     """Agents whose box reaches into the strip that the vehicle sweeps along the path.
 
     Counted from where the vehicle's origin must stand for its front to touch.
     """
-    found: list[Hindrance] = []
+    found: list[Obstacle] = []
     direction = np.gradient(path.points, path.arc, axis=0) if len(path.arc) > 1 else None
     if direction is None:
         return found
@@ -235,15 +235,15 @@ def hindrances(
         in_strip = aside.min() < reach and aside.max() > -reach
         if in_strip and arcs.max() > 0.0 and arcs.min() < path.arc[-1]:
             speed = float(velocity @ direction[nearest[arcs.argmin()]])
-            found.append(Hindrance(float(arcs.min()) - front, speed))
+            found.append(Obstacle(float(arcs.min()) - front, speed))
     return found
 
 
-def behind(hindrance: Hindrance, arc: Array, comfort: Comfort) -> Array:
-    """[N] float64 m/s at which one can still stop, or fall in, behind a hindrance."""
-    speed = max(hindrance.speed, 0.0)
-    room = hindrance.arc - comfort.gap - comfort.headway * speed - arc
-    limits: Array = np.sqrt(np.maximum(speed**2 + 2.0 * comfort.braking * room, 0.0))
+def behind(obstacle: Obstacle, arc: Array, comfort: Comfort) -> Array:
+    """[N] float64 m/s at which one can still stop, or fall in, behind a obstacle."""
+    speed = max(obstacle.speed, 0.0)
+    free = obstacle.arc - comfort.gap - comfort.headway * speed - arc
+    limits: Array = np.sqrt(np.maximum(speed**2 + 2.0 * comfort.braking * free, 0.0))
     return limits
 
 

@@ -13,10 +13,10 @@ from real2sim_proto.plans import TrajectoryPlan
 from .follow_route import (
     Array,
     Comfort,
-    Hindrance,
+    Obstacle,
     Path,
     delays_of_poses,
-    hindrances,
+    obstacles_on,
     speed_limits,
 )
 from .planner import Needs
@@ -112,14 +112,14 @@ class Idm:
         """Poses over the next seconds in the vehicle frame of ``obs``."""
         path = Path.along(obs.route)
         limits = speed_limits(path, cruise=self.speed, comfort=self.comfort)
-        found = hindrances(path, obs.ego, obs.agents, clearance=self.follower.clearance)
+        found = obstacles_on(path, obs.ego, obs.agents, clearance=self.follower.clearance)
         travelled = self._drive(path.arc, limits, found, speed=max(obs.ego.speed, 0.0))
         return TrajectoryPlan(
             times_us=[obs.t_us + round(delay * 1e6) for delay in self._delays],
             poses=[tuple(pose) for pose in path.poses(travelled, self.comfort.recovery).tolist()],
         )
 
-    def _drive(self, arc: Array, limits: Array, found: list[Hindrance], *, speed: float) -> Array:
+    def _drive(self, arc: Array, limits: Array, found: list[Obstacle], *, speed: float) -> Array:
         """[K] float64 metres travelled after each delay."""
         travelled, position, now = np.empty(len(self._delays)), 0.0, 0.0
         for k, delay in enumerate(self._delays):
@@ -133,7 +133,7 @@ class Idm:
         return travelled
 
     def _rate(
-        self, speed: float, desired: float, position: float, now: float, found: list[Hindrance]
+        self, speed: float, desired: float, position: float, now: float, found: list[Obstacle]
     ) -> float:
         rates = [self.follower.answer(speed, desired, math.inf, 0.0)]
         for one in found:

@@ -49,7 +49,7 @@ class Needs:
         cameras: by name; empty: the one that looks most nearly straight ahead.
         all_cameras: whether it wants every camera of the scene instead.
         width: of its images [px]; None: as recorded.
-        privileged: whether it is told of all objects.
+        privileged: whether observations list all objects.
         action: kind of its plans.
     """
 

@@ -14,7 +14,7 @@ from .material import Material, register_material
 class FixedCorotated(Material):
     """Fixed corotated elasticity (Stomakhin et al. 2012): soft bodies, and the paper's cars.
 
-    Psi = mu |F - R|^2 + lambda/2 (J - 1)^2.
+    ``Psi = mu |F - R|^2 + lambda/2 (J - 1)^2``.
     """
 
     constitutive_law: ClassVar[ConstitutiveLaw] = FIXED_COROTATED
