@@ -1,0 +1,188 @@
+"""Makes every picture of README.md and docs anew, by the commands that the text shows.
+
+Run it from the root of the repository, in the environment of ``make demo``, with playwright and a
+Chromium on the PATH (or in ``CHROMIUM``) for the studio::
+
+    .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
+
+NAME is one of demo, scenario, studio, wall, pair, drop, ground; without one, all are made. It takes
+about ten minutes on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import real2sim
+from real2sim_server.demo.run import SCENE
+from real2sim_server.demo.street import DURATION_S, TRAINING_HZ, record_street, unpack_street
+from real2sim_server.demo.worker import worker_process
+
+HERE = Path(__file__).parent
+EDITS = [
+    {
+        "op": "translate",
+        "object_id": "car_7",
+        "x": 4,
+        "y": 3.4,
+        "frame": "object",
+        "snap": True,
+        "time_range": {"start_us": 4_000_000},
+    },
+    {
+        "op": "duplicate",
+        "object_id": "car_6",
+        "new_id": "twin",
+        "x": -9.4,
+        "y": 0.4,
+        "frame": "object",
+        "snap": True,
+    },
+    {"op": "rotate", "object_id": "car_6", "angle": 0.2618},
+]
+"""Of docs/rest.md."""
+SHOWN_US = 5_250_000
+IN_THE_LANE = {"op": "translate", "object_id": "car_6", "y": 3.0, "frame": "object", "snap": True}
+"""Puts a parked car before the van that drives ahead, for the studio's run of physics."""
+
+
+def main() -> None:
+    """Make the pictures that are named."""
+    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
+    parser.add_argument("--work", type=Path, default=Path("out/pictures"))
+    parser.add_argument("names", nargs="*", default=list(PICTURES))
+    given = parser.parse_args()
+    scenes = given.work / "scenes"
+    shutil.rmtree(scenes, ignore_errors=True)
+    unpack_street(scenes, SCENE)
+    for name in given.names:
+        PICTURES[name](given.work, scenes)
+
+
+def demo(work: Path, _: Path) -> None:
+    """``edit.jpg``, ``drive.jpg`` and ``map.png`` from what ``real2sim demo`` leaves."""
+    command("demo", "--out", work / "demo")
+    before, after = (read(work / "demo" / f"edit_{name}.png") for name in ("before", "after"))
+    gap = np.full((before.shape[0], 8, 3), 255, np.uint8)
+    save("edit.jpg", np.concatenate([before, gap, after], axis=1), width=1200)
+    save("drive.jpg", read(work / "demo" / "drive_050.png"), width=1200)
+    save("map.png", read(work / "demo" / "map.png"), width=1000)
+
+
+def scenario(work: Path, scenes: Path) -> None:
+    """``scenario_before.jpg`` and ``scenario_after.jpg``: the three edits of docs/rest.md."""
+    with worker(work, scenes) as (client, _):
+        edited = client.scenarios.create(scene=SCENE, name="cut-in")
+        view = {"camera": "front", "t_us": SHOWN_US, "width": 960, "codec": "png"}
+        for name, operations in (("before", []), ("after", EDITS)):
+            for operation in operations:
+                edited.apply([operation])
+            edited.preview(**view).save(work / f"{name}.png")
+            save(f"scenario_{name}.jpg", read(work / f"{name}.png"), width=960)
+
+
+def studio(work: Path, scenes: Path) -> None:
+    """``studio.jpg``: a van that has run into a car, on the page of physics."""
+    from playwright.sync_api import sync_playwright
+
+    with worker(work, scenes) as (client, url), sync_playwright() as playwright:
+        edited = client.scenarios.create(scene=SCENE, name="street edit")
+        for operation in (*EDITS[:2], IN_THE_LANE):
+            edited.apply([operation])
+        end_us = SHOWN_US + 1_000_000
+        job = edited.simulate(start_us=SHOWN_US, end_us=end_us, objects=["van_0", "car_6"])
+        job = job.wait(timeout=900.0)
+        browser = playwright.chromium.launch(
+            executable_path=os.environ.get("CHROMIUM") or shutil.which("chromium"),
+            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+        )
+        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        link = f"scenario={edited.scenario_id}&camera=front&t={end_us - 100_000}&selected=van_0"
+        page.goto(f"{url}/ui/?{link}&run={job.info.job_id}")
+        page.click("button[data-tab=physics]")
+        page.wait_for_timeout(8_000)
+        page.screenshot(path=work / "studio.png")
+        browser.close()
+    save("studio.jpg", read(work / "studio.png"), width=1440)
+
+
+def wall(work: Path, scenes: Path) -> None:
+    """``wall.jpg``: a car against a wall at 15.6 m/s."""
+    experiment(work, scenes, "wall", "--preset", "vehicle", "--speed", "15.6")
+
+
+def pair(work: Path, scenes: Path) -> None:
+    """``pair.jpg``: a car into a standing van at 3.5 m/s."""
+    experiment(work, scenes, "pair", "--preset", "vehicle")
+
+
+def drop(work: Path, scenes: Path) -> None:
+    """``drop.jpg``: vehicles dropped onto the road."""
+    experiment(work, scenes, "drop", "--preset", "paper")
+
+
+def experiment(work: Path, scenes: Path, name: str, *options: str) -> None:
+    """The strip of stills that ``real2sim simulate`` leaves."""
+    command("simulate", scenes / SCENE, "--out", work / name, "--experiment", name, *options)
+    save(f"{name}.jpg", read(work / name / "strip.png"), width=1800)
+
+
+def ground(work: Path, scenes: Path) -> None:
+    """``ground.jpg``: the road from LiDAR and from Gaussians."""
+    log, picture = work / "log", work / "ground.png"
+    if not log.exists():
+        record_street(log, duration_s=DURATION_S, hz=TRAINING_HZ)
+    command("ground", scenes / SCENE, "--log", log, "--picture", picture)
+    save("ground.jpg", read(picture), width=1100)
+
+
+PICTURES = {make.__name__: make for make in (demo, scenario, studio, wall, pair, drop, ground)}
+
+
+def command(*arguments: object) -> None:
+    """Run a command of ``real2sim``."""
+    subprocess.run([sys.executable, "-m", "real2sim", *map(str, arguments)], check=True)
+
+
+@contextlib.contextmanager
+def worker(work: Path, scenes: Path) -> Iterator[tuple[real2sim.Client, str]]:
+    """A client of a worker with the demo's street, and its address."""
+    data = work / "worker"
+    shutil.rmtree(data, ignore_errors=True)
+    with (
+        worker_process(scenes=scenes, data=data, log_file=work / "worker.log") as running,
+        real2sim.connect(running.url, timeout=600.0) as client,
+    ):
+        client.wait_ready(timeout=600.0)
+        yield client, running.url
+
+
+def read(path: Path) -> np.ndarray:
+    """An image, BGR uint8 [H, W, 3]."""
+    image = cv2.imread(str(path))
+    if image is None:
+        raise FileNotFoundError(path)
+    return image
+
+
+def save(name: str, image: np.ndarray, *, width: int) -> None:
+    """Write an image into this folder, shrunk to ``width`` where it is wider."""
+    height = round(image.shape[0] * width / image.shape[1])
+    if image.shape[1] > width:
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(HERE / name), image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    print(HERE / name)
+
+
+if __name__ == "__main__":
+    main()
