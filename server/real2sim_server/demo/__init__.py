@@ -1,4 +1,4 @@
 """The product shown end to end: a street is made, served, edited and driven through.
 
-This room stands above all others and plays the user: it talks to its worker only by the SDK.
+The demo does what a user would: it talks to its worker only by the SDK.
 """

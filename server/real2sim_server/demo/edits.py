@@ -1,4 +1,4 @@
-"""The demo's edits: one car moved, another duplicated, both where there is room."""
+"""The demo's edits: one car moved, another duplicated, both where they overlap nothing."""
 
 from __future__ import annotations
 

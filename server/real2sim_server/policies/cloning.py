@@ -134,7 +134,7 @@ def train_network(
     import torch
 
     threads = torch.get_num_threads()
-    # The network is too small to share out, and one thread gives the same bits everywhere.
+    # The network is too small for several threads, and one thread gives the same bits everywhere.
     torch.set_num_threads(1)
     try:
         torch.manual_seed(seed)

@@ -87,7 +87,7 @@ def run_episodes(
         on_progress: called with (done, all).
 
     Raises:
-        Real2SimError: the worker refuses or is gone.
+        Real2SimError: the worker refuses, or has ended.
         ValueError: a planner that does not exist, or cannot drive in a scene.
     """
     for policy in grid.policies:
