@@ -12,6 +12,8 @@ from ..errors import PhysicsError
 from . import CASES, Case
 from .check import Check
 
+__all__ = ["CASES", "CaseResult", "as_figures", "run_table"]
+
 
 @dataclass(frozen=True)
 class CaseResult:
