@@ -1,4 +1,4 @@
-"""``real2sim ground``: the road surface, from LiDAR and from Gaussians."""
+"""``real2sim ground``: the scene's ground, beside what LiDAR and Gaussians say of it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .options import JsonFile, SceneBundle
 if TYPE_CHECKING:
     from ..geometry.rotation import Float
     from ..logs import DrivingLog
-    from ..scene import Scene
-    from ..simulation.ground import Road
+    from ..scene import Ground, Scene
+    from ..scene.ground_fit import RoadPlane
 
 SWEEPS_MAX = 12
 POINTS_DRAWN = 60_000
@@ -32,52 +32,78 @@ def ground(
     picture: Annotated[Path | None, typer.Option(help="PNG with inliers in red.")] = None,
     json: JsonFile = None,
 ) -> None:
-    """Find the road surface under a scene's objects, from LiDAR and from Gaussians."""
-    import numpy as np
-
+    """Tell the ground under a scene's objects, and what LiDAR and Gaussians say of it."""
     from ..logs.open import open_log
+    from ..scene.ground_fit import find_road_plane, ground_points
     from ..scene.io import load_scene
-    from ..simulation.ground import find_road
 
     loaded = load_scene(scene)
     if frame >= len(loaded.frame_times_us):
         raise CommandError(f"--frame {frame}; it has 0 to {len(loaded.frame_times_us) - 1}")
     t_us = int(loaded.frame_times_us[frame])
-    boxes = [
-        (o.trajectory.transform(t_us), o.size)
-        for o in loaded.objects.values()
-        if o.trajectory.covers(t_us)
-    ]
-    sources = {"Gaussians": _gaussian_points(loaded)}
+    there = {k: o for k, o in loaded.objects.items() if o.trajectory.covers(t_us)}
+    boxes = [(o.trajectory.transform(t_us), o.size) for o in there.values()]
+    sources = {"Gaussians": ground_points(loaded.background)}
     if log is not None:
         sources = {"LiDAR": _lidar_points(open_log(log)), **sources}
-    roads = {name: find_road(points, boxes) for name, points in sources.items()}
-    figures: dict[str, object] = {"boxes": len(boxes)}
-    for name, road in roads.items():
-        normal = np.asarray(road.plane.normal)
-        figures |= {
-            f"{name}: points around boxes": len(road.candidates),
-            f"{name}: inliers": int(road.inliers.sum()),
-            f"{name}: inliers [share]": float(road.inliers.mean()),
-            f"{name}: distance from plane, rms [m]": road.rms,
-            f"{name}: lean [deg]": float(np.degrees(np.arccos(min(normal[2], 1.0)))),
-        }
-    if len(roads) == 2:
-        apart = _apart(roads["LiDAR"], roads["Gaussians"], boxes)
-        figures["heights apart under boxes, median [m]"] = apart
+    planes = {name: find_road_plane(points, boxes) for name, points in sources.items()}
+    figures = (
+        {"boxes": len(boxes)} | _plane_figures(planes) | _height_figures(loaded, t_us, sources)
+    )
     print_figures(f"road of {scene.name}", figures)
-    write_json(json, figures)
+    under = dict(zip(there, _under(loaded.ground, boxes).tolist(), strict=True))
+    print_figures("ground under objects [m]", under)
+    write_json(json, figures | {"ground under objects [m]": under})
     if picture is not None:
-        _draw(sources, roads, loaded.ego.transform(t_us), picture)
+        _draw(sources, planes, loaded.ego.transform(t_us), picture)
         console.print(f"picture: {picture}", soft_wrap=True)
 
 
-def _gaussian_points(scene: Scene) -> Float:
+def _plane_figures(planes: dict[str, RoadPlane]) -> dict[str, object]:
+    """What RANSAC found below the boxes in each source."""
     import numpy as np
 
-    solid = scene.background.opacities.detach().cpu().numpy() > 0.3
-    means = scene.background.means.detach().cpu().numpy()
-    return np.asarray(means[solid], dtype=np.float64)
+    figures: dict[str, object] = {}
+    for name, plane in planes.items():
+        figures |= {
+            f"{name}: points around boxes": len(plane.candidates),
+            f"{name}: inliers": int(plane.inliers.sum()),
+            f"{name}: inliers [share]": float(plane.inliers.mean()),
+            f"{name}: distance from plane, rms [m]": plane.rms,
+            f"{name}: lean [deg]": float(np.degrees(np.arccos(min(plane.normal[2], 1.0)))),
+        }
+    return figures
+
+
+def _height_figures(scene: Scene, t_us: int, sources: dict[str, Float]) -> dict[str, object]:
+    """How far the ground fitted to each source is from the scene's, under the boxes."""
+    import numpy as np
+
+    from ..scene.ground_fit import DrivenPath, box_bottoms, fit_ground
+
+    objects = list(scene.objects.values())
+    path, bottoms = DrivenPath.of(scene.ego), box_bottoms(objects)
+    boxes = [(o.trajectory.transform(t_us), o.size) for o in objects if o.trajectory.covers(t_us)]
+    found = {
+        name: _under(fit_ground(p, path, bottoms).ground, boxes) for name, p in sources.items()
+    }
+    own = _under(scene.ground, boxes)
+    figures: dict[str, object] = {
+        f"{name}: heights apart from the scene's ground under boxes, median [m]": float(
+            np.median(np.abs(heights - own))
+        )
+        for name, heights in found.items()
+    }
+    if len(found) == 2:
+        apart = np.abs(found["LiDAR"] - found["Gaussians"])
+        figures["heights apart under boxes, median [m]"] = float(np.median(apart))
+    return figures
+
+
+def _under(ground: Ground, boxes: list[tuple[Float, tuple[float, float, float]]]) -> Float:
+    import numpy as np
+
+    return ground.height_at(np.array([pose[:2, 3] for pose, _ in boxes]))
 
 
 def _lidar_points(log: DrivingLog) -> Float:
@@ -105,18 +131,8 @@ def _lidar_points(log: DrivingLog) -> Float:
     return found
 
 
-def _apart(a: Road, b: Road, boxes: list[tuple[Float, tuple[float, float, float]]]) -> float:
-    import numpy as np
-
-    from ..simulation.surroundings import clearance
-
-    places = np.array([pose[:3, 3] for pose, _ in boxes])
-    difference = clearance(a.field, places)[0] - clearance(b.field, places)[0]
-    return float(np.median(np.abs(difference)))
-
-
 def _draw(
-    sources: dict[str, Float], roads: dict[str, Road], T_world_vehicle: Float, picture: Path
+    sources: dict[str, Float], planes: dict[str, RoadPlane], T_world_vehicle: Float, picture: Path
 ) -> None:
     """One panel for each source, seen from behind and above the vehicle; inliers in red."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -128,13 +144,13 @@ def _draw(
     ahead = T_world_vehicle[:3, 0]
     here = T_world_vehicle[:3, 3]
     T_world_camera = look_at(here - 14 * ahead + [0, 0, 12], here + 16 * ahead)
-    figure = Figure(figsize=(7 * len(roads), 4.6), dpi=110)
+    figure = Figure(figsize=(7 * len(planes), 4.6), dpi=110)
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(roads), squeeze=False)[0]
-    for axes, (name, road) in zip(panels, roads.items(), strict=True):
+    panels = figure.subplots(1, len(planes), squeeze=False)[0]
+    for axes, (name, plane) in zip(panels, planes.items(), strict=True):
         points = sources[name]
         step = max(len(points) // POINTS_DRAWN, 1)
-        own = points[road.candidates[road.inliers]]
+        own = points[plane.candidates[plane.inliers]]
         layers = ((points[::step], "0.55", 0.4), (own[:: max(len(own) // 20_000, 1)], "red", 1.2))
         for shown, colour, size in layers:
             local = apply_transform(invert_transform(T_world_camera), shown)
@@ -145,7 +161,9 @@ def _draw(
         axes.set_ylim(-0.5, 0.6)
         axes.set_aspect("equal")
         axes.set_axis_off()
-        axes.set_title(f"{name}: {int(road.inliers.sum()):,} inliers, {road.rms * 100:.1f} cm rms")
+        axes.set_title(
+            f"{name}: {int(plane.inliers.sum()):,} inliers, {plane.rms * 100:.1f} cm rms"
+        )
     figure.tight_layout()
     picture.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(picture)

@@ -8,14 +8,12 @@ from .scenario import LogEntry, Planned, Scenario
 from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
 from .tracks import PackedTracks, PlacedObjects
-from .validation import GroundHeight
 
 __all__ = [
     "AssetLookup",
     "AssetSource",
     "EditError",
     "EditOutcome",
-    "GroundHeight",
     "LogEntry",
     "ObjectState",
     "PackedTracks",

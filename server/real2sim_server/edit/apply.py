@@ -14,7 +14,7 @@ from . import lifecycle, motion, properties
 from .errors import EditError
 from .operation import AppliedOperation, apply_operation
 from .state import ScenarioState
-from .validation import GroundHeight, validate_edit
+from .validation import validate_edit
 
 OPERATION_MODULES = (lifecycle, motion, properties)
 """Importing them registers their operations, see :mod:`.operation`."""
@@ -38,15 +38,12 @@ class EditOutcome:
     warnings: tuple[EditWarning, ...]
 
 
-def apply_operations(
-    state: ScenarioState, operations: Sequence[Operation], *, ground: GroundHeight | None = None
-) -> EditOutcome:
+def apply_operations(state: ScenarioState, operations: Sequence[Operation]) -> EditOutcome:
     """All of ``operations`` in order, or none of them.
 
     Args:
         state: left as it is.
         operations: validated wire models.
-        ground: height of the ground for warnings; by default as the recording knows it.
 
     Raises:
         EditError: UNKNOWN_OBJECT, UNKNOWN_ASSET or INVALID_OPERATION, naming the place in the
@@ -63,7 +60,7 @@ def apply_operations(
         state=after,
         created=tuple(c.created for c in changes if c.created is not None),
         inverse=tuple(c.inverse for c in reversed(changes)),
-        warnings=tuple(validate_edit(after, tuple(touched), ground=ground or after.ground)),
+        warnings=tuple(validate_edit(after, tuple(touched))),
     )
 
 

@@ -17,7 +17,6 @@ from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform, transform_from
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene
-from .ground import RecordedGround
 from .ground_inpainting import inpaint_ground, vacated_parking
 from .shadow import contact_shadow
 from .state import ObjectState, ScenarioState
@@ -76,9 +75,8 @@ def contact_shadows(
 ) -> list[Instance]:
     """Soft shadows under the objects (each with its ``T_world_object``) that are not where the
     recording, and so their shadow in the background, has them at ``t_us``."""
-    ground = _kept(scene, "ground", lambda: _ground(scene))
     shadows = [
-        contact_shadow(transform, subject.scaled_size, ground, device=scene.background.device)
+        contact_shadow(transform, subject.scaled_size, scene.ground, device=scene.background.device)
         for subject, transform in placed
         if not _as_recorded(scene, subject, transform, t_us)
     ]
@@ -135,10 +133,6 @@ def _as_recorded(scene: Scene, subject: ObjectState, transform: Float, t_us: int
     return bool(abs(recorded.transform(t_us) - transform).max() < 0.02)
 
 
-def _ground(scene: Scene) -> RecordedGround:
-    return RecordedGround.of(scene.ego, scene.objects.values())
-
-
 _derived: WeakKeyDictionary[Scene, OrderedDict[Hashable, object]] = WeakKeyDictionary()
 _deriving = threading.Lock()
 
@@ -150,6 +144,6 @@ def _kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
         if key not in kept:
             kept[key] = make()
         kept.move_to_end(key)
-        while len(kept) > KEPT_BACKGROUNDS + 1:
+        while len(kept) > KEPT_BACKGROUNDS:
             kept.popitem(last=False)
         return kept[key]  # type: ignore[return-value]

@@ -20,10 +20,10 @@ from real2sim_proto.operations import (
     Translate,
 )
 
+from ..geometry.box import bottom_centres
 from ..geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix
 from ..geometry.transform import transform_from
-from ..scene import Trajectory
-from .ground import RecordedGround, bottoms_of
+from ..scene import Ground, Trajectory
 from .operation import (
     AppliedOperation,
     invalid_operation,
@@ -139,13 +139,13 @@ def stationary_track(pose: Pose, time_range: tuple[int, int]) -> Track:
 
 
 def snap_to_ground(
-    trajectory: Trajectory, size: tuple[float, float, float], ground: RecordedGround
+    trajectory: Trajectory, size: tuple[float, float, float], ground: Ground
 ) -> Trajectory:
     """The trajectory with the bottoms of its boxes on the ground."""
     poses = transform_from(trajectory.positions, trajectory.quaternions)
-    bottoms = bottoms_of(poses, size)
+    bottoms = bottom_centres(poses, size)
     positions = trajectory.positions.copy()
-    positions[:, 2] += ground(bottoms[:, :2]) - bottoms[:, 2]
+    positions[:, 2] += ground.height_at(bottoms[:, :2]) - bottoms[:, 2]
     return Trajectory(trajectory.times_us, positions, trajectory.quaternions)
 
 

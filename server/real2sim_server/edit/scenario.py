@@ -14,7 +14,6 @@ from real2sim_proto.operations import Operation
 from .apply import EditOutcome, apply_operations, replay_operations
 from .errors import EditError
 from .state import ScenarioState
-from .validation import GroundHeight
 
 KEPT_STATES = 32
 """States kept in memory; older ones are rebuilt from the log when an undo needs them."""
@@ -123,7 +122,6 @@ class Scenario:
         operations: Sequence[Operation],
         *,
         base_revision: int | None = None,
-        ground: GroundHeight | None = None,
         who: str = "",
     ) -> Planned:
         """What ``operations`` would lead to.
@@ -131,7 +129,6 @@ class Scenario:
         Args:
             operations: applied all, or none.
             base_revision: the revision they were made for; None for any.
-            ground: see :func:`~.apply.apply_operations`.
             who: goes on record.
 
         Raises:
@@ -139,7 +136,7 @@ class Scenario:
                 :func:`~.apply.apply_operations`.
         """
         self._refuse_stale(base_revision)
-        outcome = apply_operations(self.state, operations, ground=ground)
+        outcome = apply_operations(self.state, operations)
         return Planned(self._entry("edit", tuple(operations), None, who), outcome)
 
     def plan_undo(self, *, base_revision: int | None = None, who: str = "") -> Planned:
@@ -160,7 +157,6 @@ class Scenario:
         self,
         *,
         base_revision: int | None = None,
-        ground: GroundHeight | None = None,
         who: str = "",
     ) -> Planned:
         """What bringing back the last undone edit would lead to.
@@ -175,7 +171,7 @@ class Scenario:
                 "no edit was undone since the last edit; nothing to redo",
             )
         edit = self._undone[-1]
-        outcome = apply_operations(self.state, edit.operations, ground=ground)
+        outcome = apply_operations(self.state, edit.operations)
         return Planned(self._entry("redo", (), edit.revision, who), outcome)
 
     def commit(self, planned: Planned) -> EditOutcome:

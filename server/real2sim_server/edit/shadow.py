@@ -11,12 +11,12 @@ from functools import cache
 import numpy as np
 import torch
 
+from ..geometry.box import bottom_centres
 from ..geometry.rotation import Float, yaw_quaternion
 from ..geometry.transform import transform_from
 from ..render.types import Instance
-from ..scene import GaussianCloud
+from ..scene import GaussianCloud, Ground
 from ..scene.spherical_harmonics import SH_C0
-from .ground import RecordedGround, bottoms_of
 
 MARGIN = 0.35
 """The shadow reaches this far beyond the footprint [m], fading."""
@@ -40,7 +40,7 @@ COLOUR = (0.02, 0.02, 0.025)
 def contact_shadow(
     T_world_object: Float,
     size: tuple[float, float, float],
-    ground: RecordedGround,
+    ground: Ground,
     *,
     device: torch.device,
 ) -> Instance | None:
@@ -52,8 +52,8 @@ def contact_shadow(
         ground: below it.
         device: where the shadow's Gaussians should live.
     """
-    bottom = bottoms_of(T_world_object[None], size)[0]
-    height = float(ground(bottom[None, :2])[0])
+    bottom = bottom_centres(T_world_object[None], size)[0]
+    height = ground.height(float(bottom[0]), float(bottom[1]))
     clearance = max(0.0, float(bottom[2]) - height)
     level = round(LEVELS * (1 - clearance / FADE_HEIGHT))
     if level <= 0:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
 
-from ..scene import GaussianCloud, Scene, Trajectory
-from .ground import RecordedGround
+from ..scene import GaussianCloud, Ground, Scene, Trajectory
 from .tracks import PackedTracks
 
 
@@ -59,6 +58,8 @@ class SceneSource(Protocol):
     def objects(self) -> Mapping[str, ObjectSource] | Iterable[ObjectSource]: ...  # noqa: D102
     @property
     def ego(self) -> Trajectory: ...  # noqa: D102
+    @property
+    def ground(self) -> Ground: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,7 @@ class ScenarioState:
         colliders: by id, deleted ones too.
         tombstones: ids of deleted regions and colliders.
         recorded: the objects as the scene has them, by id.
-        ground: as the recording knows it.
+        ground: of the scene.
         assets: the asset library, or None where there is none.
         extent: [2, 2] lowest and highest x, y that the ego or an object reaches in the scene [m].
     """
@@ -143,7 +144,7 @@ class ScenarioState:
     recorded: Mapping[str, ObjectState] = field(repr=False)
     extent: NDArray[np.float64] = field(repr=False)
     clock: tuple[int, int]
-    ground: RecordedGround = field(repr=False)
+    ground: Ground = field(repr=False)
     assets: AssetLookup | None = field(default=None, repr=False)
     regions: Mapping[str, EraseRegion] = field(default_factory=dict)
     colliders: Mapping[str, AddCollider] = field(default_factory=dict)
@@ -175,7 +176,7 @@ class ScenarioState:
             recorded=frozen,
             extent=np.stack([reached.min(axis=0), reached.max(axis=0)]),
             clock=(scene.ego.start_us, scene.ego.end_us),
-            ground=RecordedGround.of(scene.ego, sources),
+            ground=scene.ground,
             assets=assets,
         )
 

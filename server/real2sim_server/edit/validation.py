@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -12,12 +12,9 @@ from real2sim_proto.scenarios import EditWarning
 
 from ..geometry.box import box_corners
 from ..geometry.box_kernels import first_overlap
-from ..scene import Trajectory
+from ..scene import Ground, Trajectory
 from .state import ObjectState, ScenarioState
 from .tracks import Float, sample
-
-GroundHeight = Callable[[Float], Float]
-"""Ground height [S] [m] below points [S, 2] of the world."""
 
 SAMPLE_PERIOD_US = 100_000
 MAX_SAMPLES = 201
@@ -34,9 +31,7 @@ REMEMBERED = 512
 """Objects whose sampled trajectories are kept, 26 kB each at most."""
 
 
-def validate_edit(
-    state: ScenarioState, touched: Sequence[str], *, ground: GroundHeight | None = None
-) -> Iterator[EditWarning]:
+def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[EditWarning]:
     """Warnings about the objects ``touched``, looked at every 0.1 s of their trajectories.
 
     Very long trajectories are looked at 201 times at most, evenly spread.
@@ -44,7 +39,6 @@ def validate_edit(
     Args:
         state: after the edit.
         touched: ids that the edit named or created; deleted ones are passed over.
-        ground: height of the ground; without it the ground counts as flat.
     """
     subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
     for subject in subjects:
@@ -52,7 +46,7 @@ def validate_edit(
         transforms, _ = _sampled(subject.trajectory, int(times[0]), int(times[-1]))
         yield from _overlaps(subject, state, times, transforms)
         recorded = None if subject.asset else state.recorded[subject.source_id]
-        yield from _off_ground(subject, recorded, transforms, ground)
+        yield from _off_ground(subject, recorded, transforms, state.ground)
         yield from _outside_map(subject, state.extent, transforms)
 
 
@@ -118,7 +112,7 @@ def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Ite
 
 
 def _off_ground(
-    subject: ObjectState, recorded: ObjectState | None, own: Float, ground: GroundHeight | None
+    subject: ObjectState, recorded: ObjectState | None, own: Float, ground: Ground
 ) -> Iterator[EditWarning]:
     usual = 0.0
     if recorded is not None:
@@ -136,17 +130,17 @@ def _off_ground(
 
 
 @lru_cache(maxsize=REMEMBERED)
-def _usual_clearance(recorded: ObjectState, ground: GroundHeight | None) -> float:
+def _usual_clearance(recorded: ObjectState, ground: Ground) -> float:
     track = recorded.trajectory
     theirs, _ = _sampled(track, track.start_us, track.end_us)
     return float(np.median(_clearance(theirs, recorded, ground)))
 
 
-def _clearance(transforms: Float, subject: ObjectState, ground: GroundHeight | None) -> Float:
+def _clearance(transforms: Float, subject: ObjectState, ground: Ground) -> Float:
     count = 1 if subject.standing else MAX_GROUND_SAMPLES
     sparse = transforms[:: -(-len(transforms) // count)]
     lowest: Float = box_corners(sparse, subject.scaled_size)[..., 2].min(axis=-1)
-    return lowest - ground(sparse[:, :2, 3]) if ground else lowest
+    return lowest - ground.height_at(sparse[:, :2, 3])
 
 
 def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iterator[EditWarning]:

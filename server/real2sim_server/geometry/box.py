@@ -30,6 +30,14 @@ def box_corners(T_world_box: ArrayLike, size: ArrayLike) -> Float:
     return apply_transform(T_world_box, local)
 
 
+def bottom_centres(T_world_box: Float, size: ArrayLike) -> Float:
+    """Centres [N, 3] [m] of the four lowest corners of boxes at ``T_world_box`` [N, 4, 4]."""
+    corners = box_corners(T_world_box, size)
+    lowest = np.argsort(corners[..., 2], axis=1, kind="stable")[:, :4]
+    chosen: Float = np.take_along_axis(corners, lowest[..., None], axis=1)
+    return chosen.mean(axis=1)
+
+
 def box_penetration(
     T_world_a: ArrayLike, size_a: ArrayLike, T_world_b: ArrayLike, size_b: ArrayLike
 ) -> Float:

@@ -8,6 +8,7 @@ from .camera import Camera, CameraRig
 from .cloud import GaussianCloud
 from .colour import TimeColour
 from .errors import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
+from .ground import Ground
 from .scene import Scene, SceneObject
 from .sky import Sky
 from .trajectory import Trajectory
@@ -18,6 +19,7 @@ __all__ = [
     "Camera",
     "CameraRig",
     "GaussianCloud",
+    "Ground",
     "Scene",
     "SceneError",
     "SceneObject",

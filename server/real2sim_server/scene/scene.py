@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -17,6 +18,8 @@ from .camera import CameraRig
 from .cloud import GaussianCloud
 from .colour import TimeColour
 from .errors import SceneError, UnknownObjectError
+from .ground import Ground, of_bundle
+from .ground_fit import fit_scene_ground
 from .sky import Sky
 from .trajectory import Trajectory
 
@@ -107,6 +110,8 @@ class Scene:
         ego_size: (length, width, height) of the recording vehicle's box [m].
         provenance: where it comes from: source, reader, settings, versions (JSON values only).
         content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
+        stored_ground: as the reconstruction fitted it; None where nobody has so far. Ask
+            :attr:`ground`.
     """
 
     name: str
@@ -119,6 +124,7 @@ class Scene:
     ego_size: tuple[float, float, float] = (4.6, 1.85, 1.6)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     content_hash: str = ""
+    stored_ground: Ground | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS:
@@ -153,6 +159,19 @@ class Scene:
         self.object(object_id)
         return 1 + list(self.objects).index(object_id)
 
+    @cached_property
+    def ground(self) -> Ground:
+        """The ground that everything stands on and falls to: the stored one, else fitted now to
+        Gaussians, boxes and the ego's path, once."""
+        if self.stored_ground is not None:
+            return self.stored_ground
+        if self.content_hash:
+            return of_bundle(self.content_hash, self._fit_ground)
+        return self._fit_ground()
+
+    def _fit_ground(self) -> Ground:
+        return fit_scene_ground(self.background, self.ego, self.objects.values())
+
     @property
     def gaussian_count(self) -> int:
         """Gaussians of background and objects together."""
@@ -160,9 +179,11 @@ class Scene:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all Gaussians and the sky [bytes]."""
+        """Memory of all Gaussians, the sky and the stored ground [bytes]."""
         sky = self.sky.nbytes if self.sky else 0
-        return self.background.nbytes + sky + sum(o.nbytes for o in self.objects.values())
+        ground = self.stored_ground.nbytes if self.stored_ground else 0
+        objects = sum(o.nbytes for o in self.objects.values())
+        return self.background.nbytes + sky + ground + objects
 
     @property
     def start_us(self) -> int:
@@ -182,4 +203,5 @@ class Scene:
             background=self.background.to(device),
             objects=objects,
             sky=self.sky.to(device) if self.sky else None,
+            stored_ground=self.__dict__.get("ground", self.stored_ground),
         )

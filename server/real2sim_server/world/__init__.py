@@ -5,7 +5,6 @@ from .ego.controller import Plan
 from .ego.motion import Motion
 from .errors import WorldError
 from .events import Event
-from .ground import LoggedGround
 from .observation import Observation
 from .path import LoggedPath
 from .scoring import Score, metrics_version
@@ -15,7 +14,6 @@ from .world import World
 __all__ = [
     "Agents",
     "Event",
-    "LoggedGround",
     "LoggedPath",
     "Motion",
     "Observation",

@@ -29,7 +29,6 @@ from .episode import episode_clock, takes_effect_us
 from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
-from .ground import LoggedGround
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
 from .scoring import Instant, MetricAccumulator, Score
@@ -54,7 +53,7 @@ class World:
         motion: planar state of the ego.
         T_world_vehicle: [4, 4] float64, the ego standing on the ground.
         traffic: drivers and poses of the other objects.
-        ground: height of the ground, usable for edits too.
+        ground: of the scene.
         accumulator: what the scores are made of.
         instant: the last committed one, as the scores get it.
         impacts: of the last step.
@@ -88,7 +87,7 @@ class World:
         self.reason: str | None = None
         self._clock = episode_clock(scene, spec)
         self._path = LoggedPath(scene.ego)
-        self.ground = LoggedGround(self._path)
+        self.ground = scene.ground
         self.motion = logged_motion(scene.ego, self.t_us, spec.ego)
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
@@ -232,7 +231,7 @@ class World:
                 f"made for revision {base_revision}; the session is at {self.revision}",
                 hint="look at the objects again and send the edit for the present revision",
             )
-        outcome = apply_operations(self.state, operations, ground=self.ground)
+        outcome = apply_operations(self.state, operations)
         self.state = outcome.state
         self.traffic = self.traffic.edited(
             self.state, self._surroundings(self.state.tracks.at(self.t_us))
@@ -341,7 +340,7 @@ class World:
             recorded = logged_motion(self.scene.ego, end_us, self.spec.ego)
             return StepMotion(controller, recorded, traffic, self._contacts, None)
         return self._contacts.advance(
-            controller, self.motion, before, traffic, t_us=t_us, height=self._height
+            controller, self.motion, before, traffic, t_us=t_us, height=self.ground.height
         )
 
     def _commit_motion(self, moved: StepMotion) -> None:
@@ -413,15 +412,14 @@ class World:
 
     def _ego_pose(self) -> Float:
         motion = self.motion
-        return self.ground.stand(motion.x, motion.y, motion.yaw, self._path_point)
-
-    def _height(self, x: float, y: float) -> float:
-        return self.ground.height(x, y, self._path.nearest(x, y, near_s=self._path_point.s))
+        return self.ground.pose_on(motion.x, motion.y, motion.yaw)
 
     def _surroundings(self, others: Agents) -> Surroundings:
         ego = ObservedEgo.of(self.motion, self._path_point, self.scene.ego_size)
         clock = self._clock
-        return Surroundings(self.t_us, clock.start_us, clock.dt_us, ego, others, self._path)
+        return Surroundings(
+            self.t_us, clock.start_us, clock.dt_us, ego, others, self._path, self.ground
+        )
 
     def _instant(self, contacts: StepContacts, plan: PlannedTrajectory | None = None) -> Instant:
         height = float(self.T_world_vehicle[2, 3])

@@ -9,7 +9,8 @@ import pytest
 
 from real2sim_server.edit import ScenarioState
 from real2sim_server.geometry.rotation import yaw_quaternion
-from real2sim_server.scene import Trajectory
+from real2sim_server.scene import GaussianCloud, Trajectory
+from real2sim_server.scene.ground_fit import fit_scene_ground
 
 STEP_US = 100_000
 FRAMES = 50
@@ -52,15 +53,15 @@ def thing(object_id: str, trajectory: Trajectory, *, category: str = "car") -> S
 @pytest.fixture(scope="session")
 def summary() -> SimpleNamespace:
     """A parked, a crossing, a turning and a late car, and the ego's path."""
-    return SimpleNamespace(
-        objects=[
-            thing("parked", drive(20.0, 5.0)),
-            thing("crossing", drive(0.0, -30.0, speed=8.0, yaw=0.3)),
-            thing("turning", turning(40.0, 10.0, radius=15.0, speed=6.0)),
-            thing("late", drive(60.0, -8.0, speed=3.0, yaw=-2.0, first=20, last=40)),
-        ],
-        ego=on_the_ground(drive(0.0, 0.0, speed=10.0)),
-    )
+    objects = [
+        thing("parked", drive(20.0, 5.0)),
+        thing("crossing", drive(0.0, -30.0, speed=8.0, yaw=0.3)),
+        thing("turning", turning(40.0, 10.0, radius=15.0, speed=6.0)),
+        thing("late", drive(60.0, -8.0, speed=3.0, yaw=-2.0, first=20, last=40)),
+    ]
+    ego = on_the_ground(drive(0.0, 0.0, speed=10.0))
+    ground = fit_scene_ground(GaussianCloud.empty(), ego, objects)
+    return SimpleNamespace(objects=objects, ego=ego, ground=ground)
 
 
 @pytest.fixture(scope="session")

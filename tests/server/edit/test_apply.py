@@ -219,7 +219,8 @@ def test_objects_cannot_leave_what_the_wire_can_carry(state):
 
 
 def test_a_scene_and_its_summary_give_the_same_state(summary, state):
-    as_mapping = type(summary)(objects={o.object_id: o for o in summary.objects}, ego=summary.ego)
+    by_id = {o.object_id: o for o in summary.objects}
+    as_mapping = type(summary)(objects=by_id, ego=summary.ego, ground=summary.ground)
 
     assert list(ScenarioState.of(as_mapping).objects) == list(state.objects)
     assert [o.instance_id for o in state.objects.values()] == [1, 2, 3, 4]

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from real2sim_proto.base import Pose
 from real2sim_proto.operations import Delete, Duplicate, Insert, Rotate, Scale, SetPose, Translate
 from real2sim_server.edit import apply_operations
+from real2sim_server.scene import Ground
 
 
-def warnings(state, *operations, ground=None):
-    outcome = apply_operations(state, operations, ground=ground)
+def warnings(state, *operations):
+    outcome = apply_operations(state, operations)
     return [(w.code, w.object_id) for w in outcome.warnings]
 
 
@@ -72,12 +76,11 @@ def test_a_tilted_object_digs_into_the_ground(state):
 
 
 def test_the_ground_is_asked_where_it_is_known(state):
-    def slope(points):
-        return 0.1 * points[:, 0]
-
+    rise = np.repeat(0.1 * np.arange(80.0)[:, None], 80, axis=1)
+    slope = Ground(np.array([-0.5, -40.5]), 1.0, rise, np.ones((80, 80), dtype=bool))
     up_the_hill = Translate(object_id="parked", x=10, z=1)
 
-    assert warnings(state, up_the_hill, ground=slope) == []
+    assert warnings(replace(state, ground=slope), up_the_hill) == []
     assert warnings(state, up_the_hill) == [("off_ground", "parked")]
 
 

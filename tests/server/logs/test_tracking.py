@@ -11,8 +11,8 @@ from real2sim_server.logs import DrivingLog, LidarSweep, ObjectTrack, open_log
 from real2sim_server.logs.overlay import points_in_box
 from real2sim_server.logs.tracking import TrackingOptions, track_moving_objects
 from real2sim_server.logs.tracking.free_space import SweepRays
-from real2sim_server.logs.tracking.ground import find_ground
 from real2sim_server.logs.tracking.motion import smooth
+from real2sim_server.logs.tracking.sweep_ground import find_sweep_ground
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 
 NEAR = 30.0
@@ -140,7 +140,7 @@ def test_ground_follows_a_slope_below_a_truck() -> None:
     on_truck = (np.abs(x - 8) < 5) & (np.abs(y) < 1.3)
     z = np.where(on_truck, slope + 2.5, slope)
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    ground = find_ground(points, 20.0)
+    ground = find_sweep_ground(points, 20.0)
     places = np.array([[8.0, 0.0], [-10.0, 5.0], [0.0, 0.0]])
     np.testing.assert_allclose(ground.at(places), 0.03 * places[:, 0], atol=0.15)
 

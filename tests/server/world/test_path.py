@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from real2sim_server.geometry.rotation import multiply_quaternions, yaw_quaternion
 from real2sim_server.scene import Trajectory
-from real2sim_server.world import LoggedGround, LoggedPath
+from real2sim_server.world import LoggedPath
 from real2sim_server.world.ego.route import command_ahead, route_ahead
 
 
@@ -84,47 +84,6 @@ def test_noise_of_a_standing_vehicle_adds_no_way():
     path = LoggedPath(along(noise, np.tile([1.0, 0, 0, 0], (100, 1))))
 
     assert path.length == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(("x", "y"), [(10.0, 0.0), (5.0, 4.0), (20.0, -6.0)])
-def test_the_ground_is_the_plane_the_recorder_stood_on(x, y):
-    trajectory = slope(pitch=0.1, roll=0.05)
-    path = LoggedPath(trajectory)
-    normal = trajectory.transform(0)[:3, 2]
-    expected = -(normal[0] * x + normal[1] * y) / normal[2]
-
-    assert LoggedGround(path)(np.array([[x, y]]))[0] == pytest.approx(expected, abs=1e-9)
-
-
-def test_far_from_the_path_the_plane_is_not_extended():
-    ground = LoggedGround(LoggedPath(slope(pitch=0.0, roll=0.1)))
-    near, far = ground(np.array([[10.0, 10.0], [10.0, 50.0]]))
-
-    assert far == pytest.approx(near)
-
-
-@settings(deadline=None)
-@given(yaw=st.floats(-3.1, 3.1))
-def test_a_vehicle_stands_upright_on_the_slope_with_its_heading(yaw):
-    trajectory = slope(pitch=0.15, roll=-0.1)
-    path = LoggedPath(trajectory)
-    T = LoggedGround(path).stand(12.0, 3.0, yaw, path.nearest(12.0, 3.0))
-
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-    np.testing.assert_allclose(T[:3, 2], trajectory.transform(0)[:3, 2], atol=1e-12)
-    assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw)
-
-
-def test_on_the_path_the_vehicle_stands_as_recorded():
-    trajectory = slope(pitch=0.15, roll=-0.1)
-    path = LoggedPath(trajectory)
-    recorded = trajectory.transform(1_000_000)
-    x, y = recorded[:2, 3]
-    yaw = math.atan2(recorded[1, 0], recorded[0, 0])
-
-    stood = LoggedGround(path).stand(x, y, yaw, path.nearest(x, y))
-    np.testing.assert_allclose(stood, recorded, atol=1e-9)
 
 
 def test_the_route_lies_on_the_recorded_path():

@@ -11,7 +11,7 @@ from scipy import ndimage
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform
 from ..driving_log import LidarSweep
-from .ground import find_ground
+from .sweep_ground import find_sweep_ground
 
 CELL = 0.35
 HEIGHTS = (0.25, 4.2)
@@ -59,7 +59,7 @@ def find_clusters(
     points = sweep.points.astype(np.float64)
     near = (np.abs(points[:, :2]) < reach).all(axis=1) & ~_on_ego(points, ego_size)
     points, offset = points[near], sweep.offset_us[near].astype(np.float64) * 1e-6
-    ground = find_ground(points, reach)
+    ground = find_sweep_ground(points, reach)
     below = ground.at(points)
     above = points[:, 2] - below
     standing = (above > HEIGHTS[0]) & (above < HEIGHTS[1])

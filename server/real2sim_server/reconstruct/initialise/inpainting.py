@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .ground import GroundSurface
-from .pull_push import pull_push
+from ...scene import Ground
+from ...scene.pull_push import pull_push
 
 MIRROR_REACH = 0.15
 """An unobserved point takes the colour of a point observed this near to its mirror image [m]."""
@@ -152,7 +152,7 @@ def fill_from_mirror(
 
 
 def fill_ground(
-    surface: GroundSurface, points: NDArray[np.float32], colours: Colours, known: Known
+    surface: Ground, points: NDArray[np.float32], colours: Colours, known: Known
 ) -> Colours:
     """Colour unobserved ground points from the observed ground around, ever smoother inwards."""
     if known.all() or not known.any():

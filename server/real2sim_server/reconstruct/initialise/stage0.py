@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ...logs import DrivingLog, ObjectTrack
-from ...scene import GaussianCloud, Scene, SceneObject, Sky
+from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
+from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
 from ...scene.spherical_harmonics import SH_C0
 from ..options import InitialiseOptions, ReconstructError
 from ..stages import OnProgress, Stages
 from .accumulate import Accumulation, accumulate, drive_path
-from .ground import GroundSurface, box_bottoms, fit_ground, spread_ground
+from .ground import spread_ground
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
@@ -101,31 +102,31 @@ def initialise_scene(
             f"log {log.name!r} has no usable LiDAR points; stage 0 builds everything from LiDAR"
         )
     with stages("shape"):
-        surface = _fit_ground(log, measured.background)
-        parts = _shape(log, measured, surface, options)
+        fitted = _fit_ground(log, measured.background)
+        parts = _shape(log, measured, fitted, options)
     with stages("walls") as report_step:
         parts = _keep_real_walls(log, parts, options, report_step)
     with stages("colour") as report_step:
         colours, known, sky_samples = _sample_colours(log, parts, options, report_step)
     with stages("fill"):
-        colours = _inpaint(log, parts, surface, colours, known)
+        colours = _inpaint(log, parts, fitted.surface, colours, known)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
-    return _assemble(log, parts, colours, sky, options)
+    scene = _assemble(log, parts, colours, sky, options)
+    return replace(scene, stored_ground=fitted.ground)
 
 
-def _fit_ground(log: DrivingLog, background: PointSet) -> GroundSurface:
-    poses = np.array([log.ego.transform(int(t)) for t in log.frame_times_us])
+def _fit_ground(log: DrivingLog, background: PointSet) -> GroundFit:
     boxes = box_bottoms(log.tracks, log.frame_times_us)
-    return fit_ground(background.points.astype(np.float64), poses, boxes)
+    return fit_ground(background.points.astype(np.float64), DrivenPath.of(log.ego), boxes)
 
 
 def _shape(
-    log: DrivingLog, measured: Accumulation, surface: GroundSurface, options: InitialiseOptions
+    log: DrivingLog, measured: Accumulation, fitted: GroundFit, options: InitialiseOptions
 ) -> _SurfelSet:
     """Gaussians without colour: the ground, what stands on it, and the objects."""
     path = drive_path(log)
-    ground = _ground_surfels(surface, options)
-    above = _above_ground(measured.background, surface)
+    ground = _ground_surfels(fitted, options)
+    above = _above_ground(measured.background, fitted.surface)
     distance = path_distance(above.points, path)
     supported = well_supported(above.points, 0.1 + 0.015 * distance)
     above, distance = above.select(supported), distance[supported]
@@ -159,8 +160,8 @@ def _shape(
     )
 
 
-def _ground_surfels(surface: GroundSurface, options: InitialiseOptions) -> Surfels:
-    ground = spread_ground(surface, options.ground_spacing, options.max_background // 2)
+def _ground_surfels(fitted: GroundFit, options: InitialiseOptions) -> Surfels:
+    ground = spread_ground(fitted, options.ground_spacing, options.max_background // 2)
     normal = ground.normals
     forward = np.cross([0.0, 1.0, 0.0], normal)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
@@ -169,7 +170,7 @@ def _ground_surfels(surface: GroundSurface, options: InitialiseOptions) -> Surfe
     return Surfels(ground.points, axes.astype(np.float32), scales.astype(np.float32))
 
 
-def _above_ground(background: PointSet, surface: GroundSurface) -> PointSet:
+def _above_ground(background: PointSet, surface: Ground) -> PointSet:
     xy = background.points[:, :2].astype(np.float64)
     height = background.points[:, 2] - surface.height_at(xy)
     return background.select(~surface.covers(xy) | (height > ABOVE_GROUND))
@@ -239,7 +240,7 @@ def _sample_colours(
 def _inpaint(
     log: DrivingLog,
     parts: _SurfelSet,
-    surface: GroundSurface,
+    surface: Ground,
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
 ) -> NDArray[np.float32]:

@@ -18,6 +18,8 @@ from ..asset import Asset
 from ..cloud import GaussianCloud
 from ..colour import TimeColour
 from ..errors import BundleError, SceneError
+from ..ground import Ground, of_bundle
+from ..ground_fit import BoxTrack, fit_scene_ground
 from ..scene import Scene, SceneObject
 from ..sky import Sky
 from .container import read_container, write_container
@@ -29,6 +31,7 @@ from .document import (
     CloudPart,
     ColourPart,
     EgoPart,
+    GroundPart,
     ObjectPart,
     SceneContent,
     SceneDocument,
@@ -40,15 +43,17 @@ from .tensors import TensorFile, cloud_shapes, cloud_tensors, tensor_hashes
 BACKGROUND_FILE = "background.safetensors"
 OBJECTS_FILE = "objects.safetensors"
 SKY_FILE = "sky.safetensors"
+GROUND_FILE = "ground.safetensors"
 ASSET_FILE = "asset.safetensors"
 
 _UNWRITTEN = {"format": "", "version": 0, "content_hash": "0" * 64, "files": {}}
 
 
 def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = False) -> Scene:
-    """Write ``scene`` as a bundle; the same scene with its content hash.
+    """Write ``scene`` as a bundle; the same scene with its content hash and its ground.
 
-    The folder appears whole or not at all. An existing bundle is replaced only with
+    A scene without a stored ground gets one: the fitted one that it would tell of anyway. The
+    folder appears whole or not at all. An existing bundle is replaced only with
     ``overwrite``; any other folder with something in it is never touched.
 
     Args:
@@ -65,6 +70,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
     objects = [_outgoing(o.cloud, f"object {k!r}") for k, o in scene.objects.items()]
     colours = [_outgoing_colour(o) for o in scene.objects.values()]
     sky = _outgoing_sky(scene.sky)
+    ground = _outgoing_ground(scene.ground)
     content = SceneContent(
         cameras=[CameraPart.of(c) for c in scene.rig],
         ego=EgoPart(size=scene.ego_size, trajectory=TrajectoryPart.of(scene.ego)),
@@ -75,6 +81,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
             for o, tensors, colour in zip(scene.objects.values(), objects, colours, strict=True)
         ],
         sky=SkyPart(resolution=sky["faces"].shape[1], tensors=tensor_hashes(sky)) if sky else None,
+        ground=_ground_part(scene.ground, ground),
     )
     document = SceneDocument(
         kind="scene",
@@ -86,9 +93,11 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
     )
     whole = [a | b for a, b in zip(objects, colours, strict=True)]
     keyed = {f"{i}.{name}": t for i, part in enumerate(whole) for name, t in part.items()}
-    files = {BACKGROUND_FILE: background, OBJECTS_FILE: keyed} | ({SKY_FILE: sky} if sky else {})
+    files = {BACKGROUND_FILE: background, OBJECTS_FILE: keyed, GROUND_FILE: ground}
+    if sky:
+        files[SKY_FILE] = sky
     written = write_container(document, Path(path), tensors=files, overwrite=overwrite)
-    return replace(scene, content_hash=written.content_hash)
+    return replace(scene, content_hash=written.content_hash, stored_ground=scene.ground)
 
 
 def load_scene(
@@ -122,8 +131,30 @@ def load_scene(
             ego_size=content.ego.size,
             provenance=document.provenance,
             content_hash=document.content_hash,
+            stored_ground=_ground(folder, document, verify) if content.ground else None,
         )
     return scene.to(device)
+
+
+def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
+    """The ground of a scene bundle, without its scene: the stored one, or of older bundles the one
+    that :attr:`~..Scene.ground` would fit. The same object as that of the scene, while it lives.
+
+    Args:
+        path: folder of the bundle.
+        content_hash: that the bundle must have.
+
+    Raises:
+        BundleError: as :func:`load_scene`, or it is another bundle by now.
+    """
+    folder = Path(path)
+    document = read_container(folder, SceneDocument, verify=False)
+    if document.content_hash != content_hash:
+        raise BundleError(f"{folder}: another bundle stands here now; read its summary again")
+    with _as_bundle_error(folder):
+        if document.content.ground is not None:
+            return of_bundle(content_hash, lambda: _read_ground(folder, document, verify=True))
+        return of_bundle(content_hash, lambda: _fit_ground(folder, document))
 
 
 def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = False) -> Asset:
@@ -184,6 +215,21 @@ def _outgoing_sky(sky: Sky | None) -> dict[str, Tensor]:
     if not bool(torch.isfinite(sky.faces).all()):
         raise SceneError("sky: faces hold values that are not finite")
     return {"faces": sky.faces.detach().cpu().contiguous()}
+
+
+def _outgoing_ground(ground: Ground) -> dict[str, Tensor]:
+    return {
+        "heights": torch.from_numpy(ground.heights.copy()),
+        "is_ground": torch.from_numpy(ground.is_ground.astype(np.uint8)),
+    }
+
+
+def _ground_part(ground: Ground, tensors: Mapping[str, Tensor]) -> GroundPart:
+    x, y = ground.origin.tolist()
+    rows, columns = ground.heights.shape
+    return GroundPart(
+        origin=(x, y), cell=ground.cell, shape=(rows, columns), tensors=tensor_hashes(tensors)
+    )
 
 
 def _cloud_part(tensors: Mapping[str, Tensor]) -> CloudPart:
@@ -282,6 +328,32 @@ def _sky(folder: Path, document: SceneDocument, verify: bool) -> Sky | None:
     if verify and not bool(torch.isfinite(sky.faces).all()):
         raise SceneError("sky: faces hold values that are not finite")
     return sky
+
+
+def _ground(folder: Path, document: SceneDocument, verify: bool) -> Ground:
+    return of_bundle(document.content_hash, lambda: _read_ground(folder, document, verify=verify))
+
+
+def _read_ground(folder: Path, document: SceneDocument, *, verify: bool) -> Ground:
+    part = document.content.ground
+    assert part is not None
+    file = _open(folder, GROUND_FILE, document.files, verify)
+    taken = file.take(
+        "",
+        shapes={"heights": part.shape, "is_ground": part.shape},
+        hashes=part.tensors,
+        dtypes={"is_ground": torch.uint8},
+    )
+    origin = np.array(part.origin)
+    return Ground(origin, part.cell, taken["heights"].numpy(), taken["is_ground"].numpy() != 0)
+
+
+def _fit_ground(folder: Path, document: SceneDocument) -> Ground:
+    content = document.content
+    file = _open(folder, BACKGROUND_FILE, document.files, verify=False)
+    background = _cloud(file, "", content.background, "background")
+    standing = [BoxTrack(o.size, o.trajectory.build()) for o in content.objects]
+    return fit_scene_ground(background, content.ego.trajectory.build(), standing)
 
 
 @contextmanager

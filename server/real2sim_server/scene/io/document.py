@@ -92,6 +92,15 @@ class SkyPart(_Part):
     tensors: dict[str, Sha256]
 
 
+class GroundPart(_Part):
+    """Grid and hashes of the ground; see :class:`~real2sim_server.scene.Ground`."""
+
+    origin: tuple[float, float]
+    cell: Annotated[float, Field(gt=0)]
+    shape: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
+    tensors: dict[str, Sha256]
+
+
 class EgoPart(_Part):
     """The recording vehicle."""
 
@@ -132,7 +141,11 @@ class ObjectPart(_Part):
 
 
 class SceneContent(_Part):
-    """Everything that makes a scene what it is; the content hash is taken over this."""
+    """Everything that makes a scene what it is; the content hash is taken over this.
+
+    Attributes:
+        ground: left out of the JSON where there is none, as versions 1 and 2 of the format ask.
+    """
 
     cameras: list[CameraPart]
     ego: EgoPart
@@ -140,10 +153,20 @@ class SceneContent(_Part):
     background: CloudPart
     objects: list[ObjectPart]
     sky: SkyPart | None
+    ground: GroundPart | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_ground(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if values.get("ground") is None:
+            values.pop("ground", None)
+        return values
 
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
+        if self.ground is not None:
+            return 3
         return 2 if any(o.colour is not None for o in self.objects) else 1
 
     def build_rig(self) -> CameraRig:

@@ -2,8 +2,8 @@
 
 A packed scene is quantised: centres to 1/65535 of their cloud's extent, axes to 1/3276 of a power
 of e, rotations to 1/127, opacities to 1/255, colours to half precision and the rest of the
-spherical harmonics to 1/127 of their largest. To work with it, unpack it into a bundle.
-Format: docs/scene_format.md.
+spherical harmonics to 1/127 of their largest, heights of the ground to a millimetre. To work with
+it, unpack it into a bundle. Format: docs/scene_format.md.
 """
 
 from __future__ import annotations
@@ -26,15 +26,18 @@ from ..camera import CameraRig
 from ..cloud import GaussianCloud
 from ..colour import TimeColour
 from ..errors import BundleError, SceneError
+from ..ground import Ground
 from ..scene import Scene, SceneObject
 from ..sky import Sky
 from .document import CameraPart, TrajectoryPart
 
-FORMAT, VERSION = "real2sim-packed", 1
+FORMAT, VERSION = "real2sim-packed", 2
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
 """Of one array when unpacked; a small file cannot ask for more memory than this."""
 MEAN_STEPS, QUAT_STEPS, OPACITY_STEPS, SH_STEPS = 65535, 127, 255, 127
+HEIGHT_STEP = 0.001
+"""Of the ground [m]."""
 LOG_SCALE_STEPS, LOWEST_LOG_SCALE = 3276, -13.0
 """Of an axis: 16 bits from 2 micrometres to a kilometre."""
 
@@ -67,6 +70,11 @@ class _PackedObject(_Part):
     colour: _PackedColour | None
 
 
+class _PackedGround(_Part):
+    origin: tuple[float, float]
+    cell: Annotated[float, Field(gt=0)]
+
+
 class _PackedDocument(_Part):
     format: str
     version: int
@@ -77,6 +85,7 @@ class _PackedDocument(_Part):
     frame_times_us: list[int]
     background: _PackedCloud
     objects: list[_PackedObject]
+    ground: _PackedGround | None = None
     provenance: dict[str, Any]
 
 
@@ -98,6 +107,7 @@ def write_packed(scene: Scene, path: str | PathLike[str]) -> None:
         frame_times_us=scene.frame_times_us.tolist(),
         background=_pack_cloud(scene.background, "background", arrays),
         objects=[_pack_object(o, f"{i}", arrays) for i, o in enumerate(scene.objects.values())],
+        ground=_pack_ground(scene.ground, arrays),
         provenance=json.loads(json.dumps(dict(scene.provenance), allow_nan=False)),
     )
     if scene.sky is not None:
@@ -145,9 +155,10 @@ def _document(data: bytes, file: Path) -> _PackedDocument:
     values = json.loads(data)
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise BundleError(f"{file}: holds no packed scene; its format must be {FORMAT!r}")
-    if values.get("version") != VERSION:
+    if values.get("version") not in range(1, VERSION + 1):
         raise BundleError(
-            f"{file}: version {values.get('version')!r} of {FORMAT}; this program reads {VERSION}"
+            f"{file}: version {values.get('version')!r} of {FORMAT}; "
+            f"this program reads 1 to {VERSION}"
         )
     try:
         return _PackedDocument.model_validate(values)
@@ -165,6 +176,21 @@ def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} has {size} bytes, more than {MAX_BYTES}")
     array: NDArray[Any] = np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
     return array
+
+
+def _pack_ground(ground: Ground, arrays: Arrays) -> _PackedGround:
+    """Heights become differences along both axes, which are mostly zero and compress well."""
+    steps = np.round(ground.heights.astype(np.float64) / HEIGHT_STEP).astype(np.int32)
+    along = np.diff(steps, axis=0, prepend=np.int32(0))
+    arrays["ground.heights"] = np.diff(along, axis=1, prepend=np.int32(0))
+    arrays["ground.is_ground"] = ground.is_ground
+    x, y = ground.origin.tolist()
+    return _PackedGround(origin=(x, y), cell=ground.cell)
+
+
+def _unpack_ground(part: _PackedGround, arrays: Arrays) -> Ground:
+    steps = arrays["ground.heights"].astype(np.int64).cumsum(axis=1).cumsum(axis=0)
+    return Ground(np.array(part.origin), part.cell, steps * HEIGHT_STEP, arrays["ground.is_ground"])
 
 
 def _pack_object(item: SceneObject, key: str, arrays: Arrays) -> _PackedObject:
@@ -250,6 +276,7 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
         frame_times_us=np.array(document.frame_times_us, dtype=np.int64),
         ego_size=document.ego_size,
         provenance=document.provenance,
+        stored_ground=_unpack_ground(document.ground, arrays) if document.ground else None,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 
 from ..camera import CameraRig
 from ..errors import BundleError, SceneError
+from ..ground import Ground
 from ..trajectory import Trajectory
+from .bundle import load_ground
 from .container import read_container
 from .document import Bounds, SceneDocument, Vector3
 
@@ -61,6 +64,15 @@ class SceneSummary:
     sky_resolution: int
     bounds: Bounds | None
     nbytes: int
+
+    @cached_property
+    def ground(self) -> Ground:
+        """The ground of the scene, read when first asked for; of older bundles it is fitted then.
+
+        Raises:
+            BundleError: the bundle is damaged, or another one stands there by now.
+        """
+        return load_ground(self.path, self.content_hash)
 
     @property
     def gaussian_count(self) -> int:

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -81,8 +82,10 @@ class TensorFile:
         *,
         shapes: Mapping[str, tuple[int, ...]],
         hashes: Mapping[str, str],
+        dtypes: Mapping[str, torch.dtype] = MappingProxyType({}),
     ) -> dict[str, Tensor]:
-        """The tensors stored under ``prefix`` + name, float32, for each name in ``shapes``.
+        """The tensors stored under ``prefix`` + name for each name in ``shapes``; float32 where
+        ``dtypes`` names no other type.
 
         Raises:
             BundleError: one is missing, has another shape or type or, when verifying, another
@@ -92,16 +95,19 @@ class TensorFile:
             raise BundleError(
                 f"{self.path}: scene.json gives hashes of {sorted(hashes)}, not of {list(shapes)}"
             )
-        return {name: self._one(prefix + name, shapes[name], hashes[name]) for name in shapes}
+        return {
+            name: self._one(prefix + name, shape, dtypes.get(name, torch.float32), hashes[name])
+            for name, shape in shapes.items()
+        }
 
-    def _one(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
+    def _one(self, key: str, shape: tuple[int, ...], dtype: torch.dtype, expected: str) -> Tensor:
         tensor = self._tensors.get(key)
         if tensor is None:
             raise BundleError(f"{self.path}: has no tensor {key!r}")
-        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+        if tuple(tensor.shape) != shape or tensor.dtype != dtype:
             raise BundleError(
                 f"{self.path}: tensor {key!r} is {tensor.dtype} {list(tensor.shape)}, "
-                f"scene.json asks for torch.float32 {list(shape)}"
+                f"scene.json asks for {dtype} {list(shape)}"
             )
         if self.verify and tensor_hash(tensor) != expected:
             raise BundleError(

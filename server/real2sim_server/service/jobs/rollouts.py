@@ -16,23 +16,18 @@ from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, PlaneS
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
-from ...edit.ground import RecordedGround
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
 from ...physics.colliders import Box, Collider, HeightField, Plane
 from ...physics.materials import named_material
 from ...render import Instance
 from ...scene import Scene, SceneObject
+from ...simulation.ground import ground_collider
 from ...simulation.playback import Playback
 from ...simulation.presets import ObjectPhysics
 from ...simulation.result import ENERGIES, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
 from ..http.problems import ServiceError
-
-GROUND = "ground"
-GROUND_MARGIN = 40.0
-GROUND_SPACING = 1.0
-"""The ground reaches this far around all objects, and is sampled so far apart [m]."""
 
 REACH = 25.0
 """What stands this near to something that moves takes part [m]; further, at most ``MOST``."""
@@ -78,7 +73,7 @@ def plan_rollout(scene: Scene, state: ScenarioState, asked: SimulateRequest) -> 
     options = SimulateOptions(
         preset=asked.preset,
         objects={object_id: _physics(there[object_id], start) for object_id in chosen},
-        colliders=_colliders(state),
+        colliders=colliders_of(state),
         start_us=start,
         duration=(end - start) * 1e-6,
         frame_rate=1e6 / asked.frame_us,
@@ -254,11 +249,13 @@ def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
     )
 
 
-def _colliders(state: ScenarioState) -> list[Collider]:
+def colliders_of(state: ScenarioState) -> list[Collider]:
+    """What does not yield: the scenario's own colliders, and the scene's ground unless one of them
+    is that."""
     colliders: list[Collider] = []
     grounds = [c for c in state.standing_colliders if isinstance(c.shape, GroundShape)]
     if not grounds:
-        colliders.append(_height_field(state, GROUND, offset=0.0, friction=None))
+        colliders.append(_ground(state, offset=0.0, friction=None))
     return colliders + [_collider(state, c) for c in state.standing_colliders]
 
 
@@ -271,29 +268,15 @@ def _collider(state: ScenarioState, given: AddCollider) -> Collider:
             pose = transform_from(box.position, box.quaternion)
             return Box(name=name, T_world_box=pose, size=box.size, friction=given.friction)
         case GroundShape() as ground:
-            # Tyres roll on what has this name.
-            return _height_field(state, GROUND, offset=ground.offset, friction=given.friction)
+            return _ground(state, offset=ground.offset, friction=given.friction)
         case _:
             assert_never(given.shape)
 
 
-def _height_field(
-    state: ScenarioState, name: str, *, offset: float, friction: float | None
-) -> HeightField:
+def _ground(state: ScenarioState, *, offset: float, friction: float | None) -> HeightField:
     positions = [o.trajectory.positions[:, :2] for o in state.visible]
-    at = np.concatenate([state.extent, *positions])
-    low = np.floor(at.min(axis=0) - GROUND_MARGIN)
-    high = at.max(axis=0) + GROUND_MARGIN
-    # Objects far outside must not make a grid that fills the memory.
-    low = np.maximum(low, state.extent[0] - 300.0)
-    high = np.minimum(high, state.extent[1] + 300.0)
-    counts = np.ceil((high - low) / GROUND_SPACING).astype(int) + 1
-    grid = np.indices(tuple(counts)).reshape(2, -1).T * GROUND_SPACING + low
-    ground: RecordedGround = state.ground
-    heights = ground(grid).reshape(tuple(counts)) + offset
-    return HeightField(
-        name=name, heights=heights, origin=low, spacing=GROUND_SPACING, friction=friction
-    )
+    places = np.concatenate([state.extent, *positions])
+    return ground_collider(state.ground, places, offset=offset, friction=friction)
 
 
 def _rounded(values: Any) -> Any:

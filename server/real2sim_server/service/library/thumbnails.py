@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...edit.ground import RecordedGround
 from ...edit.shadow import contact_shadow
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
-from ...scene import Asset
+from ...scene import Asset, Ground
 
 BACKDROP = (0.90, 0.91, 0.93)
 FOCAL = 1.6
@@ -27,12 +26,7 @@ def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.
     K = np.array([[FOCAL * width, 0, width / 2], [0, FOCAL * width, height / 2], [0, 0, 1.0]])
     distance = radius / np.sin(np.arctan(0.5 * height / (FOCAL * width)))
     eye = np.array(VIEW_FROM) / np.linalg.norm(VIEW_FROM) * distance
-    floor = RecordedGround(
-        path=np.array([[0.0, 0.0, -asset.size[2] / 2]]),
-        normals=np.array([[0.0, 0.0, 1.0]]),
-        spots=np.zeros((0, 2)),
-        offsets=np.zeros(0),
-    )
+    floor = Ground.level(-asset.size[2] / 2)
     shadow = contact_shadow(np.eye(4), asset.size, floor, device=asset.cloud.device)
     output = rasterize(
         [Instance(asset.cloud), *([shadow] if shadow else [])],

@@ -11,7 +11,7 @@ from ...physics.colliders import Collider, HeightField, Plane
 from ...physics.errors import PhysicsError
 from ...physics.materials import FixedCorotated
 from ...scene import Scene
-from ..ground import find_road
+from ..ground import ground_collider
 from ..playback import PlacedObject, PlacedObjects
 from ..presets import VEHICLES, ObjectPhysics, preset_of
 from ..rollout import SimulateOptions
@@ -31,7 +31,7 @@ SIDEWAYS, SLANT_MIN = 2.0, 0.25
 """Near views stand at most so many times as far to the side as the recording saw it from, and at
 least so far."""
 DEPTH_RANGE = (4.0, 45.0)
-OPAQUE = 0.3
+ROAD_FRICTION = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +120,12 @@ def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedOb
 
 
 def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
-    """The road as the background's Gaussians have it, under all boxes there at ``t_us``."""
-    boxes = [
-        (o.trajectory.transform(t_us), o.scaled_size)
-        for o in state.visible
-        if o.trajectory.covers(t_us)
+    """The scene's ground around all objects there at ``t_us`` and around the ego's path."""
+    there = [
+        o.trajectory.pose(t_us)[0][None, :2] for o in state.visible if o.trajectory.covers(t_us)
     ]
-    cloud = scene.background
-    solid = cloud.opacities.detach().cpu().numpy() > OPAQUE
-    means = cloud.means.detach().cpu().numpy()[solid].astype(np.float64)
-    return find_road(means, boxes).field
+    places = np.concatenate([scene.ego.positions[:, :2], *there])
+    return ground_collider(scene.ground, places, friction=ROAD_FRICTION)
 
 
 def _wall(request: _Request) -> Experiment:

@@ -8,7 +8,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ...scene import Scene
 from ..path import Float, LoggedPath
@@ -106,7 +105,7 @@ def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
 
     Args:
         scene: whose background.
-        path: recorded way of the ego, with the ground's tilt.
+        path: recorded way of the ego.
     """
     found = _grids.get(scene)
     if found is None:
@@ -123,12 +122,7 @@ def _build(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     points = points[((points[:, :2] >= lower) & (points[:, :2] < upper)).all(axis=1)]
     counts = np.zeros(shape, dtype=np.int32)
     if len(points):
-        distance, near = cKDTree(path.positions[:, :2]).query(points[:, :2])
-        up = np.where(path.ups[:, 2:] > 0.5, path.ups, [0.0, 0.0, 1.0])[near]
-        offset = points - path.positions[near]
-        share = np.minimum(1.0, 10.0 / np.maximum(distance, 1e-9))
-        rise = -share * (up[:, :2] * offset[:, :2]).sum(axis=1) / up[:, 2]
-        height = offset[:, 2] - rise
+        height = points[:, 2] - scene.ground.height_at(points[:, :2])
         standing = points[(height > LOWEST) & (height < HIGHEST)]
         cells = np.floor((standing[:, :2] - lower) / CELL).astype(np.int64)
         np.add.at(counts, (cells[:, 0], cells[:, 1]), 1)

@@ -13,6 +13,7 @@ from typing import Self
 from real2sim_proto.episode import CutInDriver, HardBrakeDriver, JunctionCrossingDriver
 
 from ...edit import ObjectState
+from ...scene import Ground
 from ..path import LoggedPath
 from .driver import AgentPose, Surroundings, level_quaternion, pose_on_path
 from .idm import advance_along
@@ -145,7 +146,7 @@ class JunctionCrossing:
     Attributes:
         subject, spec: the object and its parameters.
         crossing_s: of the crossing point along the route [m].
-        crossing: the point x, y and the height of its box centre [m].
+        crossing: the point x, y [m].
         heading: of its line [rad].
         left: way to the crossing point, negative beyond it [m].
         speed: [m/s].
@@ -155,7 +156,7 @@ class JunctionCrossing:
     subject: ObjectState
     spec: JunctionCrossingDriver
     crossing_s: float
-    crossing: tuple[float, float, float]
+    crossing: tuple[float, float]
     heading: float
     left: float
     speed: float
@@ -168,19 +169,19 @@ class JunctionCrossing:
     ) -> JunctionCrossing:
         """As far from the crossing as it goes at its speed in the time the ego needs."""
         crossing_s = surroundings.ego.s + spec.ahead
-        x, y, z, yaw = surroundings.route.at(crossing_s)
+        x, y, _, yaw = surroundings.route.at(crossing_s)
         eta = (spec.ahead - surroundings.ego.front) / max(surroundings.ego.speed, 1.0)
         made = cls(
             subject=subject,
             spec=spec,
             crossing_s=crossing_s,
-            crossing=(x, y, z + subject.scaled_size[2] / 2),
+            crossing=(x, y),
             heading=yaw + spec.angle,
             left=max(eta, 0.0) * spec.speed,
             speed=spec.speed,
             pose=recorded_pose(subject, subject.trajectory.start_us),
         )
-        return replace(made, pose=made._placed(made.left, made.speed))
+        return replace(made, pose=made._placed(made.left, made.speed, surroundings.ground))
 
     def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
@@ -193,12 +194,14 @@ class JunctionCrossing:
             rate = _towards(self.speed, wanted, self.spec.acceleration, surroundings.dt)
         way, speed = advance_along(0.0, self.speed, rate, surroundings.dt)
         left = self.left - way
-        return replace(self, left=left, speed=speed, pose=self._placed(left, speed))
+        pose = self._placed(left, speed, surroundings.ground)
+        return replace(self, left=left, speed=speed, pose=pose)
 
-    def _placed(self, left: float, speed: float) -> AgentPose:
-        (x, y, z), cos, sin = self.crossing, math.cos(self.heading), math.sin(self.heading)
+    def _placed(self, left: float, speed: float, ground: Ground) -> AgentPose:
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        x, y = self.crossing[0] - left * cos, self.crossing[1] - left * sin
         return AgentPose(
-            (x - left * cos, y - left * sin, z),
+            (x, y, ground.height(x, y) + self.subject.scaled_size[2] / 2),
             level_quaternion(self.heading),
             self.heading,
             (speed * cos, speed * sin, 0.0),
@@ -211,7 +214,7 @@ def _on_route(
     place: tuple[float, float],
     moving: tuple[float, float],
 ) -> AgentPose:
-    """An object beside the ego's route, standing on its ground.
+    """An object beside the ego's route, standing on the ground.
 
     Args:
         surroundings: has the route.
@@ -221,8 +224,9 @@ def _on_route(
     """
     s, offset = place
     pose = pose_on_path(surroundings.route, s, moving[0], offset=offset, drift=moving[1])
-    x, y, z = pose.position
-    return pose._replace(position=(x, y, z + subject.scaled_size[2] / 2))
+    x, y, _ = pose.position
+    z = surroundings.ground.height(x, y) + subject.scaled_size[2] / 2
+    return pose._replace(position=(x, y, z))
 
 
 def _towards(speed: float, wanted: float, most: float, dt: float) -> float:

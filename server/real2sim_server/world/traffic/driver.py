@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 
 from ...edit import ObjectState
+from ...scene import Ground
 from ..agents import Agents, rows_of
 from ..broad_phase_kernels import headings
 from ..ego.box import REAR_OVERHANG
@@ -86,6 +87,7 @@ class Surroundings:
         ego: the controlled vehicle.
         others: all objects, the agent itself among them.
         route: the recorded way of the ego.
+        ground: what everybody stands on.
     """
 
     t_us: int
@@ -94,6 +96,7 @@ class Surroundings:
     ego: ObservedEgo
     others: Agents
     route: LoggedPath
+    ground: Ground
 
     @property
     def dt(self) -> float:

@@ -27,7 +27,7 @@ def test_a_folder_without_json_is_no_bundle(tmp_path):
 @pytest.mark.parametrize("read", [load_scene, read_scene_summary])
 def test_a_newer_version_is_refused_with_both_versions_and_what_to_do(bundle, read):
     edit_json(bundle, version=7, content={"unheard": "of"})
-    with pytest.raises(BundleError, match=r"version 7 .* up to version 2; update real2sim"):
+    with pytest.raises(BundleError, match=r"version 7 .* up to version 3; update real2sim"):
         read(bundle)
 
 
@@ -184,6 +184,7 @@ def test_object_ids_never_become_paths(bundle, tmp_path):
     assert {f.name for f in bundle.iterdir()} == {
         "scene.json",
         "background.safetensors",
+        "ground.safetensors",
         "objects.safetensors",
         "sky.safetensors",
     }

@@ -89,7 +89,7 @@ def test_what_is_missing_or_cut_short_is_refused_by_name(packed, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, "version 2"),
+        ({"version": 3}, "version 3"),
         ({"format": "other"}, "no packed scene"),
         ({"ego_size": [1.0, 2.0]}, "damaged"),
     ],

@@ -1,4 +1,8 @@
-"""Which points of a sweep stand on the ground, and where that is."""
+"""The ground in one sweep, in the frame of the vehicle that saw it.
+
+This is no second ground of a scene: tracking runs before there is one, on single sweeps, and needs
+only to know which points stand up. A scene's ground is :class:`~real2sim_server.scene.Ground`.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ LOWEST = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class SweepGround:
     """Heights of the ground on a grid around the vehicle.
 
     Attributes:
@@ -38,7 +42,7 @@ class Ground:
         return np.asarray(found).reshape(places.shape[:-1])
 
 
-def find_ground(points: Float, reach: float) -> Ground:
+def find_sweep_ground(points: Float, reach: float) -> SweepGround:
     """The ground under points [N, 3] in the vehicle frame, within ``reach`` [m].
 
     The lowest points of each cell, opened (a minimum, then a maximum over a window), which takes
@@ -51,7 +55,7 @@ def find_ground(points: Float, reach: float) -> Ground:
     lowest = _lowest(points[inside, 2], index, side * side).reshape(side, side)
     filled = _fill(lowest)
     opened = ndimage.grey_opening(filled, size=(WINDOW, WINDOW), mode="nearest")
-    return Ground(ndimage.uniform_filter(opened, 3, mode="nearest"), side * CELL / 2)
+    return SweepGround(ndimage.uniform_filter(opened, 3, mode="nearest"), side * CELL / 2)
 
 
 def _lowest(heights: Float, index: NDArray[np.intp], cells: int) -> Float:
