@@ -106,8 +106,8 @@ class Ground:
     @property
     def centres(self) -> Float:
         """[X * Y, 2] float64, centres of all cells, row by row [m]."""
-        places: Float = np.indices(self.heights.shape).reshape(2, -1).T * self.cell
-        return places + self.first_centre
+        cells = np.indices(self.heights.shape).reshape(2, -1).T.astype(np.float64)
+        return cells * self.cell + self.first_centre
 
     @property
     def nbytes(self) -> int:

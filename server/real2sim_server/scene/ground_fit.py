@@ -181,7 +181,8 @@ def ground_points(cloud: GaussianCloud) -> Float:
     thin = scales[solid].argmin(axis=1)
     axes = quaternion_to_matrix(quats[solid].astype(np.float64))
     lying = np.abs(axes[np.arange(len(solid)), 2, thin]) > LYING
-    return means[solid[lying | (ordered[:, 0] > FLAT * ordered[:, 1])]].astype(np.float64)
+    chosen = solid[lying | (ordered[:, 0] > FLAT * ordered[:, 1])]
+    return np.asarray(means[chosen], dtype=np.float64)
 
 
 OPAQUE = 0.3
@@ -276,7 +277,7 @@ def _through_path(surface: Ground, distance: NDArray[np.float32], path: DrivenPa
     under = path.driven[nearest] - slope
     heights = surface.heights.ravel().astype(np.float64)
     heights[near] = beside + _fade(apart, inner, outer) * (under - beside)
-    shaped = heights.reshape(surface.heights.shape)
+    shaped = heights.astype(np.float32).reshape(surface.heights.shape)
     return Ground(surface.origin, surface.cell, shaped, surface.is_ground)
 
 
@@ -435,8 +436,8 @@ class _Grid:
 
     @property
     def centres(self) -> Float:
-        places: Float = (np.indices(self.shape).reshape(2, -1).T + 0.5) * self.cell
-        return places + self.low
+        cells = np.indices(self.shape).reshape(2, -1).T.astype(np.float64)
+        return (cells + 0.5) * self.cell + self.low
 
     def cells(self, xy: Float) -> NDArray[np.int64]:
         index = np.floor((xy - self.low) / self.cell).astype(np.int64)
@@ -489,7 +490,7 @@ def _fit_level(known: _Known, grid: _Grid, level: Level, coarser: _Fitted | None
     spread = pull_push(change, weights.astype(np.float32).reshape(grid.shape))[..., 0]
     measured = np.zeros(len(heights), dtype=np.bool_)
     measured[cells] = True
-    filled = base.reshape(grid.shape) + spread
+    filled = (base.reshape(grid.shape) + spread).astype(np.float32)
     ground = Ground(grid.low, grid.cell, filled, measured.reshape(grid.shape))
     return _Fitted(ground, distance.astype(np.float32).reshape(grid.shape))
 
@@ -523,11 +524,11 @@ def _close(level: _Fitted, footprints: Float) -> Ground:
         polygon = np.round((corners - surface.origin) / surface.cell - 0.5)[:, ::-1]
         cv2.fillConvexPoly(ground, polygon.astype(np.int32), 1)
     ground[distance < DRIVEN] = 1
-    ground = cv2.morphologyEx(ground, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    heights = (
-        cv2.GaussianBlur(surface.heights, (5, 5), 1.0) if surface.cell < 1 else surface.heights
-    )
-    return Ground(surface.origin, surface.cell, heights, ground.astype(np.bool_))
+    whole = cv2.morphologyEx(ground, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    heights = surface.heights
+    if surface.cell == LEVELS[-1].cell:
+        heights = np.asarray(cv2.GaussianBlur(heights, (5, 5), 1.0), dtype=np.float32)
+    return Ground(surface.origin, surface.cell, heights, whole.astype(np.bool_))
 
 
 # --- boxes -------------------------------------------------------------------------------------

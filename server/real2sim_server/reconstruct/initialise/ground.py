@@ -81,4 +81,5 @@ def _surface_normals(surface: Ground, xy: Float) -> NDArray[np.float32]:
     along_x = surface.height_at(xy + x_step) - surface.height_at(xy - x_step)
     along_y = surface.height_at(xy + y_step) - surface.height_at(xy - y_step)
     normals = np.stack([-along_x, -along_y, np.full(len(xy), 2 * step)], axis=1)
-    return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(unit, dtype=np.float32)

@@ -190,7 +190,12 @@ def _pack_ground(ground: Ground, arrays: Arrays) -> _PackedGround:
 
 def _unpack_ground(part: _PackedGround, arrays: Arrays) -> Ground:
     steps = arrays["ground.heights"].astype(np.int64).cumsum(axis=1).cumsum(axis=0)
-    return Ground(np.array(part.origin), part.cell, steps * HEIGHT_STEP, arrays["ground.is_ground"])
+    return Ground(
+        np.array(part.origin),
+        part.cell,
+        (steps * HEIGHT_STEP).astype(np.float32),
+        arrays["ground.is_ground"],
+    )
 
 
 def _pack_object(item: SceneObject, key: str, arrays: Arrays) -> _PackedObject:
