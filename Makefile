@@ -35,7 +35,7 @@ format: $(STAMP)
 
 schema: $(STAMP)
 	$(BIN)/python -m real2sim_proto.schema proto/schema
-	$(BIN)/python -m real2sim_server.service.http.openapi docs/openapi.json
+	$(BIN)/python -m real2sim_server.service.write_openapi docs/openapi.json
 
 coverage: $(STAMP)
 	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile --cov --cov-report=html:out/coverage --cov-report=term

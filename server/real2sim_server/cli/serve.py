@@ -26,7 +26,7 @@ def serve(
     """Start a worker. Settings not given here come from REAL2SIM_* variables."""
     from pydantic import ValidationError
 
-    from ..service import serve as worker
+    from ..service.preflight import check_start
     from ..settings import Settings
 
     options: dict[str, Any] = {
@@ -44,5 +44,9 @@ def serve(
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise CommandError(f"setting {name}: {first['msg']} (given: {first['input']!r})") from error
+    # Before the worker's libraries are loaded, which takes seconds.
+    check_start(settings)
+    from ..service import serve as worker
+
     if code := worker.run(settings):
         raise typer.Exit(code)

@@ -1,8 +1,9 @@
 """From Gaussians to pictures: one rasterize() call, three backends."""
 
 from .backends import Backend, BackendStatus, describe_backends, select_backend
-from .encode import EncodedImage, encode_depth, encode_image, encode_instance, encode_rgb
+from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
 from .frame import Frame, render_cameras, warm_up
+from .modalities import encode_image
 from .rasterize import rasterize
 from .types import Instance, RasterOptions, RenderError, RenderOutput, ScreenStatistics
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from .types import RenderError
 
@@ -34,31 +34,6 @@ class EncodedImage:
     codec: str
     dtype: str
     shape: tuple[int, ...]
-
-
-def encode_image(
-    image: NDArray[Any], modality: str, codec: str, *, quality: int = 90
-) -> EncodedImage:
-    """Encode an image of a modality; depth and instance become png where jpeg is asked for.
-
-    Args:
-        image: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` [m], or [H, W] uint16 ``instance``.
-        codec: ``raw``, ``jpeg`` or ``png``.
-        quality: of jpeg, 1 to 100.
-
-    Raises:
-        RenderError: unknown modality or codec, or an image of another kind.
-    """
-    if modality == "rgb":
-        data = encode_rgb(image, codec, quality=quality)
-        return EncodedImage(data, codec, "uint8", image.shape)
-    exact = "png" if codec == "jpeg" else codec
-    if modality == "depth":
-        dtype = "uint16" if exact == "png" else "float32"
-        return EncodedImage(encode_depth(image, exact), exact, dtype, image.shape)
-    if modality == "instance":
-        return EncodedImage(encode_instance(image, exact), exact, "uint16", image.shape)
-    raise RenderError(f"unknown modality {modality!r}; allowed are 'rgb', 'depth', 'instance'")
 
 
 def encode_rgb(image: NDArray[np.uint8], codec: str, *, quality: int = 90) -> bytes:
@@ -93,11 +68,26 @@ def encode_depth(depth: NDArray[np.float32], codec: str) -> bytes:
 
 def encode_instance(instance: NDArray[np.uint16], codec: str) -> bytes:
     """Instance ids [H, W] uint16 as raw uint16 or 16-bit png."""
-    _check_codec("instance", codec, EXACT_CODECS)
-    _check_array("instance", instance, np.uint16, 2)
+    return encode_lossless(instance, codec, name="instance", dtype=np.dtype("<u2"))
+
+
+def encode_lossless(image: NDArray[Any], codec: str, *, name: str, dtype: np.dtype[Any]) -> bytes:
+    """An image [H, W] of uint8 or uint16 as raw values, little-endian, or as png.
+
+    Args:
+        image: of ``dtype``.
+        codec: ``raw`` or ``png``.
+        name: of the modality, for messages.
+        dtype: of a pixel.
+
+    Raises:
+        RenderError: another codec, or an image of another dtype or shape.
+    """
+    _check_codec(name, codec, EXACT_CODECS)
+    _check_array(name, image, dtype, 2)
     if codec == "raw":
-        return instance.astype("<u2", order="C", copy=False).tobytes()
-    return _png(instance)
+        return image.astype(dtype, order="C", copy=False).tobytes()
+    return _png(image)
 
 
 def _check_codec(name: str, codec: str, codecs: tuple[str, ...]) -> None:
@@ -105,7 +95,7 @@ def _check_codec(name: str, codec: str, codecs: tuple[str, ...]) -> None:
         raise RenderError(f"{name} cannot be encoded as {codec!r}; allowed are {list(codecs)}")
 
 
-def _check_array(name: str, image: NDArray[Any], dtype: type, ndim: int) -> None:
+def _check_array(name: str, image: NDArray[Any], dtype: DTypeLike, ndim: int) -> None:
     fits = image.dtype == dtype and image.ndim == ndim and (ndim == 2 or image.shape[2] == 3)
     if not fits or image.size == 0:
         shape = "[H, W, 3]" if ndim == 3 else "[H, W]"

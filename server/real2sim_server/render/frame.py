@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..scene import Camera
 from .backends.base import Backend
 from .backends.select import select_backend
+from .modalities import modalities_drawn, modality_of, options_for
 from .rasterize import DEFAULT_OPTIONS, rasterize
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
 
@@ -21,20 +23,31 @@ class Frame:
 
     Attributes:
         camera: its name.
-        rgb: [H, W, 3] uint8.
-        depth: [H, W] float32 along the camera z axis [m], 0 where alpha is below 0.5; None when
-            not asked for.
-        instance: [H, W] uint16 instance ids, 0 is background; None when not asked for.
+        images: by modality: ``rgb`` [H, W, 3] uint8, ``depth`` [H, W] float32 along the camera z
+            axis [m], 0 where alpha is below 0.5, ``instance`` [H, W] uint16 ids, 0 is background.
         T_world_camera: [4, 4] float64, OpenCV camera frame to world.
         timing_ms: by stage; cameras drawn together share their time equally.
     """
 
     camera: str
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float32] | None
-    instance: NDArray[np.uint16] | None
+    images: Mapping[str, NDArray[Any]]
     T_world_camera: NDArray[np.float64]
     timing_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def rgb(self) -> NDArray[np.uint8]:
+        """The colour image. Raises KeyError where it was not asked for."""
+        return self.images["rgb"]
+
+    @property
+    def depth(self) -> NDArray[np.float32] | None:
+        """The depth image; None when not asked for."""
+        return self.images.get("depth")
+
+    @property
+    def instance(self) -> NDArray[np.uint16] | None:
+        """The instance image; None when not asked for."""
+        return self.images.get("instance")
 
 
 def render_cameras(
@@ -44,6 +57,7 @@ def render_cameras(
     *,
     sky: Sky | None = None,
     options: RasterOptions = DEFAULT_OPTIONS,
+    modalities: Sequence[str] | None = None,
     backend: str | Backend = "auto",
 ) -> list[Frame]:
     """Frames of ``cameras`` in their order; cameras of one size are drawn in one call.
@@ -52,13 +66,23 @@ def render_cameras(
         instances: what is in the world, see rasterize().
         cameras: on the vehicle.
         T_world_vehicle: [4, 4] pose of the vehicle.
+        sky: behind everything.
+        options: of the pass.
+        modalities: images that the frames have, and with them the switches of ``options``; None
+            for rgb and what those switches say.
+        backend: draws.
 
     Raises:
-        RenderError: as rasterize(); also for a vehicle pose that is not rigid.
+        RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for a modality
+            that nobody has registered.
     """
     vehicle = np.asarray(T_world_vehicle, dtype=np.float64)
     if vehicle.shape != (4, 4) or not np.isfinite(vehicle).all():
         raise RenderError(f"T_world_vehicle must be [4, 4] and finite, not {vehicle.tolist()}")
+    if modalities is None:
+        modalities = modalities_drawn(options)
+    else:
+        options = options_for(modalities, options)
     groups: dict[tuple[int, int], list[int]] = {}
     for index, camera in enumerate(cameras):
         groups.setdefault((camera.width, camera.height), []).append(index)
@@ -75,7 +99,7 @@ def render_cameras(
             options=options,
             backend=backend,
         )
-        frames.update(zip(members, _frames(group, vehicle, output), strict=True))
+        frames.update(zip(members, _frames(group, vehicle, output, modalities), strict=True))
     return [frames[index] for index in range(len(cameras))]
 
 
@@ -88,20 +112,17 @@ def warm_up(backend: str | Backend = "auto") -> None:
 
 
 def _frames(
-    cameras: Sequence[Camera], vehicle: NDArray[np.float64], output: RenderOutput
+    cameras: Sequence[Camera],
+    vehicle: NDArray[np.float64],
+    output: RenderOutput,
+    modalities: Sequence[str],
 ) -> list[Frame]:
-    from .quantize import solid_depth, to_uint8
-
-    rgb = to_uint8(output.rgb)
-    depth = None if output.depth is None else solid_depth(output.depth, output.alpha)
-    instance = None if output.instance is None else output.instance.cpu().numpy()
+    images = {name: modality_of(name).pixels(output) for name in modalities}
     share = {stage: value / len(cameras) for stage, value in output.timing_ms.items()}
     return [
         Frame(
             camera=camera.name,
-            rgb=rgb[c],
-            depth=None if depth is None else depth[c],
-            instance=None if instance is None else instance[c],
+            images={name: pixels[c] for name, pixels in images.items()},
             T_world_camera=camera.pose(vehicle),
             timing_ms=dict(share),
         )

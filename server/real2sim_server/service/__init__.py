@@ -1,4 +1,17 @@
-"""The worker on the network: engine, residency, store, REST routes and sockets.
+"""The worker on the network; the only package that knows HTTP.
 
-The only room that knows HTTP.
+Its parts, lowest first; each imports only those before it, and no file is part of a circle:
+
+- ``preflight``: what is refused before anything heavy is loaded.
+- ``storage``: tables and rows of scenarios, sessions, jobs and stored answers.
+- ``engine``: the thread that owns the device, and its queue.
+- ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics, sockets.
+- ``library``: scenes and assets, on disk and in memory.
+- ``rendering``: render requests, and images as frames of the wire.
+- ``scenarios``: edited under a lock each, cached, on record before they take effect.
+- ``jobs``: long work: rollouts and videos.
+- ``sessions``: closed loops; ``pipeline`` takes a step from the socket to the bytes of its answer.
+- ``worker``: all of it put together once.
+- ``routes``: calls and sockets; ``ui`` is the studio that they serve as files.
+- ``app``, ``serve``: the ASGI application, and the server that runs it.
 """

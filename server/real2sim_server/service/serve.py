@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import ipaddress
 import signal
-import socket
 import sys
 import threading
 import time
@@ -22,8 +20,9 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from ..settings import Settings
 from .app import create_app
 from .http.auth import check_bind
-from .http.websocket import PartedProtocol
+from .http.websocket import ScatterGatherProtocol
 from .logging_setup import configure_logging
+from .preflight import bind, check_scenes, listen, url_of
 from .worker import Worker
 
 PING_INTERVAL_S = 10.0
@@ -51,21 +50,18 @@ def run(settings: Settings) -> int:
 
     Raises:
         OpenBindError: another address than loopback, and no token.
+        SceneFolderError: the folder of scenes is missing.
+        AddressError: the address is taken, or none of this machine.
         RenderError: the backend of the settings cannot be used here.
-        OSError: the address is taken.
     """
     check_bind(settings.host, _token(settings))
+    check_scenes(settings)
     configure_logging(level=settings.log_level, log_format=settings.log_format)
+    listener = bind(settings.host, settings.port)
     app = create_app(settings)
-    listener = _listen(settings.host, settings.port)
-    url = _url(settings.host, listener)
+    listen(listener)
     worker: Worker = app.state.worker
-    print(
-        f"Real2Sim worker {settings.worker_id} on {url} ({worker.device.backend}: "
-        f"{worker.device.reason}); scenes in {settings.scenes_path}",
-        file=sys.stderr,
-        flush=True,
-    )
+    print(_announcement(worker, url_of(settings.host, listener)), file=sys.stderr, flush=True)
     server = uvicorn.Server(server_config(app, settings))
     # A lost device poisons the process: it ends, so that whoever supervises it starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
@@ -86,12 +82,15 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
 
     Raises:
         OpenBindError: another address than loopback, and no token.
+        SceneFolderError: the folder of scenes is missing.
+        AddressError: the address is taken, or none of this machine.
         RuntimeError: it ended, or was not ready in time; with its reasons.
     """
     check_bind(settings.host, _token(settings))
+    check_scenes(settings)
+    listener = bind(settings.host, settings.port)
     app = create_app(settings)
-    listener = _listen(settings.host, settings.port)
-    url = _url(settings.host, listener)
+    listen(listener)
     server = uvicorn.Server(server_config(app, settings))
     thread = threading.Thread(
         target=server.run, kwargs={"sockets": [listener]}, name="worker", daemon=True
@@ -99,7 +98,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
     thread.start()
     try:
         _wait_until_ready(listener.getsockname(), thread, timeout_s)
-        yield RunningWorker(url, _token(settings), app.state.worker)
+        yield RunningWorker(url_of(settings.host, listener), _token(settings), app.state.worker)
     finally:
         server.should_exit = True
         thread.join(settings.graceful_seconds + 30)
@@ -114,7 +113,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         lifespan="on",
-        ws=PartedProtocol,
+        ws=ScatterGatherProtocol,
         # Deflating a frame takes 20 ms and gains nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
@@ -124,34 +123,17 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     )
 
 
+def _announcement(worker: Worker, url: str) -> str:
+    """What whoever starts a worker is told first."""
+    settings, device = worker.settings, worker.device
+    return (
+        f"Real2Sim worker {settings.worker_id} on {url} ({device.backend}: {device.reason}); "
+        f"scenes in {settings.scenes_path}\nStudio: {url}/ui/"
+    )
+
+
 def _token(settings: Settings) -> str | None:
     return settings.token.get_secret_value() if settings.token else None
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """A listening socket, made here so that the port is known before the server runs."""
-    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    # Named as TCP, or asyncio would not turn Nagle's algorithm off on accepted connections, and
-    # every answer would wait 40 ms for an acknowledgement.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen(2048)
-    except OSError:
-        listener.close()
-        raise
-    return listener
-
-
-def _url(host: str, listener: socket.socket) -> str:
-    port = listener.getsockname()[1]
-    try:
-        version = ipaddress.ip_address(host).version
-    except ValueError:
-        version = 4
-    shown = f"[{host}]" if version == 6 else host
-    return f"http://{shown}:{port}"
 
 
 def _wait_until_ready(address: tuple[str, int], thread: threading.Thread, timeout_s: float) -> None:

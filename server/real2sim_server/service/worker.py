@@ -20,6 +20,7 @@ from real2sim_proto.scenes import DeviceInfo, Readiness
 from ..render import Backend, describe_backends, select_backend
 from ..settings import Settings
 from ..world import warm_up
+from .engine import Engine
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
 from .jobs.jobs import Jobs
@@ -27,11 +28,10 @@ from .jobs.simulations import Simulations
 from .library.assets import AssetLibrary
 from .library.scene_cache import SceneCache
 from .library.scene_catalog import SceneCatalog
-from .rendering.engine import Engine
 from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
-from .sessions.observation_renderer import ObservationRenderer
+from .sessions.pipeline import StepPipeline
 from .storage.job_log import JobLog
 from .storage.store import Store
 
@@ -54,13 +54,13 @@ class Worker:
     engine: Engine
     metrics: Metrics
     store: Store
-    residency: SceneCache
+    scene_cache: SceneCache
     scenarios: Scenarios
     assets: AssetLibrary
     jobs: Jobs
     simulations: Simulations
     idempotency: Idempotency
-    pictures: Renderer
+    renderer: Renderer
     sessions: Sessions
     backend: Backend
     device: DeviceInfo
@@ -81,7 +81,7 @@ class Worker:
             threads=settings.threads,
             on_job=metrics.observe_job,
         )
-        residency = SceneCache(
+        scene_cache = SceneCache(
             SceneCatalog(settings.scenes_path),
             engine,
             budget_bytes=settings.scene_memory_bytes,
@@ -90,30 +90,30 @@ class Worker:
         )
         store = Store(settings.database_url)
         assets = AssetLibrary(settings.assets_path)
-        scenarios = Scenarios(store, residency, metrics, assets=assets.find)
+        scenarios = Scenarios(store, scene_cache, metrics, assets=assets.find)
         jobs = Jobs(JobLog(store, settings.worker_id), settings.jobs_path)
-        pictures = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
+        renderer = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(
             settings=settings,
             engine=engine,
             metrics=metrics,
             store=store,
-            residency=residency,
+            scene_cache=scene_cache,
             scenarios=scenarios,
             assets=assets,
             jobs=jobs,
-            simulations=Simulations(jobs, scenarios, residency),
+            simulations=Simulations(jobs, scenarios, scene_cache),
             idempotency=Idempotency(store),
-            pictures=pictures,
+            renderer=renderer,
             sessions=Sessions(
                 SessionLimits(
                     settings.worker_id, settings.max_sessions, settings.session_idle_seconds
                 ),
-                show=ObservationRenderer(
-                    engine, pictures, metrics, max_pixels=settings.max_pixels_per_step
+                pipeline=StepPipeline(
+                    engine, renderer, metrics, max_pixels=settings.max_pixels_per_step
                 ),
                 store=store,
-                residency=residency,
+                scene_cache=scene_cache,
                 scenarios=scenarios,
                 metrics=metrics,
             ),
@@ -133,12 +133,12 @@ class Worker:
         async with AsyncExitStack() as at_exit:
             self.engine.start()
             at_exit.push_async_callback(asyncio.to_thread, self.engine.stop)
-            at_exit.callback(self.pictures.close)
-            at_exit.callback(self.residency.close)
+            at_exit.callback(self.renderer.close)
+            at_exit.callback(self.scene_cache.close)
             at_exit.push_async_callback(self.store.close)
             await self.store.open()
-            at_exit.push_async_callback(self.scenarios.settle)
-            await self.residency.refresh()
+            at_exit.push_async_callback(self.scenarios.flush)
+            await self.scene_cache.refresh()
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
@@ -171,7 +171,7 @@ class Worker:
     async def _warm_up(self) -> None:
         started = time.perf_counter()
         try:
-            await self.pictures.warm_up()
+            await self.renderer.warm_up()
             await asyncio.to_thread(warm_up)
         except Exception as error:
             log.exception("warm-up failed")
@@ -192,8 +192,8 @@ class Worker:
             {"version": version("real2sim"), "backend": self.backend.name},
         )
         self.metrics.watch(self.metrics.queue_depth, lambda: self.engine.queue_depth)
-        self.metrics.watch(self.metrics.scene_bytes, lambda: self.residency.resident_bytes)
-        for state, count in self.residency.counters().items():
+        self.metrics.watch(self.metrics.scene_bytes, lambda: self.scene_cache.resident_bytes)
+        for state, count in self.scene_cache.counters().items():
             self.metrics.watch(self.metrics.scenes.labels(state), count)
 
 

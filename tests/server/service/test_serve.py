@@ -9,13 +9,15 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 
 import httpx2
 import pytest
 
 import real2sim
 from real2sim_server.service.http.auth import OpenBindError
-from real2sim_server.service.http.websocket import PartedProtocol
+from real2sim_server.service.http.websocket import ScatterGatherProtocol
+from real2sim_server.service.preflight import AddressError, SceneFolderError, check_start
 from real2sim_server.service.serve import run, running_worker, server_config
 
 pytestmark = pytest.mark.network
@@ -84,15 +86,69 @@ def test_an_open_address_without_a_token_is_refused_before_anything_starts(make_
         pass
 
 
-def test_a_port_that_is_taken_is_refused(make_settings):
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    """A port that another program listens on."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with (
-            pytest.raises(OSError, match="in use"),
-            running_worker(make_settings(port=taken.getsockname()[1])),
-        ):
-            pass
+        yield taken.getsockname()[1]
+
+
+def test_a_port_that_is_taken_is_refused(make_settings, taken_port):
+    with (
+        pytest.raises(AddressError, match="in use"),
+        running_worker(make_settings(port=taken_port)),
+    ):
+        pass
+
+
+def test_a_taken_port_is_refused_with_port_and_remedy_before_the_worker_is_loaded(taken_port):
+    code = (
+        "import sys\n"
+        "from real2sim_server.cli.serve import serve\n"
+        "try:\n"
+        "    serve(port=int(sys.argv[1]))\n"
+        "except OSError as error:\n"
+        "    print(error)\n"
+        "print('torch' in sys.modules or 'fastapi' in sys.modules)\n"
+    )
+    command = [sys.executable, "-c", code, str(taken_port)]
+    told, heavy = subprocess.check_output(command, text=True, timeout=60).splitlines()
+    assert f"port {taken_port}" in told
+    assert "--port" in told
+    assert heavy == "False"
+
+
+def test_an_address_of_another_machine_is_refused_with_the_remedy(make_settings):
+    with pytest.raises(AddressError, match="--host"):
+        check_start(make_settings(host="192.0.2.1"))
+
+
+@pytest.mark.parametrize("start", [check_start, run])
+def test_a_missing_scene_folder_is_refused_with_its_path_and_the_remedy(
+    make_settings, tmp_path, start
+):
+    missing = tmp_path / "missing"
+    with pytest.raises(SceneFolderError, match="mkdir -p") as refused:
+        start(make_settings(scenes_dir=missing))
+    assert str(missing) in str(refused.value)
+
+
+def test_no_worker_runs_without_the_scene_folder_it_is_given(make_settings, tmp_path):
+    settings = make_settings(scenes_dir=tmp_path / "missing")
+    with pytest.raises(SceneFolderError), running_worker(settings):
+        pass
+
+
+def test_a_file_is_no_scene_folder(make_settings, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(SceneFolderError, match="not a folder"):
+        check_start(make_settings(scenes_dir=tmp_path / "file"))
+
+
+def test_the_default_scene_folder_may_be_missing(make_settings):
+    check_start(make_settings(scenes_dir=None))
 
 
 def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
@@ -100,7 +156,7 @@ def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
     from real2sim_server.service.app import create_app
 
     config = server_config(create_app(make_settings()), make_settings())
-    assert config.ws is PartedProtocol
+    assert config.ws is ScatterGatherProtocol
     assert config.ws_per_message_deflate is False
     assert config.ws_max_size == MAX_CLIENT_MESSAGE_BYTES
 
@@ -141,12 +197,13 @@ def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(ma
         text=True,
     )
     with process:
-        first = process.stderr.readline()
+        first, second = process.stderr.readline(), process.stderr.readline()
         url = re.search(r"http://127\.0\.0\.1:\d+", first).group()
         answer = httpx2.get(f"{url}/v1/server", timeout=30)
         process.send_signal(signal.SIGTERM)
         lines = process.stderr.read().splitlines()
     assert process.returncode == 0
+    assert second == f"Studio: {url}/ui/\n"
     requests = [entry for line in lines if (entry := json.loads(line))["event"] == "request"]
     assert [(r["path"], r["status"]) for r in requests] == [("/v1/server", 200)]
     assert requests[0]["request_id"] == answer.headers["X-Request-Id"]

@@ -46,15 +46,15 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def same_secret(given: str | None, expected: str) -> bool:
+def secrets_equal(given: str | None, expected: str) -> bool:
     """Compare in a time that does not depend on where the two differ."""
     return hmac.compare_digest((given or "").encode(), expected.encode())
 
 
-def opens(given: str | None, *secrets: str | None) -> bool:
+def matches_any_secret(given: str | None, *secrets: str | None) -> bool:
     """Whether ``given`` is one of ``secrets``; None is no secret."""
     # All are compared, so that the time tells nothing.
-    matches = [same_secret(given, secret) for secret in secrets if secret is not None]
+    matches = [secrets_equal(given, secret) for secret in secrets if secret is not None]
     return any(matches)
 
 
@@ -72,7 +72,7 @@ async def require_token(
         return
     if credentials is None:
         raise unauthorized("this worker wants a bearer token")
-    if not same_secret(credentials.credentials, secret.get_secret_value()):
+    if not secrets_equal(credentials.credentials, secret.get_secret_value()):
         raise unauthorized("the bearer token is not this worker's")
 
 

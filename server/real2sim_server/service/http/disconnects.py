@@ -13,38 +13,38 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class ClientGoneError(Exception):
+class ClientDisconnectedError(Exception):
     """Nobody waits for the answer any more."""
 
 
-async def unless_gone(request: Request, work: Coroutine[Any, Any, T]) -> T:
+async def cancel_on_disconnect(request: Request, work: Coroutine[Any, Any, T]) -> T:
     """The result of ``work``, which is cancelled when the client hangs up.
 
     Jobs that still wait for the engine are dropped with it, so that a client which gives up and
     asks again does not fill the queue.
 
     Raises:
-        ClientGoneError: the client has hung up.
+        ClientDisconnectedError: the client has hung up.
     """
     working = asyncio.create_task(work)
-    watching = asyncio.create_task(_hang_up(request))
+    watching = asyncio.create_task(_wait_for_disconnect(request))
     try:
         await asyncio.wait({working, watching}, return_when=asyncio.FIRST_COMPLETED)
         if working.done():
             return working.result()
-        raise ClientGoneError
+        raise ClientDisconnectedError
     finally:
         for task in (working, watching):
             task.cancel()
         await asyncio.gather(working, watching, return_exceptions=True)
 
 
-async def _hang_up(request: Request) -> None:
+async def _wait_for_disconnect(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
-def to_its_end(
+def uncancellable(
     method: Callable[P, Coroutine[Any, Any, T]],
 ) -> Callable[P, Coroutine[Any, Any, T]]:
     """A coroutine function that goes to its end even when its caller is cancelled meanwhile.

@@ -12,7 +12,7 @@ from real2sim_proto import ErrorCode
 from .auth import is_loopback
 from .problems import ServiceError
 
-FOREIGN = 4403
+FOREIGN_HOST = 4403
 """Code with which sockets of other sites' pages are closed."""
 
 
@@ -32,7 +32,7 @@ class LoopbackOnly:
             _check(Headers(scope=scope))
         elif scope["type"] == "websocket" and not _is_from_here(Headers(scope=scope)):
             await receive()
-            await send({"type": "websocket.close", "code": FOREIGN, "reason": "foreign host"})
+            await send({"type": "websocket.close", "code": FOREIGN_HOST, "reason": "foreign host"})
             return
         await self._app(scope, receive, send)
 

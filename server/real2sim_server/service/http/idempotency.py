@@ -67,7 +67,7 @@ class Idempotency:
         self._locks: dict[str, tuple[asyncio.Lock, int]] = {}
 
     @asynccontextmanager
-    async def once(self, request: Request, key: str | None) -> AsyncIterator[IdempotentRequest]:
+    async def guard(self, request: Request, key: str | None) -> AsyncIterator[IdempotentRequest]:
         """The request's :class:`IdempotentRequest`, held until the block ends.
 
         Raises:

@@ -1,6 +1,6 @@
 """The OpenAPI document: what FastAPI makes of the routes, with examples and true error types.
 
-``python -m real2sim_server.service.http.openapi FILE`` writes it; the committed copy is
+``python -m real2sim_server.service.write_openapi FILE`` writes it; the committed copy is
 ``docs/openapi.json``, and a test holds it against the routes.
 """
 
@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
@@ -85,8 +82,8 @@ def document(app: FastAPI) -> dict[str, Any]:
     """The OpenAPI document of ``app``."""
     made = app.openapi()
     for path, method, operation in operations(made):
-        _tell_errors(operation)
-        _give_examples(operation)
+        _describe_errors(operation)
+        _add_examples(operation)
         operation["x-codeSamples"] = [{"lang": "Shell", "source": curl(path, method, operation)}]
     schemas = made["components"]["schemas"]
     for unused in ("HTTPValidationError", "ValidationError"):
@@ -120,7 +117,7 @@ def curl(path: str, method: str, operation: dict[str, Any]) -> str:
     return " ".join(words)
 
 
-def _tell_errors(operation: dict[str, Any]) -> None:
+def _describe_errors(operation: dict[str, Any]) -> None:
     """Errors are problem documents, also those of validation."""
     responses = operation["responses"]
     responses.pop("422", None)
@@ -129,7 +126,7 @@ def _tell_errors(operation: dict[str, Any]) -> None:
         problem[PROBLEM_MEDIA_TYPE] = problem.pop("application/json")
 
 
-def _give_examples(operation: dict[str, Any]) -> None:
+def _add_examples(operation: dict[str, Any]) -> None:
     for parameter in operation.get("parameters", ()):
         if "example" not in parameter and parameter["name"] in PARAMETERS:
             parameter["example"] = PARAMETERS[parameter["name"]]
@@ -148,15 +145,3 @@ def _schema_name(schema: dict[str, Any]) -> str:
 def text_of(made: dict[str, Any]) -> str:
     """The committed form of a document."""
     return json.dumps(made, indent=1, sort_keys=True) + "\n"
-
-
-def _write(path: Path) -> None:
-    from ...settings import Settings
-    from ..app import create_app
-
-    with tempfile.TemporaryDirectory() as folder:
-        path.write_text(text_of(document(create_app(Settings(data_dir=Path(folder))))))
-
-
-if __name__ == "__main__":
-    _write(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/openapi.json"))

@@ -25,8 +25,8 @@ from ...physics.errors import PhysicsError
 from ...render import RenderError
 from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from ...world import WorldError
-from ..rendering.engine import DeviceLostError, EngineStoppedError, QueueFullError
-from .disconnects import ClientGoneError
+from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
+from .disconnects import ClientDisconnectedError
 
 MAX_DETAILS = 50
 REQUEST_ID_KEY = "real2sim.request_id"
@@ -147,13 +147,13 @@ def problem_response(error: ServiceError, *, path: str, request_id: str | None) 
 def install_problem_handlers(app: FastAPI) -> None:
     """Answer every error of ``app`` with a problem document."""
 
-    async def leave(_request: Request, _error: Exception) -> Response:
+    async def closed(_request: Request, _error: Exception) -> Response:
         # Never sent; the number is what proxies log for it.
         return Response(status_code=499)
 
-    app.add_exception_handler(ClientGoneError, leave)
+    app.add_exception_handler(ClientDisconnectedError, closed)
 
-    async def refuse(request: Request, error: Exception) -> Response:
+    async def respond(request: Request, error: Exception) -> Response:
         return problem_response(
             _of_framework(request, error),
             path=request.url.path,
@@ -161,7 +161,7 @@ def install_problem_handlers(app: FastAPI) -> None:
         )
 
     for kind in (ServiceError, RequestValidationError, HTTPException):
-        app.add_exception_handler(kind, refuse)
+        app.add_exception_handler(kind, respond)
 
 
 def _of_framework(request: Request, error: Exception) -> ServiceError:

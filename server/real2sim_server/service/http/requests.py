@@ -65,10 +65,10 @@ class RequestContext:
         try:
             await self._app(scope, receive, send_with_id)
         except Exception as error:
-            refused = _told(error)
+            failure = _as_service_error(error)
             if status:  # the answer is under way; the server must cut it short
                 raise
-            response = problem_response(refused, path=scope["path"], request_id=request_id)
+            response = problem_response(failure, path=scope["path"], request_id=request_id)
             await response(scope, receive, send_with_id)
         finally:
             self._note(scope, status, time.perf_counter() - started)
@@ -136,8 +136,8 @@ def _request_id(headers: Headers) -> str:
     return given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
 
 
-def _told(error: Exception) -> ServiceError:
-    refused = service_error(error)
-    if refused.status == 500:
+def _as_service_error(error: Exception) -> ServiceError:
+    failure = service_error(error)
+    if failure.status == 500:
         log.error("unexpected error", exc_info=error)
-    return refused
+    return failure

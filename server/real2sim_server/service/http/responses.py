@@ -1,49 +1,16 @@
-"""Answers: models as JSON, and pictures in the form that the client accepts."""
+"""Answers: models as JSON, and the media type that a client accepts."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from fastapi import Response
 from pydantic import BaseModel
 
 from real2sim_proto import ErrorCode
-from real2sim_proto import encode as encode_message
-from real2sim_proto.base import Codec, Modality
 
-from ..library.views import etag
-from ..rendering.renderer import RenderedFrames
 from .problems import ServiceError
-
-CODEC_OF: dict[str, Codec] = {
-    "image/jpeg": "jpeg",
-    "image/png": "png",
-    "application/msgpack": "raw",
-}
-"""Codec by media type; the order is that of preference."""
-
-FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "one frame, in the form that Accept picks",
-        "content": {
-            "image/jpeg": {"schema": {"type": "string", "format": "binary"}},
-            "image/png": {"schema": {"type": "string", "format": "binary"}},
-            "application/msgpack": {"schema": {"type": "string", "format": "binary"}},
-        },
-    }
-}
-
-
-def choose_media_type(accept: str | None, modality: Modality) -> str:
-    """The media type that the client likes best (RFC 9110, section 12.5.1).
-
-    Raises:
-        ServiceError: NOT_ACCEPTABLE when there is none; depth and instance are never jpeg.
-    """
-    offered = [m for m in CODEC_OF if m != "image/jpeg" or modality == "rgb"]
-    return choose_among(offered, accept, of=f"modality {modality!r}")
 
 
 def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
@@ -105,23 +72,9 @@ def json_in_pieces(model: BaseModel) -> str:
     return text
 
 
-def frame_response(
-    pictured: RenderedFrames, media_type: str, *, revision: int | None = None
-) -> Response:
-    """The answer that carries the first frame.
-
-    msgpack holds the whole frame (pose, intrinsics, raw pixels) as on the drive socket; image
-    files carry the milliseconds by stage in ``Server-Timing`` as well.
-    """
-    frame = pictured.frames[0]
-    content = frame.data
-    if media_type == "application/msgpack":
-        content = encode_message(dict(frame))
-    timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in pictured.timing_ms.items())
-    headers = {"Server-Timing": timing, "Vary": "Accept", "Cache-Control": "no-store"}
-    if revision is not None:
-        headers["X-Real2Sim-Revision"] = etag(revision)
-    return Response(content, media_type=media_type, headers=headers)
+def etag(revision: int) -> str:
+    """Value of ETag and If-Match for a revision."""
+    return f'"r{revision}"'
 
 
 def _quality(accept: str, media_type: str) -> float:

@@ -1,4 +1,4 @@
-"""WebSocket connections of megabytes a message: written in parts, unpaced on the way to oneself.
+"""WebSocket connections of megabytes a message: scatter-gather sends, unpaced on loopback.
 
 ASGI knows messages of one piece only; servers may offer more as an extension of it. Where a server
 does not offer this one, or the client is slow to read, the parts are joined and sent as ever.
@@ -10,17 +10,19 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Sequence
+from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
-from uvicorn.protocols.websockets.websockets_sansio_impl import Request, WebSocketsSansIOProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Opcode
+from websockets.http11 import Request
 from websockets.protocol import State
 
 from .auth import is_loopback
 
 Part = bytes | memoryview
 
-EXTENSION = "real2sim.websocket.write"
+EXTENSION = "websocket.send_parts"
 """Holds a function that writes the parts of a binary message, or returns False."""
 
 FIN = 0x80
@@ -28,21 +30,24 @@ SHORT, LONG = 126, 127
 """Stand for a length of 2 and of 8 bytes behind the first two of a frame (RFC 6455, 5.2)."""
 
 
-async def send(websocket: WebSocket, parts: Sequence[Part]) -> None:
+async def send_parts(websocket: WebSocket, parts: Sequence[Part]) -> None:
     """Send one binary message. Raises WebSocketDisconnect when the client is gone."""
     if websocket.application_state is WebSocketState.DISCONNECTED:
         raise WebSocketDisconnect
-    if not written(websocket, parts):
+    if not try_send_parts(websocket, parts):
         await websocket.send_bytes(b"".join(parts))
 
 
-def written(websocket: WebSocket, parts: Sequence[Part]) -> bool:
-    """Whether one binary message could be written, with nothing to wait for. On the event loop."""
-    write = websocket.scope.get("extensions", {}).get(EXTENSION)
-    return write is not None and bool(write(parts))
+def try_send_parts(websocket: WebSocket, parts: Sequence[Part]) -> bool:
+    """Write one binary message if nothing has to be waited for; whether it is written.
+
+    On the event loop.
+    """
+    send = websocket.scope.get("extensions", {}).get(EXTENSION)
+    return send is not None and bool(send(parts))
 
 
-class PartedProtocol(WebSocketsSansIOProtocol):
+class ScatterGatherProtocol(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket protocol with that extension, for connections without compression."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -55,9 +60,10 @@ class PartedProtocol(WebSocketsSansIOProtocol):
         """Offer the extension in the scope of an accepted connection."""
         super().handle_connect(event)
         if not self.close_sent and not self.config.ws_per_message_deflate:
-            self.scope["extensions"][EXTENSION] = self._write
+            extensions: dict[str, Any] = self.scope["extensions"]
+            extensions[EXTENSION] = self._send_parts
 
-    def _write(self, parts: Sequence[Part]) -> bool:
+    def _send_parts(self, parts: Sequence[Part]) -> bool:
         """Write one binary message, if nothing has to be waited for."""
         if self.disconnected or self.conn.state is not State.OPEN or not self.writable.is_set():
             return False

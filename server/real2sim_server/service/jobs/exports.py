@@ -10,14 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import Frame, SensorSpec
+from real2sim_proto.episode import SensorSpec
 from real2sim_proto.jobs import ExportRequest
 
 from ...render import Instance
 from ...render.video import VideoError, VideoFile
 from ...scene import Scene
+from ..engine import QueueFullError
 from ..http.problems import ServiceError
-from ..rendering.engine import QueueFullError
+from ..rendering.frames import EncodedFrame
 from ..rendering.renderer import Renderer, RenderRequest, check_sensors
 from .jobs import JobContext, JobResult
 
@@ -27,7 +28,7 @@ MAX_FRAMES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
+class VideoSource:
     """What a video shows.
 
     Attributes:
@@ -42,7 +43,7 @@ class Film:
 
 
 async def export_video(
-    film: Film, asked: ExportRequest, *, pictures: Renderer, ticket: JobContext
+    video_source: VideoSource, request: ExportRequest, *, renderer: Renderer, context: JobContext
 ) -> JobResult:
     """Draw a video frame by frame, other users of the engine in between.
 
@@ -50,17 +51,19 @@ async def export_video(
         ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST; TIME_OUT_OF_RANGE.
         JobCancelled: nobody wants it any more.
     """
-    times = frame_times(film, asked)
-    sensor = SensorSpec(camera=asked.camera, width=asked.width, codec="raw")
-    await asyncio.to_thread(ticket.folder.mkdir, parents=True, exist_ok=True)
+    times = frame_times(video_source, request)
+    sensor = SensorSpec(camera=request.camera, width=request.width, codec="raw")
+    await asyncio.to_thread(context.folder.mkdir, parents=True, exist_ok=True)
     loop = asyncio.get_running_loop()
     with ThreadPoolExecutor(1, thread_name_prefix="video") as encoder:
-        video = VideoFile(ticket.folder / VIDEO, asked.fps)
+        video = VideoFile(context.folder / VIDEO, request.fps)
         try:
             for index, t_us in enumerate(times):
-                ticket.progress(index / len(times), "drawing")
-                shot = await asyncio.to_thread(_shot, film, sensor, t_us)
-                frame = await _drawn(pictures, shot, ticket)
+                context.progress(index / len(times), "drawing")
+                render_request = await asyncio.to_thread(
+                    _render_request, video_source, sensor, t_us
+                )
+                frame = await _render_frame(renderer, render_request, context)
                 pixels = np.frombuffer(frame.data, np.uint8).reshape(frame.shape)
                 await loop.run_in_executor(encoder, video.add, pixels)
             await loop.run_in_executor(encoder, video.close)
@@ -68,54 +71,56 @@ async def export_video(
             raise ServiceError(ErrorCode.UNSUPPORTED, str(error)) from error
         finally:
             await loop.run_in_executor(encoder, video.discard)
-    values = {"frames": len(times), "fps": asked.fps, "start_us": times[0], "end_us": times[-1]}
+    values = {"frames": len(times), "fps": request.fps, "start_us": times[0], "end_us": times[-1]}
     return JobResult(values, {VIDEO: VIDEO_TYPE})
 
 
-async def _drawn(pictures: Renderer, shot: RenderRequest, ticket: JobContext) -> Frame:
+async def _render_frame(
+    renderer: Renderer, render_request: RenderRequest, context: JobContext
+) -> EncodedFrame:
     """The frame, drawn when those who wait for an answer leave room."""
     while True:
         try:
-            return (await pictures.take(shot, stream="export")).frames[0]
+            return (await renderer.render(render_request, stream="export")).frames[0]
         except QueueFullError:
-            ticket.check()
+            context.check()
             await asyncio.sleep(0.2)
 
 
-def frame_times(film: Film, asked: ExportRequest) -> list[int]:
+def frame_times(video_source: VideoSource, request: ExportRequest) -> list[int]:
     """Instants of the frames [us].
 
     Raises:
         ServiceError: TIME_OUT_OF_RANGE or INVALID_REQUEST.
     """
-    first, last = film.span
-    start = first if asked.start_us is None else asked.start_us
-    end = last if asked.end_us is None else asked.end_us
+    first, last = video_source.span
+    start = first if request.start_us is None else request.start_us
+    end = last if request.end_us is None else request.end_us
     if not first <= start <= end <= last:
         raise ServiceError(
             ErrorCode.TIME_OUT_OF_RANGE,
             f"the video would show {start} to {end} us; there is {first} to {last} us",
             hint="leave start_us and end_us out for all of it",
         )
-    count = int((end - start) * 1e-6 * asked.fps) + 1
+    count = int((end - start) * 1e-6 * request.fps) + 1
     if count > MAX_FRAMES:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST, f"{count} frames; {MAX_FRAMES} is the most in one video"
         )
-    return [start + round(i * 1e6 / asked.fps) for i in range(count)]
+    return [start + round(i * 1e6 / request.fps) for i in range(count)]
 
 
-def check_camera(film: Film, asked: ExportRequest, *, max_pixels: int) -> None:
+def check_camera(video_source: VideoSource, request: ExportRequest, *, max_pixels: int) -> None:
     """Refuse a camera or size before the job begins. Raises ServiceError."""
-    sensor = SensorSpec(camera=asked.camera, width=asked.width, codec="raw")
-    check_sensors(film.scene.rig, [sensor], max_pixels=max_pixels)
+    sensor = SensorSpec(camera=request.camera, width=request.width, codec="raw")
+    check_sensors(video_source.scene.rig, [sensor], max_pixels=max_pixels)
 
 
-def _shot(film: Film, sensor: SensorSpec, t_us: int) -> RenderRequest:
+def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) -> RenderRequest:
     return RenderRequest(
-        scene=film.scene,
-        instances=film.instances(t_us),
-        T_world_vehicle=film.scene.ego.transform(t_us),
+        scene=video_source.scene,
+        instances=video_source.instances(t_us),
+        T_world_vehicle=video_source.scene.ego.transform(t_us),
         t_us=t_us,
         sensors=(sensor,),
     )

@@ -25,16 +25,16 @@ from ..scenarios.replies import iso_time
 from ..storage.job_log import JobLog
 from ..storage.store import now_us
 
-MAX_WAITING = 32
+MAX_QUEUED_JOBS = 32
 """Jobs that may wait for their turn; more are refused."""
 
-KEPT_EVENTS = 256
+MAX_EVENTS = 256
 """Of one job, for readers that come back; older progress is of no use to anybody."""
 
 UNKNOWN_EVENTS = 1_000_000
-"""More events than a job has: its end is newer than any progress that was told but not kept."""
+"""More events than a job has: its end is newer than any progress that was sent but not stored."""
 
-KEPT_JOBS = 64
+MAX_FINISHED_JOBS = 64
 """Ended jobs kept in memory; others are read from the store."""
 
 log = structlog.get_logger(__name__)
@@ -94,10 +94,10 @@ Work = Callable[[JobContext], Awaitable[JobResult]]
 @dataclass(eq=False)
 class _Job:
     info: JobInfo
-    ticket: JobContext
+    context: JobContext
     work: Work
     task: asyncio.Task[None] | None = None
-    events: deque[JobInfo] = field(default_factory=lambda: deque(maxlen=KEPT_EVENTS))
+    events: deque[JobInfo] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     changed: asyncio.Condition = field(default_factory=asyncio.Condition)
 
 
@@ -132,18 +132,18 @@ class Jobs:
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Jobs]:
         """Marks what an earlier run left unfinished; cancels what is unfinished at the end."""
-        for left in await self._log.unfinished():
-            ended = _ended(left, JobState.INTERRUPTED, error=_interruption())
-            newest = {"event": left.event + UNKNOWN_EVENTS}
+        for info in await self._log.unfinished():
+            ended = _ended(info, JobState.INTERRUPTED, error=_interruption())
+            newest = {"event": info.event + UNKNOWN_EVENTS}
             await self._log.update(ended.model_copy(update=newest))
-            log.warning("job interrupted", job_id=left.job_id, kind=left.kind)
+            log.warning("job interrupted", job_id=info.job_id, kind=info.kind)
         try:
             yield self
         finally:
             self._closing = True
             tasks = [job.task for job in self._jobs.values() if job.task and not job.task.done()]
             for job in self._jobs.values():
-                job.ticket.cancel()
+                job.context.cancel()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -151,14 +151,14 @@ class Jobs:
     # --- life -------------------------------------------------------------------------------
 
     async def start(
-        self, new: NewJob, work: Work, *, once: IdempotentRequest | None = None
+        self, new: NewJob, work: Work, *, idempotent: IdempotentRequest | None = None
     ) -> JobInfo:
         """Put a job on record and let it run.
 
         Args:
             new: what it is.
             work: called on the event loop; hands what computes to threads.
-            once: what the answer is stored under.
+            idempotent: what the answer is stored under.
 
         Raises:
             ServiceError: QUEUE_FULL, or DRAINING.
@@ -166,7 +166,7 @@ class Jobs:
         if self._closing:
             raise ServiceError(ErrorCode.DRAINING, "the worker is stopping")
         waiting = sum(job.info.state is JobState.QUEUED for job in self._jobs.values())
-        if waiting >= MAX_WAITING and not new.light:
+        if waiting >= MAX_QUEUED_JOBS and not new.light:
             raise ServiceError(
                 ErrorCode.QUEUE_FULL,
                 f"{waiting} jobs wait already",
@@ -182,7 +182,11 @@ class Jobs:
             request=dict(new.request),
             created_at=iso_time(now_us()),
         )
-        reply = once.reply(info, status=202, headers=accepted_headers(info)) if once else None
+        reply = (
+            idempotent.reply(info, status=202, headers=accepted_headers(info))
+            if idempotent
+            else None
+        )
         await self._log.add(info, reply=reply)
         job = self._hold(info, work)
         job.task = asyncio.create_task(self._run(job, light=new.light), name=info.job_id)
@@ -201,7 +205,7 @@ class Jobs:
             await self._log.remove(job_id)
             await asyncio.to_thread(shutil.rmtree, self._folder / job_id, ignore_errors=True)
             return None
-        job.ticket.cancel()
+        job.context.cancel()
         if job.info.state is JobState.QUEUED and job.task:
             job.task.cancel()
         with contextlib.suppress(TimeoutError):
@@ -222,8 +226,8 @@ class Jobs:
     async def list(self, *, subject: str | None = None, limit: int = 100) -> list[JobInfo]:
         """Jobs, newest first."""
         stored = await self._log.newest(subject=subject, limit=limit)
-        held = {job_id: job.info for job_id, job in self._jobs.items()}
-        return [held.get(info.job_id, info) for info in stored]
+        current = {job_id: job.info for job_id, job in self._jobs.items()}
+        return [current.get(info.job_id, info) for info in stored]
 
     async def file(self, job_id: str, name: str) -> tuple[Path, JobFile]:
         """A file that a job left. Raises ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, NOT_FOUND."""
@@ -280,8 +284,8 @@ class Jobs:
         job = _Job(info, JobContext(self._folder / info.job_id, report), work)
         job.events.append(info)
         self._jobs[info.job_id] = job
-        over = [key for key, held in self._jobs.items() if held.info.over]
-        for key in over[: max(0, len(over) - KEPT_JOBS)]:
+        over = [key for key, other in self._jobs.items() if other.info.over]
+        for key in over[: max(0, len(over) - MAX_FINISHED_JOBS)]:
             del self._jobs[key]
         return job
 
@@ -302,21 +306,21 @@ class Jobs:
         started = {"state": JobState.RUNNING, "started_at": iso_time(now_us())}
         await self._become(job, job.info.model_copy(update=started))
         try:
-            job.ticket.check()
-            result = await job.work(job.ticket)
-            files = await asyncio.to_thread(_files, job.ticket.folder, result.files)
+            job.context.check()
+            result = await job.work(job.context)
+            files = await asyncio.to_thread(_files, job.context.folder, result.files)
             done = {"result": result.values, "files": files, "progress": 1.0, "stage": ""}
             ended = _ended(job.info.model_copy(update=done), JobState.SUCCEEDED)
         except JobCancelled:
             ended = _ended(job.info, JobState.CANCELLED)
         except Exception as error:
-            refused = service_error(error)
-            if refused.status == 500:
+            failure = service_error(error)
+            if failure.status == 500:
                 log.error("job failed", job_id=job.info.job_id, exc_info=error)
-            problem = problem_of(refused, path=f"/v1/jobs/{job.info.job_id}", request_id=None)
+            problem = problem_of(failure, path=f"/v1/jobs/{job.info.job_id}", request_id=None)
             ended = _ended(job.info, JobState.FAILED, error=problem)
         if ended.state is not JobState.SUCCEEDED:
-            await asyncio.to_thread(shutil.rmtree, job.ticket.folder, ignore_errors=True)
+            await asyncio.to_thread(shutil.rmtree, job.context.folder, ignore_errors=True)
         await self._become(job, ended)
 
     async def _become(self, job: _Job, info: JobInfo) -> None:
@@ -335,14 +339,14 @@ class Jobs:
         moved = {"progress": share, "stage": stage, "event": now.event + 1}
         job.info = now.model_copy(update=moved)
         job.events.append(job.info)
-        asyncio.ensure_future(_wake(job))  # noqa: RUF006, wakes readers and is gone at once
+        asyncio.ensure_future(_notify_readers(job))  # noqa: RUF006, wakes readers and is gone at once
 
     async def _wait_until_over(self, job: _Job) -> None:
         async with job.changed:
             await job.changed.wait_for(lambda: job.info.over)
 
 
-async def _wake(job: _Job) -> None:
+async def _notify_readers(job: _Job) -> None:
     async with job.changed:
         job.changed.notify_all()
 
@@ -380,10 +384,10 @@ def _ended(info: JobInfo, state: JobState, *, error: Problem | None = None) -> J
 
 
 def _interruption() -> Problem:
-    refused = ServiceError(
+    failure = ServiceError(
         ErrorCode.DRAINING, "the worker stopped before this job was done", hint="start it again"
     )
-    return problem_of(refused, path="", request_id=None)
+    return problem_of(failure, path="", request_id=None)
 
 
 def _files(folder: Path, names: Mapping[str, str]) -> list[JobFile]:

@@ -29,66 +29,70 @@ from ...simulation.result import ENERGIES, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
 from ..http.problems import ServiceError
 
-REACH = 25.0
-"""What stands this near to something that moves takes part [m]; further, at most ``MOST``."""
+NEARBY_DISTANCE = 25.0
+"""Objects this close to one that moves take part [m], up to ``MAX_NEARBY_OBJECTS`` in all."""
 
-MOST = 12
+MAX_NEARBY_OBJECTS = 12
 PLAYBACK = "playback.json"
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class RolloutPlan:
     """A rollout that can begin.
 
     Attributes:
         scene: with what is erased hidden, and inserted assets among its objects.
-        state: of the scenario; ``stand_ins`` are its objects as ``scene`` has them.
+        state: of the scenario; ``resolved_objects`` are its objects as ``scene`` has them.
         options: of the physics.
     """
 
     scene: Scene
     state: ScenarioState
-    stand_ins: StandIns
+    resolved_objects: ResolvedObjects
     options: SimulateOptions
 
 
 @dataclass(frozen=True, eq=False)
-class StandIns:
+class ResolvedObjects:
     """A scenario's objects, each with the id of the object in the scene that it shows."""
 
     visible: tuple[ObjectState, ...]
 
 
-def plan_rollout(scene: Scene, state: ScenarioState, asked: SimulateRequest) -> Plan:
+def plan_rollout(scene: Scene, state: ScenarioState, request: SimulateRequest) -> RolloutPlan:
     """What a request asks for.
 
     Raises:
         ServiceError: INVALID_REQUEST, UNKNOWN_OBJECT or TIME_OUT_OF_RANGE.
         PhysicsError: a value that the physics cannot have.
     """
-    start, end = _span(state, asked)
-    there = {o.object_id: o for o in state.visible if o.trajectory.covers(start)}
-    chosen = _chosen(there, asked, start)
-    complete, stand_ins = with_everything(scene, state)
+    start, end = _span(state, request)
+    present = {o.object_id: o for o in state.visible if o.trajectory.covers(start)}
+    chosen = _chosen(present, request, start)
+    complete, resolved_objects = with_assets(scene, state)
     options = SimulateOptions(
-        preset=asked.preset,
-        objects={object_id: _physics(there[object_id], start) for object_id in chosen},
+        preset=request.preset,
+        objects={object_id: _physics(present[object_id], start) for object_id in chosen},
         colliders=colliders_of(state),
         start_us=start,
         duration=(end - start) * 1e-6,
-        frame_rate=1e6 / asked.frame_us,
-        backend=asked.backend,
+        frame_rate=1e6 / request.frame_us,
+        backend=request.backend,
     )
-    return Plan(complete, state, stand_ins, options)
+    return RolloutPlan(complete, state, resolved_objects, options)
 
 
 def run_rollout(
-    plan: Plan, folder: Path, *, progress: Callable[[float], None], cancelled: Callable[[], bool]
+    plan: RolloutPlan,
+    folder: Path,
+    *,
+    progress: Callable[[float], None],
+    cancelled: Callable[[], bool],
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Simulate and keep the result in ``folder``; figures, and names of files by media type."""
     result = simulate(
         plan.scene,
-        plan.stand_ins,
+        plan.resolved_objects,
         plan.options,
         on_progress=lambda done, frames: progress(done / frames),
         cancelled=cancelled,
@@ -138,15 +142,15 @@ def describe(result: SimulationResult) -> dict[str, Any]:
     }
 
 
-class Show:
+class RolloutPlayback:
     """A finished rollout as pictures; for one thread at a time."""
 
     def __init__(self, scene: Scene, state: ScenarioState, result: SimulationResult) -> None:
         self._scene = scene
         self._state = state
         self._result = result
-        complete, stand_ins = with_everything(scene, state)
-        self._playback = Playback(complete, stand_ins, result)
+        complete, resolved_objects = with_assets(scene, state)
+        self._playback = Playback(complete, resolved_objects, result)
         self.span = (result.start_us, self._playback.time_us(result.frames - 1))
 
     def instances(self, t_us: int) -> Sequence[Instance]:
@@ -175,7 +179,7 @@ class Show:
         return subject.trajectory.transform(t_us)
 
 
-def with_everything(scene: Scene, state: ScenarioState) -> tuple[Scene, StandIns]:
+def with_assets(scene: Scene, state: ScenarioState) -> tuple[Scene, ResolvedObjects]:
     """The scene with the scenario's assets as objects of it."""
     objects = dict(scene.objects)
     visible = []
@@ -183,19 +187,19 @@ def with_everything(scene: Scene, state: ScenarioState) -> tuple[Scene, StandIns
         if subject.asset is None:
             visible.append(subject)
             continue
-        stand_in = f"asset.{subject.asset.asset_id}"
+        resolved_id = f"asset.{subject.asset.asset_id}"
         cloud = subject.asset.cloud_in(scene)
-        objects[stand_in] = SceneObject(
-            stand_in, subject.category, subject.size, cloud, subject.trajectory
+        objects[resolved_id] = SceneObject(
+            resolved_id, subject.category, subject.size, cloud, subject.trajectory
         )
-        visible.append(replace(subject, source_id=stand_in))
-    return replace(scene, objects=objects), StandIns(tuple(visible))
+        visible.append(replace(subject, source_id=resolved_id))
+    return replace(scene, objects=objects), ResolvedObjects(tuple(visible))
 
 
-def _span(state: ScenarioState, asked: SimulateRequest) -> tuple[int, int]:
+def _span(state: ScenarioState, request: SimulateRequest) -> tuple[int, int]:
     first, last = state.clock
-    start = first if asked.start_us is None else asked.start_us
-    end = last if asked.end_us is None else asked.end_us
+    start = first if request.start_us is None else request.start_us
+    end = last if request.end_us is None else request.end_us
     if not first <= start < end <= last:
         raise ServiceError(
             ErrorCode.TIME_OUT_OF_RANGE,
@@ -206,17 +210,17 @@ def _span(state: ScenarioState, asked: SimulateRequest) -> tuple[int, int]:
     return start, end
 
 
-def _chosen(there: dict[str, ObjectState], asked: SimulateRequest, start: int) -> list[str]:
-    if asked.objects is not None:
-        missing = [name for name in asked.objects if name not in there]
-        if missing or not asked.objects:
+def _chosen(present: dict[str, ObjectState], request: SimulateRequest, start: int) -> list[str]:
+    if request.objects is not None:
+        missing = [name for name in request.objects if name not in present]
+        if missing or not request.objects:
             raise ServiceError(
                 ErrorCode.UNKNOWN_OBJECT if missing else ErrorCode.INVALID_REQUEST,
                 f"no object {missing[0]!r} at {start} us" if missing else "objects is empty",
-                hint=f"there are: {', '.join(there) or 'none'}",
+                hint=f"there are: {', '.join(present) or 'none'}",
             )
-        return list(dict.fromkeys(asked.objects))
-    moved = [o for o in there.values() if o.velocity is not None or o.physics is not None]
+        return list(dict.fromkeys(request.objects))
+    moved = [o for o in present.values() if o.velocity is not None or o.physics is not None]
     if not moved:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
@@ -224,12 +228,12 @@ def _chosen(there: dict[str, ObjectState], asked: SimulateRequest, start: int) -
             hint="name objects, or edit one with set_velocity or set_physics first",
         )
     centres = np.array([o.trajectory.pose(start)[0] for o in moved])
-    rest = [o for o in there.values() if o not in moved]
+    rest = [o for o in present.values() if o not in moved]
     apart = [
         float(np.linalg.norm(centres - o.trajectory.pose(start)[0], axis=1).min()) for o in rest
     ]
-    near = [rest[i] for i in np.argsort(apart, kind="stable") if apart[i] <= REACH]
-    return [o.object_id for o in (moved + near)[: max(MOST, len(moved))]]
+    near = [rest[i] for i in np.argsort(apart, kind="stable") if apart[i] <= NEARBY_DISTANCE]
+    return [o.object_id for o in (moved + near)[: max(MAX_NEARBY_OBJECTS, len(moved))]]
 
 
 def _physics(subject: ObjectState, start: int) -> ObjectPhysics:

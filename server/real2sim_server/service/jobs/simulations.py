@@ -18,26 +18,26 @@ from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
-from .exports import Film
+from .exports import VideoSource
 from .jobs import JobCancelled, JobContext, JobResult, Jobs, NewJob, require_success
-from .rollouts import PLAYBACK, Show, plan_rollout, run_rollout
+from .rollouts import PLAYBACK, RolloutPlayback, plan_rollout, run_rollout
 
-KEPT_SHOWS = 4
-"""Finished rollouts kept ready to be looked at; others are read from their files again."""
+MAX_CACHED_PLAYBACKS = 4
+"""Finished rollouts kept open; others are read from their files again."""
 
 
 class Simulations:
     """Starts rollouts and shows finished ones. Belongs to the event loop."""
 
-    def __init__(self, jobs: Jobs, scenarios: Scenarios, residency: SceneCache) -> None:
+    def __init__(self, jobs: Jobs, scenarios: Scenarios, scene_cache: SceneCache) -> None:
         self._jobs = jobs
         self._scenarios = scenarios
-        self._residency = residency
-        self._shows: OrderedDict[str, tuple[Scene, Show]] = OrderedDict()
+        self._scene_cache = scene_cache
+        self._playbacks: OrderedDict[str, tuple[Scene, RolloutPlayback]] = OrderedDict()
         self._drawing = threading.Lock()
 
     async def start(
-        self, scenario_id: str, asked: SimulateRequest, *, who: str, once: IdempotentRequest
+        self, scenario_id: str, request: SimulateRequest, *, who: str, idempotent: IdempotentRequest
     ) -> JobInfo:
         """Begin a rollout of the scenario as it is now.
 
@@ -46,51 +46,51 @@ class Simulations:
                 TIME_OUT_OF_RANGE for what cannot be simulated.
         """
         view = await self._scenarios.view(scenario_id)
-        scene = await self._residency.get(view.row.scene)
-        plan = await asyncio.to_thread(plan_rollout, scene, view.state, asked)
+        scene = await self._scene_cache.get(view.row.scene)
+        plan = await asyncio.to_thread(plan_rollout, scene, view.state, request)
 
-        async def work(ticket: JobContext) -> JobResult:
+        async def work(context: JobContext) -> JobResult:
             values, files = await asyncio.to_thread(
                 run_rollout,
                 plan,
-                ticket.folder,
-                progress=lambda share: ticket.progress(share, "simulating"),
-                cancelled=ticket.cancelled,
+                context.folder,
+                progress=lambda share: context.progress(share, "simulating"),
+                cancelled=context.cancelled,
             )
-            ticket.check()
+            context.check()
             if values["stopped"] == "cancelled":
                 raise JobCancelled
             return JobResult(values, files)
 
-        request = asked.model_dump(mode="json", exclude_none=True)
-        request |= {"scenario": scenario_id, "revision": view.revision}
-        new = NewJob("simulate", scenario_id, request, who)
-        return await self._jobs.start(new, work, once=once)
+        fields = request.model_dump(mode="json", exclude_none=True)
+        fields |= {"scenario": scenario_id, "revision": view.revision}
+        new = NewJob("simulate", scenario_id, fields, who)
+        return await self._jobs.start(new, work, idempotent=idempotent)
 
-    async def film(self, job_id: str) -> Film:
+    async def video_source(self, job_id: str) -> VideoSource:
         """What a finished rollout shows.
 
         Raises:
             ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; INVALID_REQUEST for another kind
                 of job; UNKNOWN_SCENARIO where that was deleted.
         """
-        kept = self._shows.get(job_id)
-        if kept is None:
-            kept = await self._open(job_id)
-            self._shows[job_id] = kept
-            while len(self._shows) > KEPT_SHOWS:
-                self._shows.popitem(last=False)
-        self._shows.move_to_end(job_id)
-        scene, show = kept
+        cached = self._playbacks.get(job_id)
+        if cached is None:
+            cached = await self._open(job_id)
+            self._playbacks[job_id] = cached
+            while len(self._playbacks) > MAX_CACHED_PLAYBACKS:
+                self._playbacks.popitem(last=False)
+        self._playbacks.move_to_end(job_id)
+        scene, playback = cached
 
         def instances(t_us: int) -> Sequence[Instance]:
             # It keeps the last deformed clouds, which is not for two threads at once.
             with self._drawing:
-                return show.instances(t_us)
+                return playback.instances(t_us)
 
-        return Film(scene, instances, show.span)
+        return VideoSource(scene, instances, playback.span)
 
-    async def _open(self, job_id: str) -> tuple[Scene, Show]:
+    async def _open(self, job_id: str) -> tuple[Scene, RolloutPlayback]:
         info = await self._jobs.get(job_id)
         if info.kind != "simulate":
             raise ServiceError(
@@ -99,11 +99,11 @@ class Simulations:
                 hint="POST /v1/scenarios/{id}/simulate starts one",
             )
         require_success(info)
-        request: dict[str, Any] = info.request
-        view = await self._scenarios.view(request["scenario"])
-        state = await self._scenarios.state_at(request["scenario"], request["revision"])
-        scene = await self._residency.get(view.row.scene)
+        fields: dict[str, Any] = info.request
+        view = await self._scenarios.view(fields["scenario"])
+        state = await self._scenarios.state_at(fields["scenario"], fields["revision"])
+        scene = await self._scene_cache.get(view.row.scene)
         path, _ = await self._jobs.file(job_id, PLAYBACK)
         return scene, await asyncio.to_thread(
-            lambda: Show(scene, state, SimulationResult.load(path.parent))
+            lambda: RolloutPlayback(scene, state, SimulationResult.load(path.parent))
         )

@@ -25,7 +25,14 @@ from ..http.problems import ServiceError
 
 ASSET_SUFFIX = ".r2a"
 
-LENGTHS = {"car": 4.5, "van": 5.2, "truck": 8.0, "bus": 12.0, "motorcycle": 2.1, "cyclist": 1.8}
+USUAL_LENGTHS = {
+    "car": 4.5,
+    "van": 5.2,
+    "truck": 8.0,
+    "bus": 12.0,
+    "motorcycle": 2.1,
+    "cyclist": 1.8,
+}
 """Usual length by category [m], for files that do not say what a unit is."""
 
 log = structlog.get_logger(__name__)
@@ -102,7 +109,7 @@ class AssetLibrary:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._assets: dict[str, LibraryAsset] = {}
-        self._leaving: set[str] = set()
+        self._removing: set[str] = set()
         self._lock = threading.Lock()
 
     def list(self) -> list[LibraryAsset]:
@@ -116,7 +123,7 @@ class AssetLibrary:
     def find(self, asset_id: str) -> LibraryAsset | None:
         """The asset of that id, read from disk the first time."""
         with self._lock:
-            if asset_id in self._leaving:
+            if asset_id in self._removing:
                 return None
             known = self._assets.get(asset_id)
             if known is None and self._bundle(asset_id).is_dir():
@@ -154,11 +161,11 @@ class AssetLibrary:
                     hint="give another asset_id",
                 )
             self.folder.mkdir(parents=True, exist_ok=True)
-            kept = self._assets[asset.asset_id] = LibraryAsset(save_asset(asset, target))
-            return kept
+            added = self._assets[asset.asset_id] = LibraryAsset(save_asset(asset, target))
+            return added
 
     @contextmanager
-    def withheld(self, asset_id: str) -> Iterator[None]:
+    def removing(self, asset_id: str) -> Iterator[None]:
         """Nobody finds the asset while the block runs; it stays on disk until :meth:`remove`.
 
         Raises:
@@ -166,27 +173,27 @@ class AssetLibrary:
         """
         self.get(asset_id)
         with self._lock:
-            self._leaving.add(asset_id)
+            self._removing.add(asset_id)
         try:
             yield
         finally:
             with self._lock:
-                self._leaving.discard(asset_id)
+                self._removing.discard(asset_id)
 
     def remove(self, asset_id: str) -> None:
         """Delete a withheld asset; its id may be given again."""
         with self._lock:
             # Renamed first: a crash must not leave half a bundle under its name.
-            gone = self.folder / f".removed-{secrets.token_hex(6)}"
-            self._bundle(asset_id).rename(gone)
+            trash = self.folder / f".removed-{secrets.token_hex(6)}"
+            self._bundle(asset_id).rename(trash)
             self._assets.pop(asset_id, None)
-        shutil.rmtree(gone, ignore_errors=True)
+        shutil.rmtree(trash, ignore_errors=True)
 
     def _bundle(self, asset_id: str) -> Path:
         return self.folder / f"{asset_id}{ASSET_SUFFIX}"
 
 
-def cut_out(scene: Scene, object_id: str, *, asset_id: str, category: str | None) -> Asset:
+def extract_object(scene: Scene, object_id: str, *, asset_id: str, category: str | None) -> Asset:
     """An object of a scene as an asset, with the light it was seen in.
 
     Raises:
@@ -210,7 +217,7 @@ def cut_out(scene: Scene, object_id: str, *, asset_id: str, category: str | None
     return Asset(asset_id, category or found.category, found.size, cloud, provenance)
 
 
-def uploaded(path: Path, asked: AssetUpload, *, asset_id: str) -> Asset:
+def import_asset(path: Path, upload: AssetUpload, *, asset_id: str) -> Asset:
     """The asset in a splat file, upright, centred and at a real size.
 
     Raises:
@@ -221,9 +228,9 @@ def uploaded(path: Path, asked: AssetUpload, *, asset_id: str) -> Asset:
             path,
             name=asset_id,
             as_asset=True,
-            category=asked.category,
-            up_axis=asked.up_axis,
-            yaw=asked.yaw,
+            category=upload.category,
+            up_axis=upload.up_axis,
+            yaw=upload.yaw,
         )
     except (BundleError, SceneError) as error:
         reason = str(error).replace(f"{path.parent}/", "")
@@ -232,7 +239,7 @@ def uploaded(path: Path, asked: AssetUpload, *, asset_id: str) -> Asset:
             reason,
             hint="give a splat file: .ply, .compressed.ply, .spz or .splat",
         ) from error
-    length = asked.length or LENGTHS.get(asked.category, raw.size[0])
+    length = upload.length or USUAL_LENGTHS.get(upload.category, raw.size[0])
     factor = length / raw.size[0]
     x, y, z = (side * factor for side in raw.size)
     cloud = raw.cloud.moved(np.eye(4), scale=factor)

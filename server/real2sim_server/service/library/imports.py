@@ -11,7 +11,7 @@ from real2sim_proto.base import ID_PATTERN
 from ...scene import BundleError, SceneError
 from ...scene.io import import_splats, load_scene, save_scene
 from ..http.problems import ServiceError
-from .scene_catalog import DOCUMENT_NAME, bundle_folder
+from .scene_catalog import SCENE_DOCUMENT, bundle_folder
 
 
 def resolve_import(root: Path, given: str) -> Path:
@@ -27,9 +27,11 @@ def resolve_import(root: Path, given: str) -> Path:
         # A link inside a bundle could lead out of the folder just as well.
         inside = [target, *(p.resolve() for p in target.rglob("*"))]
     except (OSError, ValueError, RuntimeError):
-        raise _refused(f"there is no file or folder {given!r} below the import folder") from None
+        raise _import_failed(
+            f"there is no file or folder {given!r} below the import folder"
+        ) from None
     if not all(p.is_relative_to(top) for p in inside) or target == top:
-        raise _refused(f"path {given!r} leads out of the import folder")
+        raise _import_failed(f"path {given!r} leads out of the import folder")
     return target
 
 
@@ -50,11 +52,11 @@ def import_scene(source: Path, *, scenes: Path, name: str) -> None:
         scene = load_scene(source) if source.is_dir() else import_splats(source, name=name)
         save_scene(scene, folder)
     except BundleError as error:
-        raise _refused(str(error).replace(f"{source.parent}/", "")) from error
+        raise _import_failed(str(error).replace(f"{source.parent}/", "")) from error
     except SceneError as error:
-        raise _refused(str(error)) from error
+        raise _import_failed(str(error)) from error
     except OSError as error:
-        raise _refused(f"scene {name!r} cannot be written: {error.strerror}") from error
+        raise _import_failed(f"scene {name!r} cannot be written: {error.strerror}") from error
 
 
 def scene_name(source: Path, given: str | None) -> str:
@@ -75,9 +77,9 @@ def scene_name(source: Path, given: str | None) -> str:
     return given
 
 
-def _refused(detail: str) -> ServiceError:
+def _import_failed(detail: str) -> ServiceError:
     return ServiceError(
         ErrorCode.IMPORT_FAILED,
         detail,
-        hint=f"give a bundle (a folder with {DOCUMENT_NAME}) or a Gaussian splat ply",
+        hint=f"give a bundle (a folder with {SCENE_DOCUMENT}) or a Gaussian splat ply",
     )

@@ -18,8 +18,8 @@ from real2sim_proto.scenes import SceneState
 
 from ...scene import BundleError, Scene
 from ...scene.io import SceneSummary, load_scene
+from ..engine import Engine
 from ..http.problems import ServiceError
-from ..rendering.engine import Engine
 from .scene_catalog import Listing, SceneCatalog
 
 T = TypeVar("T")
@@ -43,7 +43,7 @@ class SceneCache:
     other threads.
 
     Args:
-        library: the scene folder.
+        catalog: the scene folder.
         engine: puts loaded scenes onto the device.
         budget_bytes: of all resident scenes together.
         device: where their tensors live.
@@ -52,14 +52,14 @@ class SceneCache:
 
     def __init__(
         self,
-        library: SceneCatalog,
+        catalog: SceneCatalog,
         engine: Engine,
         *,
         budget_bytes: int,
         device: str = "cpu",
         on_load: Callable[[float], None] | None = None,
     ) -> None:
-        self.library = library
+        self.catalog = catalog
         self.budget_bytes = budget_bytes
         self.device = device
         self._engine = engine
@@ -85,7 +85,7 @@ class SceneCache:
 
     async def refresh(self) -> dict[str, Listing]:
         """Look into the scene folder; all scenes by name."""
-        self._listings = await asyncio.to_thread(self.library.scan)
+        self._listings = await asyncio.to_thread(self.catalog.scan)
         return self._listings
 
     async def listing(self, name: str) -> Listing:
@@ -204,7 +204,7 @@ class SceneCache:
                 summary = await self.summary(name)
                 if name in self._resident or name in self._loading:
                     continue
-                self._make_room(name, summary.nbytes)
+                self._evict_for(name, summary.nbytes)
                 self._reserved[name] = summary.nbytes
                 task = asyncio.create_task(self._load(name, summary), name=f"load {name}")
                 # Read the outcome even when all who waited have left.
@@ -221,10 +221,10 @@ class SceneCache:
             scene = await self.on_disk_thread(lambda: load_scene(summary.path))
             scene = await self._engine.call(scene.to, self.device, label="load")
         except BundleError as error:
-            reason = self.library.public(error)
+            reason = self.catalog.public(error)
             listing = Listing(name, summary.path, None, reason)
             self._listings = self._listings | {name: listing}
-            await asyncio.to_thread(self.library.mark_broken, listing, reason)
+            await asyncio.to_thread(self.catalog.mark_broken, listing, reason)
             log.warning("scene broken", scene=name, reason=reason)
             raise _broken(name, reason) from error
         finally:
@@ -237,7 +237,7 @@ class SceneCache:
         log.info("scene loaded", scene=name, bytes=scene.nbytes, seconds=round(seconds, 3))
         return scene
 
-    def _make_room(self, name: str, needed: int) -> None:
+    def _evict_for(self, name: str, needed: int) -> None:
         """Evict unpinned scenes, longest unused first, until ``needed`` bytes fit.
 
         Raises:

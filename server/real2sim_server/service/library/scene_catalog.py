@@ -14,7 +14,7 @@ from ...scene import SceneError
 from ...scene.io import SceneSummary, read_scene_summary
 
 BUNDLE_SUFFIX = ".r2s"
-DOCUMENT_NAME = "scene.json"
+SCENE_DOCUMENT = "scene.json"
 _IDENTIFIER = re.compile(ID_PATTERN)
 
 
@@ -87,7 +87,7 @@ class SceneCatalog:
             # Hidden folders are bundles that are just being written.
             if path.name.startswith(".") or not path.is_dir():
                 continue
-            if path.suffix == BUNDLE_SUFFIX or (path / DOCUMENT_NAME).exists():
+            if path.suffix == BUNDLE_SUFFIX or (path / SCENE_DOCUMENT).exists():
                 yield path
 
     def _look(self, path: Path) -> tuple[Fingerprint, Listing]:

@@ -111,8 +111,3 @@ def track(trajectory: Trajectory) -> Track:
         positions=[tuple(p) for p in trajectory.positions.tolist()],
         quaternions=[tuple(q) for q in trajectory.quaternions.tolist()],
     )
-
-
-def etag(revision: int) -> str:
-    """Value of ETag and If-Match for a revision."""
-    return f'"r{revision}"'

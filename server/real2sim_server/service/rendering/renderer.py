@@ -1,4 +1,4 @@
-"""From instances to encoded frames: drawn on the engine, encoded beside it."""
+"""From instances to encoded frames: rendered on the engine, encoded beside it."""
 
 from __future__ import annotations
 
@@ -7,37 +7,37 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Codec, Modality
-from real2sim_proto.drive import Frame, SensorSpec
+from real2sim_proto.base import Codec
+from real2sim_proto.episode import SensorSpec
 
-from ...render import Backend, Instance, RasterOptions, encode_image, render_cameras, warm_up
+from ...render import Backend, Instance, RasterOptions, render_cameras, warm_up
+from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
+from ..engine import Engine
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
-from .engine import Engine
+from .frames import EncodedFrame, RenderedImage, encode_frame
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-A = TypeVar("A")
-B = TypeVar("B")
-
 ENCODER_THREADS = 2
+DEFAULT_OPTIONS = RasterOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """All that is needed to draw the sensors of one instant.
+    """All that is needed to render the sensors of one instant.
 
     Attributes:
         scene: gives the sky; its clouds are those of ``instances``.
-        instances: what is drawn.
+        instances: what is rendered.
         T_world_vehicle: [4, 4] float64, where the rig stands.
         t_us: instant, noted in the frames [us].
         sensors: cameras, modalities, sizes and codecs.
@@ -51,37 +51,25 @@ class RenderRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
-    """One drawn image on its way into a frame."""
-
-    sensor: SensorSpec
-    modality: Modality
-    t_us: int
-    T_world_sensor: NDArray[np.float64]
-    K: NDArray[np.float64]
-    pixels: NDArray[Any]
-
-
-@dataclass(frozen=True, eq=False)
 class RenderedFrames:
     """Frames in the order of sensors and modalities, and milliseconds by stage."""
 
-    frames: list[Frame]
+    frames: list[EncodedFrame]
     timing_ms: dict[str, float] = field(default_factory=dict)
 
 
 class Renderer:
-    """Draws shots.
+    """Answers render requests.
 
-    Drawing runs on the engine. Encoding runs on a small pool of its own: simplejpeg and OpenCV
-    release the GIL, so the engine draws the next shot meanwhile and the event loop stays free. A
-    1920x1280 jpeg takes 17 ms, a png 170 ms; either way the loop's median lag is below 0.2 ms.
+    Rendering runs on the engine. Encoding runs on a small pool of its own: simplejpeg and OpenCV
+    release the GIL, so the engine renders the next request meanwhile and the event loop stays free.
+    A 1920x1280 jpeg takes 17 ms, a png 170 ms; either way the loop's median lag is below 0.2 ms.
 
     Args:
-        engine: runs the drawing.
-        backend: draws.
+        engine: runs the rendering.
+        backend: rasterizes.
         metrics: gets durations by stage.
-        max_pixels: over all sensors and modalities of one shot.
+        max_pixels: over all sensors and modalities of one request.
     """
 
     def __init__(
@@ -98,29 +86,28 @@ class Renderer:
         self._encoders.shutdown(cancel_futures=True)
 
     async def warm_up(self) -> None:
-        """Draw and encode something in every form, so that no first frame waits for it."""
+        """Render and encode something in every form, so that no first frame waits for it."""
         await self._engine.call(warm_up, self._backend, label="warm-up")
-        await self.on_encoders(encode, list(_samples()))
+        await self.on_encoders(encode_frame, list(_samples()))
 
-    async def take(self, shot: RenderRequest, *, stream: str = "rest") -> RenderedFrames:
-        """Draw and encode all sensors of a shot.
+    async def render(self, request: RenderRequest, *, stream: str = "rest") -> RenderedFrames:
+        """Render and encode all sensors of a request.
 
         Raises:
             ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
-            QueueFullError, RenderError: as the engine and the renderer do.
+            QueueFullError, RenderError: as the engine and the rasterizer do.
         """
-        cameras = check_sensors(shot.scene.rig, shot.sensors, max_pixels=self._max_pixels)
-        asked = time.perf_counter()
-        images, drawn_ms = await self._engine.call(self.draw, shot, cameras, label="render")
-        waited_ms = (time.perf_counter() - asked) * 1e3 - drawn_ms
+        cameras = check_sensors(request.scene.rig, request.sensors, max_pixels=self._max_pixels)
+        submitted = time.perf_counter()
+        images, render_ms = await self._engine.call(
+            self.render_images, request, cameras, label="render"
+        )
+        queue_ms = (time.perf_counter() - submitted) * 1e3 - render_ms
         started = time.perf_counter()
-        frames = await self.on_encoders(encode, images)
-        timing = {
-            "queue": waited_ms,
-            "render": drawn_ms,
-            "encode": (time.perf_counter() - started) * 1e3,
-        }
-        self._note(frames, timing, stream)
+        frames = await self.on_encoders(encode_frame, images)
+        encode_ms = (time.perf_counter() - started) * 1e3
+        timing = {"queue": queue_ms, "render": render_ms, "encode": encode_ms}
+        self._count(frames, timing, stream)
         return RenderedFrames(frames, timing)
 
     async def on_encoders(self, fn: Callable[[T], R], items: Iterable[T]) -> list[R]:
@@ -129,82 +116,66 @@ class Renderer:
         work = [loop.run_in_executor(self._encoders, fn, item) for item in items]
         return await asyncio.gather(*work)
 
-    def draw(self, shot: RenderRequest, cameras: Sequence[Camera]) -> tuple[list[Image], float]:
+    def render_images(
+        self, request: RenderRequest, cameras: Sequence[Camera]
+    ) -> tuple[list[RenderedImage], float]:
         """Images of all sensors, and the milliseconds it took; on the engine thread."""
         started = time.perf_counter()
-        drawn: dict[int, list[Image]] = {}
-        for options, members in _by_options(shot.sensors).items():
+        rendered: dict[int, list[RenderedImage]] = {}
+        for options, members in _passes(request.sensors).items():
             frames = render_cameras(
-                shot.instances,
+                request.instances,
                 [cameras[i] for i in members],
-                shot.T_world_vehicle,
-                sky=shot.scene.sky,
+                request.T_world_vehicle,
+                sky=request.scene.sky,
                 options=options,
+                modalities=_modalities(request.sensors[i] for i in members),
                 backend=self._backend,
             )
             for i, frame in zip(members, frames, strict=True):
-                drawn[i] = [
-                    Image(shot.sensors[i], m, shot.t_us, frame.T_world_camera, cameras[i].K, pixels)
-                    for m in shot.sensors[i].modalities
-                    if (pixels := getattr(frame, m)) is not None
+                sensor, pose, K = request.sensors[i], frame.T_world_camera, cameras[i].K
+                rendered[i] = [
+                    RenderedImage(sensor, name, request.t_us, pose, K, frame.images[name])
+                    for name in sensor.modalities
                 ]
-        images = [image for i in range(len(shot.sensors)) for image in drawn[i]]
+        images = [image for i in range(len(request.sensors)) for image in rendered[i]]
         return images, (time.perf_counter() - started) * 1e3
 
-    def _note(self, frames: Sequence[Frame], timing_ms: dict[str, float], stream: str) -> None:
+    def _count(
+        self, frames: Sequence[EncodedFrame], timing_ms: dict[str, float], stream: str
+    ) -> None:
         for stage, ms in timing_ms.items():
             self._metrics.stages.labels(stage).observe(ms / 1e3)
         for frame in frames:
             self._metrics.frames.labels(stream, frame.codec).inc()
 
 
-def _samples() -> Iterator[Image]:
-    pixels: dict[Modality, NDArray[Any]] = {
-        "rgb": np.zeros((16, 16, 3), np.uint8),
-        "depth": np.zeros((16, 16), np.float32),
-        "instance": np.zeros((16, 16), np.uint16),
-    }
-    for codec in get_args(Codec):
-        for modality, values in pixels.items():
-            sensor = SensorSpec(camera="warm-up", modalities=[modality], codec=codec)
-            yield Image(sensor, modality, 0, np.eye(4), np.eye(3), values)
-
-
-def _by_options(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, list[int]]:
-    """Places of the sensors that can be drawn in one call."""
-    groups: dict[RasterOptions, list[int]] = {}
+def _passes(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, list[int]]:
+    """Indices of the sensors by the pass that renders them."""
+    passes: dict[RasterOptions, list[int]] = {}
     for i, sensor in enumerate(sensors):
-        options = RasterOptions(
-            depth="depth" in sensor.modalities, instance="instance" in sensor.modalities
-        )
-        groups.setdefault(options, []).append(i)
-    return groups
+        passes.setdefault(options_for(sensor.modalities, DEFAULT_OPTIONS), []).append(i)
+    return passes
 
 
-def encode(image: Image) -> Frame:
-    """The frame of an image; on any thread."""
-    encoded = encode_image(
-        image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality
-    )
-    values: dict[str, Any] = {
-        "sensor": image.sensor.camera,
-        "modality": image.modality,
-        "t_us": image.t_us,
-        "T_world_sensor": image.T_world_sensor,
-        "K": image.K,
-        "codec": encoded.codec,
-        "dtype": encoded.dtype,
-        "shape": list(encoded.shape),
-        "data": encoded.data,
-    }
-    # Every value is ours; validating a megabyte of pixels again would cost more than sending it.
-    return Frame.model_construct(**values)
+def _modalities(sensors: Iterable[SensorSpec]) -> list[str]:
+    """Everything that one of the sensors wants, each once."""
+    return list(dict.fromkeys(name for sensor in sensors for name in sensor.modalities))
+
+
+def _samples() -> Iterator[RenderedImage]:
+    for codec in get_args(Codec):
+        for name in modality_names():
+            modality = modality_of(name)
+            sensor = SensorSpec(camera="warm-up", codec=codec)
+            pixels = np.zeros(modality.shape(16, 16), modality.dtype)
+            yield RenderedImage(sensor, name, 0, np.eye(4), np.eye(3), pixels)
 
 
 def check_sensors(
     rig: CameraRig, sensors: Sequence[SensorSpec], *, max_pixels: int
 ) -> list[Camera]:
-    """The cameras of ``sensors`` at the sizes asked for.
+    """The cameras of ``sensors`` at the sizes they name.
 
     Raises:
         ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.

@@ -21,13 +21,13 @@ from real2sim_proto.base import Identifier
 from ...render import encode_image
 from ..http.problems import ServiceError
 from ..http.responses import info_response
-from ..library.assets import LibraryAsset, cut_out, uploaded
+from ..library.assets import LibraryAsset, extract_object, import_asset
 from ..library.imports import scene_name
 from ..library.thumbnails import draw_thumbnail
 from ..worker import Worker, WorkerOf
 
 UPLOAD_PATH = "/v1/assets"
-ENDINGS = (".compressed.ply", ".ply", ".spz", ".splat")
+SPLAT_SUFFIXES = (".compressed.ply", ".ply", ".spz", ".splat")
 
 _UPLOAD_SCHEMA = AssetUpload.model_json_schema()
 _BODY: dict[str, Any] = {
@@ -70,10 +70,10 @@ async def add(worker: WorkerOf, request: Request) -> Response:
     """
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     if kind == "multipart/form-data":
-        kept = await _upload(worker, request)
+        asset = await _upload(worker, request)
     else:
-        kept = await _cut(worker, _parsed(AssetCut, await request.body()))
-    info = kept.info()
+        asset = await _extract(worker, _parsed(AssetCut, await request.body()))
+    info = asset.info()
     headers = {"Location": f"/v1/assets/{info.asset_id}"}
     return info_response(info, status=201, headers=headers)
 
@@ -98,11 +98,11 @@ async def delete(worker: WorkerOf, asset_id: Identifier) -> Response:
     Sessions that show it go on.
     """
     asset = await asyncio.to_thread(worker.assets.get, asset_id)
-    await _refuse_use(worker, asset.asset_id)
-    with worker.assets.withheld(asset_id):
+    await _check_unused(worker, asset.asset_id)
+    with worker.assets.removing(asset_id):
         # Once more: an edit that was under way may have found it before.
-        await _refuse_use(worker, asset_id)
-        await worker.residency.on_disk_thread(lambda: worker.assets.remove(asset_id))
+        await _check_unused(worker, asset_id)
+        await worker.scene_cache.on_disk_thread(lambda: worker.assets.remove(asset_id))
     return Response(status_code=204)
 
 
@@ -130,8 +130,8 @@ async def thumbnail(
     return Response(encoded.data, media_type="image/png", headers=headers)
 
 
-async def _refuse_use(worker: Worker, asset_id: str) -> None:
-    users = await worker.scenarios.with_asset(asset_id)
+async def _check_unused(worker: Worker, asset_id: str) -> None:
+    users = await worker.scenarios.using_asset(asset_id)
     if users:
         more = f" and {len(users) - 3} more" if len(users) > 3 else ""
         raise ServiceError(
@@ -141,15 +141,15 @@ async def _refuse_use(worker: Worker, asset_id: str) -> None:
         )
 
 
-async def _cut(worker: Worker, asked: AssetCut) -> LibraryAsset:
-    scene = await worker.residency.get(asked.scene)
-    asset_id = asked.asset_id or asked.object_id
+async def _extract(worker: Worker, cut: AssetCut) -> LibraryAsset:
+    scene = await worker.scene_cache.get(cut.scene)
+    asset_id = cut.asset_id or cut.object_id
 
     def work() -> LibraryAsset:
-        asset = cut_out(scene, asked.object_id, asset_id=asset_id, category=asked.category)
+        asset = extract_object(scene, cut.object_id, asset_id=asset_id, category=cut.category)
         return worker.assets.add(asset)
 
-    return await worker.residency.on_disk_thread(work)
+    return await worker.scene_cache.on_disk_thread(work)
 
 
 async def _upload(worker: Worker, request: Request) -> LibraryAsset:
@@ -162,27 +162,25 @@ async def _upload(worker: Worker, request: Request) -> LibraryAsset:
                 hint="curl -F file=@car.ply -F category=car",
             )
         fields = {name: value for name, value in form.items() if name != "file"}
-        asked = _parsed(AssetUpload, fields)
+        upload = _parsed(AssetUpload, fields)
 
         def work() -> LibraryAsset:
-            asset_id = asked.asset_id or scene_name(Path(file.filename or "asset"), None)
+            asset_id = upload.asset_id or scene_name(Path(file.filename or "asset"), None)
             stored = _stored(file, worker.assets.folder)
             try:
-                return worker.assets.add(uploaded(stored, asked, asset_id=asset_id))
+                return worker.assets.add(import_asset(stored, upload, asset_id=asset_id))
             finally:
                 stored.unlink()
 
-        return await worker.residency.on_disk_thread(work)
+        return await worker.scene_cache.on_disk_thread(work)
 
 
 def _stored(file: UploadFile, folder: Path) -> Path:
-    """The upload as a hidden file: readers map files into memory, and know formats by endings."""
+    """The upload as a hidden file: readers map files into memory, and tell formats by suffix."""
     folder.mkdir(parents=True, exist_ok=True)
     given = Path(file.filename or "upload.ply").name.lower()
-    ending = next(
-        (e for e in (".compressed.ply", ".ply", ".spz", ".splat") if given.endswith(e)), ""
-    )
-    stored = folder / f".upload-{secrets.token_hex(6)}{ending or '.ply'}"
+    ending = next((suffix for suffix in SPLAT_SUFFIXES if given.endswith(suffix)), ".ply")
+    stored = folder / f".upload-{secrets.token_hex(6)}{ending}"
     with stored.open("xb") as target:
         shutil.copyfileobj(file.file, target, 1 << 20)
     return stored

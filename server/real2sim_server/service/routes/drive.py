@@ -6,7 +6,7 @@ from fastapi import APIRouter, WebSocket
 
 from real2sim_proto import SUPPORTED_SUBPROTOCOLS
 
-from ..http.auth import same_secret, unauthorized
+from ..http.auth import secrets_equal, unauthorized
 from ..http.problems import REQUEST_ID_KEY, ServiceError, problem_response
 from ..sessions.connection import Connection
 from ..sessions.messages import unsupported_protocol
@@ -58,6 +58,6 @@ def _carries_worker_token(socket: WebSocket, worker: Worker) -> bool:
     scheme, _, given = socket.headers.get("Authorization", "").partition(" ")
     if secret is None or scheme.lower() != "bearer":
         return False
-    if not same_secret(given.strip(), secret.get_secret_value()):
+    if not secrets_equal(given.strip(), secret.get_secret_value()):
         raise unauthorized("the bearer token is not this worker's")
     return True

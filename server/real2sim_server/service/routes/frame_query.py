@@ -9,13 +9,13 @@ from typing import Annotated
 from fastapi import Depends, Header, Query
 
 from real2sim_proto.base import Identifier, Microseconds, Modality
-from real2sim_proto.drive import SensorSpec
+from real2sim_proto.episode import SensorSpec
 
 from ...edit import ScenarioState, instances_at
 from ...render import Instance
 from ...scene import Scene
-from ..http.responses import CODEC_OF, choose_media_type
 from ..rendering.renderer import RenderRequest
+from ..rendering.responses import CODEC_OF, choose_media_type
 
 
 @dataclass(frozen=True)
@@ -40,16 +40,16 @@ class FrameQuery:
         """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
         return choose_media_type(self.accept, self.modality)
 
-    def shot(self, scene: Scene, state: ScenarioState, media_type: str) -> RenderRequest:
+    def render_request(self, scene: Scene, state: ScenarioState, media_type: str) -> RenderRequest:
         """What to draw, from where the recording vehicle was.
 
         Raises:
             TimeOutOfRangeError: ``t_us`` outside the recording.
         """
         t_us = state.clock[0] if self.t_us is None else self.t_us
-        return self.shot_of(scene, instances_at(scene, state, t_us), t_us, media_type)
+        return self.render_request_for(scene, instances_at(scene, state, t_us), t_us, media_type)
 
-    def shot_of(
+    def render_request_for(
         self, scene: Scene, instances: Sequence[Instance], t_us: int, media_type: str
     ) -> RenderRequest:
         """The same for instances that are there already."""

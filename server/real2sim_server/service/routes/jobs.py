@@ -12,11 +12,12 @@ from fastapi.responses import FileResponse, StreamingResponse
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo, JobList
 
-from ..http.disconnects import unless_gone
+from ..http.disconnects import cancel_on_disconnect
 from ..http.events import event_stream
-from ..http.responses import FRAME_RESPONSES, frame_response, info_response
+from ..http.responses import info_response
 from ..jobs.jobs import Jobs
 from ..rendering.renderer import RenderRequest
+from ..rendering.responses import FRAME_RESPONSES, frame_response
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -90,19 +91,21 @@ async def events(
 
 @router.get("/{job_id}/preview", responses=FRAME_RESPONSES, response_class=Response)
 async def preview(
-    worker: WorkerOf, job_id: Identifier, asked: FrameQueryOf, request: Request
+    worker: WorkerOf, job_id: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
     """One frame of a finished simulation, from where the recording vehicle was at ``t_us``."""
-    media_type = asked.media_type()
-    film = await worker.simulations.film(job_id)
-    t_us = film.span[0] if asked.t_us is None else asked.t_us
+    media_type = query.media_type()
+    video_source = await worker.simulations.video_source(job_id)
+    t_us = video_source.span[0] if query.t_us is None else query.t_us
 
-    def shot() -> RenderRequest:
-        return asked.shot_of(film.scene, film.instances(t_us), t_us, media_type)
+    def build() -> RenderRequest:
+        return query.render_request_for(
+            video_source.scene, video_source.instances(t_us), t_us, media_type
+        )
 
-    taken = await asyncio.to_thread(shot)
-    pictured = await unless_gone(request, worker.pictures.take(taken))
-    return frame_response(pictured, media_type)
+    render_request = await asyncio.to_thread(build)
+    rendered = await cancel_on_disconnect(request, worker.renderer.render(render_request))
+    return frame_response(rendered, media_type)
 
 
 @router.get(

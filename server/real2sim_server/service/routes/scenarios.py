@@ -25,12 +25,12 @@ from real2sim_proto.scenarios import (
 )
 
 from ..http.clients import ClientName
-from ..http.disconnects import unless_gone
+from ..http.disconnects import cancel_on_disconnect
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
-from ..http.responses import FRAME_RESPONSES, frame_response, info_response, large_response
+from ..http.responses import etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
-from ..library.views import etag
+from ..rendering.responses import FRAME_RESPONSES, frame_response
 from ..scenarios.scenarios import created_headers, tag
 from ..worker import Worker, WorkerOf
 from .frame_query import FrameQueryOf
@@ -62,9 +62,9 @@ class Change:
         """Revision that the change was made for. Raises ServiceError: INVALID_REQUEST."""
         return expected_revision(self.if_match)
 
-    def once(self, worker: Worker) -> AbstractAsyncContextManager[IdempotentRequest]:
-        """See :meth:`Idempotency.once`."""
-        return worker.idempotency.once(self.request, self.idempotency_key)
+    def guard(self, worker: Worker) -> AbstractAsyncContextManager[IdempotentRequest]:
+        """See :meth:`Idempotency.guard`."""
+        return worker.idempotency.guard(self.request, self.idempotency_key)
 
 
 async def _change_of(
@@ -84,10 +84,10 @@ async def create(
     worker: WorkerOf, body: ScenarioCreate, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
     """A new scenario on a scene; it is stored and survives a restart."""
-    async with worker.idempotency.once(request, idempotency_key) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
-        info = await worker.scenarios.create(body, once=once)
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await worker.scenarios.create(body, idempotent=idempotent)
         return info_response(info, status=201, headers=created_headers(info))
 
 
@@ -108,10 +108,10 @@ async def import_(
 
     Its scene is found by hash. The whole history comes along, undo and redo included.
     """
-    async with worker.idempotency.once(request, idempotency_key) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
-        info = await worker.scenarios.import_(body, once=once)
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await worker.scenarios.import_(body, idempotent=idempotent)
         return info_response(info, status=201, headers=created_headers(info))
 
 
@@ -137,15 +137,15 @@ async def edit(
     change: ChangeOf,
 ) -> Response:
     """Apply a batch of operations, all or none; 412 with the missed entries when it is stale."""
-    async with change.once(worker) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
+    async with change.guard(worker) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
         result = await worker.scenarios.edit(
             scenario_id,
             body.operations,
             expected=change.expected,
             dry_run=body.dry_run,
-            once=once,
+            idempotent=idempotent,
             who=change.who,
         )
         return info_response(result, headers=tag(result))
@@ -166,11 +166,11 @@ async def undo(
     change: ChangeOf,
 ) -> Response:
     """Take back the last batch that is in effect."""
-    async with change.once(worker) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
+    async with change.guard(worker) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
         result = await worker.scenarios.undo(
-            scenario_id, expected=change.expected, once=once, who=change.who
+            scenario_id, expected=change.expected, idempotent=idempotent, who=change.who
         )
         return info_response(result, headers=tag(result))
 
@@ -182,11 +182,11 @@ async def redo(
     change: ChangeOf,
 ) -> Response:
     """Bring back the last batch that was undone."""
-    async with change.once(worker) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
+    async with change.guard(worker) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
         result = await worker.scenarios.redo(
-            scenario_id, expected=change.expected, once=once, who=change.who
+            scenario_id, expected=change.expected, idempotent=idempotent, who=change.who
         )
         return info_response(result, headers=tag(result))
 
@@ -200,10 +200,12 @@ async def fork(
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A new scenario with the same history, up to a revision; the two go separate ways."""
-    async with worker.idempotency.once(request, idempotency_key) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
-        info = await worker.scenarios.fork(scenario_id, body or ScenarioFork(), once=once)
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await worker.scenarios.fork(
+            scenario_id, body or ScenarioFork(), idempotent=idempotent
+        )
         return info_response(info, status=201, headers=created_headers(info))
 
 
@@ -221,11 +223,12 @@ async def simulate(  # noqa: PLR0917, one parameter for each part of the request
     Once it has succeeded, its result has contacts and figures, its file `playback.json` poses and
     energies of every frame; `GET /v1/jobs/{id}/preview` shows it, `POST /v1/exports` films it.
     """
-    async with worker.idempotency.once(request, idempotency_key) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
-        asked = body or SimulateRequest()
-        info = await worker.simulations.start(scenario_id, asked, who=who, once=once)
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await worker.simulations.start(
+            scenario_id, body or SimulateRequest(), who=who, idempotent=idempotent
+        )
         return info_response(info, status=202, headers=accepted_headers(info))
 
 
@@ -240,15 +243,15 @@ async def export(worker: WorkerOf, scenario_id: Identifier) -> Response:
 
 @router.get("/{scenario_id}/preview", responses=FRAME_RESPONSES, response_class=Response)
 async def preview(
-    worker: WorkerOf, scenario_id: Identifier, asked: FrameQueryOf, request: Request
+    worker: WorkerOf, scenario_id: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
     """One frame of the scenario as it is now, from where the recording vehicle was at ``t_us``."""
-    media_type = asked.media_type()
+    media_type = query.media_type()
     view = await worker.scenarios.view(scenario_id)
-    scene = await worker.residency.get(view.row.scene)
-    shot = await asyncio.to_thread(asked.shot, scene, view.state, media_type)
-    pictured = await unless_gone(request, worker.pictures.take(shot))
-    return frame_response(pictured, media_type, revision=view.revision)
+    scene = await worker.scene_cache.get(view.row.scene)
+    render_request = await asyncio.to_thread(query.render_request, scene, view.state, media_type)
+    rendered = await cancel_on_disconnect(request, worker.renderer.render(render_request))
+    return frame_response(rendered, media_type, revision=view.revision)
 
 
 def expected_revision(if_match: str | None) -> int | None:

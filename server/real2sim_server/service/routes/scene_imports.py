@@ -57,22 +57,22 @@ async def import_(worker: WorkerOf, request: Request) -> Response:
         name = await _import_upload(worker, request)
     else:
         name = await _import_path(worker, await request.body())
-    await worker.residency.refresh()
+    await worker.scene_cache.refresh()
     headers = {"Location": f"/v1/scenes/{name}"}
     return await scene_response(worker, name, status=201, headers=headers)
 
 
 async def _import_path(worker: Worker, body: bytes) -> str:
-    asked = _parse(body)
+    request = _parse(body)
     settings = worker.settings
 
     def work() -> str:
-        source = resolve_import(settings.import_path, asked.path)
-        name = scene_name(source, asked.scene)
+        source = resolve_import(settings.import_path, request.path)
+        name = scene_name(source, request.scene)
         import_scene(source, scenes=settings.scenes_path, name=name)
         return name
 
-    return await worker.residency.on_disk_thread(work)
+    return await worker.scene_cache.on_disk_thread(work)
 
 
 async def _import_upload(worker: Worker, request: Request) -> str:
@@ -94,7 +94,7 @@ async def _import_upload(worker: Worker, request: Request) -> str:
                 stored.unlink()
             return name
 
-        return await worker.residency.on_disk_thread(work)
+        return await worker.scene_cache.on_disk_thread(work)
 
 
 def _store_upload(file: UploadFile, scenes: Path) -> Path:

@@ -14,11 +14,12 @@ from real2sim_proto.scenes import SceneInfo, SceneList, SceneState
 
 from ...edit import ScenarioState
 from ..http.clients import ClientName
-from ..http.disconnects import unless_gone
+from ..http.disconnects import cancel_on_disconnect
 from ..http.problems import ServiceError
-from ..http.responses import FRAME_RESPONSES, frame_response, info_response, large_response
+from ..http.responses import info_response, large_response
 from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
 from ..library.views import scene_info
+from ..rendering.responses import FRAME_RESPONSES, frame_response
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -31,8 +32,10 @@ router = APIRouter(prefix="/v1", tags=["scenes"])
 @router.get("/scenes", response_model=SceneList)
 async def list_scenes(worker: WorkerOf) -> Response:
     """Every scene below the worker's scene folder, resident or not, broken ones with the reason."""
-    residency = worker.residency
-    listed = [(item, residency.state(name)) for name, item in (await residency.refresh()).items()]
+    scene_cache = worker.scene_cache
+    listed = [
+        (item, scene_cache.state(name)) for name, item in (await scene_cache.refresh()).items()
+    ]
 
     def build() -> SceneList:
         infos = [scene_info(i, state, summary=i.summary, tracks=False) for i, state in listed]
@@ -66,18 +69,18 @@ async def load(
     200 when it is there, at once or within two seconds; else 202 and the job that loads it. 507
     when the memory budget does not allow it.
     """
-    state = worker.residency.state(scene)
+    state = worker.scene_cache.state(scene)
     if state is SceneState.RESIDENT:
         return await scene_response(worker, scene)
-    await worker.residency.summary(scene)
+    await worker.scene_cache.summary(scene)
 
-    async def work(_ticket: JobContext) -> JobResult:
-        await worker.residency.get(scene)
+    async def work(_context: JobContext) -> JobResult:
+        await worker.scene_cache.get(scene)
         return JobResult()
 
     new = NewJob("load_scene", scene, who=who, light=True)
     job = await worker.jobs.start(new, work)
-    job = await worker.jobs.wait(job.job_id, _patience(prefer))
+    job = await worker.jobs.wait(job.job_id, _wait_seconds(prefer))
     if job.error is not None:
         raise ServiceError(
             job.error.code,
@@ -93,30 +96,30 @@ async def load(
 @router.delete("/scenes/{scene}/residency", response_model=SceneInfo)
 async def unload(worker: WorkerOf, scene: Identifier) -> Response:
     """Take a scene out of memory; 409 while sessions use it."""
-    await worker.residency.unload(scene)
+    await worker.scene_cache.unload(scene)
     return await scene_response(worker, scene)
 
 
 @router.get("/scenes/{scene}/render", responses=FRAME_RESPONSES, response_class=Response)
 async def render(
-    worker: WorkerOf, scene: Identifier, asked: FrameQueryOf, request: Request
+    worker: WorkerOf, scene: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
     """One frame of the unedited scene, from where the recording vehicle was at ``t_us``."""
-    media_type = asked.media_type()
-    resident = await worker.residency.get(scene)
-    shot = await asyncio.to_thread(
-        lambda: asked.shot(resident, ScenarioState.of(resident), media_type)
+    media_type = query.media_type()
+    resident = await worker.scene_cache.get(scene)
+    render_request = await asyncio.to_thread(
+        lambda: query.render_request(resident, ScenarioState.of(resident), media_type)
     )
-    pictured = await unless_gone(request, worker.pictures.take(shot))
-    return frame_response(pictured, media_type)
+    rendered = await cancel_on_disconnect(request, worker.renderer.render(render_request))
+    return frame_response(rendered, media_type)
 
 
-def _patience(prefer: str | None) -> float:
+def _wait_seconds(prefer: str | None) -> float:
     """Seconds that a client wants to wait for the end of a job."""
-    asked = (prefer or "").lower()
-    if "respond-async" in asked:
+    preference = (prefer or "").lower()
+    if "respond-async" in preference:
         return 0.0
-    wait = re.search(r"\bwait=(\d{1,4})\b", asked)
+    wait = re.search(r"\bwait=(\d{1,4})\b", preference)
     return min(float(wait.group(1)), MAX_WAIT_S) if wait else WAIT_S
 
 
@@ -124,9 +127,9 @@ async def scene_response(
     worker: WorkerOf, scene: str, *, status: int = 200, headers: dict[str, str] | None = None
 ) -> Response:
     """The full description of one scene."""
-    listing = await worker.residency.listing(scene)
-    state = worker.residency.state(scene)
-    summary = await worker.residency.summary(scene) if listing.summary else None
+    listing = await worker.scene_cache.listing(scene)
+    state = worker.scene_cache.state(scene)
+    summary = await worker.scene_cache.summary(scene) if listing.summary else None
     return await large_response(
         lambda: scene_info(listing, state, summary=summary, tracks=True),
         status=status,

@@ -10,7 +10,7 @@ from fastapi import APIRouter
 from real2sim_proto import CONVENTIONS, PROTOCOL_VERSION
 from real2sim_proto.base import Codec, Modality
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
-from real2sim_proto.drive import MAX_SENSORS
+from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.scenes import Limits, ServerInfo
 from real2sim_proto.sessions import MAX_STEPS_PER_REQUEST

@@ -19,7 +19,7 @@ from real2sim_proto.sessions import (
     StepRequest,
 )
 
-from ..http.auth import opens, require_token, unauthorized
+from ..http.auth import matches_any_secret, require_token, unauthorized
 from ..http.idempotency import IdempotencyKey
 from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
@@ -48,7 +48,9 @@ async def _session_of(
     session = await worker.sessions.find(session_id)
     given = credentials.credentials if credentials else None
     secret = worker.settings.token
-    if not opens(given, session.row.token, secret.get_secret_value() if secret else None):
+    if not matches_any_secret(
+        given, session.row.token, secret.get_secret_value() if secret else None
+    ):
         error = unauthorized("this call wants the session's token or the worker's")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
         raise error
@@ -69,14 +71,14 @@ async def create(  # noqa: PLR0917, one parameter for each part of the request
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A new session on a scene or a scenario; with a body its first episode begins at once."""
-    async with worker.idempotency.once(request, idempotency_key) as once:
-        if once.replay:
-            return worker.replayed(once.replay)
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
         info = await worker.sessions.create(
             scene=scene,
             scenario=scenario,
             spec=body.reset if body else None,
-            once=once,
+            idempotent=idempotent,
             ws_base=_ws_base(request),
         )
         return info_response(info, status=201, headers=created_headers(info))
@@ -182,7 +184,8 @@ async def render(
     accept: Annotated[str | None, Header()] = None,
 ) -> Response:
     """Images of the current instant; never moves time."""
-    return await view_response(worker.sessions.show, session.running_world(), body.sensors, accept)
+    pipeline, world = worker.sessions.pipeline, session.running_world()
+    return await view_response(pipeline, world, body.sensors, accept)
 
 
 def _ws_base(request: Request) -> str:

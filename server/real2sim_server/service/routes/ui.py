@@ -27,6 +27,7 @@ POLICY = (
 router = APIRouter(include_in_schema=False)
 
 
+@router.get("/")
 @router.get("/ui")
 async def entry() -> Response:
     """To the studio; relative links need the slash."""

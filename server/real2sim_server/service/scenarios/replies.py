@@ -15,7 +15,8 @@ from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 from ...edit import AssetLookup, LogEntry, Planned, Scenario, ScenarioState
 from ...scene.io import SceneSummary
 from ..http.problems import ServiceError
-from ..library.views import edited_objects, etag
+from ..http.responses import etag
+from ..library.views import edited_objects
 from ..storage.store import ScenarioRow
 
 

@@ -14,15 +14,15 @@ from ...edit import AssetLookup, Scenario
 from ...scene.io import SceneSummary
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
-from ..storage.snapshots import Snapshots
 from ..storage.store import ScenarioRow, Store
+from .snapshots import Snapshots
 
-KEPT_IN_MEMORY = 256
+MAX_CACHED_SCENARIOS = 256
 """Scenarios kept ready; others are rebuilt from the store when they are asked for."""
 
 
 @dataclass
-class HeldScenario:
+class CachedScenario:
     """A scenario in memory.
 
     Attributes:
@@ -35,64 +35,64 @@ class HeldScenario:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-class HeldScenarios:
+class ScenarioCache:
     """The scenarios asked for last. Belongs to the event loop."""
 
     def __init__(
         self,
         store: Store,
-        residency: SceneCache,
+        scene_cache: SceneCache,
         snapshots: Snapshots,
         assets: AssetLookup | None,
     ) -> None:
         self._store = store
-        self._residency = residency
+        self._scene_cache = scene_cache
         self._snapshots = snapshots
         self._assets = assets
-        self._held: OrderedDict[str, HeldScenario] = OrderedDict()
+        self._cached: OrderedDict[str, CachedScenario] = OrderedDict()
         self._opening: dict[str, asyncio.Lock] = {}
 
-    def drop(self, scenario_id: str) -> None:
+    def evict(self, scenario_id: str) -> None:
         """Hold it no more; who asks for it next gets it from the store."""
-        self._held.pop(scenario_id, None)
+        self._cached.pop(scenario_id, None)
 
-    async def settled(self) -> None:
+    async def wait_for_changes(self) -> None:
         """Wait for the changes that are under way."""
-        for held in list(self._held.values()):
-            async with held.lock:
+        for cached in list(self._cached.values()):
+            async with cached.lock:
                 pass
 
     @asynccontextmanager
-    async def exclusive(self, scenario_id: str) -> AsyncIterator[HeldScenario]:
+    async def locked(self, scenario_id: str) -> AsyncIterator[CachedScenario]:
         """The scenario while nobody else changes it. Raises as :meth:`get`."""
         while True:
-            held = await self.get(scenario_id)
-            async with held.lock:
+            cached = await self.get(scenario_id)
+            async with cached.lock:
                 # Whoever had the lock before may have dropped or deleted it.
-                if self._held.get(scenario_id) is held:
-                    yield held
+                if self._cached.get(scenario_id) is cached:
+                    yield cached
                     return
 
-    async def get(self, scenario_id: str) -> HeldScenario:
+    async def get(self, scenario_id: str) -> CachedScenario:
         """The scenario, from the store where it is not in memory.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN where its scene has changed.
         """
-        held = self._held.get(scenario_id)
-        if held is None:
+        cached = self._cached.get(scenario_id)
+        if cached is None:
             lock = self._opening.setdefault(scenario_id, asyncio.Lock())
             try:
                 async with lock:
-                    held = self._held.get(scenario_id) or await self._rebuild(scenario_id)
-                    self.keep(held)
+                    cached = self._cached.get(scenario_id) or await self._rebuild(scenario_id)
+                    self.put(cached)
             finally:
                 if not lock.locked():
                     self._opening.pop(scenario_id, None)
-        self._held.move_to_end(scenario_id)
-        return held
+        self._cached.move_to_end(scenario_id)
+        return cached
 
-    async def _rebuild(self, scenario_id: str) -> HeldScenario:
+    async def _rebuild(self, scenario_id: str) -> CachedScenario:
         row = await self._store.scenario(scenario_id)
         if row is None:
             raise ServiceError(
@@ -100,7 +100,7 @@ class HeldScenarios:
                 f"no scenario {scenario_id!r}",
                 hint="GET /v1/scenarios lists them",
             )
-        summary = await self._residency.summary(row.scene)
+        summary = await self._scene_cache.summary(row.scene)
         if summary.content_hash != row.scene_hash:
             raise ServiceError(
                 ErrorCode.SCENE_BROKEN,
@@ -108,12 +108,14 @@ class HeldScenarios:
                 f"{row.scene_hash[:12]}; the bundle now has {summary.content_hash[:12]}",
                 hint="put the old bundle back, or start a new scenario",
             )
-        scenario = await self._snapshots.opened(row, summary, self._assets)
-        return HeldScenario(row, scenario, summary)
+        scenario = await self._snapshots.load(row, summary, self._assets)
+        return CachedScenario(row, scenario, summary)
 
-    def keep(self, held: HeldScenario) -> None:
+    def put(self, cached: CachedScenario) -> None:
         """Hold a scenario; the ones not asked for the longest go, unless they are being edited."""
-        self._held[held.row.scenario_id] = held
-        if len(self._held) > KEPT_IN_MEMORY:
-            for key in [k for k, h in self._held.items() if not h.lock.locked()][:-KEPT_IN_MEMORY]:
-                del self._held[key]
+        self._cached[cached.row.scenario_id] = cached
+        if len(self._cached) > MAX_CACHED_SCENARIOS:
+            for key in [k for k, h in self._cached.items() if not h.lock.locked()][
+                :-MAX_CACHED_SCENARIOS
+            ]:
+                del self._cached[key]

@@ -21,13 +21,12 @@ from real2sim_proto.scenarios import (
 
 from ...edit import AssetLookup, EditError, LogEntry, Planned, Scenario, ScenarioState
 from ...scene.io import SceneSummary
-from ..http.disconnects import to_its_end
+from ..http.disconnects import uncancellable
 from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..library.scene_catalog import BUNDLE_SUFFIX
-from ..storage.snapshots import Snapshots
 from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply, now_us
 from .replies import (
     ScenarioView,
@@ -42,7 +41,8 @@ from .replies import (
     stale_revision,
     tag,
 )
-from .scenario_cache import HeldScenario, HeldScenarios
+from .scenario_cache import CachedScenario, ScenarioCache
+from .snapshots import Snapshots
 
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 
@@ -53,35 +53,37 @@ class Scenarios:
     def __init__(
         self,
         store: Store,
-        residency: SceneCache,
+        scene_cache: SceneCache,
         metrics: Metrics,
         *,
         assets: AssetLookup | None = None,
     ) -> None:
         self._store = store
         self._assets = assets
-        self._residency = residency
+        self._scene_cache = scene_cache
         self._metrics = metrics
         self._snapshots = Snapshots(store)
-        self._held = HeldScenarios(store, residency, self._snapshots, assets)
+        self._scenarios_cache = ScenarioCache(store, scene_cache, self._snapshots, assets)
 
     # --- life -------------------------------------------------------------------------------
 
-    async def create(self, request: ScenarioCreate, *, once: IdempotentRequest) -> ScenarioInfo:
+    async def create(
+        self, request: ScenarioCreate, *, idempotent: IdempotentRequest
+    ) -> ScenarioInfo:
         """A new scenario, stored. Raises ServiceError: UNKNOWN_SCENE or SCENE_BROKEN."""
-        summary = await self._residency.summary(request.scene)
-        return await self._create(request.name, request.scene, summary, [], once=once)
+        summary = await self._scene_cache.summary(request.scene)
+        return await self._create(request.name, request.scene, summary, [], idempotent=idempotent)
 
     async def fork(
-        self, scenario_id: str, request: ScenarioFork, *, once: IdempotentRequest
+        self, scenario_id: str, request: ScenarioFork, *, idempotent: IdempotentRequest
     ) -> ScenarioInfo:
         """A new scenario with the same history, up to a revision.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO, or INVALID_REQUEST for a revision that is not there.
         """
-        held = await self._held.get(scenario_id)
-        entries = list(held.scenario.entries)
+        cached = await self._scenarios_cache.get(scenario_id)
+        entries = list(cached.scenario.entries)
         revision = len(entries) if request.revision is None else request.revision
         if revision > len(entries):
             raise ServiceError(
@@ -89,23 +91,27 @@ class Scenarios:
                 f"scenario {scenario_id!r} has {len(entries)} revisions; {revision} is not there",
                 hint="leave revision out to fork what it is now",
             )
-        name = held.row.name if request.name is None else request.name
+        name = cached.row.name if request.name is None else request.name
         log = [history_entry(e) for e in entries[:revision]]
-        return await self._create(name, held.row.scene, held.summary, log, once=once)
+        return await self._create(
+            name, cached.row.scene, cached.summary, log, idempotent=idempotent
+        )
 
     async def export(self, scenario_id: str) -> ScenarioDocument:
         """The scenario as one file. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
-        held = await self._held.get(scenario_id)
+        cached = await self._scenarios_cache.get(scenario_id)
         return ScenarioDocument(
-            name=held.row.name,
-            scene=held.row.scene,
-            scene_hash=held.row.scene_hash,
-            assets=asset_hashes(held.scenario.entries, self._assets),
-            entries=[history_entry(e) for e in held.scenario.entries],
+            name=cached.row.name,
+            scene=cached.row.scene,
+            scene_hash=cached.row.scene_hash,
+            assets=asset_hashes(cached.scenario.entries, self._assets),
+            entries=[history_entry(e) for e in cached.scenario.entries],
             exported_at=iso_time(now_us()),
         )
 
-    async def import_(self, document: ScenarioDocument, *, once: IdempotentRequest) -> ScenarioInfo:
+    async def import_(
+        self, document: ScenarioDocument, *, idempotent: IdempotentRequest
+    ) -> ScenarioInfo:
         """A new scenario from a file, on the scene of its hash.
 
         Raises:
@@ -123,18 +129,20 @@ class Scenarios:
                     hint="add it with POST /v1/assets under that id first",
                 )
         scene = summary.path.name.removesuffix(BUNDLE_SUFFIX)
-        return await self._create(document.name, scene, summary, document.entries, once=once)
+        return await self._create(
+            document.name, scene, summary, document.entries, idempotent=idempotent
+        )
 
     async def delete(self, scenario_id: str) -> None:
         """Remove a scenario and its history. Raises ServiceError: UNKNOWN_SCENARIO."""
-        async with self._held.exclusive(scenario_id):
-            self._held.drop(scenario_id)
-            self._snapshots.forget(scenario_id)
+        async with self._scenarios_cache.locked(scenario_id):
+            self._scenarios_cache.evict(scenario_id)
+            self._snapshots.discard(scenario_id)
             await self._store.delete_scenario(scenario_id)
 
-    async def settle(self) -> None:
+    async def flush(self) -> None:
         """Wait for what is still written behind the answers; none may be asked for after."""
-        await self._snapshots.written()
+        await self._snapshots.flush()
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -146,20 +154,20 @@ class Scenarios:
 
     async def view(self, scenario_id: str) -> ScenarioView:
         """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
-        return _view(await self._held.get(scenario_id))
+        return _view(await self._scenarios_cache.get(scenario_id))
 
     async def state_at(self, scenario_id: str, revision: int) -> ScenarioState:
         """What the scenario was at a revision. Raises ServiceError: UNKNOWN_SCENARIO."""
-        held = await self._held.get(scenario_id)
-        if revision == held.scenario.revision:
-            return held.scenario.state
-        log = [history_entry(e) for e in held.scenario.entries[:revision]]
-        earlier = await asyncio.to_thread(replayed, held.row, held.summary, log, self._assets)
+        cached = await self._scenarios_cache.get(scenario_id)
+        if revision == cached.scenario.revision:
+            return cached.scenario.state
+        log = [history_entry(e) for e in cached.scenario.entries[:revision]]
+        earlier = await asyncio.to_thread(replayed, cached.row, cached.summary, log, self._assets)
         return earlier.state
 
     async def history(self, scenario_id: str, *, after: int = 0) -> History:
         """Revisions behind ``after``, oldest first."""
-        scenario = (await self._held.get(scenario_id)).scenario
+        scenario = (await self._scenarios_cache.get(scenario_id)).scenario
         return History(
             revision=scenario.revision,
             can_undo=scenario.can_undo,
@@ -167,9 +175,9 @@ class Scenarios:
             entries=[history_entry(e) for e in scenario.entries[max(0, after) :]],
         )
 
-    async def with_asset(self, asset_id: str) -> Sequence[str]:
+    async def using_asset(self, asset_id: str) -> Sequence[str]:
         """Ids of the scenarios whose history names an asset, edits that are under way included."""
-        await self._held.settled()
+        await self._scenarios_cache.wait_for_changes()
         return await self._store.scenarios_naming(asset_id)
 
     @property
@@ -186,7 +194,7 @@ class Scenarios:
         *,
         expected: int | None,
         dry_run: bool,
-        once: IdempotentRequest,
+        idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
         """Apply operations, all or none.
@@ -196,7 +204,7 @@ class Scenarios:
             operations: in order.
             expected: revision they were made for; None for any.
             dry_run: check and answer, change nothing.
-            once: what the answer is stored under.
+            idempotent: what the answer is stored under.
             who: goes on record.
 
         Raises:
@@ -208,7 +216,7 @@ class Scenarios:
             lambda s: s.plan_edit(operations, who=who),
             expected,
             dry_run=dry_run,
-            once=once,
+            idempotent=idempotent,
         )
         if not dry_run:
             for op, count in Counter(o.op for o in operations).items():
@@ -216,21 +224,31 @@ class Scenarios:
         return result
 
     async def undo(
-        self, scenario_id: str, *, expected: int | None, once: IdempotentRequest, who: str = ""
+        self,
+        scenario_id: str,
+        *,
+        expected: int | None,
+        idempotent: IdempotentRequest,
+        who: str = "",
     ) -> OperationResult:
         """Take back the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
         result = await self._change(
-            scenario_id, lambda s: s.plan_undo(who=who), expected, once=once
+            scenario_id, lambda s: s.plan_undo(who=who), expected, idempotent=idempotent
         )
         self._metrics.edits.labels("undo").inc()
         return result
 
     async def redo(
-        self, scenario_id: str, *, expected: int | None, once: IdempotentRequest, who: str = ""
+        self,
+        scenario_id: str,
+        *,
+        expected: int | None,
+        idempotent: IdempotentRequest,
+        who: str = "",
     ) -> OperationResult:
         """Bring back the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
         result = await self._change(
-            scenario_id, lambda s: s.plan_redo(who=who), expected, once=once
+            scenario_id, lambda s: s.plan_redo(who=who), expected, idempotent=idempotent
         )
         self._metrics.edits.labels("redo").inc()
         return result
@@ -244,7 +262,7 @@ class Scenarios:
         summary: SceneSummary,
         log: Sequence[HistoryEntry],
         *,
-        once: IdempotentRequest,
+        idempotent: IdempotentRequest,
     ) -> ScenarioInfo:
         row = ScenarioRow(
             scenario_id=f"sc_{secrets.token_hex(8)}",
@@ -254,16 +272,16 @@ class Scenarios:
             created_us=now_us(),
         )
         scenario = await asyncio.to_thread(replayed, row, summary, log, self._assets)
-        held = HeldScenario(row, scenario, summary)
-        info = _view(held).info(tracks=False)
-        reply = once.reply(info, status=201, headers=created_headers(info))
+        cached = CachedScenario(row, scenario, summary)
+        info = _view(cached).info(tracks=False)
+        reply = idempotent.reply(info, status=201, headers=created_headers(info))
         entries = [entry.model_dump(mode="json") for entry in log]
         await self._store.create_scenario(row, entries=entries, reply=reply)
-        self._held.keep(held)
+        self._scenarios_cache.put(cached)
         return info
 
     async def _summary_of(self, document: ScenarioDocument) -> SceneSummary:
-        for listing in (await self._residency.refresh()).values():
+        for listing in (await self._scene_cache.refresh()).values():
             if listing.summary and listing.summary.content_hash == document.scene_hash:
                 return listing.summary
         raise ServiceError(
@@ -273,7 +291,7 @@ class Scenarios:
             hint="put that bundle into the scene folder, or POST /v1/scenes to import it",
         )
 
-    @to_its_end
+    @uncancellable
     async def _change(
         self,
         scenario_id: str,
@@ -281,10 +299,10 @@ class Scenarios:
         expected: int | None,
         *,
         dry_run: bool = False,
-        once: IdempotentRequest,
+        idempotent: IdempotentRequest,
     ) -> OperationResult:
-        async with self._held.exclusive(scenario_id) as held:
-            scenario = held.scenario
+        async with self._scenarios_cache.locked(scenario_id) as cached:
+            scenario = cached.scenario
             if expected is not None and expected != scenario.revision:
                 self._metrics.edit_conflicts.inc()
                 raise stale_revision(scenario, expected)
@@ -295,7 +313,7 @@ class Scenarios:
                 revision = scenario.revision if dry_run else planned.entry.revision
                 result = operation_result(planned, revision=revision, dry_run=dry_run)
                 if not dry_run:
-                    reply = once.reply(result, status=200, headers=tag(result))
+                    reply = idempotent.reply(result, status=200, headers=tag(result))
                     self._record(scenario_id, planned.entry, reply)
                 return planned, result
 
@@ -305,13 +323,13 @@ class Scenarios:
                 raise
             except Exception as error:
                 # Only the store knows whether the entry is in the log.
-                self._held.drop(scenario_id)
+                self._scenarios_cache.evict(scenario_id)
                 if isinstance(error, ConflictError):
                     raise changed_elsewhere(scenario_id) from error
                 raise
             if not dry_run:
                 scenario.commit(planned)
-                self._snapshots.offer(scenario_id, scenario.revision, scenario.state)
+                self._snapshots.save_if_due(scenario_id, scenario.revision, scenario.state)
             return result
 
     def _record(self, scenario_id: str, entry: LogEntry, reply: StoredReply | None) -> None:
@@ -321,11 +339,11 @@ class Scenarios:
         )
 
 
-def _view(held: HeldScenario) -> ScenarioView:
-    scenario = held.scenario
+def _view(cached: CachedScenario) -> ScenarioView:
+    scenario = cached.scenario
     return ScenarioView(
-        row=held.row,
-        summary=held.summary,
+        row=cached.row,
+        summary=cached.summary,
         state=scenario.state,
         revision=scenario.revision,
         can_undo=scenario.can_undo,

@@ -1,10 +1,14 @@
-"""One drive socket: greeted, then served in lock step or as an observer."""
+"""One drive socket: its handshake, then messages in lock step or as an observer.
+
+The first two phases of a step are here, ``_receive`` and ``_check``; see `pipeline` for the others.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Any, assert_never
 
 import structlog
@@ -15,6 +19,7 @@ from real2sim_proto.drive import (
     Action,
     Agent,
     Bye,
+    ClientMessage,
     Edit,
     Fork,
     Hello,
@@ -24,13 +29,19 @@ from real2sim_proto.drive import (
     Snapshot,
 )
 
-from ..http.auth import opens, same_secret, unauthorized
+from ..http.auth import matches_any_secret, secrets_equal, unauthorized
 from ..http.problems import ServiceError, service_error
-from ..http.websocket import send, written
+from ..http.websocket import send_parts, try_send_parts
 from .deadline_timer import DeadlineTimer
 from .describe import welcome_fields
-from .messages import BadMessageError, Incoming, bad_message, read_message, unsupported_protocol
-from .observers import Mailbox
+from .messages import (
+    BadMessageError,
+    ReceivedMessage,
+    bad_message,
+    read_message,
+    unsupported_protocol,
+)
+from .observers import ObserverQueue
 from .registry import Sessions
 from .session import Session, controller_taken
 from .wire import Message, pack_message
@@ -41,7 +52,7 @@ CLOSE_TIMEOUT_S = 2.0
 SMALL_BYTES = 16_384
 """Messages up to this size are read on the event loop: that takes less than handing them over."""
 
-MAY_SEND: dict[str, tuple[type, ...]] = {
+ALLOWED_MESSAGES: dict[str, tuple[type, ...]] = {
     "controller": (Hello, Reset, Action, Edit, Render, Agent, Snapshot, Restore, Fork, Bye),
     "observer": (Hello, Render, Bye),
     "agent": (Hello, Agent, Render, Bye),
@@ -54,11 +65,11 @@ log = structlog.get_logger(__name__)
 
 
 class FatalError(Exception):
-    """Ends the connection after telling the client why."""
+    """Ends the connection with an error message."""
 
-    def __init__(self, refusal: ServiceError, *, message_id: int = 0) -> None:
-        super().__init__(refusal.detail)
-        self.refusal = refusal
+    def __init__(self, error: ServiceError, *, message_id: int = 0) -> None:
+        super().__init__(error.detail)
+        self.error = error
         self.message_id = message_id
 
 
@@ -91,67 +102,68 @@ class Connection:
         self._worker_token = worker_token
         self._ws_base = ws_base
         self._sending = asyncio.Lock()
-        self._patience = DeadlineTimer(session, sessions.stepper, self._send)
+        self._deadline_timer = DeadlineTimer(session, sessions.stepper, self._send)
 
     async def serve(self) -> None:
-        """Talk until one of both leaves. A client that vanishes disturbs nobody."""
+        """Serve until one of both leaves. A client that vanishes disturbs nobody."""
         session = self._session
         try:
-            hello = await self._greeting()
+            hello = await self._handshake()
             session.check_open()
-            session.hangups.add(self._hang_up)
+            session.close_callbacks.add(self._close_with_error)
             if hello.role == "controller":
                 async with self._as_controller(hello):
                     await self._welcome(hello)
-                    await self._catch_up(hello)
-                    await self._converse(hello.role)
+                    await self._resend_missed_observation(hello)
+                    await self._serve_messages(hello.role)
             else:
                 await self._welcome(hello)
                 async with self._as_observer():
-                    await self._converse(hello.role)
+                    await self._serve_messages(hello.role)
         except WebSocketDisconnect:
             pass
         except (FatalError, ServiceError) as error:
-            refusal = error.refusal if isinstance(error, FatalError) else error
-            message_id = error.message_id if isinstance(error, FatalError) else 0
-            await self._hang_up(refusal, message_id=message_id)
+            if isinstance(error, FatalError):
+                await self._close_with_error(error.error, message_id=error.message_id)
+            else:
+                await self._close_with_error(error)
         finally:
-            session.hangups.discard(self._hang_up)
+            session.close_callbacks.discard(self._close_with_error)
             session.touch()
 
-    # --- greeting ---------------------------------------------------------------------------
+    # --- handshake --------------------------------------------------------------------------
 
-    async def _greeting(self) -> Hello:
-        """The client's hello. Raises FatalError when there is no talking to it."""
+    async def _handshake(self) -> Hello:
+        """The client's hello. Raises FatalError for anything else, or none in time."""
         try:
             async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
                 message = (await self._receive()).message
         except TimeoutError as error:
-            refusal = ServiceError(ErrorCode.TIMEOUT, f"no hello within {HANDSHAKE_TIMEOUT_S:g} s")
-            raise FatalError(refusal) from error
+            detail = f"no hello within {HANDSHAKE_TIMEOUT_S:g} s"
+            raise FatalError(ServiceError(ErrorCode.TIMEOUT, detail)) from error
         except BadMessageError as error:
-            raise FatalError(error.refusal, message_id=error.message_id) from error
+            raise FatalError(error.error, message_id=error.message_id) from error
         if not isinstance(message, Hello):
-            refusal = bad_message(f"the first message must be hello, not {message.type}")
-            raise FatalError(refusal, message_id=message.id)
+            wrong_type = bad_message(f"the first message must be hello, not {message.type}")
+            raise FatalError(wrong_type, message_id=message.id)
         if not set(message.protocols) & set(SUPPORTED_SUBPROTOCOLS):
             raise FatalError(unsupported_protocol(message.protocols), message_id=message.id)
-        if not (self._authorised or self._resumes(message) or self._opens(message)):
-            refusal = unauthorized("hello carries neither the session's token nor the worker's")
-            refusal.hint = "the answer to POST /v1/sessions has the session's token"
-            raise FatalError(refusal, message_id=message.id)
+        if not (self._authorised or self._is_resuming(message) or self._has_token(message)):
+            no_token = unauthorized("hello carries neither the session's token nor the worker's")
+            no_token.hint = "the answer to POST /v1/sessions has the session's token"
+            raise FatalError(no_token, message_id=message.id)
         return message
 
-    def _opens(self, hello: Hello) -> bool:
-        return opens(hello.token, self._session.row.token, self._worker_token)
+    def _has_token(self, hello: Hello) -> bool:
+        return matches_any_secret(hello.token, self._session.row.token, self._worker_token)
 
-    def _resumes(self, hello: Hello) -> bool:
+    def _is_resuming(self, hello: Hello) -> bool:
         """Whether this is the session's controller who comes back."""
         resume = hello.resume
-        return resume is not None and same_secret(resume.token, self._session.resume_token)
+        return resume is not None and secrets_equal(resume.token, self._session.resume_token)
 
     async def _welcome(self, hello: Hello) -> None:
-        """Have everything warm, saying so meanwhile, and tell the client what there is."""
+        """Warm up, with progress messages meanwhile, and send what there is."""
         warming = asyncio.create_task(self._sessions.warm_up(self._session))
         # Read the outcome even when the client has left meanwhile.
         warming.add_done_callback(lambda task: task.cancelled() or task.exception())
@@ -161,7 +173,7 @@ class Connection:
         try:
             await warming
         except Exception as error:
-            raise FatalError(_told(error), message_id=hello.id) from error
+            raise FatalError(_as_service_error(error), message_id=hello.id) from error
         fields = await asyncio.to_thread(welcome_fields, self._session, hello.role)
         await self._send(pack_message("welcome", fields), hello.id)
 
@@ -169,26 +181,26 @@ class Connection:
     async def _as_controller(self, hello: Hello) -> AsyncIterator[None]:
         session = self._session
         old = session.controller
-        if old is not None and not self._resumes(hello):
+        if old is not None and not self._is_resuming(hello):
             raise FatalError(controller_taken(session.session_id), message_id=hello.id)
         session.controller = self
         if isinstance(old, Connection):
             # Its client has come back by another way; the old one may never notice.
-            await old.give_way()
+            await old.yield_control()
         try:
             yield
         finally:
-            self._patience.end()
+            self._deadline_timer.cancel()
             if session.controller is self:
                 session.controller = None
 
-    async def give_way(self) -> None:
+    async def yield_control(self) -> None:
         """Leave the session to the connection that has resumed it."""
-        self._session.hangups.discard(self._hang_up)
-        self._patience.end()
-        await self._hang_up(controller_taken(self._session.session_id))
+        self._session.close_callbacks.discard(self._close_with_error)
+        self._deadline_timer.cancel()
+        await self._close_with_error(controller_taken(self._session.session_id))
 
-    async def _catch_up(self, hello: Hello) -> None:
+    async def _resend_missed_observation(self, hello: Hello) -> None:
         """Send a controller that comes back the present observation, unless it has it."""
         session = self._session
         async with session.lock:
@@ -196,132 +208,130 @@ class Connection:
             missing = hello.resume is not None and hello.resume.last_step != step
             if missing and newest is not None:
                 await self._send(newest)
-        self._patience.begin()
+        self._deadline_timer.start()
 
     @contextlib.asynccontextmanager
     async def _as_observer(self) -> AsyncIterator[None]:
-        mailbox = Mailbox()
-        self._session.observers.add(mailbox)
-        forwarding = asyncio.create_task(self._forward(mailbox))
+        queue = ObserverQueue()
+        self._session.observers.add(queue)
+        forwarding = asyncio.create_task(self._forward(queue))
         try:
             yield
         finally:
-            self._session.observers.discard(mailbox)
+            self._session.observers.discard(queue)
             forwarding.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await forwarding
 
-    async def _forward(self, mailbox: Mailbox) -> None:
+    async def _forward(self, queue: ObserverQueue) -> None:
         # A client that left is noticed by whoever receives from it.
         with contextlib.suppress(WebSocketDisconnect):
             while True:
-                await self._send(await mailbox.take())
+                await self._send(await queue.take())
 
-    # --- conversation -----------------------------------------------------------------------
+    # --- messages ---------------------------------------------------------------------------
 
-    async def _converse(self, role: str) -> None:
+    async def _serve_messages(self, role: str) -> None:
         """Answer every message with one message, in order, until bye."""
         while True:
             try:
-                incoming = await self._receive()
-                if (answer := await self._answer(incoming, role)) is not None:
-                    await self._send(answer, incoming.message.id)
-                if role == "controller" and not self._patience.waiting:
-                    self._patience.begin()
+                received = await self._receive()
+                if (answer := await self._answer(received, role)) is not None:
+                    await self._send(answer, received.message.id)
+                if role == "controller" and not self._deadline_timer.waiting:
+                    self._deadline_timer.start()
             except BadMessageError as error:
                 if error.fatal:
-                    raise FatalError(error.refusal, message_id=error.message_id) from error
-                await self._send(self._error(error.refusal), error.message_id)
+                    raise FatalError(error.error, message_id=error.message_id) from error
+                await self._send(self._error_message(error.error), error.message_id)
             else:
-                if isinstance(incoming.message, Bye):
+                if isinstance(received.message, Bye):
                     await self._socket.close(NORMAL_CLOSURE)
                     return
 
-    async def _answer(self, incoming: Incoming, role: str) -> Message | None:
+    async def _answer(self, received: ReceivedMessage, role: str) -> Message | None:
         """The answer; None where it has been sent already."""
-        message, allowed = incoming.message, MAY_SEND[role]
-        if not isinstance(message, allowed):
-            refusal = ServiceError(
-                ErrorCode.NOT_CONTROLLER,
-                f"{'an' if role[0] in 'ao' else 'a'} {role} sent {message.type}; such clients may "
-                f"send {', '.join(kind.__name__.lower() for kind in allowed)}",
-                hint="connect with role 'controller' to drive",
-            )
-            return self._error(refusal)
         try:
-            return await self._obey(incoming, role)
+            _check_role(received.message, role)
+            return await self._dispatch(received, role)
         except Exception as error:
-            return self._error(_told(error))
+            return self._error_message(_as_service_error(error))
 
-    async def _obey(self, incoming: Incoming, role: str) -> Message | None:
-        message, session, stepper = incoming.message, self._session, self._sessions.stepper
+    async def _dispatch(self, received: ReceivedMessage, role: str) -> Message | None:
+        message, session = received.message, self._session
         match message:
             case Action():
-                return await self._act(message, incoming.content)
+                return await self._act(message, received.content)
             case Reset():
-                self._patience.end()
+                self._deadline_timer.cancel()
                 async with session.lock:
                     session.check_open()
-                    return await stepper.reset(session, message.spec)
+                    return await self._sessions.stepper.reset(session, message.spec)
             case Edit():
                 return await self._edit(message)
             case Render():
                 session.check_open()
-                shown = await self._sessions.show.view(session.running_world(), message.sensors)
-                return shown.message
+                world, sensors = session.running_world(), message.sensors
+                return (await self._sessions.pipeline.view(world, sensors)).message
             case Agent() | Snapshot() | Restore() | Fork():
                 async with session.lock:
                     session.check_open()
                     return await self._change(message)
             case Bye():
-                return await self._leave(role)
+                return await self._finish(role)
             case Hello():
                 raise bad_message("hello has been said already")
             case _:
                 assert_never(message)
 
     async def _act(self, action: Action, content: bytes) -> Message | None:
-        session, told = self._session, False
-
-        def tell(message: Message) -> None:
-            nonlocal told
-            told = not self._sending.locked() and written(self._socket, message.parts(action.id))
-
-        waited_us = self._patience.waited_us
+        """Check an action, and let it pass the rest of the step pipeline."""
+        session, waited_us = self._session, self._deadline_timer.waited_us
         if action.step == session.lockstep.step:
-            self._patience.end()
+            self._deadline_timer.cancel()
         async with session.lock:
-            session.check_open()
-            cached = session.lockstep.cached_answer(action.step, content)
-            if cached is not None:
-                return cached
-            message = await self._sessions.stepper.act(
-                session, action.plan, content, latency_us=waited_us, tell=tell
+            given_before = self._check(action, content)
+            if given_before is not None:
+                return given_before
+            return await self._sessions.stepper.act(
+                session,
+                action.plan,
+                content,
+                latency_us=waited_us,
+                write=partial(self._write_at_once, action.id),
             )
-            return None if told else message
 
-    async def _change(self, asked: Agent | Snapshot | Restore | Fork) -> Message:
-        """Everything that is rare, for whoever holds the session's lock."""
+    def _check(self, action: Action, content: bytes) -> Message | None:
+        """Whether this action is due; the answer to it where it was given before.
+
+        Raises:
+            ServiceError: the session is over, or the action is out of step.
+        """
+        self._session.check_open()
+        return self._session.lockstep.cached_answer(action.step, content)
+
+    async def _change(self, message: Agent | Snapshot | Restore | Fork) -> Message:
+        """Changes other than steps and edits; the session's lock is held."""
         session, stepper = self._session, self._sessions.stepper
-        match asked:
+        match message:
             case Agent():
-                await stepper.steer(session, asked)
-                fields = {"object_id": asked.object_id, "step": session.running_world().steps}
+                await stepper.set_agent_plan(session, message)
+                fields = {"object_id": message.object_id, "step": session.running_world().steps}
                 return pack_message("driven", fields)
             case Snapshot():
-                kept = await stepper.snapshot(session, asked.name)
-                fields = {"name": asked.name, "step": kept.steps, "t_us": kept.t_us}
+                world = await stepper.snapshot(session, message.name)
+                fields = {"name": message.name, "step": world.steps, "t_us": world.t_us}
                 return pack_message("kept", fields)
             case Restore():
-                self._patience.end()
-                return await stepper.restore(session, asked.name)
+                self._deadline_timer.cancel()
+                return await stepper.restore(session, message.name)
             case Fork():
                 info = await self._sessions.fork(session, ws_base=self._ws_base)
                 fields = info.model_dump(include={"session_id", "token", "ws_url"})
                 fields["step"] = session.running_world().steps
                 return pack_message("forked", fields)
             case _:
-                assert_never(asked)
+                assert_never(message)
 
     async def _edit(self, edit: Edit) -> Message:
         session = self._session
@@ -335,13 +345,13 @@ class Connection:
         fields = {"revision": revision, "created": list(outcome.created), "warnings": warnings}
         return pack_message("edited", fields)
 
-    async def _leave(self, role: str) -> Message:
+    async def _finish(self, role: str) -> Message:
         """The result; a controller that says bye ends the session."""
         session = self._session
         scores = await self._sessions.scores(session)
         if role == "controller":
-            self._patience.end()
-            session.hangups.discard(self._hang_up)
+            self._deadline_timer.cancel()
+            session.close_callbacks.discard(self._close_with_error)
             await self._sessions.close(session, reason="its controller said bye")
         world = session.world
         fields = {
@@ -355,7 +365,7 @@ class Connection:
 
     # --- bytes ------------------------------------------------------------------------------
 
-    async def _receive(self) -> Incoming:
+    async def _receive(self) -> ReceivedMessage:
         event = await self._socket.receive()
         if event["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(event.get("code", 1005))
@@ -367,32 +377,51 @@ class Connection:
             return read_message(data)
         return await asyncio.to_thread(read_message, data)
 
+    def _write_at_once(self, message_id: int, message: Message) -> bool:
+        """Write a message if nothing has to be waited for; whether it is written."""
+        if self._sending.locked():
+            return False
+        return try_send_parts(self._socket, message.parts(message_id))
+
     async def _send(self, message: Message, message_id: int = 0) -> None:
         # Whoever ends the session may send too.
         async with self._sending:
-            await send(self._socket, message.parts(message_id))
+            await send_parts(self._socket, message.parts(message_id))
 
-    async def _hang_up(self, refusal: ServiceError, *, message_id: int = 0) -> None:
-        """Tell the client why this is over and close; one that does not listen is left alone."""
+    async def _close_with_error(self, error: ServiceError, *, message_id: int = 0) -> None:
+        """Send the error and close; a client that does not read is left alone."""
         with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
             async with asyncio.timeout(CLOSE_TIMEOUT_S):
-                await self._send(self._error(refusal, fatal=True), message_id)
-                await self._socket.close(POLICY_VIOLATION, refusal.code.value)
+                await self._send(self._error_message(error, fatal=True), message_id)
+                await self._socket.close(POLICY_VIOLATION, error.code.value)
 
-    def _error(self, refusal: ServiceError, *, fatal: bool = False) -> Message:
+    def _error_message(self, error: ServiceError, *, fatal: bool = False) -> Message:
         fields: dict[str, Any] = {
-            "code": refusal.code.value,
-            "detail": refusal.detail,
-            "hint": refusal.hint,
-            "retryable": refusal.code in RETRYABLE,
+            "code": error.code.value,
+            "detail": error.detail,
+            "hint": error.hint,
+            "retryable": error.code in RETRYABLE,
             "fatal": fatal,
             "step": self._session.lockstep.step,
         }
         return pack_message("error", fields)
 
 
-def _told(error: Exception) -> ServiceError:
-    refusal = service_error(error)
-    if refusal.code is ErrorCode.INTERNAL:
+def _check_role(message: ClientMessage, role: str) -> None:
+    """Raises ServiceError: NOT_CONTROLLER for a message that such clients may not send."""
+    allowed = ALLOWED_MESSAGES[role]
+    if isinstance(message, allowed):
+        return
+    raise ServiceError(
+        ErrorCode.NOT_CONTROLLER,
+        f"{'an' if role[0] in 'ao' else 'a'} {role} sent {message.type}; such clients may "
+        f"send {', '.join(kind.__name__.lower() for kind in allowed)}",
+        hint="connect with role 'controller' to drive",
+    )
+
+
+def _as_service_error(error: Exception) -> ServiceError:
+    error = service_error(error)
+    if error.code is ErrorCode.INTERNAL:
         log.error("unexpected error", exc_info=error)
-    return refusal
+    return error

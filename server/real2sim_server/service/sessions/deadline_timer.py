@@ -1,4 +1,4 @@
-"""How long a session waits for its controller: deadlines of plans, wall-clock time of episodes."""
+"""Deadlines of plans, and the wall-clock time of episodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .wire import Message
 
 log = structlog.get_logger(__name__)
 
-Tell = Callable[[Message], Awaitable[None]]
+Send = Callable[[Message], Awaitable[None]]
 
 
 class DeadlineTimer:
@@ -28,20 +28,20 @@ class DeadlineTimer:
     Args:
         session: whose controller is connected.
         stepper: makes the fallback's step.
-        tell: sends an observation that nobody asked for.
+        send: sends an observation that no action has led to.
     """
 
-    def __init__(self, session: Session, stepper: Stepper, tell: Tell) -> None:
+    def __init__(self, session: Session, stepper: Stepper, send: Send) -> None:
         self._session = session
         self._stepper = stepper
-        self._tell = tell
+        self._send = send
         self._waiting: asyncio.Task[None] | None = None
         self._sent_at = time.monotonic()
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """An observation has been sent."""
         self._sent_at = time.monotonic()
-        self.end()
+        self.cancel()
         session = self._session
         if session.world is None or session.world.over:
             return
@@ -49,7 +49,7 @@ class DeadlineTimer:
         if (deadline is not None and not session.late) or cap is not None:
             self._waiting = asyncio.create_task(self._wait(session.world.steps))
 
-    def end(self) -> None:
+    def cancel(self) -> None:
         """The action has arrived, or the controller has left."""
         if self._waiting is not None:
             self._waiting.cancel()
@@ -70,13 +70,13 @@ class DeadlineTimer:
             while (until := self._next(step)) is not None:
                 await asyncio.sleep(max(until - time.monotonic(), 0.0))
                 # The fallback itself must not be broken off half way by an action that arrives.
-                await asyncio.shield(asyncio.ensure_future(self._run_out(step)))
+                await asyncio.shield(asyncio.ensure_future(self._expire(step)))
                 step = self._session.lockstep.step or 0
         except Exception:
             log.exception("fallback failed", session_id=self._session.session_id)
 
     def _next(self, step: int) -> float | None:
-        """Monotonic time at which patience ends; None where it does not."""
+        """Monotonic time of the next deadline; None where there is none."""
         session = self._session
         if session.world is None or session.world.over or session.lockstep.step != step:
             return None
@@ -85,7 +85,7 @@ class DeadlineTimer:
             times.append(self._sent_at + session.spec.deadline_ms * 1e-3)
         return min(times, default=None)
 
-    async def _run_out(self, step: int) -> None:
+    async def _expire(self, step: int) -> None:
         session = self._session
         async with session.lock:
             if session.closed is not None or session.lockstep.step != step:
@@ -100,8 +100,8 @@ class DeadlineTimer:
             elif session.spec.on_timeout == "fail":
                 message = await self._stepper.stop(session, "deadline")
             else:
-                message = await self._stepper.miss(session)
+                message = await self._stepper.step_without_action(session)
             self._sent_at = time.monotonic()
         with contextlib.suppress(Exception):
-            await self._tell(message)
+            await self._send(message)
         self._sent_at = time.monotonic()

@@ -25,7 +25,7 @@ TYPES = "hello, reset, action, edit, render, agent, snapshot, restore, fork, bye
 
 
 @dataclass(frozen=True)
-class Incoming:
+class ReceivedMessage:
     """One message of a client.
 
     Attributes:
@@ -41,19 +41,19 @@ class BadMessageError(Exception):
     """A message that is refused before anybody looks at what it wants.
 
     Attributes:
-        refusal: what the client is told.
+        error: what the client is told.
         message_id: of the message, as far as it could be read.
         fatal: whether there is no sense in going on.
     """
 
-    def __init__(self, refusal: ServiceError, *, message_id: int = 0, fatal: bool = False) -> None:
-        super().__init__(refusal.detail)
-        self.refusal = refusal
+    def __init__(self, error: ServiceError, *, message_id: int = 0, fatal: bool = False) -> None:
+        super().__init__(error.detail)
+        self.error = error
         self.message_id = message_id
         self.fatal = fatal
 
 
-def read_message(data: bytes) -> Incoming:
+def read_message(data: bytes) -> ReceivedMessage:
     """The message in ``data``.
 
     Raises:
@@ -70,14 +70,16 @@ def read_message(data: bytes) -> Incoming:
             f"the message has protocol version {version!r}; this worker speaks {PROTOCOL_VERSION}. "
             "Install a client and a worker of the same major version."
         )
-        refusal = ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, detail)
-        raise BadMessageError(refusal, message_id=message_id, fatal=True)
+        mismatch = ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, detail)
+        raise BadMessageError(mismatch, message_id=message_id, fatal=True)
     try:
         message = CLIENT_MESSAGE.validate_python(fields)
     except ValidationError as error:
-        raise BadMessageError(bad_message(_sentence(error)), message_id=message_id) from error
+        raise BadMessageError(
+            bad_message(_validation_summary(error)), message_id=message_id
+        ) from error
     content = plan_payload(message.plan) if isinstance(message, Action) else b""
-    return Incoming(message, content)
+    return ReceivedMessage(message, content)
 
 
 def bad_message(detail: str) -> ServiceError:
@@ -97,7 +99,7 @@ def _id_of(fields: dict[str, Any]) -> int:
     return given if type(given) is int and 0 <= given <= 2**53 else 0
 
 
-def _sentence(error: ValidationError) -> str:
+def _validation_summary(error: ValidationError) -> str:
     """What is wrong and where: ``action/plan/poses/0/1: input should be a finite number``."""
     found = error.errors(include_url=False, include_context=False)
     texts = []

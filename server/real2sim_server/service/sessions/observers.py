@@ -11,7 +11,7 @@ KEPT = 4
 """Observations that wait for a slow observer; older ones are dropped."""
 
 
-class Mailbox:
+class ObserverQueue:
     """A few observations on their way to one observer. Whoever puts one in never waits.
 
     Attributes:

@@ -11,10 +11,10 @@ from ...world import World
 from ...world.recording.recording import Recording, record, to_bytes
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ..http.problems import ServiceError
-from .observation_renderer import ObservationRenderer
+from ..rendering.frames import EncodedFrame
+from .pipeline import StepPipeline
 from .registry import Sessions
-from .session import Session, Start
-from .wire import EncodedFrame
+from .session import EpisodeStart, Session
 
 RECORDING = "application/vnd.real2sim.episode"
 
@@ -55,21 +55,21 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
             no_action_impact=impact,
         )
 
-    recording = await sessions.show.on_world_thread(made)
+    recording = await sessions.pipeline.on_world_thread(made)
     if frames:
-        recording = replace(recording, frames=await _frames(sessions.show, start, entries))
-    return await sessions.show.on_world_thread(to_bytes, recording)
+        recording = replace(recording, frames=await _frames(sessions.pipeline, start, entries))
+    return await sessions.pipeline.on_world_thread(to_bytes, recording)
 
 
 async def _frames(
-    show: ObservationRenderer, start: Start, entries: Iterable[Entry]
+    pipeline: StepPipeline, start: EpisodeStart, entries: Iterable[Entry]
 ) -> Mapping[str, bytes]:
     replayer, kept, total = Replayer.on(start.scene, start.state), dict[str, bytes](), 0
     for entry in entries:
-        world = await show.on_world_thread(replayer.apply, entry)
+        world = await pipeline.on_world_thread(replayer.apply, entry)
         if entry.kind not in {"reset", "action"}:
             continue
-        for frame in await _drawn(show, world):
+        for frame in await _drawn(pipeline, world):
             kept[_name(frame, world.steps)] = bytes(frame.data)
             total += len(frame.data)
         if total > MAX_FRAMES_BYTES:
@@ -81,15 +81,15 @@ async def _frames(
     return kept
 
 
-async def _drawn(show: ObservationRenderer, world: World) -> list[EncodedFrame]:
+async def _drawn(pipeline: StepPipeline, world: World) -> list[EncodedFrame]:
     sensors = [
         s.model_copy(update={"codec": "png"}) if s.codec == "raw" else s
         for s in world.due_sensors()
     ]
-    return list((await show.view(world, sensors)).frames) if sensors else []
+    return list((await pipeline.view(world, sensors)).frames) if sensors else []
 
 
 def _name(frame: EncodedFrame, step: int) -> str:
     suffix = "jpg" if frame.codec == "jpeg" else "png"
-    fields = frame.head.fields
+    fields = frame.header.fields
     return f"frames/{fields['sensor']}/{fields['modality']}/{step:06d}.{suffix}"

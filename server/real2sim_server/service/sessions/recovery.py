@@ -14,12 +14,12 @@ from ..http.problems import ServiceError
 from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store
 from .log import entries_of
-from .observation_renderer import ObservationRenderer
-from .session import Session, Start
+from .pipeline import StepPipeline, Transition
+from .session import EpisodeStart, Session
 
 
 async def rebuild(
-    row: SessionRow, start: Start, *, store: Store, show: ObservationRenderer
+    row: SessionRow, start: EpisodeStart, *, store: Store, pipeline: StepPipeline
 ) -> Session:
     """The session as it was when its last entry took effect.
 
@@ -30,7 +30,7 @@ async def rebuild(
         row: of the session.
         start: its scene, pinned, and the objects it began from.
         store: has its log.
-        show: moves worlds and draws.
+        pipeline: moves worlds and draws.
     """
     session = Session(row, start)
     rows = await store.session_entries(row.session_id)
@@ -40,19 +40,19 @@ async def rebuild(
         return session
     replayer = Replayer.on(start.scene, start.state)
     *before, last = entries
-    await show.on_world_thread(_apply_all, replayer, before)
+    await pipeline.on_world_thread(_apply_all, replayer, before)
     session.snapshots = replayer.snapshots
     if last.kind == "action":
-        cameras = show.cameras(start.scene, _world(replayer).spec.sensors)
-        shown = await show.observe(lambda: replayer.apply(last), cameras)
-        session.begin(shown.world, cameras)
-        session.lockstep.reset(shown.world.steps, over=shown.world.over)
+        cameras = pipeline.cameras(start.scene, _world(replayer).spec.sensors)
+        observation = await pipeline.run(Transition(lambda: replayer.apply(last), cameras))
+        session.begin(observation.world, cameras)
+        session.lockstep.reset(observation.world.steps, over=observation.world.over)
         if not decode(last.payload).get("missed"):
-            session.lockstep.taken(_content(last), shown.message)
-        session.newest = shown.message
+            session.lockstep.taken(_content(last), observation.message)
+        session.newest = observation.message
         return session
-    world = await show.on_world_thread(replayer.apply, last)
-    session.begin(world, show.cameras(start.scene, world.spec.sensors))
+    world = await pipeline.on_world_thread(replayer.apply, last)
+    session.begin(world, pipeline.cameras(start.scene, world.spec.sensors))
     session.lockstep.reset(world.steps, over=world.over)
     return session
 

@@ -30,9 +30,9 @@ from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store, now_us
 from .describe import session_info
 from .log import entries_of
-from .observation_renderer import ObservationRenderer
+from .pipeline import StepPipeline
 from .recovery import check_scene, rebuild, state_at
-from .session import Session, Start
+from .session import EpisodeStart, Session
 from .step import Stepper
 
 RETRY_AFTER_S = 5
@@ -62,9 +62,9 @@ class Sessions:
 
     Args:
         limits: how many, and for how long.
-        show: draws what sessions look like.
+        pipeline: draws what sessions look like.
         store: where they and their logs are written before they take effect.
-        residency: keeps their scenes in memory.
+        scene_cache: keeps their scenes in memory.
         scenarios: what they may begin from.
         metrics: gets their number.
     """
@@ -73,23 +73,23 @@ class Sessions:
         self,
         limits: SessionLimits,
         *,
-        show: ObservationRenderer,
+        pipeline: StepPipeline,
         store: Store,
-        residency: SceneCache,
+        scene_cache: SceneCache,
         scenarios: Scenarios,
         metrics: Metrics,
     ) -> None:
-        self.show = show
-        self.stepper = Stepper(show, store)
+        self.pipeline = pipeline
+        self.stepper = Stepper(pipeline, store)
         self.draining = False
         self._limits = limits
         self._store = store
-        self._residency = residency
+        self._scene_cache = scene_cache
         self._scenarios = scenarios
         self._open: dict[str, Session] = {}
         self._in_creation = 0
         self._rebuilding: dict[str, asyncio.Task[Session]] = {}
-        self._farewells: set[asyncio.Future[None]] = set()
+        self._closing: set[asyncio.Future[None]] = set()
         # Objects of a bare scene are the same for all sessions on it.
         self._bare_states: WeakKeyDictionary[Scene, ScenarioState] = WeakKeyDictionary()
         self._warm: WeakSet[Scene] = WeakSet()
@@ -117,7 +117,7 @@ class Sessions:
             sweeping.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await sweeping
-            self.show.close()
+            self.pipeline.close()
 
     # --- life -------------------------------------------------------------------------------
 
@@ -127,7 +127,7 @@ class Sessions:
         scene: str | None,
         scenario: str | None,
         spec: ResetSpec | None,
-        once: IdempotentRequest,
+        idempotent: IdempotentRequest,
         ws_base: str,
     ) -> SessionInfo:
         """A new session on a scene or a scenario.
@@ -135,7 +135,7 @@ class Sessions:
         Args:
             scene, scenario: exactly one of them.
             spec: of the episode that begins at once; None waits for a reset.
-            once: what the answer is stored under.
+            idempotent: what the answer is stored under.
             ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
 
         Raises:
@@ -157,11 +157,11 @@ class Sessions:
                 if spec is not None:
                     await self.stepper.begin(session, spec)
                 info = session_info(session, ws_base=ws_base, token=row.token)
-                reply = once.reply(info, status=201, headers=created_headers(info))
+                reply = idempotent.reply(info, status=201, headers=created_headers(info))
                 await self._store.create_session(row, reply=reply)
                 await self.stepper.record_beginning(session)
             except BaseException:
-                self._residency.unpin(row.scene)
+                self._scene_cache.unpin(row.scene)
                 raise
             self._open[session.session_id] = session
         log.info("session created", session_id=session.session_id, scene=row.scene)
@@ -200,13 +200,13 @@ class Sessions:
                 token=secrets.token_urlsafe(24),
                 created_us=now_us(),
             )
-            await self._residency.pin(row.scene)
+            await self._scene_cache.pin(row.scene)
             try:
                 await self._store.create_session(row)
                 entries = await self._store.session_entries(session.session_id)
                 await self._store.append_session_entries(row.session_id, entries)
             except BaseException:
-                self._residency.unpin(row.scene)
+                self._scene_cache.unpin(row.scene)
                 raise
             forked = Session(row, session.start)
             forked.begin(world, session.cameras)
@@ -241,7 +241,7 @@ class Sessions:
                 context = replace(context, no_action_impact=no_action_impact(replayer, entries))
             return scores_of(world.accumulator, context)
 
-        return await self.show.on_world_thread(score)
+        return await self.pipeline.on_world_thread(score)
 
     async def close(self, session: Session, *, reason: str) -> None:
         """End a session once its step under way is done; a second time changes nothing."""
@@ -249,16 +249,16 @@ class Sessions:
             return
         session.closed = _closed(session.session_id, reason)
         async with session.lock:
-            self._residency.unpin(session.row.scene)
+            self._scene_cache.unpin(session.row.scene)
             await self._store.close_session(session.session_id, reason=reason)
-        for hangup in session.hangups:
+        for close in session.close_callbacks:
             # Nobody waits for clients that are slow to listen.
-            farewell = asyncio.ensure_future(hangup(session.closed))
-            self._farewells.add(farewell)
-            farewell.add_done_callback(self._farewells.discard)
+            closing = asyncio.ensure_future(close(session.closed))
+            self._closing.add(closing)
+            closing.add_done_callback(self._closing.discard)
         log.info("session closed", session_id=session.session_id, reason=reason)
 
-    def put_aside(self, session: Session) -> None:
+    def evict(self, session: Session) -> None:
         """Free the memory of a session that nobody is connected to; :meth:`find` brings it back."""
         if self._open.pop(session.session_id, None) is None:
             return
@@ -268,14 +268,14 @@ class Sessions:
             f"session {session.session_id!r} was put aside just now because nobody used it",
             hint="send it again: the session is rebuilt from its log",
         )
-        self._residency.unpin(session.row.scene)
+        self._scene_cache.unpin(session.row.scene)
         log.info("session put aside", session_id=session.session_id)
 
     async def warm_up(self, session: Session) -> None:
         """Draw the session's scene once, so that no observation waits for a first render."""
         scene = session.start.scene
         if scene not in self._warm:
-            await self.show.first_render(scene, session.start.state)
+            await self.pipeline.first_render(scene, session.start.state)
             self._warm.add(scene)
 
     # --- inside -----------------------------------------------------------------------------
@@ -310,33 +310,35 @@ class Sessions:
 
     async def _rebuild(self, row: SessionRow) -> Session:
         with self._place():
-            pinned = await self._residency.pin(row.scene)
+            pinned = await self._scene_cache.pin(row.scene)
             try:
-                summary = await self._residency.summary(row.scene)
+                summary = await self._scene_cache.summary(row.scene)
                 check_scene(row, summary.content_hash)
                 if row.scenario_id is not None and row.scenario_revision is not None:
                     state = await state_at(self._scenarios, row.scenario_id, row.scenario_revision)
                 else:
                     state = await self._bare_state(pinned)
-                start = Start(pinned, summary, state)
-                session = await rebuild(row, start, store=self._store, show=self.show)
+                start = EpisodeStart(pinned, summary, state)
+                session = await rebuild(row, start, store=self._store, pipeline=self.pipeline)
             except BaseException:
-                self._residency.unpin(row.scene)
+                self._scene_cache.unpin(row.scene)
                 raise
             self._open[row.session_id] = session
         log.info("session rebuilt", session_id=row.session_id, entries=session.next_seq)
         return session
 
-    async def _start(self, scene: str | None, scenario: str | None) -> tuple[SessionRow, Start]:
+    async def _start(
+        self, scene: str | None, scenario: str | None
+    ) -> tuple[SessionRow, EpisodeStart]:
         """What the new session is and begins from; its scene is pinned."""
         view = await self._scenarios.view(scenario) if scenario is not None else None
         name = view.row.scene if view is not None else str(scene)
-        pinned = await self._residency.pin(name)
+        pinned = await self._scene_cache.pin(name)
         try:
-            summary = await self._residency.summary(name)
+            summary = await self._scene_cache.summary(name)
             state = view.state if view is not None else await self._bare_state(pinned)
         except BaseException:
-            self._residency.unpin(name)
+            self._scene_cache.unpin(name)
             raise
         row = SessionRow(
             session_id=f"{self._limits.worker_id}.{secrets.token_hex(8)}",
@@ -348,7 +350,7 @@ class Sessions:
             token=secrets.token_urlsafe(24),
             created_us=now_us(),
         )
-        return row, Start(pinned, summary, state)
+        return row, EpisodeStart(pinned, summary, state)
 
     async def _bare_state(self, scene: Scene) -> ScenarioState:
         state = self._bare_states.get(scene)
@@ -365,7 +367,7 @@ class Sessions:
             for session in self:
                 unused = time.monotonic() - session.used_at
                 if unused > idle and not session.connected and not session.lock.locked():
-                    self.put_aside(session)
+                    self.evict(session)
 
 
 def created_headers(info: SessionInfo) -> dict[str, str]:

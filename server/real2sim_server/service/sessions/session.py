@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import ResetSpec
+from real2sim_proto.episode import ResetSpec
 
 from ...edit import ScenarioState
 from ...scene import Camera, Scene
@@ -18,15 +18,15 @@ from ...world import Event, World
 from ..http.problems import ServiceError
 from ..storage.store import SessionRow
 from .lockstep import LockStep, not_reset
-from .observers import Mailbox
+from .observers import ObserverQueue
 from .wire import Message
 
-Hangup = Callable[[ServiceError], Awaitable[None]]
+CloseWithError = Callable[[ServiceError], Awaitable[None]]
 """Tells a connection that its session is over, and ends it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class EpisodeStart:
     """What a session begins from, at its creation and at every reset.
 
     Attributes:
@@ -59,12 +59,12 @@ class Session:
         expires_at: monotonic time at which the episode is cut off [s]; None for never.
         controller: the connection that drives, if there is one.
         observers: what the connections that look on still have to be sent.
-        hangups: one for each open connection.
+        close_callbacks: one for each open connection.
         closed: why the session is over; None while it is not.
     """
 
     row: SessionRow
-    start: Start
+    start: EpisodeStart
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     world: World | None = None
     cameras: dict[str, Camera] = field(default_factory=dict)
@@ -76,8 +76,8 @@ class Session:
     late: bool = False
     expires_at: float | None = None
     controller: object | None = None
-    observers: set[Mailbox] = field(default_factory=set)
-    hangups: set[Hangup] = field(default_factory=set)
+    observers: set[ObserverQueue] = field(default_factory=set)
+    close_callbacks: set[CloseWithError] = field(default_factory=set)
     closed: ServiceError | None = None
     used_at: float = field(default_factory=time.monotonic)
 
@@ -89,7 +89,7 @@ class Session:
     @property
     def connected(self) -> bool:
         """Whether anybody is connected by socket."""
-        return bool(self.hangups)
+        return bool(self.close_callbacks)
 
     def touch(self) -> None:
         """Somebody uses the session."""
@@ -142,8 +142,8 @@ class Session:
     def publish(self, message: Message) -> None:
         """The newest observation, for all observers; never waits."""
         self.newest = message
-        for mailbox in self.observers:
-            mailbox.put(message)
+        for queue in self.observers:
+            queue.put(message)
 
 
 def controller_taken(session_id: str) -> ServiceError:

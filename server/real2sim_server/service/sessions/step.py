@@ -1,13 +1,14 @@
 """From one committed instant to the next, and to the bytes that show it.
 
-A change is made on a light copy of the world. While that is drawn, the change is written ahead to
-the session's log; it takes effect once its observation is encoded and packed. Whatever goes wrong
-before leaves the session as it was, and what is in its log already is withdrawn.
+A change is made on a fork of the world and passes the step pipeline (`pipeline`), which writes it
+ahead to the session's log; it takes effect once its observation is encoded and packed. Whatever
+goes wrong before leaves the session as it was, and what is in its log already is withdrawn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Agent
@@ -28,11 +29,11 @@ from ...world.recording.replay import (
 )
 from ..http.problems import ServiceError
 from ..storage.store import SessionEntry, Store, now_us
-from .observation_renderer import EncodedObservation, ObservationRenderer, Tell
+from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
 from .wire import Message
 
-Thing = tuple[str, int, bytes]
+LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
 
 MAX_SNAPSHOTS = 32
@@ -45,12 +46,12 @@ class Stepper:
     """Moves the worlds of sessions; for whoever holds the session's lock.
 
     Args:
-        show: makes observations of instants.
+        pipeline: makes observations of changed worlds.
         store: takes the logs of the sessions.
     """
 
-    def __init__(self, show: ObservationRenderer, store: Store) -> None:
-        self._show = show
+    def __init__(self, pipeline: StepPipeline, store: Store) -> None:
+        self._pipeline = pipeline
         self._store = store
 
     async def reset(self, session: Session, spec: ResetSpec) -> Message:
@@ -59,24 +60,24 @@ class Stepper:
         Raises:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
-        cameras = self._show.cameras(session.start.scene, spec.sensors)
-        thing = ("reset", 0, reset_payload(spec))
-        shown = await self._show_and_record(session, _beginning(session, spec), cameras, thing)
-        session.begin(shown.world, cameras)
-        session.publish(shown.message)
-        return shown.message
+        cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
+        record = ("reset", 0, reset_payload(spec))
+        observation, _ = await self._observe(session, _beginning(session, spec), cameras, record)
+        session.begin(observation.world, cameras)
+        session.publish(observation.message)
+        return observation.message
 
     async def restart(self, session: Session, spec: ResetSpec) -> None:
         """Begin an episode of which nobody needs the first observation. Raises like reset()."""
-        cameras = self._show.cameras(session.start.scene, spec.sensors)
-        world = await self._show.on_world_thread(_beginning(session, spec))
+        cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
+        world = await self._pipeline.on_world_thread(_beginning(session, spec))
         await self._record(session, [("reset", 0, reset_payload(spec))])
         session.begin(world, cameras)
 
     async def begin(self, session: Session, spec: ResetSpec) -> None:
         """Like restart(), for a session that is not in the store yet: record it once it is."""
-        cameras = self._show.cameras(session.start.scene, spec.sensors)
-        world = await self._show.on_world_thread(_beginning(session, spec))
+        cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
+        world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
 
     async def record_beginning(self, session: Session) -> None:
@@ -91,77 +92,70 @@ class Stepper:
         payload: bytes,
         *,
         latency_us: int = 0,
-        tell: Tell | None = None,
-    ) -> Message:
-        """Take the action that is due; the next observation.
+        write: Callable[[Message], bool] | None = None,
+    ) -> Message | None:
+        """Take the action that is due; the next observation, None where it is written already.
 
         Args:
             session: its lock step wants this action now.
             plan: what the ego does.
             payload: canonical bytes of the plan.
             latency_us: wall-clock time from the observation to this action.
-            tell: may get the observation before it is returned, see
-                :meth:`ObservationRenderer.observe`.
+            write: may hand the observation to the socket before this returns; see
+                :class:`~.pipeline.Transition`.
 
         Raises:
             WorldError: the plan is refused.
             QueueFullError: too much waits for the engine; the same action may be sent again.
         """
         measured = session.spec.latency.model == "measured"
-        told = {"latency_us": latency_us if measured else 0, "missed": session.late}
-        recorded = action_payload(plan, **told) if any(told.values()) else payload
-        shown = await self._step(
-            session, lambda world: world.move(plan, **told), recorded, tell=tell
-        )
-        session.lockstep.advance(payload, shown.message, over=shown.world.over)
-        return shown.message
+        latency_us, missed = latency_us if measured else 0, session.late
+        entry = payload
+        if latency_us or missed:
+            entry = action_payload(plan, latency_us=latency_us, missed=missed)
+        change = partial(_moved, session.running_world(), plan, latency_us, missed)
+        observation, written = await self._step(session, change, entry, write=write)
+        session.lockstep.advance(payload, observation.message, over=observation.world.over)
+        return None if written else observation.message
 
-    async def miss(self, session: Session) -> Message:
-        """Go on without the action that is due, by the episode's fallback; what to tell.
+    async def step_without_action(self, session: Session) -> Message:
+        """Go on without the action that is due, by the episode's fallback; the observation.
 
-        Whoever sends that action later is told that it is stale.
+        That action is stale from here on.
         """
-        recorded = action_payload(None, missed=True)
-        shown = await self._step(session, lambda world: world.move(missed=True), recorded)
-        session.lockstep.skip(1, over=shown.world.over)
-        return shown.message
+        change = partial(_moved, session.running_world(), None, 0, True)
+        entry = action_payload(None, missed=True)
+        observation, _ = await self._step(session, change, entry)
+        session.lockstep.skip(1, over=observation.world.over)
+        return observation.message
 
     async def stop(self, session: Session, reason: str) -> Message:
         """End the episode where it is; the present observation with the reason."""
         now = session.running_world()
-
-        def stopped() -> World:
-            world = now.fork()
-            world.stop(reason)
-            return world
-
-        thing = ("stop", now.steps, stop_payload(reason))
-        shown = await self._show_and_record(session, stopped, session.cameras, thing)
-        session.world = shown.world
+        record = ("stop", now.steps, stop_payload(reason))
+        observation, _ = await self._observe(
+            session, partial(_stopped, now, reason), session.cameras, record
+        )
+        session.world = observation.world
         session.lockstep.end()
-        session.publish(shown.message)
-        return shown.message
+        session.publish(observation.message)
+        return observation.message
 
     async def _step(
         self,
         session: Session,
-        move: Callable[[World], None],
+        change: Callable[[], World],
         payload: bytes,
         *,
-        tell: Tell | None = None,
-    ) -> EncodedObservation:
-        now = session.running_world()
-
-        def moved() -> World:
-            world = now.fork()
-            move(world)
-            return world
-
-        thing = ("action", now.steps, payload)
-        shown = await self._show_and_record(session, moved, session.cameras, thing, tell=tell)
-        session.world, session.late = shown.world, False
-        session.publish(shown.message)
-        return shown
+        write: Callable[[Message], bool] | None = None,
+    ) -> tuple[EncodedObservation, bool]:
+        record = ("action", session.running_world().steps, payload)
+        observation, written = await self._observe(
+            session, change, session.cameras, record, write=write
+        )
+        session.world, session.late = observation.world, False
+        session.publish(observation.message)
+        return observation, written
 
     async def step(self, session: Session, n: int, plan: Plan | None) -> None:
         """Move the clock ``n`` times under one plan, or to the end; nothing is drawn.
@@ -173,7 +167,7 @@ class Stepper:
         while left and (left == n or not session.running_world().over):
             now = session.running_world()
             count = min(STEPS_AT_ONCE, left)
-            world, events = await self._show.on_world_thread(_moved_on(now, count, given))
+            world, events = await self._pipeline.on_world_thread(_moved_on, now, count, given)
             done = world.steps - now.steps
             payloads = [action_payload(given), *[KEPT_PLAN] * (done - 1)]
             entries = [("action", now.steps + k, p) for k, p in enumerate(payloads)]
@@ -193,22 +187,22 @@ class Stepper:
             world = now.fork()
             return world, world.apply(operations, base_revision=base_rev)
 
-        world, outcome = await self._show.on_world_thread(edited)
+        world, outcome = await self._pipeline.on_world_thread(edited)
         await self._record(session, [("edit", now.steps, edit_payload(operations))])
         session.world = world
         return outcome
 
-    async def steer(self, session: Session, asked: Agent) -> None:
+    async def set_agent_plan(self, session: Session, message: Agent) -> None:
         """Give an externally driven object a plan. Raises WorldError."""
         now = session.running_world()
 
         def steered() -> World:
             world = now.fork()
-            world.set_agent_plan(asked.object_id, asked.times_us, asked.poses)
+            world.set_agent_plan(message.object_id, message.times_us, message.poses)
             return world
 
-        world = await self._show.on_world_thread(steered)
-        payload = agent_payload(asked.object_id, asked.times_us, asked.poses)
+        world = await self._pipeline.on_world_thread(steered)
+        payload = agent_payload(message.object_id, message.times_us, message.poses)
         await self._record(session, [("agent", now.steps, payload)])
         session.world = world
 
@@ -231,60 +225,55 @@ class Stepper:
         Raises:
             ServiceError: NOT_FOUND.
         """
-        kept = session.snapshots.get(name)
-        if kept is None:
+        snapshot = session.snapshots.get(name)
+        if snapshot is None:
             named = ", ".join(sorted(session.snapshots)) or "none"
             raise ServiceError(
                 ErrorCode.NOT_FOUND,
                 f"the session has no snapshot {name!r}",
                 hint=f"snapshots of this session: {named}",
             )
-        cameras = self._show.cameras(kept.scene, kept.spec.sensors)
-        thing = ("restore", kept.steps, name_payload(name))
-        shown = await self._show_and_record(session, lambda: kept, cameras, thing)
-        session.begin(kept, cameras)
-        session.lockstep.reset(kept.steps, over=kept.over)
-        session.publish(shown.message)
-        return shown.message
+        cameras = self._pipeline.cameras(snapshot.scene, snapshot.spec.sensors)
+        record = ("restore", snapshot.steps, name_payload(name))
+        observation, _ = await self._observe(session, lambda: snapshot, cameras, record)
+        session.begin(snapshot, cameras)
+        session.lockstep.reset(snapshot.steps, over=snapshot.over)
+        session.publish(observation.message)
+        return observation.message
 
-    async def _show_and_record(
+    async def _observe(
         self,
         session: Session,
         change: Callable[[], World],
         cameras: Mapping[str, Camera],
-        thing: Thing,
+        record: LogRecord,
         *,
-        tell: Tell | None = None,
-    ) -> EncodedObservation:
-        entries = _entries(session, [thing])
-        recorded = False
-
-        def settle(world: World) -> None:
-            nonlocal recorded
-            world.evaluate()
-            self._store.record(session.session_id, entries)
-            recorded = True
-
+        write: Callable[[Message], bool] | None = None,
+    ) -> tuple[EncodedObservation, bool]:
+        """The observation of a change, and whether it is written to the socket already."""
+        entries = _entries(session, [record])
+        store = partial(self._store.record, session.session_id, entries)
+        transition = Transition(change, cameras, record=store, write=write)
         try:
-            shown = await self._show.observe(change, cameras, settle=settle, tell=tell)
+            observation = await self._pipeline.run(transition)
         except Exception:
-            if recorded:
+            if transition.recorded:
                 await self._store.withdraw(session.session_id, from_seq=session.next_seq)
             raise
         session.next_seq += len(entries)
-        return shown
+        return observation, transition.sent
 
-    async def _record(self, session: Session, things: Sequence[Thing]) -> None:
-        entries = _entries(session, things)
+    async def _record(self, session: Session, records: Sequence[LogRecord]) -> None:
+        entries = _entries(session, records)
         await self._store.append_session_entries(session.session_id, entries)
         session.next_seq += len(entries)
 
 
-def _entries(session: Session, things: Sequence[Thing]) -> list[SessionEntry]:
+def _entries(session: Session, records: Sequence[LogRecord]) -> list[SessionEntry]:
     created_us = now_us()
     return [
         SessionEntry(session.next_seq + k, kind, step, payload, created_us)
-        for k, (kind, step, payload) in enumerate(things)
+        for k, (kind, step, payload) in enumerate(records)
     ]
 
 
@@ -293,12 +282,21 @@ def _beginning(session: Session, spec: ResetSpec) -> Callable[[], World]:
     return lambda: World(start.scene, start.state, spec)
 
 
-def _moved_on(now: World, count: int, plan: Plan | None) -> Callable[[], tuple[World, list[Event]]]:
-    def move() -> tuple[World, list[Event]]:
-        world = now.fork()
-        events = world.step(plan)
-        while world.steps < now.steps + count and not world.over:
-            events += world.step()
-        return world, events
+def _moved(now: World, plan: Plan | None, latency_us: int, missed: bool) -> World:
+    world = now.fork()
+    world.move(plan, latency_us=latency_us, missed=missed)
+    return world
 
-    return move
+
+def _stopped(now: World, reason: str) -> World:
+    world = now.fork()
+    world.stop(reason)
+    return world
+
+
+def _moved_on(now: World, count: int, plan: Plan | None) -> tuple[World, list[Event]]:
+    world = now.fork()
+    events = world.step(plan)
+    while world.steps < now.steps + count and not world.over:
+        events += world.step()
+    return world, events

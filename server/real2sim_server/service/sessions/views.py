@@ -6,25 +6,25 @@ from collections.abc import Sequence
 
 from fastapi import Response
 
-from real2sim_proto.drive import SensorSpec
+from real2sim_proto.episode import SensorSpec
 
 from ...world import World
-from ..http.responses import CODEC_OF, choose_among, choose_media_type
-from ..library.views import etag
-from .observation_renderer import ObservationRenderer
+from ..http.responses import choose_among, etag
+from ..rendering.responses import CODEC_OF, choose_media_type
+from .pipeline import StepPipeline
 
 MSGPACK = "application/msgpack"
 
 
 async def view_response(
-    show: ObservationRenderer, world: World, sensors: Sequence[SensorSpec], accept: str | None
+    pipeline: StepPipeline, world: World, sensors: Sequence[SensorSpec], accept: str | None
 ) -> Response:
     """All frames as msgpack; a single one also as an image file, if ``accept`` likes that best.
 
     In msgpack each frame has the codec its sensor names.
 
     Raises:
-        ServiceError: NOT_ACCEPTABLE, or as Show.view().
+        ServiceError: NOT_ACCEPTABLE, or as StepPipeline.view().
     """
     single = len(sensors) == 1 and len(sensors[0].modalities) == 1
     if single:
@@ -33,8 +33,8 @@ async def view_response(
         media_type = choose_among([MSGPACK], accept, of="more than one image")
     if media_type != MSGPACK:
         sensors = [sensors[0].model_copy(update={"codec": CODEC_OF[media_type]})]
-    shown = await show.view(world, sensors)
-    timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in shown.timing_ms.items())
+    observation = await pipeline.view(world, sensors)
+    timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in observation.timing_ms.items())
     headers = {
         "Server-Timing": timing,
         "Vary": "Accept",
@@ -42,7 +42,7 @@ async def view_response(
         "X-Real2Sim-Revision": etag(world.revision),
     }
     if media_type == MSGPACK:
-        content = await show.on_world_thread(shown.message.joined)
+        content = await pipeline.on_world_thread(observation.message.joined)
     else:
-        content = bytes(shown.frames[0].data)
+        content = bytes(observation.frames[0].data)
     return Response(content, media_type=media_type, headers=headers)

@@ -66,7 +66,7 @@ class Store:
     def __init__(self, url: str) -> None:
         self.url = url
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="store")
-        self._writing = threading.Lock()
+        self._write_lock = threading.Lock()
         self._engine: sa.Engine | None = None
         self._writer: sa.Connection | None = None
 
@@ -95,8 +95,8 @@ class Store:
         """Add a scenario with a log that it may have, and in the same transaction the answer to
         the request for it; ``entries`` hold their revisions."""
         rows = [_log_row(row.scenario_id, e["revision"], e, row.created_us) for e in entries]
-        log = [_added(t.scenario_log, *rows)] if rows else []
-        await self._write(_added(t.scenarios, asdict(row)), *log, *_keep(reply))
+        log = [_insert_rows(t.scenario_log, *rows)] if rows else []
+        await self._write(_insert_rows(t.scenarios, asdict(row)), *log, *_reply_writes(reply))
 
     async def scenario(self, scenario_id: str) -> ScenarioRow | None:
         """The scenario of that id."""
@@ -142,7 +142,7 @@ class Store:
             ConflictError: the revision exists, or the scenario does not.
         """
         row = _log_row(scenario_id, revision, entry, created_us)
-        self._written([_added(t.scenario_log, row), *_keep(reply)])
+        self._execute([_insert_rows(t.scenario_log, row), *_reply_writes(reply)])
 
     async def scenario_entries(self, scenario_id: str) -> list[dict[str, Any]]:
         """The log of a scenario, oldest first."""
@@ -151,7 +151,7 @@ class Store:
         rows = await self._read(query.order_by(log.c.revision))
         return [json.loads(row["entry"]) for row in rows]
 
-    async def keep_snapshot(self, row: SnapshotRow) -> None:
+    async def save_snapshot(self, row: SnapshotRow) -> None:
         """Keep it in place of an older one of its scenario.
 
         Raises:
@@ -159,7 +159,7 @@ class Store:
         """
         await self._write(
             Write(sa.delete(t.scenario_snapshots).where(_snapshot_of(row.scenario_id))),
-            _added(t.scenario_snapshots, asdict(row)),
+            _insert_rows(t.scenario_snapshots, asdict(row)),
         )
 
     async def snapshot(self, scenario_id: str) -> SnapshotRow | None:
@@ -188,7 +188,7 @@ class Store:
 
     async def create_session(self, row: SessionRow, *, reply: StoredReply | None = None) -> None:
         """Add a session, and in the same transaction the answer to the request for it."""
-        await self._write(_added(t.sessions, asdict(row)), *_keep(reply))
+        await self._write(_insert_rows(t.sessions, asdict(row)), *_reply_writes(reply))
 
     async def session(self, session_id: str) -> SessionRow | None:
         """The session of that id, open or closed."""
@@ -223,7 +223,7 @@ class Store:
         """Like :meth:`append_session_entries`, on the calling thread; never on the event loop."""
         rows = [{"session_id": session_id} | vars(entry) for entry in entries]
         if rows:
-            self._written([_added(t.session_log, *rows)])
+            self._execute([_insert_rows(t.session_log, *rows)])
 
     async def withdraw(self, session_id: str, *, from_seq: int) -> None:
         """Remove the end of a session's log: what was recorded ahead and never took effect."""
@@ -263,7 +263,7 @@ class Store:
         Raises:
             ConflictError: a row that must be new exists.
         """
-        return await self._write(*changes, *_keep(reply))
+        return await self._write(*changes, *_reply_writes(reply))
 
     # --- inside -----------------------------------------------------------------------------
 
@@ -282,12 +282,12 @@ class Store:
 
     async def _write(self, *changes: Write) -> list[int]:
         """Rows changed by each statement, in one transaction."""
-        return await self._run(self._written, changes)
+        return await self._run(self._execute, changes)
 
-    def _written(self, changes: Sequence[Write]) -> list[int]:
+    def _execute(self, changes: Sequence[Write]) -> list[int]:
         try:
             # SQLite lets those who find it locked sleep and try again; they had better queue here.
-            with self._writing, self._transaction() as connection:
+            with self._write_lock, self._transaction() as connection:
                 return [connection.execute(c.statement, c.rows).rowcount for c in changes]
         except DBAPIError as error:
             if _is_conflict(error):
@@ -365,7 +365,7 @@ def _log_row(
     }
 
 
-def _added(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
+def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
     return Write(_insert(table), [dict(row) for row in rows])
 
 
@@ -375,8 +375,8 @@ def _insert(table: sa.Table) -> sa.Insert:
     return sa.insert(table)
 
 
-def _keep(reply: StoredReply | None) -> list[Write]:
+def _reply_writes(reply: StoredReply | None) -> list[Write]:
     if reply is None:
         return []
     row = asdict(reply) | {"headers": json.dumps(dict(reply.headers)), "created_us": now_us()}
-    return [Write(_delete_old_replies()), _added(t.idempotent_replies, row)]
+    return [Write(_delete_old_replies()), _insert_rows(t.idempotent_replies, row)]

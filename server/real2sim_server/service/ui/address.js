@@ -1,11 +1,23 @@
 // What is open, in the address: a link shows the same to somebody else.
 import { model, on } from "./model.js";
-export const asked = () => Object.fromEntries(new URLSearchParams(location.search));
+export const addressParameters = () => Object.fromEntries(new URLSearchParams(location.search));
 let waiting = null;
-export function startAddress() { on("scenario selection time camera run mosaic", () => { waiting ??= setTimeout(write, 250); }); write(); }
+export function startAddress() {
+  on("scenario selection time camera run mosaic", () => {
+    waiting ??= setTimeout(write, 250);
+  });
+  write();
+}
 function write() {
   waiting = null;
-  const values = { scene: model.scenario.scene, scenario: model.scenario.scenario_id, camera: model.mosaic ? "*" : model.camera, t: model.t, selected: model.selected, run: model.job };
+  const values = {
+    scene: model.scenario.scene,
+    scenario: model.scenario.scenario_id,
+    camera: model.mosaic ? "*" : model.camera,
+    t: model.t,
+    selected: model.selected,
+    run: model.job,
+  };
   const query = new URLSearchParams(Object.entries(values).filter(([, v]) => v !== null));
   history.replaceState(null, "", `?${query}`);
 }

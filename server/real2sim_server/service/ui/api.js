@@ -2,7 +2,7 @@
 const KEY = "real2sim-token";
 export const token = () => sessionStorage.getItem(KEY) ?? "";
 
-export class Refused extends Error {
+export class ApiError extends Error {
   constructor(problem, status) {
     const detail = problem.detail ?? `the worker answered with status ${status}`;
     super(sentence(problem.hint ? `${detail}: ${problem.hint}` : detail));
@@ -19,8 +19,12 @@ export const sentence = (text) => {
 
 export async function call(method, path, { body, headers = {}, accept = "application/json" } = {}) {
   const given = { Accept: accept, "X-Real2Sim-Client": "studio", ...headers };
-  if (token()) given.Authorization = `Bearer ${token()}`;
-  if (body !== undefined) given["Content-Type"] = "application/json";
+  if (token()) {
+    given.Authorization = `Bearer ${token()}`;
+  }
+  if (body !== undefined) {
+    given["Content-Type"] = "application/json";
+  }
   let answer;
   try {
     const content = body === undefined ? undefined : JSON.stringify(body);
@@ -32,12 +36,15 @@ export async function call(method, path, { body, headers = {}, accept = "applica
     await askForToken();
     return call(method, path, { body, headers, accept });
   }
-  if (!answer.ok) throw new Refused(await answer.json().catch(() => ({})), answer.status);
+  if (!answer.ok) {
+    throw new ApiError(await answer.json().catch(() => ({})), answer.status);
+  }
   return answer;
 }
 
 export const get = async (path) => (await call("GET", path)).json();
-export const post = async (path, body, headers) => (await call("POST", path, { body, headers })).json();
+export const post = async (path, body, headers) =>
+  (await call("POST", path, { body, headers })).json();
 export const picture = async (path, accept = "image/jpeg") =>
   URL.createObjectURL(await (await call("GET", path, { accept })).blob());
 
@@ -48,13 +55,21 @@ export async function* events(path) {
   let text = "";
   for (;;) {
     const { value, done } = await reader.read();
-    if (done) return;
+    if (done) {
+      return;
+    }
     text += value;
     const messages = text.split("\n\n");
     text = messages.pop();
     for (const message of messages) {
-      const data = message.split("\n").filter((line) => line.startsWith("data: ")).map((line) => line.slice(6)).join("");
-      if (data) yield JSON.parse(data);
+      const data = message
+        .split("\n")
+        .filter((line) => line.startsWith("data: "))
+        .map((line) => line.slice(6))
+        .join("");
+      if (data) {
+        yield JSON.parse(data);
+      }
     }
   }
 }
@@ -64,11 +79,15 @@ export function askForToken() {
   asking ??= new Promise((done) => {
     const dialog = document.getElementById("token");
     dialog.showModal();
-    dialog.addEventListener("close", () => {
-      sessionStorage.setItem(KEY, dialog.querySelector("input").value);
-      asking = null;
-      done();
-    }, { once: true });
+    dialog.addEventListener(
+      "close",
+      () => {
+        sessionStorage.setItem(KEY, dialog.querySelector("input").value);
+        asking = null;
+        done();
+      },
+      { once: true },
+    );
   });
   return asking;
 }

@@ -1,35 +1,58 @@
 // The camera picture: asks for frames, selects on a click, outlines the selection, flies freely.
-import { model, on, tell, object, poseOf, draftOperations, select, refresh } from "./model.js";
+import { model, on, emit, object, poseOf, draftOperations, select, refresh } from "./model.js";
 import { ViewSocket } from "./view_socket.js";
 import { project, rotate, present } from "./poses.js";
-import { attempt, say } from "./messages.js";
+import { attempt, notify } from "./messages.js";
 
 const $ = (id) => document.getElementById(id);
-const MOVING_WIDTH = 640, STILL_WIDTH = 1600, STILL_AFTER_MS = 180;
-let socket, header, url, still, arrivals = [];
+const MOVING_WIDTH = 640;
+const STILL_WIDTH = 1600;
+const STILL_AFTER_MS = 180;
+let socket;
+let header;
+let url;
+let still;
+let arrivals = [];
 
 export function startView() {
   socket = new ViewSocket(model.scenario.scenario_id, {
-    onFrame: show, onPick: select, onChanged: attempt(refresh), onError: (text) => say(text, "bad") });
-  on("time draft camera", () => look(true));
-  on("scenario run", () => look(false));
+    onFrame: show,
+    onPick: select,
+    onChanged: attempt(refresh),
+    onError: (text) => notify(text, "bad"),
+  });
+  on("time draft camera", () => requestFrame(true));
+  on("scenario run", () => requestFrame(false));
   on("selection draft scenario", outline);
   new ResizeObserver(outline).observe($("stage"));
   fly($("stage"));
-  look(false);
+  requestFrame(false);
 }
 
-function question(width) {
-  return { camera: model.camera, t_us: model.t, width, job: model.job,
-    T_world_camera: model.free, operations: model.job ? [] : draftOperations() };
+function viewRequest(width) {
+  return {
+    camera: model.camera,
+    t_us: model.t,
+    width,
+    job: model.job,
+    T_world_camera: model.free,
+    operations: model.job ? [] : draftOperations(),
+  };
 }
 
 // Small pictures while something moves, a full one as soon as it rests.
-function look(moving) {
-  if (model.mosaic) return;
+function requestFrame(moving) {
+  if (model.mosaic) {
+    return;
+  }
   clearTimeout(still);
-  if (moving) socket.look(question(Math.min(MOVING_WIDTH, fullWidth())));
-  still = setTimeout(() => socket.look(question(fullWidth())), moving ? STILL_AFTER_MS : 0);
+  if (moving) {
+    socket.requestFrame(viewRequest(Math.min(MOVING_WIDTH, fullWidth())));
+  }
+  still = setTimeout(
+    () => socket.requestFrame(viewRequest(fullWidth())),
+    moving ? STILL_AFTER_MS : 0,
+  );
 }
 // Gaussians have no pixels of their own: the picture at rest is as fine as the stage shows it.
 function fullWidth() {
@@ -47,10 +70,15 @@ function show(head, blob) {
   $("picture").src = url;
   $("picture").dataset.seq = head.seq;
   // A picture may be the first to tell of somebody else's edit; nothing else tells of it again.
-  if (head.revision > model.scenario.revision) socket.onChanged();
+  if (head.revision > model.scenario.revision) {
+    socket.onChanged();
+  }
   const now = performance.now();
   arrivals = [...arrivals.filter((t) => now - t < 1000), now];
-  $("rate").textContent = arrivals.length > 2 ? `${arrivals.length} fps · ${head.width}×${head.height}` : `${head.width}×${head.height}`;
+  $("rate").textContent =
+    arrivals.length > 2
+      ? `${arrivals.length} fps · ${head.width}×${head.height}`
+      : `${head.width}×${head.height}`;
   outline();
 }
 
@@ -73,69 +101,120 @@ function outline() {
   canvas.width = canvas.clientWidth * devicePixelRatio;
   canvas.height = canvas.clientHeight * devicePixelRatio;
   const subject = object(model.selected);
-  $("stage-hint").textContent = subject ? subject.object_id : model.free || model.mosaic ? "" : "Click an object to select it";
-  if (!header || !subject || !present(subject, model.t)) return;
+  $("stage-hint").textContent = subject
+    ? subject.object_id
+    : model.free || model.mosaic
+      ? ""
+      : "Click an object to select it";
+  if (!header || !subject || !present(subject, model.t)) {
+    return;
+  }
   const { scale, left, top } = frameBox();
   const pen = canvas.getContext("2d");
   pen.scale(devicePixelRatio, devicePixelRatio);
   const { position, quaternion } = poseOf(subject);
   const corners = [...Array(8).keys()].map((i) => {
     const offset = subject.size.map((s, axis) => ((i >> axis) & 1 ? s : -s) / 2);
-    const pixel = project(rotate(quaternion, offset).map((v, k) => v + position[k]), header.T_world_camera, header.K);
+    const pixel = project(
+      rotate(quaternion, offset).map((v, k) => v + position[k]),
+      header.T_world_camera,
+      header.K,
+    );
     return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
   });
   pen.strokeStyle = "#ffb454";
   pen.lineWidth = 1.6;
-  for (let a = 0; a < 8; a++) for (const bit of [1, 2, 4]) {
-    const b = a | bit;
-    if (b === a || !corners[a] || !corners[b]) continue;
-    pen.beginPath(); pen.moveTo(...corners[a]); pen.lineTo(...corners[b]); pen.stroke();
+  for (let a = 0; a < 8; a++) {
+    for (const bit of [1, 2, 4]) {
+      const b = a | bit;
+      if (b === a || !corners[a] || !corners[b]) {
+        continue;
+      }
+      pen.beginPath();
+      pen.moveTo(...corners[a]);
+      pen.lineTo(...corners[b]);
+      pen.stroke();
+    }
   }
 }
 
 export function toggleFree() {
-  model.free = model.free ? null : header?.T_world_camera?.slice() ?? null;
+  model.free = model.free ? null : (header?.T_world_camera?.slice() ?? null);
   $("free").classList.toggle("on", !!model.free);
   $("stage").classList.toggle("free", !!model.free);
-  tell("camera");
+  emit("camera");
 }
 
 function fly(stage) {
-  let from = null, moved = 0;
+  let from = null;
+  let moved = 0;
   stage.addEventListener("contextmenu", (e) => e.preventDefault());
-  stage.addEventListener("pointerdown", (e) => { from = e; moved = 0; if (model.free) stage.setPointerCapture(e.pointerId); });
+  stage.addEventListener("pointerdown", (e) => {
+    from = e;
+    moved = 0;
+    if (model.free) {
+      stage.setPointerCapture(e.pointerId);
+    }
+  });
   stage.addEventListener("pointermove", (e) => {
-    if (!from) return;
-    const dx = e.clientX - from.clientX, dy = e.clientY - from.clientY;
+    if (!from) {
+      return;
+    }
+    const dx = e.clientX - from.clientX;
+    const dy = e.clientY - from.clientY;
     moved += Math.abs(dx) + Math.abs(dy);
-    if (model.free) { from.button === 2 ? shift(-dx * 0.02, -dy * 0.02, 0) : turn(dx * 0.004, dy * 0.004); from = keep(e, from.button); }
+    if (model.free) {
+      from.button === 2 ? shift(-dx * 0.02, -dy * 0.02, 0) : turn(dx * 0.004, dy * 0.004);
+      from = keep(e, from.button);
+    }
   });
   stage.addEventListener("pointerup", (e) => {
-    if (from && moved < 4 && from.button === 0 && !model.mosaic) pickAt(e);
+    if (from && moved < 4 && from.button === 0 && !model.mosaic) {
+      pickAt(e);
+    }
     from = null;
   });
-  stage.addEventListener("wheel", (e) => { if (model.free) { e.preventDefault(); shift(0, 0, -e.deltaY * 0.01); } }, { passive: false });
+  stage.addEventListener(
+    "wheel",
+    (e) => {
+      if (model.free) {
+        e.preventDefault();
+        shift(0, 0, -e.deltaY * 0.01);
+      }
+    },
+    { passive: false },
+  );
 }
 const keep = ({ clientX, clientY }, button) => ({ clientX, clientY, button });
 
 function pickAt(e) {
-  if (!header) return;
+  if (!header) {
+    return;
+  }
   const { scale, left, top } = frameBox();
   const box = $("stage").getBoundingClientRect();
-  const pick = [(e.clientX - box.left - left) / scale / header.width, (e.clientY - box.top - top) / scale / header.height];
-  if (pick.every((v) => v >= 0 && v <= 1)) socket.pick({ ...question(MOVING_WIDTH), pick });
+  const pick = [
+    (e.clientX - box.left - left) / scale / header.width,
+    (e.clientY - box.top - top) / scale / header.height,
+  ];
+  if (pick.every((v) => v >= 0 && v <= 1)) {
+    socket.pick({ ...viewRequest(MOVING_WIDTH), pick });
+  }
 }
 
 // Camera axes are the columns of T: right, down, forward.
 export function shift(right, down, forward) {
   const T = model.free.slice();
-  for (let i = 0; i < 3; i++) T[4 * i + 3] += T[4 * i] * right + T[4 * i + 1] * down + T[4 * i + 2] * forward;
+  for (let i = 0; i < 3; i++) {
+    T[4 * i + 3] += T[4 * i] * right + T[4 * i + 1] * down + T[4 * i + 2] * forward;
+  }
   model.free = T;
-  tell("camera");
+  emit("camera");
 }
 function turn(yaw, pitch) {
   const T = model.free.slice();
-  const [c, s] = [Math.cos(yaw), Math.sin(yaw)], [d, e] = [Math.cos(pitch), Math.sin(pitch)];
+  const [c, s] = [Math.cos(yaw), Math.sin(yaw)];
+  const [d, e] = [Math.cos(pitch), Math.sin(pitch)];
   for (let column = 0; column < 3; column++) {
     const [x, y] = [T[column], T[4 + column]];
     T[column] = c * x - s * y;
@@ -147,5 +226,5 @@ function turn(yaw, pitch) {
     T[4 * i + 2] = d * forward - e * down;
   }
   model.free = T;
-  tell("camera");
+  emit("camera");
 }

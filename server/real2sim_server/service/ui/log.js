@@ -1,57 +1,121 @@
 // What was done: every revision, as Python and as curl.
 import { model, on } from "./model.js";
 import { el } from "./dom.js";
-import { say, attempt } from "./messages.js";
+import { notify, attempt } from "./messages.js";
 
-export function startLog() { on("scenario", draw); draw(); }
+export function startLog() {
+  on("scenario", draw);
+  draw();
+}
 
 function draw() {
-  const entries = model.history.entries, undone = undoneRevisions(entries);
+  const entries = model.history.entries;
+  const undone = undoneRevisions(entries);
   const edits = entries.filter((e) => e.kind === "edit");
   document.getElementById("log").replaceChildren(
-    el("div", { class: "actions" },
-      el("button", { textContent: "Copy as Python", id: "copy-python", onclick: attempt(() => copy(asPython(inEffect()))) }),
-      el("button", { textContent: "Copy as curl", id: "copy-curl", onclick: attempt(() => copy(asCurl(inEffect()))) })),
-    ...(edits.length ? [] : [el("p", { textContent: "Nothing was changed yet. Each change is kept here at once; nothing has to be saved." })]),
-    ...edits.reverse().map((entry) => card(entry, undone.has(entry.revision))));
+    el(
+      "div",
+      { class: "actions" },
+      el("button", {
+        textContent: "Copy as Python",
+        id: "copy-python",
+        onclick: attempt(() => copy(asPython(inEffect()))),
+      }),
+      el("button", {
+        textContent: "Copy as curl",
+        id: "copy-curl",
+        onclick: attempt(() => copy(asCurl(inEffect()))),
+      }),
+    ),
+    ...(edits.length
+      ? []
+      : [
+          el("p", {
+            textContent:
+              "Nothing was changed yet. Each change is kept here at once; nothing has to be saved.",
+          }),
+        ]),
+    ...edits.reverse().map((entry) => card(entry, undone.has(entry.revision))),
+  );
 }
 function undoneRevisions(entries) {
   const undone = new Set();
-  for (const e of entries) if (e.kind === "undo") undone.add(e.target); else if (e.kind === "redo") undone.delete(e.target);
+  for (const e of entries) {
+    if (e.kind === "undo") {
+      undone.add(e.target);
+    } else if (e.kind === "redo") {
+      undone.delete(e.target);
+    }
+  }
   return undone;
 }
 function inEffect() {
   const undone = undoneRevisions(model.history.entries);
-  return model.history.entries.filter((e) => e.kind === "edit" && !undone.has(e.revision)).map((e) => e.operations);
+  return model.history.entries
+    .filter((e) => e.kind === "edit" && !undone.has(e.revision))
+    .map((e) => e.operations);
 }
 function card(entry, undone) {
   const when = new Date(entry.created_at).toLocaleTimeString();
-  return el("div", { class: `entry${undone ? " undone" : ""}`, "data-revision": entry.revision },
-    el("header", {}, el("strong", { textContent: `r${entry.revision}` }), el("span", { textContent: [...new Set(entry.operations.map((o) => o.op))].join(", ") }),
-      el("span", { class: "grow" }), el("small", { textContent: `${undone ? "undone · " : ""}${entry.who || "somebody"} · ${when}` })),
-    ...entry.operations.map((o) => el("code", { textContent: JSON.stringify(lean(o)) })));
+  return el(
+    "div",
+    { class: `entry${undone ? " undone" : ""}`, "data-revision": entry.revision },
+    el(
+      "header",
+      {},
+      el("strong", { textContent: `r${entry.revision}` }),
+      el("span", { textContent: [...new Set(entry.operations.map((o) => o.op))].join(", ") }),
+      el("span", { class: "grow" }),
+      el("small", {
+        textContent: `${undone ? "undone · " : ""}${entry.who || "somebody"} · ${when}`,
+      }),
+    ),
+    ...entry.operations.map((o) => el("code", { textContent: JSON.stringify(withoutNulls(o)) })),
+  );
 }
-export const lean = (operation) => Object.fromEntries(Object.entries(operation).filter(([, v]) => v !== null));
+export const withoutNulls = (operation) =>
+  Object.fromEntries(Object.entries(operation).filter(([, v]) => v !== null));
 
 export function asPython(batches) {
   const { scene, name } = model.scenario;
-  const calls = batches.map((batch) => `    scenario.apply(${python(batch.map(lean))})`);
-  return ["import real2sim", "", `with real2sim.connect(${python(location.origin)}) as sim:`,
-    `    scenario = sim.scenarios.create(scene=${python(scene)}, name=${python(name)})`, ...calls, ""].join("\n");
+  const calls = batches.map((batch) => `    scenario.apply(${python(batch.map(withoutNulls))})`);
+  return [
+    "import real2sim",
+    "",
+    `with real2sim.connect(${python(location.origin)}) as sim:`,
+    `    scenario = sim.scenarios.create(scene=${python(scene)}, name=${python(name)})`,
+    ...calls,
+    "",
+  ].join("\n");
 }
 export function python(value) {
-  if (value === null || value === undefined) return "None";
-  if (typeof value === "boolean") return value ? "True" : "False";
-  if (Array.isArray(value)) return `[${value.map(python).join(", ")}]`;
-  if (typeof value === "object") return `{${Object.entries(value).map(([k, v]) => `${JSON.stringify(k)}: ${python(v)}`).join(", ")}}`;
+  if (value === null || value === undefined) {
+    return "None";
+  }
+  if (typeof value === "boolean") {
+    return value ? "True" : "False";
+  }
+  if (Array.isArray(value)) {
+    return `[${value.map(python).join(", ")}]`;
+  }
+  if (typeof value === "object") {
+    return `{${Object.entries(value)
+      .map(([k, v]) => `${JSON.stringify(k)}: ${python(v)}`)
+      .join(", ")}}`;
+  }
   return JSON.stringify(value);
 }
 export function asCurl(batches) {
   const url = `${location.origin}/v1/scenarios/${model.scenario.scenario_id}/operations`;
   const quoted = (body) => `'${JSON.stringify(body).replaceAll("'", "'\\''")}'`;
-  return batches.map((batch) => `curl -s -X POST ${url} -H 'Content-Type: application/json' \\\n     -d ${quoted({ operations: batch.map(lean) })}`).join("\n");
+  return batches
+    .map(
+      (batch) =>
+        `curl -s -X POST ${url} -H 'Content-Type: application/json' \\\n     -d ${quoted({ operations: batch.map(withoutNulls) })}`,
+    )
+    .join("\n");
 }
 async function copy(text) {
   await navigator.clipboard.writeText(text);
-  say("Copied: all changes that are in effect.");
+  notify("Copied: all changes that are in effect.");
 }

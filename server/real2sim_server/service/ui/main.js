@@ -1,7 +1,7 @@
 // Opens what the address names, or the first page.
-import { asked, startAddress } from "./address.js";
+import { addressParameters, startAddress } from "./address.js";
 import { model, open, on, undo, redo, fork, exportFile, select, setTime } from "./model.js";
-import { attempt, say } from "./messages.js";
+import { attempt, notify } from "./messages.js";
 import { startPage } from "./start.js";
 import { startView, toggleFree } from "./camera_view.js";
 import { startMosaic } from "./mosaic.js";
@@ -16,18 +16,33 @@ import { startShortcuts } from "./shortcuts.js";
 const $ = (id) => document.getElementById(id);
 
 async function main() {
-  const address = asked();
-  if (!address.scenario) return startPage();
+  const address = addressParameters();
+  if (!address.scenario) {
+    return startPage();
+  }
   await open(address.scenario);
-  const names = model.scene.cameras.map((c) => c.name), { start_us: start, end_us: end } = model.scenario;
+  const names = model.scene.cameras.map((c) => c.name);
+  const { start_us: firstUs, end_us: lastUs } = model.scenario;
   model.camera = names.includes(address.camera) ? address.camera : names[0];
   model.mosaic = address.camera === "*";
-  model.t = Math.min(end, Math.max(start, Number(address.t ?? start)));
+  model.t = Math.min(lastUs, Math.max(firstUs, Number(address.t ?? firstUs)));
   $("studio").hidden = false;
-  [startMap, startTimeline, startProperties, startLog, startAssets, startPhysics, startMosaic, startView, startShortcuts].forEach((start) => start());
+  [
+    startMap,
+    startTimeline,
+    startProperties,
+    startLog,
+    startAssets,
+    startPhysics,
+    startMosaic,
+    startView,
+    startShortcuts,
+  ].forEach((start) => start());
   bar();
   tabs();
-  if (model.scenario.objects.some((o) => o.object_id === address.selected)) select(address.selected);
+  if (model.scenario.objects.some((o) => o.object_id === address.selected)) {
+    select(address.selected);
+  }
   if (address.run) {
     const t = model.t;
     await attempt(show)(address.run);
@@ -54,7 +69,12 @@ function bar() {
   $("fit").onclick = fit;
   $("centre").onclick = centre;
   $("fork").onclick = attempt(() => copyAs(`${model.scenario.name} (fork)`));
-  $("save").onclick = attempt(async () => { const name = prompt("Name", model.scenario.name); if (name) await copyAs(name); });
+  $("save").onclick = attempt(async () => {
+    const name = prompt("Name", model.scenario.name);
+    if (name) {
+      await copyAs(name);
+    }
+  });
   $("download").onclick = attempt(download);
 }
 async function copyAs(name) {
@@ -70,9 +90,15 @@ async function download() {
 }
 function tabs() {
   $("side-tabs").onclick = ({ target }) => {
-    if (!target.dataset.tab) return;
-    for (const b of $("side-tabs").children) b.classList.toggle("on", b === target);
-    for (const page of document.querySelectorAll("[data-page]")) page.hidden = page.dataset.page !== target.dataset.tab;
+    if (!target.dataset.tab) {
+      return;
+    }
+    for (const b of $("side-tabs").children) {
+      b.classList.toggle("on", b === target);
+    }
+    for (const page of document.querySelectorAll("[data-page]")) {
+      page.hidden = page.dataset.page !== target.dataset.tab;
+    }
   };
 }
-main().catch((error) => say(error.message, "bad"));
+main().catch((error) => notify(error.message, "bad"));

@@ -1,16 +1,26 @@
 // What is open: scenario, selection, time. Everything else listens.
-import { call, get, post, Refused } from "./api.js";
+import { call, get, post, ApiError } from "./api.js";
 import { poseAt, aboutZ, multiply } from "./poses.js";
-import { say } from "./messages.js";
+import { notify } from "./messages.js";
 
 export const model = {
-  scene: null, scenario: null, history: null, camera: null, t: 0,
-  selected: null, draft: null, job: null, playback: null, free: null, mosaic: false,
-  when: "always", box: null,
+  scene: null,
+  scenario: null,
+  history: null,
+  camera: null,
+  t: 0,
+  selected: null,
+  draft: null,
+  job: null,
+  playback: null,
+  free: null,
+  mosaic: false,
+  when: "always",
+  box: null,
 };
 const listeners = {};
 export const on = (names, fn) => names.split(" ").forEach((n) => (listeners[n] ??= []).push(fn));
-export const tell = (name) => (listeners[name] ?? []).forEach((fn) => fn());
+export const emit = (name) => (listeners[name] ?? []).forEach((fn) => fn());
 
 const path = (rest = "") => `/v1/scenarios/${model.scenario.scenario_id}${rest}`;
 
@@ -22,8 +32,10 @@ export async function open(id) {
 
 export async function refresh() {
   [model.scenario, model.history] = await Promise.all([get(path()), get(path("/operations"))]);
-  if (!object(model.selected)) model.selected = null;
-  tell("scenario");
+  if (!object(model.selected)) {
+    model.selected = null;
+  }
+  emit("scenario");
 }
 
 export const object = (id) => model.scenario.objects.find((o) => o.object_id === id);
@@ -31,29 +43,57 @@ export const object = (id) => model.scenario.objects.find((o) => o.object_id ===
 // Pose as shown: of a physics run while one is played, else with what is being dragged.
 export function poseOf(subject) {
   const run = model.playback?.tracks[subject.object_id];
-  if (model.job && run) return poseAt({ times_us: model.playback.times_us, ...run }, model.t);
+  if (model.job && run) {
+    return poseAt({ times_us: model.playback.times_us, ...run }, model.t);
+  }
   const pose = poseAt(subject.trajectory, model.t);
   const draft = model.draft;
-  if (draft?.id !== subject.object_id) return pose;
+  if (draft?.id !== subject.object_id) {
+    return pose;
+  }
   const [x, y, z] = pose.position;
-  return { position: [x + draft.x, y + draft.y, z], quaternion: multiply(aboutZ(draft.angle), pose.quaternion) };
+  return {
+    position: [x + draft.x, y + draft.y, z],
+    quaternion: multiply(aboutZ(draft.angle), pose.quaternion),
+  };
 }
 
 export function draftOperations() {
   const draft = model.draft;
-  if (!draft) return [];
-  const list = [], time_range = timeRange();
-  if (draft.x || draft.y) list.push({ op: "translate", object_id: draft.id, x: draft.x, y: draft.y, snap: true, time_range });
-  if (draft.angle) list.push({ op: "rotate", object_id: draft.id, angle: draft.angle, time_range });
+  if (!draft) {
+    return [];
+  }
+  const list = [];
+  const time_range = timeRange();
+  if (draft.x || draft.y) {
+    list.push({
+      op: "translate",
+      object_id: draft.id,
+      x: draft.x,
+      y: draft.y,
+      snap: true,
+      time_range,
+    });
+  }
+  if (draft.angle) {
+    list.push({ op: "rotate", object_id: draft.id, angle: draft.angle, time_range });
+  }
   return list;
 }
 
 // When a move holds; it is whole at the time shown, and blends in before or out after it.
 export function timeRange() {
-  const blend_us = 500_000, [start_us, end_us] = [model.t - blend_us, model.t + blend_us];
-  if (model.when === "on") return { start_us, blend_us };
-  if (model.when === "until") return { end_us, blend_us };
-  if (model.when === "around") return { start_us: start_us - blend_us, end_us: end_us + blend_us, blend_us };
+  const blend_us = 500_000;
+  const [start_us, end_us] = [model.t - blend_us, model.t + blend_us];
+  if (model.when === "on") {
+    return { start_us, blend_us };
+  }
+  if (model.when === "until") {
+    return { end_us, blend_us };
+  }
+  if (model.when === "around") {
+    return { start_us: start_us - blend_us, end_us: end_us + blend_us, blend_us };
+  }
   return undefined;
 }
 
@@ -66,36 +106,55 @@ export const redo = () => change("/redo");
 
 async function change(rest, body) {
   try {
-    const result = await post(path(rest), body, { "If-Match": model.scenario.etag, "Idempotency-Key": crypto.randomUUID?.() ?? `${Date.now()}-${Math.random()}` });
-    result.warnings.forEach((w) => say(w.message, "warm"));
+    const result = await post(path(rest), body, {
+      "If-Match": model.scenario.etag,
+      "Idempotency-Key": crypto.randomUUID?.() ?? `${Date.now()}-${Math.random()}`,
+    });
+    result.warnings.forEach((w) => notify(w.message, "warm"));
     await refresh();
-    if (result.created.length) select(result.created[0]);
+    if (result.created.length) {
+      select(result.created[0]);
+    }
     return result;
   } catch (error) {
-    const stale = error instanceof Refused && error.status === 412;
-    say(stale ? "Somebody else changed the scenario meanwhile; their changes are shown now. Please do it again." : error.message, "bad");
+    const stale = error instanceof ApiError && error.status === 412;
+    notify(
+      stale
+        ? "Somebody else changed the scenario meanwhile; their changes are shown now. Please do it again."
+        : error.message,
+      "bad",
+    );
     await refresh();
     return null;
   } finally {
     model.draft = null;
-    tell("draft");
+    emit("draft");
   }
 }
 
-export function select(id) { model.selected = id; tell("selection"); }
+export function select(id) {
+  model.selected = id;
+  emit("selection");
+}
 export function setTime(t) {
   const { start_us: start, end_us: end } = span();
   model.t = Math.round(Math.min(end, Math.max(start, t)));
-  tell("time");
+  emit("time");
 }
-export const span = () => model.job && model.playback
-  ? { start_us: model.playback.times_us[0], end_us: model.playback.times_us.at(-1) } : model.scenario;
+export const span = () =>
+  model.job && model.playback
+    ? { start_us: model.playback.times_us[0], end_us: model.playback.times_us.at(-1) }
+    : model.scenario;
 export function stopRun() {
-  if (!model.job) return;
+  if (!model.job) {
+    return;
+  }
   model.job = model.playback = null;
-  tell("run");
+  emit("run");
   setTime(model.t);
 }
 export const fork = (name) => post(path("/fork"), { name });
-export async function exportFile() { return (await call("GET", path("/export"))).blob(); }
+export async function exportFile() {
+  return (await call("GET", path("/export"))).blob();
+}
 export const startSimulation = (body) => post(path("/simulate"), body);

@@ -1,13 +1,17 @@
 // Tabs of cameras, and all of them at once.
-import { model, on, tell } from "./model.js";
+import { model, on, emit } from "./model.js";
 import { picture } from "./api.js";
 
 const $ = (id) => document.getElementById(id);
-let busy = false, again = false;
+let busy = false;
+let again = false;
 
 export function startMosaic() {
   const names = model.scene.cameras.map((c) => c.name);
-  $("cameras").replaceChildren(...names.map((name) => tab(name, name)), ...(names.length > 1 ? [tab("All cameras", null)] : []));
+  $("cameras").replaceChildren(
+    ...names.map((name) => tab(name, name)),
+    ...(names.length > 1 ? [tab("All cameras", null)] : []),
+  );
   on("time scenario run mosaic", draw);
   mark();
 }
@@ -20,27 +24,48 @@ function tab(label, name) {
 }
 export function choose(name) {
   model.mosaic = name === null;
-  if (name) { model.camera = name; model.free = null; $("free").classList.remove("on"); $("stage").classList.remove("free"); }
+  if (name) {
+    model.camera = name;
+    model.free = null;
+    $("free").classList.remove("on");
+    $("stage").classList.remove("free");
+  }
   mark();
-  tell("mosaic");
-  tell("camera");
+  emit("mosaic");
+  emit("camera");
 }
 function mark() {
   $("mosaic").hidden = !model.mosaic;
-  for (const b of $("cameras").children) b.classList.toggle("on", b.dataset.camera === (model.mosaic ? "*" : model.camera));
+  for (const b of $("cameras").children) {
+    b.classList.toggle("on", b.dataset.camera === (model.mosaic ? "*" : model.camera));
+  }
 }
 async function draw() {
-  if (!model.mosaic) return;
-  if (busy) { again = true; return; }
+  if (!model.mosaic) {
+    return;
+  }
+  if (busy) {
+    again = true;
+    return;
+  }
   busy = true;
   try {
-    const base = model.job ? `/v1/jobs/${model.job}` : `/v1/scenarios/${model.scenario.scenario_id}`;
+    const base = model.job
+      ? `/v1/jobs/${model.job}`
+      : `/v1/scenarios/${model.scenario.scenario_id}`;
     for (const { name } of model.scene.cameras) {
-      const src = await picture(`${base}/preview?camera=${encodeURIComponent(name)}&t_us=${model.t}&width=400`);
+      const src = await picture(
+        `${base}/preview?camera=${encodeURIComponent(name)}&t_us=${model.t}&width=400`,
+      );
       tile(name, src);
     }
-  } finally { busy = false; }
-  if (again) { again = false; draw(); }
+  } finally {
+    busy = false;
+  }
+  if (again) {
+    again = false;
+    draw();
+  }
 }
 function tile(name, src) {
   let figure = [...$("mosaic").children].find((f) => f.dataset.camera === name);
@@ -54,6 +79,8 @@ function tile(name, src) {
     $("mosaic").append(figure);
   }
   const image = figure.querySelector("img");
-  if (image.src) URL.revokeObjectURL(image.src);
+  if (image.src) {
+    URL.revokeObjectURL(image.src);
+  }
   image.src = src;
 }

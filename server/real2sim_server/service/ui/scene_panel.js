@@ -1,39 +1,87 @@
 // What belongs to no object: when the scenario plays, boxes hidden from the background, colliders.
-import { model, edit, tell } from "./model.js";
+import { model, edit, emit } from "./model.js";
 import { poseAt } from "./poses.js";
 import { el, number, row } from "./dom.js";
 
 export function scenePanel() {
   const { erased, colliders } = model.scenario;
-  if (!model.box?.placed) model.box = ahead();
+  if (!model.box?.placed) {
+    model.box = ahead();
+  }
   return [
     el("fieldset", {}, el("legend", { textContent: "Scenario plays" }), span()),
-    el("fieldset", {}, el("legend", { textContent: "Box, dashed on the map" }),
+    el(
+      "fieldset",
+      {},
+      el("legend", { textContent: "Box, dashed on the map" }),
       el("p", { textContent: "Drag it there, or type its place and size." }),
-      row("x y z [m]", ["x", "y", "z"].map((axis, k) => field(`box-${axis}`, model.box.position, k))),
-      row("l w h [m]", ["l", "w", "h"].map((axis, k) => field(`box-${axis}`, model.box.size, k))),
-      el("div", { class: "actions" },
+      row(
+        "x y z [m]",
+        ["x", "y", "z"].map((axis, k) => field(`box-${axis}`, model.box.position, k)),
+      ),
+      row(
+        "l w h [m]",
+        ["l", "w", "h"].map((axis, k) => field(`box-${axis}`, model.box.size, k)),
+      ),
+      el(
+        "div",
+        { class: "actions" },
         el("button", { textContent: "Erase background in it", id: "erase", onclick: erase }),
-        el("button", { textContent: "Make it a wall", title: "A solid, invisible box for the physics", id: "collide", onclick: collide }),
-        el("button", { textContent: "Flat ground", title: "The physics gets a level plane at the box's bottom", id: "plane", onclick: plane }))),
-    ...listed("Erased from the background", erased.map((r) => [r.region_id, place(r.pose.position)])),
-    ...listed("Colliders", colliders.map((c) => [c.collider_id, c.shape.kind === "box" ? place(c.shape.position) : c.shape.kind])),
+        el("button", {
+          textContent: "Make it a wall",
+          title: "A solid, invisible box for the physics",
+          id: "collide",
+          onclick: collide,
+        }),
+        el("button", {
+          textContent: "Flat ground",
+          title: "The physics gets a level plane at the box's bottom",
+          id: "plane",
+          onclick: plane,
+        }),
+      ),
+    ),
+    ...listed(
+      "Erased from the background",
+      erased.map((r) => [r.region_id, place(r.pose.position)]),
+    ),
+    ...listed(
+      "Colliders",
+      colliders.map((c) => [
+        c.collider_id,
+        c.shape.kind === "box" ? place(c.shape.position) : c.shape.kind,
+      ]),
+    ),
   ];
 }
 const tenth = (v) => Math.round(v * 10) / 10;
 const place = ([x, y]) => `box at ${tenth(x)}, ${tenth(y)} m`;
 
 function ahead() {
-  const { position: [x, y, z], quaternion: [w, a, b, c] } = poseAt(model.scene.ego, model.t);
+  const {
+    position: [x, y, z],
+    quaternion: [w, a, b, c],
+  } = poseAt(model.scene.ego, model.t);
   const forward = [1 - 2 * (b * b + c * c), 2 * (a * b + w * c)];
-  return { position: [x + 12 * forward[0], y + 12 * forward[1], z + 1].map(tenth), size: [4, 4, 2] };
+  return {
+    position: [x + 12 * forward[0], y + 12 * forward[1], z + 1].map(tenth),
+    size: [4, 4, 2],
+  };
 }
 function field(id, values, k) {
-  return number(id, values[k], (v) => { if (v !== null) values[k] = v; model.box.placed = true; tell("draft"); });
+  return number(id, values[k], (v) => {
+    if (v !== null) {
+      values[k] = v;
+    }
+    model.box.placed = true;
+    emit("draft");
+  });
 }
 // While the box is dragged on the map.
 export function refreshBox() {
-  ["x", "y", "z"].forEach((axis, k) => { document.getElementById(`box-${axis}`).value = model.box.position[k]; });
+  ["x", "y", "z"].forEach((axis, k) => {
+    document.getElementById(`box-${axis}`).value = model.box.position[k];
+  });
 }
 function span() {
   const { start_us: start, end_us: end } = model.scenario;
@@ -43,18 +91,39 @@ function span() {
     const [from, to] = seconds.map((s) => (s === null ? null : Math.round(s * 1e6)));
     return edit([{ op: "set_time", start_us: from, end_us: to }]);
   };
-  return row("from, to [s]", [number("clock-start", seconds[0], set(0)), number("clock-end", seconds[1], set(1))]);
+  return row("from, to [s]", [
+    number("clock-start", seconds[0], set(0)),
+    number("clock-end", seconds[1], set(1)),
+  ]);
 }
 const copy = () => ({ position: [...model.box.position], size: [...model.box.size] });
-const erase = () => edit([{ op: "erase_region", pose: { position: copy().position }, size: copy().size }]);
+const erase = () =>
+  edit([{ op: "erase_region", pose: { position: copy().position }, size: copy().size }]);
 const collide = () => edit([{ op: "add_collider", shape: { kind: "box", ...copy() } }]);
 function plane() {
-  const { position: [x, y, z], size } = copy();
+  const {
+    position: [x, y, z],
+    size,
+  } = copy();
   return edit([{ op: "add_collider", shape: { kind: "plane", point: [x, y, z - size[2] / 2] } }]);
 }
 function listed(title, things) {
-  if (!things.length) return [];
-  const rows = things.map(([id, where]) => el("div", { class: "thing" }, el("span", { textContent: id }), el("small", { textContent: where }),
-    el("button", { textContent: "Remove", class: "danger", "data-remove": id, onclick: () => edit([{ op: "delete", object_id: id }]) })));
+  if (!things.length) {
+    return [];
+  }
+  const rows = things.map(([id, where]) =>
+    el(
+      "div",
+      { class: "thing" },
+      el("span", { textContent: id }),
+      el("small", { textContent: where }),
+      el("button", {
+        textContent: "Remove",
+        class: "danger",
+        "data-remove": id,
+        onclick: () => edit([{ op: "delete", object_id: id }]),
+      }),
+    ),
+  );
   return [el("fieldset", {}, el("legend", { textContent: title }), ...rows)];
 }

@@ -8,30 +8,72 @@ import { choose } from "./mosaic.js";
 import { el } from "./dom.js";
 
 const selected = (fn) => () => model.selected && fn(model.selected);
-const nudge = (x, y) => selected((id) => edit([{ op: "translate", object_id: id, x, y, frame: "object", snap: true }]));
+const nudge = (x, y) =>
+  selected((id) => edit([{ op: "translate", object_id: id, x, y, frame: "object", snap: true }]));
 const flying = (r, d, f) => () => model.free && shift(r, d, f);
 const KEYS = [
-  ["Space", "play, pause", " ", toggle], ["← →", "one frame back, on", "ArrowLeft", () => step(-1)], [null, "", "ArrowRight", () => step(1)],
-  ["Ctrl Z", "undo", "ctrl+z", undo], ["Ctrl Y", "redo", "ctrl+y", redo], [null, "", "ctrl+shift+z", redo],
-  ["Ctrl D", "duplicate the selection", "ctrl+d", selected(duplicate)], ["Del", "delete the selection", "Delete", selected((id) => edit([{ op: "delete", object_id: id }]))],
-  ["Shift + arrows", "move the selection by 0.25 m along its own axes", "shift+ArrowUp", nudge(0.25, 0)], [null, "", "shift+ArrowDown", nudge(-0.25, 0)], [null, "", "shift+ArrowLeft", nudge(0, 0.25)], [null, "", "shift+ArrowRight", nudge(0, -0.25)],
-  ["[ ]", "turn the selection by 5°", "[", selected((id) => edit([{ op: "rotate", object_id: id, angle: 0.0872665 }]))], [null, "", "]", selected((id) => edit([{ op: "rotate", object_id: id, angle: -0.0872665 }]))],
-  ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree], ["W A S D", "fly", "w", flying(0, 0, 0.5)], [null, "", "s", flying(0, 0, -0.5)], [null, "", "a", flying(-0.5, 0, 0)], [null, "", "d", flying(0.5, 0, 0)],
-  ["M", "all cameras", "m", () => choose(model.mosaic ? model.camera : null)], ["0", "whole map", "0", fit], ["C", "map to the selection", "c", centre],
-  ["Esc", "select nothing", "Escape", () => select(null)], ["?", "this page", "?", () => help()],
+  ["Space", "play, pause", " ", toggle],
+  ["← →", "one frame back, on", "ArrowLeft", () => step(-1)],
+  [null, "", "ArrowRight", () => step(1)],
+  ["Ctrl Z", "undo", "ctrl+z", undo],
+  ["Ctrl Y", "redo", "ctrl+y", redo],
+  [null, "", "ctrl+shift+z", redo],
+  ["Ctrl D", "duplicate the selection", "ctrl+d", selected(duplicate)],
+  [
+    "Del",
+    "delete the selection",
+    "Delete",
+    selected((id) => edit([{ op: "delete", object_id: id }])),
+  ],
+  [
+    "Shift + arrows",
+    "move the selection by 0.25 m along its own axes",
+    "shift+ArrowUp",
+    nudge(0.25, 0),
+  ],
+  [null, "", "shift+ArrowDown", nudge(-0.25, 0)],
+  [null, "", "shift+ArrowLeft", nudge(0, 0.25)],
+  [null, "", "shift+ArrowRight", nudge(0, -0.25)],
+  [
+    "[ ]",
+    "turn the selection by 5°",
+    "[",
+    selected((id) => edit([{ op: "rotate", object_id: id, angle: 0.0872665 }])),
+  ],
+  [null, "", "]", selected((id) => edit([{ op: "rotate", object_id: id, angle: -0.0872665 }]))],
+  ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree],
+  ["W A S D", "fly", "w", flying(0, 0, 0.5)],
+  [null, "", "s", flying(0, 0, -0.5)],
+  [null, "", "a", flying(-0.5, 0, 0)],
+  [null, "", "d", flying(0.5, 0, 0)],
+  ["M", "all cameras", "m", () => choose(model.mosaic ? model.camera : null)],
+  ["0", "whole map", "0", fit],
+  ["C", "map to the selection", "c", centre],
+  ["Esc", "select nothing", "Escape", () => select(null)],
+  ["?", "this page", "?", () => help()],
 ];
 export function startShortcuts() {
-  const rows = KEYS.filter(([label]) => label).flatMap(([label, what]) => [el("dt", {}, el("kbd", { textContent: label })), el("dd", { textContent: what })]);
+  const rows = KEYS.filter(([label]) => label).flatMap(([label, what]) => [
+    el("dt", {}, el("kbd", { textContent: label })),
+    el("dd", { textContent: what }),
+  ]);
   const dialog = document.getElementById("help");
   dialog.replaceChildren(el("h2", { textContent: "Keyboard" }), el("dl", {}, ...rows));
   dialog.onclick = () => dialog.close();
   document.getElementById("help-button").onclick = help;
   document.addEventListener("keydown", (e) => {
-    if (e.target.matches("input:not([type=range]), select, textarea") || document.querySelector("dialog[open]")) return;
+    if (
+      e.target.matches("input:not([type=range]), select, textarea") ||
+      document.querySelector("dialog[open]")
+    ) {
+      return;
+    }
     const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
     const name = `${e.ctrlKey || e.metaKey ? "ctrl+" : ""}${e.shiftKey && (key.length > 1 || e.ctrlKey) ? "shift+" : ""}${key}`;
     const found = KEYS.find(([, , k]) => k === name);
-    if (!found) return;
+    if (!found) {
+      return;
+    }
     e.preventDefault();
     found[3]();
   });

@@ -2,7 +2,8 @@
 import { model, on, setTime, span } from "./model.js";
 
 const $ = (id) => document.getElementById(id);
-let playing = false, last = 0;
+let playing = false;
+let last = 0;
 
 export function startTimeline() {
   $("time").oninput = (e) => setTime(Number(e.target.value));
@@ -15,23 +16,34 @@ export function startTimeline() {
 function draw() {
   const { start_us: start, end_us: end } = span();
   Object.assign($("time"), { min: start, max: end, value: model.t });
-  $("clock").textContent = `${((model.t - start) / 1e6).toFixed(2)} / ${((end - start) / 1e6).toFixed(2)} s`;
+  $("clock").textContent =
+    `${((model.t - start) / 1e6).toFixed(2)} / ${((end - start) / 1e6).toFixed(2)} s`;
   $("play").textContent = playing ? "Pause" : "Play";
 }
 export function toggle() {
   playing = !playing;
-  if (playing && model.t >= span().end_us) setTime(span().start_us);
+  if (playing && model.t >= span().end_us) {
+    setTime(span().start_us);
+  }
   last = performance.now();
-  if (playing) requestAnimationFrame(tick);
+  if (playing) {
+    requestAnimationFrame(tick);
+  }
   draw();
 }
 function tick(now) {
-  if (!playing) return;
+  if (!playing) {
+    return;
+  }
   const t = model.t + (now - last) * 1000 * Number($("speed").value);
   last = now;
-  if (t >= span().end_us) playing = false;
+  if (t >= span().end_us) {
+    playing = false;
+  }
   setTime(t);
-  if (playing) requestAnimationFrame(tick);
+  if (playing) {
+    requestAnimationFrame(tick);
+  }
 }
 export function step(direction) {
   playing = false;

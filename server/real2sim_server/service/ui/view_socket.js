@@ -1,9 +1,18 @@
-// The view socket: the newest question waits until the answer to the last one is here.
+// The view socket: the newest request waits until the answer to the last one is here.
 import { token } from "./api.js";
 
 export class ViewSocket {
   constructor(id, { onFrame, onPick, onChanged, onError }) {
-    Object.assign(this, { id, onFrame, onPick, onChanged, onError, busy: false, next: null, seq: 0 });
+    Object.assign(this, {
+      id,
+      onFrame,
+      onPick,
+      onChanged,
+      onError,
+      busy: false,
+      next: null,
+      seq: 0,
+    });
     this.connect();
   }
   connect() {
@@ -12,30 +21,52 @@ export class ViewSocket {
     this.socket.binaryType = "arraybuffer";
     this.ready = false;
     this.socket.onopen = () => this.socket.send(JSON.stringify({ type: "hello", token: token() }));
-    this.socket.onmessage = ({ data }) => (typeof data === "string" ? this.text(JSON.parse(data)) : this.frame(data));
+    this.socket.onmessage = ({ data }) =>
+      typeof data === "string" ? this.text(JSON.parse(data)) : this.frame(data);
     this.socket.onclose = ({ code, reason }) => {
       this.busy = this.ready = false;
       this.next ??= this.last;
-      if (code >= 4400) this.onError(reason);
-      else setTimeout(() => this.connect(), 1000);
+      if (code >= 4400) {
+        this.onError(reason);
+      } else {
+        setTimeout(() => this.connect(), 1000);
+      }
     };
   }
-  look(question) {
-    this.next = this.last = question;
+  requestFrame(request) {
+    this.next = this.last = request;
     this.flush();
   }
-  pick(question) { if (this.ready) this.socket.send(JSON.stringify({ ...question, seq: ++this.seq })); }
+  pick(request) {
+    if (this.ready) {
+      this.socket.send(JSON.stringify({ ...request, seq: ++this.seq }));
+    }
+  }
   flush() {
-    if (!this.ready || this.busy || !this.next) return;
+    if (!this.ready || this.busy || !this.next) {
+      return;
+    }
     this.busy = true;
     this.socket.send(JSON.stringify({ ...this.next, seq: ++this.seq }));
     this.next = null;
   }
   text(message) {
-    if (message.type === "welcome") { this.ready = true; this.flush(); return; }
-    if (message.type === "picked") this.onPick(message.object_id);
-    if (message.type === "changed") this.onChanged();
-    if (message.type === "error") { this.busy = false; this.onError(message.detail); this.flush(); }
+    if (message.type === "welcome") {
+      this.ready = true;
+      this.flush();
+      return;
+    }
+    if (message.type === "picked") {
+      this.onPick(message.object_id);
+    }
+    if (message.type === "changed") {
+      this.onChanged();
+    }
+    if (message.type === "error") {
+      this.busy = false;
+      this.onError(message.detail);
+      this.flush();
+    }
   }
   frame(data) {
     const size = new DataView(data).getUint32(0, true);

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from real2sim_server.service.http.disconnects import to_its_end
+from real2sim_server.service.http.disconnects import uncancellable
 
 
 def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():
@@ -12,7 +12,7 @@ def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():
         done: list[str] = []
         begun, go_on = asyncio.Event(), asyncio.Event()
 
-        @to_its_end
+        @uncancellable
         async def change() -> None:
             begun.set()
             await go_on.wait()
@@ -32,7 +32,7 @@ def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():
 
 
 def test_answers_and_errors_come_through():
-    @to_its_end
+    @uncancellable
     async def divided(a: float, b: float) -> float:
         return a / b
 

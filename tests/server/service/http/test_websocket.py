@@ -17,7 +17,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.sync.client import connect
 
-from real2sim_server.service.http.websocket import EXTENSION, PartedProtocol, send
+from real2sim_server.service.http.websocket import EXTENSION, ScatterGatherProtocol, send_parts
 
 pytestmark = pytest.mark.network
 
@@ -36,7 +36,7 @@ def app(talk: Talk) -> Starlette:
 def served(talk: Talk, *, deflate: bool = False) -> Iterator[str]:
     listener = socket.create_server(("127.0.0.1", 0))
     config = uvicorn.Config(
-        app(talk), ws=PartedProtocol, ws_per_message_deflate=deflate, log_level="error"
+        app(talk), ws=ScatterGatherProtocol, ws_per_message_deflate=deflate, log_level="error"
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([listener],))
@@ -67,7 +67,7 @@ def test_parts_arrive_as_one_message(size):
     data = noise(size)
 
     async def talk(websocket: WebSocket) -> None:
-        await send(websocket, halves(data))
+        await send_parts(websocket, halves(data))
         await websocket.receive_bytes()
 
     with served(talk) as url, client(url) as connection:
@@ -88,7 +88,7 @@ def test_a_client_that_reads_late_gets_all_messages_in_order():
 
         websocket.scope["extensions"][EXTENSION] = noted
         for message in messages:
-            await send(websocket, halves(message))
+            await send_parts(websocket, halves(message))
         await websocket.receive_bytes()
 
     with served(talk) as url, client(url, max_queue=1) as connection:
@@ -107,7 +107,7 @@ def test_the_client_of_a_closed_socket_is_told_to_be_gone():
         with pytest.raises(WebSocketDisconnect):
             await websocket.receive_bytes()
         try:
-            await send(websocket, [b"too", b"late"])
+            await send_parts(websocket, [b"too", b"late"])
         except WebSocketDisconnect:
             raised.set()
 
@@ -122,7 +122,7 @@ def test_compressed_connections_get_their_messages_by_uvicorn():
 
     async def talk(websocket: WebSocket) -> None:
         assert EXTENSION not in websocket.scope["extensions"]
-        await send(websocket, halves(data))
+        await send_parts(websocket, halves(data))
         await websocket.receive_bytes()
 
     with served(talk, deflate=True) as url, client(url) as connection:
@@ -132,7 +132,7 @@ def test_compressed_connections_get_their_messages_by_uvicorn():
 
 def test_a_server_without_the_extension_sends_the_parts_joined():
     async def talk(websocket: WebSocket) -> None:
-        await send(websocket, halves(b"abcdef"))
+        await send_parts(websocket, halves(b"abcdef"))
 
     with TestClient(app(talk)).websocket_connect("/") as connection:
         assert connection.receive_bytes() == b"abcdef"
@@ -147,7 +147,7 @@ def test_what_goes_to_the_same_machine_is_not_paced():
         connection = transport.get_extra_info("socket")
         name = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16)
         chosen.append(name.rstrip(b"\0"))
-        await send(websocket, [b"done"])
+        await send_parts(websocket, [b"done"])
 
     with served(talk) as url, client(url) as connection:
         connection.recv()

@@ -42,17 +42,17 @@ async def until_over(jobs: Jobs, job: JobInfo) -> JobInfo:
     return await jobs.wait(job.job_id, 10)
 
 
-async def nothing(_ticket) -> JobResult:
+async def nothing(_context) -> JobResult:
     return JobResult({"answer": 42})
 
 
-async def for_ever(ticket) -> JobResult:
+async def for_ever(context) -> JobResult:
     while True:
-        ticket.progress(0.5, "waiting")
+        context.progress(0.5, "waiting")
         await asyncio.sleep(0.005)
 
 
-async def wrongly(_ticket) -> JobResult:
+async def wrongly(_context) -> JobResult:
     raise ServiceError(ErrorCode.UNKNOWN_CAMERA, "no camera 'back'", hint="try 'front'")
 
 
@@ -137,15 +137,15 @@ def test_too_many_waiting_jobs_are_refused(with_jobs):
             await start_many()
         return refused.value
 
-    refusal = with_jobs(work)
-    assert refusal.code == ErrorCode.QUEUE_FULL
-    assert refusal.headers["Retry-After"]
+    error = with_jobs(work)
+    assert error.code == ErrorCode.QUEUE_FULL
+    assert error.headers["Retry-After"]
 
 
 def test_events_tell_every_change_in_order(with_jobs):
-    async def three_steps(ticket):
+    async def three_steps(context):
         for share in (0.2, 0.4, 0.6):
-            ticket.progress(share, "stepping")
+            context.progress(share, "stepping")
             await asyncio.sleep(0.01)
         return JobResult()
 

@@ -55,8 +55,8 @@ def test_a_pushed_car_rolls_on_and_can_be_looked_at(client, scenario):
     assert (ids[0] != ids[1]).any()
 
     asked = {"simulation": job["job_id"], "camera": "front", "width": 64}
-    film = finished(client, client.post("/v1/exports", json=asked))
-    assert film["result"]["frames"] == 4
+    video_source = finished(client, client.post("/v1/exports", json=asked))
+    assert video_source["result"]["frames"] == 4
 
 
 def test_physics_speed_and_wall_given_by_operations_are_what_the_rollout_has(client, scenario):

@@ -53,10 +53,10 @@ def test_a_scene_above_the_budget_is_refused_with_its_bytes(start_worker):
 
 
 def test_a_scene_in_use_is_not_unloaded(client):
-    residency = client.app.state.worker.residency
-    client.portal.call(residency.pin, "tiny")
+    scene_cache = client.app.state.worker.scene_cache
+    client.portal.call(scene_cache.pin, "tiny")
     assert client.delete("/v1/scenes/tiny/residency").json()["code"] == ErrorCode.SCENE_IN_USE
-    residency.unpin("tiny")
+    scene_cache.unpin("tiny")
 
 
 def test_unknown_scenes_are_refused(client):

@@ -11,7 +11,7 @@ from real2sim_proto import ErrorCode, decode
 from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
 from real2sim_server.edit import replay_operations
 from real2sim_server.scene.io import save_scene
-from real2sim_server.service.storage import snapshots
+from real2sim_server.service.scenarios import snapshots
 from real2sim_server.service.storage.store import StoreError
 
 DELETE_RED = {"op": "delete", "object_id": "car_red"}
@@ -272,11 +272,11 @@ def test_a_snapshot_spares_replaying_and_is_never_needed(
             edit(first, scenario, operation)
         before = first.get(f"/v1/scenarios/{scenario.scenario_id}").json()
         store = first.app.state.worker.store
-        first.portal.call(first.app.state.worker.scenarios.settle)
+        first.portal.call(first.app.state.worker.scenarios.flush)
         kept = first.portal.call(store.snapshot, scenario.scenario_id)
         assert kept.revision == 2
         if damage is not None:
-            first.portal.call(store.keep_snapshot, replace(kept, state=damage))
+            first.portal.call(store.save_snapshot, replace(kept, state=damage))
     replayed = []
     monkeypatch.setattr(
         "real2sim_server.edit.scenario.replay_operations",
@@ -345,7 +345,11 @@ def test_a_cancelled_edit_is_on_record_or_not_but_never_half(client):
 
         operations = OPERATIONS.validate_python([MOVE_POST])
         coroutine = worker.scenarios.edit(
-            scenario.scenario_id, operations, expected=None, dry_run=False, once=IdempotentRequest()
+            scenario.scenario_id,
+            operations,
+            expected=None,
+            dry_run=False,
+            idempotent=IdempotentRequest(),
         )
         task = asyncio.create_task(coroutine)
         for _ in range(after):

@@ -114,10 +114,10 @@ def test_any_interleaving_ends_in_a_state_that_both_authors_can_explain(client, 
         *(a.own for a in authors.values()),
         replayed(view.row, view.summary, log, None),
     ):
-        assert _told(view, scenario) == found
+        assert _as_service_error(view, scenario) == found
 
 
-def _told(view: ScenarioView, scenario: Scenario) -> dict[str, Any]:
+def _as_service_error(view: ScenarioView, scenario: Scenario) -> dict[str, Any]:
     """What the server would say of a scenario like this one."""
     shown = ScenarioView(
         row=view.row,

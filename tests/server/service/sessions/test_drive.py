@@ -10,8 +10,8 @@ import pytest
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode
 from real2sim_proto.drive import SERVER_MESSAGE
-from real2sim_server.service.http.websocket import written
-from real2sim_server.service.rendering.engine import QueueFullError
+from real2sim_server.service.engine import QueueFullError
+from real2sim_server.service.http.websocket import try_send_parts
 
 pytestmark = pytest.mark.network
 
@@ -72,10 +72,10 @@ def test_an_observation_arrives_once_also_where_it_cannot_be_written_at_once(
     tried = []
 
     def try_to_write(websocket: object, parts: list[bytes]) -> bool:
-        tried.append(at_once and written(websocket, parts))
+        tried.append(at_once and try_send_parts(websocket, parts))
         return tried[-1]
 
-    monkeypatch.setattr("real2sim_server.service.sessions.connection.written", try_to_write)
+    monkeypatch.setattr("real2sim_server.service.sessions.connection.try_send_parts", try_to_write)
     planner.reset(sensors=[CAMERA])
     for step in range(3):
         obs = planner.act(step)

@@ -24,7 +24,7 @@ def begun(steps: int = 0) -> LockStep[str]:
     return lockstep
 
 
-def refusal(lockstep: LockStep[str], step: int, content: bytes = b"x") -> ErrorCode:
+def error(lockstep: LockStep[str], step: int, content: bytes = b"x") -> ErrorCode:
     with pytest.raises(ServiceError) as refused:
         lockstep.cached_answer(step, content)
     return refused.value.code
@@ -39,34 +39,34 @@ def test_the_same_action_again_gets_the_same_answer():
 
 
 def test_another_action_for_an_answered_step_is_a_conflict():
-    assert refusal(begun(3), 2, b"other") is ErrorCode.STEP_CONFLICT
+    assert error(begun(3), 2, b"other") is ErrorCode.STEP_CONFLICT
 
 
 def test_only_the_last_answer_is_kept():
-    assert refusal(begun(3), 1, b"plan 1") is ErrorCode.STALE_STEP
+    assert error(begun(3), 1, b"plan 1") is ErrorCode.STALE_STEP
 
 
 def test_an_action_from_the_future_is_refused():
-    assert refusal(begun(3), 4) is ErrorCode.BAD_STEP
+    assert error(begun(3), 4) is ErrorCode.BAD_STEP
 
 
 def test_nothing_can_be_done_before_a_reset():
-    assert refusal(LockStep(), 0) is ErrorCode.NOT_RESET
+    assert error(LockStep(), 0) is ErrorCode.NOT_RESET
 
 
 def test_after_the_end_the_last_answer_can_be_had_again_and_nothing_else():
     lockstep = begun(2)
     lockstep.advance(b"last", "end", over=True)
     assert lockstep.cached_answer(2, b"last") == "end"
-    assert refusal(lockstep, 3) is ErrorCode.EPISODE_OVER
-    assert refusal(lockstep, 4) is ErrorCode.EPISODE_OVER
+    assert error(lockstep, 3) is ErrorCode.EPISODE_OVER
+    assert error(lockstep, 4) is ErrorCode.EPISODE_OVER
 
 
 def test_a_reset_forgets_the_episode_before():
     lockstep = begun(3)
     lockstep.reset()
     assert lockstep.step == 0
-    assert refusal(lockstep, 2, b"plan 2") is ErrorCode.BAD_STEP
+    assert error(lockstep, 2, b"plan 2") is ErrorCode.BAD_STEP
     assert lockstep.cached_answer(0, b"plan 0") is None
 
 
@@ -74,7 +74,7 @@ def test_steps_made_by_other_means_leave_no_answer():
     lockstep = begun(3)
     lockstep.skip(4, over=False)
     assert lockstep.step == 7
-    assert refusal(lockstep, 6, b"plan 6") is ErrorCode.STALE_STEP
+    assert error(lockstep, 6, b"plan 6") is ErrorCode.STALE_STEP
 
 
 @given(ACTIONS)

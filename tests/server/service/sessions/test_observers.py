@@ -62,5 +62,5 @@ def test_an_observer_that_does_not_read_never_holds_up_the_controller(site, join
     for step in range(20):
         controller.act(step)
     assert time.perf_counter() - started < 20
-    (mailbox,) = site.session(info).observers
-    assert mailbox.dropped > 0
+    (queue,) = site.session(info).observers
+    assert queue.dropped > 0

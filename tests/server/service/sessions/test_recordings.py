@@ -65,9 +65,9 @@ def test_replay_finds_the_same_bits_and_films_them(recorded, site, tmp_path):
     done = runner.invoke(build_app(), [*arguments, "--video", str(video), "--width", "96"])
     assert done.exit_code == 0, done.output
     assert json.loads(out.read_text())["bit_identical"] is True
-    film = cv2.VideoCapture(str(video))
-    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 6
-    film.release()
+    video_source = cv2.VideoCapture(str(video))
+    assert int(video_source.get(cv2.CAP_PROP_FRAME_COUNT)) == 6
+    video_source.release()
 
 
 def test_episodes_of_scenarios_are_replayed_with_the_assets_they_show(site, tmp_path):

@@ -143,7 +143,7 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(
         raise RenderError("no memory for this picture")
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"real2sim_server.service.sessions.observation_renderer.{encoding}", fail)
+        patch.setattr(f"real2sim_server.service.sessions.pipeline.{encoding}", fail)
         assert planner.act(0)["type"] == "error"
     assert [e.kind for e in entries(site, info)] == ["reset"]
     assert planner.act(0, acceleration=0.2)["step"] == 1
@@ -154,8 +154,8 @@ def test_a_step_on_its_way_is_on_record_and_told_to_nobody(site, join, monkeypat
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA])
-    session, pictures, seen = site.session(info), site.worker.pictures, []
-    draw = pictures.draw
+    session, renderer, seen = site.session(info), site.worker.renderer, []
+    draw = renderer.draw
 
     def look(*given: object) -> object:
         give_up = time.monotonic() + 30
@@ -166,7 +166,7 @@ def test_a_step_on_its_way_is_on_record_and_told_to_nobody(site, join, monkeypat
         return draw(*given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pictures, "draw", look)
+        patch.setattr(renderer, "draw", look)
         planner.act(0)
     assert seen == [["reset", "action"], ["reset"]]
 

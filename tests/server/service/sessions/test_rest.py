@@ -74,7 +74,7 @@ def test_a_session_whose_episode_cannot_begin_is_not_made(site):
     answer = site.http.post("/v1/sessions", params={"scene": "tiny"}, json=body)
     assert problem(answer) == (422, "TIME_OUT_OF_RANGE")
     assert site.http.get("/v1/sessions").json()["sessions"] == []
-    assert site.worker.residency._resident["tiny"].pins == 0
+    assert site.worker.scene_cache._resident["tiny"].pins == 0
 
 
 def test_the_list_tells_no_tokens(site, info):
@@ -99,9 +99,9 @@ def test_unknown_sessions_are_told_apart_from_closed_ones(site, info):
 
 
 def test_a_deleted_session_gives_its_scene_back(site, info):
-    assert site.worker.residency._resident["tiny"].pins == 1
+    assert site.worker.scene_cache._resident["tiny"].pins == 1
     site.call("DELETE", info)
-    assert site.worker.residency._resident["tiny"].pins == 0
+    assert site.worker.scene_cache._resident["tiny"].pins == 0
 
 
 def test_the_same_creation_twice_makes_one_session(site):

@@ -10,24 +10,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from real2sim_proto import decode
-from real2sim_proto.drive import SERVER_MESSAGE, SensorSpec
+from real2sim_proto.drive import SERVER_MESSAGE
+from real2sim_proto.episode import SensorSpec
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.scene import Camera
-from real2sim_server.service.rendering.renderer import Image
-from real2sim_server.service.sessions.wire import (
-    Stopwatch,
+from real2sim_server.service.rendering.frames import (
+    RenderedImage,
     encode_frame,
+    raw_headers,
+    with_pixels,
+)
+from real2sim_server.service.sessions.wire import (
+    StageTimer,
     pack_members,
     pack_message,
     pack_with_frames,
-    raw_heads,
-    with_pixels,
 )
 
 MOUNTED = transform_from(np.array([1.5, 0.0, 1.6]), np.array([0.5, -0.5, 0.5, -0.5]))
 
 
-def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) -> Image:
+def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) -> RenderedImage:
     rng = np.random.default_rng(3)
     pixels = {
         "rgb": rng.integers(0, 255, (height, width, 3)).astype(np.uint8),
@@ -35,13 +38,13 @@ def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) 
         "instance": rng.integers(0, 65535, (height, width)).astype(np.uint16),
     }[modality]
     sensor = SensorSpec(camera="front", modalities=[modality], codec=codec)
-    return Image(sensor, modality, 7, np.eye(4), np.eye(3), pixels)
+    return RenderedImage(sensor, modality, 7, np.eye(4), np.eye(3), pixels)
 
 
 def view(frames: int, codec: str = "raw") -> bytes:
     encoded = [encode_frame(image(codec)) for _ in range(frames)]
     fields = {"t_us": 7, "revision": 2}
-    return pack_with_frames("view", pack_members(fields), encoded, Stopwatch()).joined(5)
+    return pack_with_frames("view", pack_members(fields), encoded, StageTimer()).joined(5)
 
 
 @given(st.integers(min_value=0, max_value=2**53))
@@ -67,8 +70,8 @@ def test_any_number_of_frames_makes_a_valid_message(frames):
 def test_raw_pixels_arrive_as_they_were(modality):
     drawn = image("raw", modality)
     frame = encode_frame(drawn)
-    pixels = np.frombuffer(frame.data, frame.head.fields["dtype"]).reshape(
-        frame.head.fields["shape"]
+    pixels = np.frombuffer(frame.data, frame.header.fields["dtype"]).reshape(
+        frame.header.fields["shape"]
     )
     np.testing.assert_array_equal(pixels, drawn.pixels)
 
@@ -79,16 +82,16 @@ def test_what_is_said_of_a_raw_image_before_it_is_drawn_is_what_it_says_itself(m
     stands = transform_from(np.array([3.0, 4.0, 0.5]), np.array([0.6, 0.0, 0.0, 0.8]))
     sensor = SensorSpec(camera="front", modalities=[modality], codec="raw")
     drawn = replace(image("raw", modality), K=camera.K, T_world_sensor=camera.pose(stands), t_us=50)
-    (head,) = raw_heads([sensor], [camera], stands, 50)
-    assert head.encoded == encode_frame(drawn).head.encoded
+    (header,) = raw_headers([sensor], [camera], stands, 50)
+    assert header.encoded == encode_frame(drawn).header.encoded
 
 
 def test_an_image_that_is_not_as_it_was_announced_is_refused():
-    head = encode_frame(image("raw", "depth")).head
+    header = encode_frame(image("raw", "depth")).header
     with pytest.raises(TypeError, match=r"float64 \(20, 30\) instead of float32 \[20, 30\]"):
-        with_pixels(head, np.zeros((20, 30)))
+        with_pixels(header, np.zeros((20, 30)))
     with pytest.raises(TypeError, match="instead of"):
-        with_pixels(head, np.zeros((30, 20), np.float32))
+        with_pixels(header, np.zeros((30, 20), np.float32))
 
 
 def test_raw_pixels_are_not_copied_before_they_are_joined():

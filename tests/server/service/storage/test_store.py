@@ -110,7 +110,7 @@ def test_the_last_snapshot_of_a_scenario_is_kept(url):
     async def write(store):
         await store.create_scenario(SCENARIO)
         for revision in (128, 256):
-            await store.keep_snapshot(SnapshotRow("sc_1", revision, "1", bytes([revision % 255])))
+            await store.save_snapshot(SnapshotRow("sc_1", revision, "1", bytes([revision % 255])))
         return await store.snapshot("sc_1"), await store.snapshot("sc_2")
 
     assert run(url, write) == (SnapshotRow("sc_1", 256, "1", b"\x01"), None)
@@ -119,10 +119,10 @@ def test_the_last_snapshot_of_a_scenario_is_kept(url):
 def test_snapshots_go_with_their_scenario(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
-        await store.keep_snapshot(SnapshotRow("sc_1", 128, "1", b"state"))
+        await store.save_snapshot(SnapshotRow("sc_1", 128, "1", b"state"))
         await store.delete_scenario("sc_1")
         with pytest.raises(ConflictError):
-            await store.keep_snapshot(SnapshotRow("sc_1", 256, "1", b"state"))
+            await store.save_snapshot(SnapshotRow("sc_1", 256, "1", b"state"))
         return await store.snapshot("sc_1")
 
     assert run(url, work) is None

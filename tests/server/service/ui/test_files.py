@@ -21,6 +21,12 @@ def test_the_page_is_served_with_a_policy_that_allows_nothing_from_elsewhere(cli
     assert "default-src 'none'; script-src 'self'" in answer.headers["content-security-policy"]
 
 
+@pytest.mark.parametrize("path", ["/", "/ui"])
+def test_the_root_leads_to_the_page(client, path):
+    answer = client.get(path, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (307, "/ui/")
+
+
 def test_the_page_needs_no_token_and_its_data_does(start_worker):
     client = start_worker(token="correct horse")
     assert client.get("/ui/").status_code == 200

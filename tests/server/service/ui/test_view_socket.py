@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from real2sim_server.service.rendering.views_socket import instance_at
+from real2sim_server.service.routes.view_connection import instance_at
 
 
 @pytest.fixture
@@ -47,12 +47,12 @@ def test_the_preview_of_an_edit_shows_it_and_changes_nothing(client, scenario):
     away = [{"op": "delete", "object_id": o["object_id"]} for o in scenario["objects"]]
     with opened(client, scenario) as socket:
         introduce(socket)
-        pictures = []
+        renderer = []
         for operations in ([], away, []):
             socket.send_json(look | {"operations": operations})
-            pictures.append(frame(socket)[1])
-    assert pictures[0] != pictures[1]
-    assert pictures[0] == pictures[2]
+            renderer.append(frame(socket)[1])
+    assert renderer[0] != renderer[1]
+    assert renderer[0] == renderer[2]
     after = client.get(f"/v1/scenarios/{scenario['scenario_id']}").json()
     assert after["revision"] == 0
 

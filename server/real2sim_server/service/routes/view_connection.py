@@ -20,19 +20,19 @@ from real2sim_proto.operations import Operation
 from ...edit import EditError, instances_at, replay_operations
 from ...render import Instance, RenderError
 from ...scene import Scene, SceneError
+from ..engine import QueueFullError
 from ..http.problems import ServiceError
+from ..rendering.renderer import RenderRequest
 from ..worker import Worker
-from .engine import QueueFullError
-from .renderer import RenderRequest
 
-WATCH_S = 1.0
+REVISION_CHECK_S = 1.0
 """How often an idle view looks whether somebody else changed the scenario."""
 PICK_WIDTH = 640
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-class Look(Model):
+class ViewRequest(Model):
     """A question of the browser.
 
     Attributes:
@@ -51,13 +51,13 @@ class Look(Model):
     T_world_camera: list[float] | None = Field(default=None, min_length=16, max_length=16)
     operations: list[Operation] = Field(default_factory=list, max_length=16)
     job: Identifier | None = None
-    pick: tuple[Share, Share] | None = None
+    pick: tuple[Fraction, Fraction] | None = None
 
 
-LOOK: TypeAdapter[Look] = TypeAdapter(Look)
+VIEW_REQUEST: TypeAdapter[ViewRequest] = TypeAdapter(ViewRequest)
 
 
-class View:
+class ViewConnection:
     """One browser's view of one scenario.
 
     The reader keeps one picture and one pick that wait; a newer one takes the place of the older,
@@ -68,14 +68,14 @@ class View:
         self._socket = socket
         self._worker = worker
         self._scenario_id = scenario_id
-        self._waiting: dict[str, Look] = {}
-        self._asked = asyncio.Event()
-        self._told = -1
+        self._pending: dict[str, ViewRequest] = {}
+        self._request_received = asyncio.Event()
+        self._sent_revision = -1
 
     async def serve(self) -> None:
         """Answer until the browser leaves."""
         reader = asyncio.create_task(self._read())
-        answerer = asyncio.create_task(self._answer())
+        answerer = asyncio.create_task(self._answer_requests())
         tasks = {reader, answerer}
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -93,87 +93,91 @@ class View:
         while True:
             text = await self._socket.receive_text()
             try:
-                look = LOOK.validate_json(text)
+                request = VIEW_REQUEST.validate_json(text)
             except ValidationError as error:
                 first = error.errors()[0]
                 where = ".".join(str(part) for part in first["loc"])
-                await self._tell("error", code="INVALID_REQUEST", detail=f"{where}: {first['msg']}")
+                await self._send_event(
+                    "error", code="INVALID_REQUEST", detail=f"{where}: {first['msg']}"
+                )
                 continue
-            self._waiting["pick" if look.pick else "picture"] = look
-            self._asked.set()
+            self._pending["pick" if request.pick else "picture"] = request
+            self._request_received.set()
 
-    async def _answer(self) -> None:
+    async def _answer_requests(self) -> None:
         while True:
             try:
-                await asyncio.wait_for(self._asked.wait(), WATCH_S)
+                await asyncio.wait_for(self._request_received.wait(), REVISION_CHECK_S)
             except TimeoutError:
-                await self._watch()
+                await self._check_revision()
                 continue
-            self._asked.clear()
+            self._request_received.clear()
             for kind in ("pick", "picture"):
-                look = self._waiting.pop(kind, None)
-                if look is not None:
-                    await self._answer_one(look)
+                request = self._pending.pop(kind, None)
+                if request is not None:
+                    await self._answer_one(request)
 
-    async def _answer_one(self, look: Look) -> None:
+    async def _answer_one(self, request: ViewRequest) -> None:
         try:
-            await self._show(look)
+            await self._answer_view(request)
         except ServiceError as error:
             detail = {"code": error.code, "detail": error.detail, "hint": error.hint}
-            await self._tell("error", seq=look.seq, **detail)
+            await self._send_event("error", seq=request.seq, **detail)
         except (EditError, SceneError, RenderError, QueueFullError) as error:
-            await self._tell("error", seq=look.seq, code="REFUSED", detail=str(error))
+            await self._send_event("error", seq=request.seq, code="REFUSED", detail=str(error))
 
-    async def _watch(self) -> None:
+    async def _check_revision(self) -> None:
         view = await self._worker.scenarios.view(self._scenario_id)
-        if self._told not in (-1, view.revision):
-            await self._tell("changed", revision=view.revision)
-        self._told = view.revision
+        if self._sent_revision not in (-1, view.revision):
+            await self._send_event("changed", revision=view.revision)
+        self._sent_revision = view.revision
 
-    async def _show(self, look: Look) -> None:
+    async def _answer_view(self, request: ViewRequest) -> None:
         view = await self._worker.scenarios.view(self._scenario_id)
-        if look.job is None:
-            scene = await self._worker.residency.get(view.row.scene)
+        if request.job is None:
+            scene = await self._worker.scene_cache.get(view.row.scene)
 
             def instances() -> Sequence[Instance]:
                 state = (
-                    replay_operations(view.state, look.operations)
-                    if look.operations
+                    replay_operations(view.state, request.operations)
+                    if request.operations
                     else view.state
                 )
-                return instances_at(scene, state, look.t_us)
+                return instances_at(scene, state, request.t_us)
         else:
-            film = await self._worker.simulations.film(look.job)
-            scene = film.scene
+            video_source = await self._worker.simulations.video_source(request.job)
+            scene = video_source.scene
 
             def instances() -> Sequence[Instance]:
-                return film.instances(look.t_us)
+                return video_source.instances(request.t_us)
 
-        shot = await asyncio.to_thread(lambda: _shot(scene, instances(), look))
-        pictured = await self._worker.pictures.take(shot, stream="view")
-        frame = pictured.frames[0]
-        if look.pick is not None:
+        render_request = await asyncio.to_thread(
+            lambda: _render_request(scene, instances(), request)
+        )
+        rendered = await self._worker.renderer.render(render_request, stream="view")
+        frame = rendered.frames[0]
+        if request.pick is not None:
             ids = np.frombuffer(frame.data, np.uint16).reshape(frame.shape[0], frame.shape[1])
-            picked = instance_at(ids, look.pick)
+            picked = instance_at(ids, request.pick)
             names = {o.instance_id: o.object_id for o in view.state.visible}
-            await self._tell("picked", seq=look.seq, object_id=names.get(picked))
+            await self._send_event("picked", seq=request.seq, object_id=names.get(picked))
             return
         header: dict[str, Any] = {
             "type": "frame",
-            "seq": look.seq,
+            "seq": request.seq,
             "revision": view.revision,
-            "camera": look.camera,
-            "t_us": look.t_us,
+            "camera": request.camera,
+            "t_us": request.t_us,
             "width": frame.shape[1],
             "height": frame.shape[0],
-            "T_world_camera": np.asarray(frame.T_world_sensor).ravel().tolist(),
-            "K": np.asarray(frame.K).ravel().tolist(),
-            "timing_ms": {k: round(v, 2) for k, v in pictured.timing_ms.items()},
+            "T_world_camera": np.asarray(frame.header.fields["T_world_sensor"]).ravel().tolist(),
+            "K": np.asarray(frame.header.fields["K"]).ravel().tolist(),
+            "timing_ms": {k: round(v, 2) for k, v in rendered.timing_ms.items()},
         }
-        self._told = view.revision
-        await self._socket.send_bytes(packed(header, bytes(frame.data)))
+        self._sent_revision = view.revision
+        await self._socket.send_bytes(pack_frame_message(header, bytes(frame.data)))
 
-    async def _tell(self, kind: str, **values: Any) -> None:
+    async def _send_event(self, kind: str, **values: Any) -> None:
         await self._socket.send_text(json.dumps({"type": kind, **values}))
 
 
@@ -199,24 +203,26 @@ def instance_at(ids: NDArray[np.uint16], place: tuple[float, float], *, reach: i
     return int(near[rows[nearest], columns[nearest]])
 
 
-def packed(header: dict[str, Any], data: bytes) -> bytes:
+def pack_frame_message(header: dict[str, Any], data: bytes) -> bytes:
     """One binary message: length of the header (uint32, little endian), header as JSON, data."""
     head = json.dumps(header, separators=(",", ":")).encode()
     return struct.pack("<I", len(head)) + head + data
 
 
-def _shot(scene: Scene, instances: Sequence[Instance], look: Look) -> RenderRequest:
+def _render_request(
+    scene: Scene, instances: Sequence[Instance], request: ViewRequest
+) -> RenderRequest:
     """Raises SceneError for a time or camera that the scene does not have."""
-    vehicle = scene.ego.transform(look.t_us)
-    if look.T_world_camera is not None:
-        camera = next((c for c in scene.rig if c.name == look.camera), None)
+    vehicle = scene.ego.transform(request.t_us)
+    if request.T_world_camera is not None:
+        camera = next((c for c in scene.rig if c.name == request.camera), None)
         if camera is not None:
-            T_world_camera = np.asarray(look.T_world_camera, np.float64).reshape(4, 4)
+            T_world_camera = np.asarray(request.T_world_camera, np.float64).reshape(4, 4)
             vehicle = T_world_camera @ np.linalg.inv(camera.T_vehicle_camera)
     sensor = SensorSpec(
-        camera=look.camera,
-        modalities=["instance" if look.pick else "rgb"],
-        width=PICK_WIDTH if look.pick else look.width,
-        codec="raw" if look.pick else "jpeg",
+        camera=request.camera,
+        modalities=["instance" if request.pick else "rgb"],
+        width=PICK_WIDTH if request.pick else request.width,
+        codec="raw" if request.pick else "jpeg",
     )
-    return RenderRequest(scene, instances, vehicle, look.t_us, (sensor,))
+    return RenderRequest(scene, instances, vehicle, request.t_us, (sensor,))

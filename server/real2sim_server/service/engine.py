@@ -46,21 +46,21 @@ class DeviceLostError(EngineError):
     """The device reported an error after which nothing on it works; only a new process helps."""
 
 
-class _Awaited:
+class _LoopFuture:
     """Stands for the future of a job that a coroutine awaits.
 
     :func:`asyncio.wrap_future` would do, but takes three calls more to wake the coroutine, and some
     of its work just when the engine wants to begin.
 
     Args:
-        first: called on the event loop with the result before the coroutine is woken.
+        on_result: called on the event loop with the result before the coroutine is woken.
 
     Attributes:
         outcome: what is awaited.
     """
 
-    def __init__(self, first: Callable[[Any], object] | None) -> None:
-        self._first = first
+    def __init__(self, on_result: Callable[[Any], object] | None) -> None:
+        self._on_result = on_result
         self._loop = asyncio.get_running_loop()
         self.outcome: asyncio.Future[Any] = self._loop.create_future()
 
@@ -79,17 +79,17 @@ class _Awaited:
     def set_exception(self, error: BaseException) -> None:
         self._on_loop(self._fail, error)
 
-    def _on_loop(self, settle: Callable[[Any], None], value: Any) -> None:
+    def _on_loop(self, resolve: Callable[[Any], None], value: Any) -> None:
         # Nobody waits on a loop that has been closed meanwhile.
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(settle, value)
+            self._loop.call_soon_threadsafe(resolve, value)
 
     def _succeed(self, result: Any) -> None:
         if self.outcome.done():
             return
         try:
-            if self._first is not None:
-                self._first(result)
+            if self._on_result is not None:
+                self._on_result(result)
         except Exception as error:
             self.outcome.set_exception(error)
         else:
@@ -104,7 +104,7 @@ class _Awaited:
 class _Job:
     run: Callable[[], Any]
     label: str
-    future: Future[Any] | _Awaited
+    future: Future[Any] | _LoopFuture
     queued_at: float = field(default_factory=time.perf_counter)
 
 
@@ -163,7 +163,7 @@ class Engine:
             self._accepting = False
             dropped = deque() if drain else self._take_all()
             self._changed.notify_all()
-        _refuse(dropped, EngineStoppedError("the worker stopped before this job's turn"))
+        _fail(dropped, EngineStoppedError("the worker stopped before this job's turn"))
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
             if self._thread.is_alive():
@@ -176,7 +176,7 @@ class Engine:
         fn: Callable[..., T],
         *args: Any,
         label: str = "work",
-        first: Callable[[T], object] | None = None,
+        on_result: Callable[[T], object] | None = None,
         **kwargs: Any,
     ) -> T:
         """``fn(*args, **kwargs)`` on the engine thread, awaited.
@@ -187,14 +187,14 @@ class Engine:
         Args:
             fn: with ``args`` and ``kwargs``.
             label: for metrics and messages.
-            first: called with the result on the event loop, just before the awaiting task is woken.
+            on_result: called with the result on the event loop, before the awaiting task is woken.
 
         Raises:
             QueueFullError: ``queue_length`` jobs wait already.
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
-        awaited = _Awaited(first)
+        awaited = _LoopFuture(on_result)
         job = self._submit(lambda: fn(*args, **kwargs), label, awaited)
         try:
             result: T = await awaited.outcome
@@ -227,10 +227,6 @@ class Engine:
                 self._drop(job)
             raise
 
-    def tick(self) -> None:
-        """Say that a long job makes progress."""
-        self._last_tick = time.monotonic()
-
     # --- state ------------------------------------------------------------------------------
 
     @property
@@ -252,7 +248,7 @@ class Engine:
     def queue_depth(self) -> int:
         """Jobs that wait."""
         with self._changed:
-            self._forget_cancelled()
+            self._discard_cancelled()
             return len(self._jobs)
 
     @property
@@ -262,7 +258,9 @@ class Engine:
 
     # --- inside -----------------------------------------------------------------------------
 
-    def _submit(self, run: Callable[[], Any], label: str, future: Future[Any] | _Awaited) -> _Job:
+    def _submit(
+        self, run: Callable[[], Any], label: str, future: Future[Any] | _LoopFuture
+    ) -> _Job:
         job = _Job(run, label, future)
         with self._changed:
             if self._failure is not None:
@@ -270,7 +268,7 @@ class Engine:
             if not self._accepting:
                 raise EngineStoppedError("the engine does not take jobs: it is stopping")
             if len(self._jobs) >= self.queue_length:
-                self._forget_cancelled()
+                self._discard_cancelled()
             if len(self._jobs) >= self.queue_length:
                 raise QueueFullError(
                     f"{len(self._jobs)} jobs wait for the engine, {self.queue_length} may; "
@@ -283,9 +281,9 @@ class Engine:
     def _drop(self, job: _Job) -> None:
         job.future.cancel()
         with self._changed:
-            self._forget_cancelled()
+            self._discard_cancelled()
 
-    def _forget_cancelled(self) -> None:
+    def _discard_cancelled(self) -> None:
         if any(job.future.cancelled() for job in self._jobs):
             self._jobs = deque(job for job in self._jobs if not job.future.cancelled())
 
@@ -335,7 +333,7 @@ class Engine:
             self._failure = error
             self._accepting = False
             waiting = self._take_all()
-        _refuse(waiting, DeviceLostError(f"the device was lost: {error}"))
+        _fail(waiting, DeviceLostError(f"the device was lost: {error}"))
         self.on_failure()
 
 
@@ -356,7 +354,7 @@ def _lower_priority() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
-def _refuse(jobs: Iterable[_Job], error: EngineError) -> None:
+def _fail(jobs: Iterable[_Job], error: EngineError) -> None:
     for job in jobs:
         if job.future.set_running_or_notify_cancel():
             job.future.set_exception(error)

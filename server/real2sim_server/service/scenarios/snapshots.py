@@ -10,8 +10,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ...edit import AssetLookup, EditError, Scenario, ScenarioState, pack_state, unpack_state
 from ...scene.io import SceneSummary
-from ..scenarios.replies import stored_entry
-from .store import ScenarioRow, SnapshotRow, Store, StoreError
+from ..storage.store import ScenarioRow, SnapshotRow, Store, StoreError
+from .replies import stored_entry
 
 INTERVAL = 128
 """Revisions between snapshots: each takes a few milliseconds off the back of one edit in so many,
@@ -35,7 +35,7 @@ class Snapshots:
         self._revisions: dict[str, int] = {}
         self._writing: set[asyncio.Task[None]] = set()
 
-    async def opened(
+    async def load(
         self, row: ScenarioRow, summary: SceneSummary, assets: AssetLookup | None
     ) -> Scenario:
         """A scenario from its log, which is what counts, and from a snapshot where there is one."""
@@ -50,10 +50,10 @@ class Snapshots:
             )
 
         scenario = await asyncio.to_thread(replay)
-        self.offer(row.scenario_id, scenario.revision, scenario.state)
+        self.save_if_due(row.scenario_id, scenario.revision, scenario.state)
         return scenario
 
-    def offer(self, scenario_id: str, revision: int, state: ScenarioState) -> None:
+    def save_if_due(self, scenario_id: str, revision: int, state: ScenarioState) -> None:
         """Let ``state`` be kept when the last snapshot is old; returns at once."""
         if revision - self._revisions.get(scenario_id, 0) < INTERVAL:
             return
@@ -62,11 +62,11 @@ class Snapshots:
         self._writing.add(task)
         task.add_done_callback(self._writing.discard)
 
-    def forget(self, scenario_id: str) -> None:
+    def discard(self, scenario_id: str) -> None:
         """Of a scenario that is gone."""
         self._revisions.pop(scenario_id, None)
 
-    async def written(self) -> None:
+    async def flush(self) -> None:
         """Wait until everything offered is kept."""
         await asyncio.gather(*self._writing)
 
@@ -89,7 +89,7 @@ class Snapshots:
         try:
             packed = await asyncio.to_thread(pack_state, state)
             row = SnapshotRow(scenario_id, revision, self._made_by, packed)
-            await self._store.keep_snapshot(row)
+            await self._store.save_snapshot(row)
         except (StoreError, SQLAlchemyError, RuntimeError) as error:
             # Deleted meanwhile, or the worker is stopping: the log is all that counts.
             log.info("snapshot not kept", scenario_id=scenario_id, reason=str(error))

@@ -10,11 +10,11 @@ import pytest
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import SceneState
 from real2sim_server.scene.io import read_scene_summary, save_scene
+from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.problems import ServiceError
-from real2sim_server.service.library import scene_cache as residency_module
+from real2sim_server.service.library import scene_cache as scene_cache_module
 from real2sim_server.service.library.scene_cache import SceneCache
 from real2sim_server.service.library.scene_catalog import SceneCatalog
-from real2sim_server.service.rendering.engine import Engine
 
 NAMES = ("a", "b", "c")
 
@@ -32,49 +32,49 @@ def one_scene(folder) -> int:
 
 
 def run(folder, work, *, budget_bytes: int = 10**9):
-    """Run ``work(residency)`` with an engine of its own."""
+    """Run ``work(scene_cache)`` with an engine of its own."""
 
     @asynccontextmanager
     async def running():
         engine = Engine()
         engine.start()
-        residency = SceneCache(SceneCatalog(folder), engine, budget_bytes=budget_bytes)
+        scene_cache = SceneCache(SceneCatalog(folder), engine, budget_bytes=budget_bytes)
         try:
-            yield residency
+            yield scene_cache
         finally:
-            residency.close()
+            scene_cache.close()
             await asyncio.to_thread(engine.stop)
 
     async def inside():
-        async with running() as residency:
-            return await work(residency)
+        async with running() as scene_cache:
+            return await work(scene_cache)
 
     return asyncio.run(inside())
 
 
-def resident(residency) -> list[str]:
-    return [name for name in NAMES if residency.state(name) is SceneState.RESIDENT]
+def resident(scene_cache) -> list[str]:
+    return [name for name in NAMES if scene_cache.state(name) is SceneState.RESIDENT]
 
 
 def test_a_scene_is_loaded_when_it_is_first_needed(folder):
-    async def work(residency):
-        await residency.refresh()
-        before = residency.state("a")
-        scene = await residency.get("a")
-        return before, residency.state("a"), len(scene.objects)
+    async def work(scene_cache):
+        await scene_cache.refresh()
+        before = scene_cache.state("a")
+        scene = await scene_cache.get("a")
+        return before, scene_cache.state("a"), len(scene.objects)
 
     assert run(folder, work) == (SceneState.AVAILABLE, SceneState.RESIDENT, 3)
 
 
 def test_all_users_share_one_scene_object_and_one_load(folder, monkeypatch):
     loads = []
-    load = residency_module.load_scene
+    load = scene_cache_module.load_scene
     monkeypatch.setattr(
-        residency_module, "load_scene", lambda path: loads.append(path) or load(path)
+        scene_cache_module, "load_scene", lambda path: loads.append(path) or load(path)
     )
 
-    async def work(residency):
-        return await asyncio.gather(*(residency.get("a") for _ in range(5)))
+    async def work(scene_cache):
+        return await asyncio.gather(*(scene_cache.get("a") for _ in range(5)))
 
     scenes = run(folder, work)
     assert all(scene is scenes[0] for scene in scenes)
@@ -82,11 +82,11 @@ def test_all_users_share_one_scene_object_and_one_load(folder, monkeypatch):
 
 
 def test_a_scene_is_loading_while_it_is_read(folder):
-    async def work(residency):
-        task = asyncio.create_task(residency.get("a"))
+    async def work(scene_cache):
+        task = asyncio.create_task(scene_cache.get("a"))
         states = set()
         while not task.done():
-            states.add(residency.state("a"))
+            states.add(scene_cache.state("a"))
             await asyncio.sleep(0)
         return states
 
@@ -94,10 +94,10 @@ def test_a_scene_is_loading_while_it_is_read(folder):
 
 
 def test_one_who_stops_waiting_does_not_end_the_load_for_the_others(folder):
-    async def work(residency):
-        first = asyncio.create_task(residency.get("a"))
-        second = asyncio.create_task(residency.get("a"))
-        while residency.state("a") is not SceneState.LOADING:
+    async def work(scene_cache):
+        first = asyncio.create_task(scene_cache.get("a"))
+        second = asyncio.create_task(scene_cache.get("a"))
+        while scene_cache.state("a") is not SceneState.LOADING:
             await asyncio.sleep(0)
         first.cancel()
         return await second
@@ -106,30 +106,30 @@ def test_one_who_stops_waiting_does_not_end_the_load_for_the_others(folder):
 
 
 def test_the_longest_unused_scene_leaves_first(folder, one_scene):
-    async def work(residency):
+    async def work(scene_cache):
         for name in ("a", "b", "a", "c"):
-            await residency.get(name)
-        return resident(residency)
+            await scene_cache.get(name)
+        return resident(scene_cache)
 
     assert run(folder, work, budget_bytes=2 * one_scene) == ["a", "c"]
 
 
 def test_a_pinned_scene_never_leaves(folder, one_scene):
-    async def work(residency):
-        await residency.pin("a")
+    async def work(scene_cache):
+        await scene_cache.pin("a")
         for name in ("b", "c"):
-            await residency.get(name)
-        return resident(residency)
+            await scene_cache.get(name)
+        return resident(scene_cache)
 
     assert run(folder, work, budget_bytes=2 * one_scene) == ["a", "c"]
 
 
 def test_when_all_is_pinned_another_scene_is_refused_with_the_bytes(folder, one_scene):
-    async def work(residency):
-        await residency.pin("a")
+    async def work(scene_cache):
+        await scene_cache.pin("a")
         with pytest.raises(ServiceError) as caught:
-            await residency.get("b")
-        return caught.value, resident(residency)
+            await scene_cache.get("b")
+        return caught.value, resident(scene_cache)
 
     error, left = run(folder, work, budget_bytes=one_scene + 10)
     assert error.code is ErrorCode.OUT_OF_MEMORY
@@ -138,11 +138,11 @@ def test_when_all_is_pinned_another_scene_is_refused_with_the_bytes(folder, one_
 
 
 def test_unpinned_again_it_makes_room(folder, one_scene):
-    async def work(residency):
-        async with residency.pinned("a"):
+    async def work(scene_cache):
+        async with scene_cache.pinned("a"):
             pass
-        await residency.get("b")
-        return resident(residency)
+        await scene_cache.get("b")
+        return resident(scene_cache)
 
     assert run(folder, work, budget_bytes=one_scene + 10) == ["b"]
 
@@ -151,21 +151,23 @@ def test_a_scene_above_the_budget_is_refused_and_nothing_leaves(folder, one_scen
     big = replace(tiny_scene, name="big", background=tiny_scene.background.with_sh_degree(3))
     save_scene(big, folder / "big.r2s")
 
-    async def work(residency):
-        await residency.get("a")
+    async def work(scene_cache):
+        await scene_cache.get("a")
         with pytest.raises(ServiceError, match=f"the budget is {one_scene + 10}") as caught:
-            await residency.get("big")
-        return caught.value.code, resident(residency)
+            await scene_cache.get("big")
+        return caught.value.code, resident(scene_cache)
 
     assert run(folder, work, budget_bytes=one_scene + 10) == (ErrorCode.OUT_OF_MEMORY, ["a"])
 
 
 def test_loads_under_way_count_against_the_budget(folder, one_scene, monkeypatch):
-    go_on, load = threading.Event(), residency_module.load_scene
-    monkeypatch.setattr(residency_module, "load_scene", lambda path: go_on.wait(60) and load(path))
+    go_on, load = threading.Event(), scene_cache_module.load_scene
+    monkeypatch.setattr(
+        scene_cache_module, "load_scene", lambda path: go_on.wait(60) and load(path)
+    )
 
-    async def work(residency):
-        asked = [asyncio.create_task(residency.get(name)) for name in NAMES]
+    async def work(scene_cache):
+        asked = [asyncio.create_task(scene_cache.get(name)) for name in NAMES]
         (refused,), loading = await asyncio.wait(asked, return_when=asyncio.FIRST_COMPLETED)
         go_on.set()
         await asyncio.gather(*loading)
@@ -175,20 +177,20 @@ def test_loads_under_way_count_against_the_budget(folder, one_scene, monkeypatch
 
 
 def test_a_scene_in_use_is_not_unloaded(folder):
-    async def work(residency):
-        await residency.pin("a")
+    async def work(scene_cache):
+        await scene_cache.pin("a")
         with pytest.raises(ServiceError, match="1 sessions use scene 'a'") as caught:
-            await residency.unload("a")
-        residency.unpin("a")
-        await residency.unload("a")
-        return caught.value.code, residency.state("a")
+            await scene_cache.unload("a")
+        scene_cache.unpin("a")
+        await scene_cache.unload("a")
+        return caught.value.code, scene_cache.state("a")
 
     assert run(folder, work) == (ErrorCode.SCENE_IN_USE, SceneState.AVAILABLE)
 
 
 def test_an_unknown_scene_is_refused_with_the_names_there_are(folder):
-    async def work(residency):
-        await residency.get("zzz")
+    async def work(scene_cache):
+        await scene_cache.get("zzz")
 
     with pytest.raises(ServiceError, match="there are: a, b, c") as caught:
         run(folder, work)
@@ -201,22 +203,22 @@ def test_a_bundle_changed_byte_is_found_while_loading_and_the_others_work(folder
     content[-5] ^= 0xFF
     tensors.write_bytes(content)
 
-    async def work(residency):
-        await residency.refresh()
-        before = residency.state("a")
+    async def work(scene_cache):
+        await scene_cache.refresh()
+        before = scene_cache.state("a")
         with pytest.raises(ServiceError) as caught:
-            await residency.get("a")
-        await residency.get("b")
-        return before, caught.value.code, residency.state("a")
+            await scene_cache.get("a")
+        await scene_cache.get("b")
+        return before, caught.value.code, scene_cache.state("a")
 
     broken = (SceneState.AVAILABLE, ErrorCode.SCENE_BROKEN, SceneState.BROKEN)
     assert run(folder, work) == broken
 
 
 def test_a_scene_added_later_is_found(folder, tiny_scene):
-    async def work(residency):
-        await residency.refresh()
+    async def work(scene_cache):
+        await scene_cache.refresh()
         save_scene(replace(tiny_scene, name="late"), folder / "late.r2s")
-        return await residency.get("late")
+        return await scene_cache.get("late")
 
     assert run(folder, work).name == "late"

@@ -1,0 +1,24 @@
+"""Kinds of images that a camera gives: each one module with its registration."""
+
+from . import rgb, depth, instance  # noqa: F401, I001, registered in this order
+from .base import (
+    SensorModality,
+    encode_image,
+    modalities_drawn,
+    modality_names,
+    modality_of,
+    options_for,
+    register,
+    unregister,
+)
+
+__all__ = [
+    "SensorModality",
+    "encode_image",
+    "modalities_drawn",
+    "modality_names",
+    "modality_of",
+    "options_for",
+    "register",
+    "unregister",
+]

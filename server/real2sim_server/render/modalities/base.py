@@ -1,0 +1,123 @@
+"""What a sensor modality is, and the registry of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..encode import EncodedImage
+from ..types import RasterOptions, RenderError, RenderOutput
+
+SWITCHES = ("depth", "instance")
+"""Fields of RasterOptions that turn an image of the pass on."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModality:
+    """One kind of image of a camera, from the rasterizer's output to bytes.
+
+    Attributes:
+        name: as sensors ask for it.
+        dtype: of a raw pixel; little-endian.
+        channels: trailing shape of an image: ``(3,)`` is [H, W, 3], ``()`` is [H, W].
+        codecs: that it can be encoded with; ``jpeg`` becomes ``png`` where it is not among them.
+        pixels: images [C, H, W, *channels] of a pass, of ``dtype``.
+        encode: bytes of an image by codec and quality; raises RenderError for an image of another
+            dtype or shape.
+        switch: field of RasterOptions without which the pass does not draw it; None for none.
+        encoded_dtypes: dtype of the decoded array by codec, where it is not ``dtype``.
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    channels: tuple[int, ...]
+    codecs: tuple[str, ...]
+    pixels: Callable[[RenderOutput], NDArray[Any]]
+    encode: Callable[[NDArray[Any], str, int], bytes]
+    switch: str | None = None
+    encoded_dtypes: dict[str, str] = field(default_factory=dict)
+
+    def shape(self, width: int, height: int) -> tuple[int, ...]:
+        """Of an image of that size [px]."""
+        return (height, width, *self.channels)
+
+    def raw_bytes(self, width: int, height: int) -> int:
+        """Size of a raw image."""
+        return int(np.prod(self.shape(width, height))) * self.dtype.itemsize
+
+
+_registry: dict[str, SensorModality] = {}
+
+
+def register(modality: SensorModality) -> SensorModality:
+    """Make a modality known under its name.
+
+    Raises:
+        ValueError: the name is taken, or ``raw`` and ``png`` are not among the codecs, or the
+            rasterizer has no such switch.
+    """
+    if modality.name in _registry:
+        raise ValueError(f"there is a modality {modality.name!r} already")
+    if not {"raw", "png"} <= set(modality.codecs):
+        raise ValueError(f"modality {modality.name!r} must know the codecs 'raw' and 'png'")
+    if modality.switch is not None and modality.switch not in SWITCHES:
+        raise ValueError(f"switch {modality.switch!r} is none of {', '.join(SWITCHES)}")
+    _registry[modality.name] = modality
+    return modality
+
+
+def unregister(name: str) -> None:
+    """Forget a modality, for tests that register one."""
+    del _registry[name]
+
+
+def modality_names() -> tuple[str, ...]:
+    """All modalities in the order of their registration."""
+    return tuple(_registry)
+
+
+def modality_of(name: str) -> SensorModality:
+    """The modality of that name. Raises RenderError, naming those there are."""
+    found = _registry.get(name)
+    if found is None:
+        allowed = ", ".join(repr(known) for known in _registry)
+        raise RenderError(f"unknown modality {name!r}; allowed are {allowed}")
+    return found
+
+
+def options_for(names: Iterable[str], options: RasterOptions) -> RasterOptions:
+    """``options`` with the switches of a pass that draws these modalities."""
+    wanted = {modality_of(name).switch for name in names}
+    return replace(options, depth="depth" in wanted, instance="instance" in wanted)
+
+
+def modalities_drawn(options: RasterOptions) -> tuple[str, ...]:
+    """``rgb``, and what the switches of a pass add to it."""
+    return ("rgb", *(switch for switch in SWITCHES if getattr(options, switch)))
+
+
+def encode_image(
+    image: NDArray[Any], modality: str, codec: str, *, quality: int = 90
+) -> EncodedImage:
+    """Encode an image of a modality; lossless ones become png where jpeg is asked for.
+
+    Args:
+        image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` [m], or
+            [H, W] uint16 ``instance``.
+        modality: name of a registered one.
+        codec: ``raw``, ``jpeg`` or ``png``.
+        quality: of jpeg, 1 to 100.
+
+    Raises:
+        RenderError: unknown modality or codec, or an image of another kind.
+    """
+    kind = modality_of(modality)
+    if codec == "jpeg" and codec not in kind.codecs:
+        codec = "png"
+    data = kind.encode(image, codec, quality)
+    dtype = kind.encoded_dtypes.get(codec, kind.dtype.name)
+    return EncodedImage(data, codec, dtype, image.shape)

@@ -1,0 +1,197 @@
+"""Images as frames of the wire: the one place where an image becomes bytes.
+
+A frame is a msgpack map whose last member is ``data``. All before it is its header, which for a raw
+image is known before the image is drawn; the image itself is never copied.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto import encode
+from real2sim_proto.episode import SensorSpec
+
+from ...render.modalities import encode_image, modality_of
+from ...scene import Camera
+
+Part = bytes | memoryview
+"""Bytes of a message, sent as they lie in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedImage:
+    """One rendered image on its way into a frame.
+
+    Attributes:
+        sensor: that it was rendered for.
+        modality: name of a registered one.
+        t_us: instant [us].
+        T_world_sensor: [4, 4] float64, camera frame to world.
+        K: [3, 3] float64 intrinsics [px].
+        pixels: of the dtype and shape of the modality.
+    """
+
+    sensor: SensorSpec
+    modality: str
+    t_us: int
+    T_world_sensor: NDArray[np.float64]
+    K: NDArray[np.float64]
+    pixels: NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameHeader:
+    """A frame up to the bytes of its image.
+
+    Attributes:
+        fields: of the wire's Frame, in its order, without ``data``.
+        encoded: those fields, and the beginning of ``data``.
+    """
+
+    fields: dict[str, Any]
+    encoded: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedFrame:
+    """One image, encoded.
+
+    Attributes:
+        header: everything but its bytes.
+        data: its bytes.
+    """
+
+    header: FrameHeader
+    data: Part
+
+    @property
+    def codec(self) -> str:
+        """``raw``, ``jpeg`` or ``png``."""
+        return str(self.header.fields["codec"])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the decoded image."""
+        return tuple(self.header.fields["shape"])
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Of the wire's Frame, ``data`` as bytes among them."""
+        return self.header.fields | {"data": bytes(self.data)}
+
+
+def encode_frame(image: RenderedImage) -> EncodedFrame:
+    """The frame of an image; raw ones are views of its pixels. On any thread."""
+    fields = _place_fields(image.sensor, image.modality, image.t_us, image.T_world_sensor, image.K)
+    if image.sensor.codec == "raw":
+        return with_pixels(_raw_header(fields, image.pixels.shape[:2]), image.pixels)
+    encoded = encode_image(
+        image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality
+    )
+    fields |= {"codec": encoded.codec, "dtype": encoded.dtype, "shape": list(encoded.shape)}
+    return EncodedFrame(_frame_header(fields, len(encoded.data)), encoded.data)
+
+
+def raw_headers(
+    sensors: Sequence[SensorSpec],
+    cameras: Sequence[Camera],
+    T_world_vehicle: NDArray[np.float64],
+    t_us: int,
+) -> list[FrameHeader]:
+    """Headers of the raw images of ``sensors``, which need not be rendered yet.
+
+    Args:
+        sensors: S of them.
+        cameras: of the sensors, S of them.
+        T_world_vehicle: [4, 4], where the cameras' vehicle stands.
+        t_us: the instant [us].
+    """
+    return [
+        _raw_header(
+            _place_fields(sensor, modality, t_us, camera.pose(T_world_vehicle), camera.K),
+            (camera.height, camera.width),
+        )
+        for sensor, camera in zip(sensors, cameras, strict=True)
+        for modality in sensor.modalities
+    ]
+
+
+def with_pixels(header: FrameHeader, pixels: NDArray[Any]) -> EncodedFrame:
+    """The frame of a raw image; a view of its pixels.
+
+    Raises:
+        TypeError: the image has another dtype or shape than its header says.
+    """
+    fields = header.fields
+    dtype = modality_of(fields["modality"]).dtype
+    if list(pixels.shape) != fields["shape"] or pixels.dtype != dtype:
+        raise TypeError(
+            f"an image of {pixels.dtype} {pixels.shape} instead of {fields['dtype']} "
+            f"{fields['shape']}"
+        )
+    return EncodedFrame(header, np.ascontiguousarray(pixels).data.cast("B"))
+
+
+@functools.cache
+def map_header(members: int) -> bytes:
+    """Of a msgpack map."""
+    header: bytes = msgpack.Packer().pack_map_header(members)
+    return header
+
+
+@functools.cache
+def array_header(items: int) -> bytes:
+    """Of a msgpack array."""
+    header: bytes = msgpack.Packer().pack_array_header(items)
+    return header
+
+
+def pack_pairs(fields: Mapping[str, Any]) -> bytes:
+    """The members of a map without its header, to be joined with others into one map."""
+    return encode(dict(fields))[len(map_header(len(fields))) :]
+
+
+def _place_fields(
+    sensor: SensorSpec,
+    modality: str,
+    t_us: int,
+    T_world_sensor: NDArray[np.float64],
+    K: NDArray[np.float64],
+) -> dict[str, Any]:
+    """What a frame says of when and from where."""
+    return {
+        "sensor": sensor.camera,
+        "modality": modality,
+        "t_us": t_us,
+        "T_world_sensor": T_world_sensor,
+        "K": K,
+    }
+
+
+def _raw_header(place: dict[str, Any], size: tuple[int, ...]) -> FrameHeader:
+    """Of a raw image of ``size`` (height, width)."""
+    modality = modality_of(place["modality"])
+    height, width = size
+    shape = [height, width, *modality.channels]
+    form = {"codec": "raw", "dtype": modality.dtype.name, "shape": shape}
+    return _frame_header(place | form, modality.raw_bytes(width, height))
+
+
+def _frame_header(fields: dict[str, Any], size: int) -> FrameHeader:
+    encoded = map_header(len(fields) + 1) + pack_pairs(fields) + DATA + _bin_header(size)
+    return FrameHeader(fields, encoded)
+
+
+def _bin_header(length: int) -> bytes:
+    # Always of 32 bits, which msgpack's own packer writes for large values only.
+    return b"\xc6" + length.to_bytes(4, "big")
+
+
+DATA: bytes = msgpack.packb("data")

@@ -1,0 +1,351 @@
+"""The step pipeline: from the bytes of an action to the bytes of the observation that answers it.
+
+A step passes seven phases. Each is a function of that name, so that a profile shows them too.
+
+============  =====================  ==========================================================
+phase         runs on                what happens
+============  =====================  ==========================================================
+``receive``   event loop             a message is read, decoded and validated (`connection`)
+``check``     event loop             role, session, lock step: is this the action due (`connection`)
+``advance``   engine                 a fork of the world moves, as far as images show it
+``render``    engine                 deformations, then the images of all sensors due
+``evaluate``  beside the rendering   metrics and events; the log entry is written; all of the
+                                     observation but its images is packed, headers of raw images
+                                     included
+``encode``    engine, or encoders    raw images are taken as they are on the engine; others are
+                                     encoded beside it; the parts become one message
+``send``      event loop             written to the socket in the very call that ends the engine's
+                                     job; what cannot be written at once goes the ordinary way
+============  =====================  ==========================================================
+
+A world without sensors moves on a thread of its own: it needs no device, and its planner should not
+wait while other sessions are rendered.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, TypeVar
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.codec import DEFAULT_MAX_BYTES
+from real2sim_proto.episode import SensorSpec
+
+from ...edit import ScenarioState, instances_at
+from ...render.modalities import modality_of
+from ...scene import Camera, Scene
+from ...world import World
+from ..engine import Engine
+from ..http.metrics import Metrics
+from ..http.problems import ServiceError
+from ..rendering.frames import (
+    EncodedFrame,
+    FrameHeader,
+    RenderedImage,
+    encode_frame,
+    raw_headers,
+    with_pixels,
+)
+from ..rendering.renderer import Renderer, RenderRequest, check_sensors
+from .wire import EncodedMembers, Message, StageTimer, pack_members, pack_with_frames
+
+T = TypeVar("T")
+
+WARM_UP_WIDTH = 320
+MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
+"""Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
+
+
+@dataclass(eq=False)
+class Transition:
+    """A change of a session's world on its way through the pipeline.
+
+    Attributes:
+        change: makes the new world, complete as far as images show it, and leaves the present one
+            alone; runs off the event loop.
+        cameras: of the world's sensors, by name, at the sizes asked for.
+        record: writes the log entry of the change; runs off the event loop, once the new world is
+            evaluated. None where it is in the log already.
+        write: hands a message to the socket if nothing has to be waited for; whether it did. None
+            where nobody waits for the observation. Runs on the event loop; nothing fails after it.
+        timer: of the stages.
+        recorded: whether ``record`` is done.
+        sent: whether ``write`` is done.
+    """
+
+    change: Callable[[], World]
+    cameras: Mapping[str, Camera]
+    record: Callable[[], object] | None = None
+    write: Callable[[Message], bool] | None = None
+    timer: StageTimer = field(default_factory=StageTimer)
+    recorded: bool = False
+    sent: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedObservation:
+    """An instant before its images are encoded.
+
+    Attributes:
+        world: at that instant.
+        images: in the order of sensors and modalities.
+        kind, members: of the message, without frames and timing.
+        timer: runs on.
+    """
+
+    world: World
+    images: Sequence[RenderedImage]
+    kind: str
+    members: EncodedMembers
+    timer: StageTimer
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedObservation:
+    """An instant as a message.
+
+    Attributes:
+        world: at that instant; it is not committed by being shown.
+        frames: the images of the message.
+        message: for all who get it.
+        timing_ms: by stage.
+    """
+
+    world: World
+    frames: Sequence[EncodedFrame]
+    message: Message
+    timing_ms: Mapping[str, float]
+
+
+class StepPipeline:
+    """Makes observations of changed worlds, and views of present ones.
+
+    Args:
+        engine: runs what is rendered.
+        renderer: renders and encodes.
+        metrics: gets durations by stage.
+        max_pixels: over all images of one instant.
+    """
+
+    def __init__(
+        self, engine: Engine, renderer: Renderer, metrics: Metrics, *, max_pixels: int
+    ) -> None:
+        self._engine = engine
+        self._renderer = renderer
+        self._metrics = metrics
+        self._max_pixels = max_pixels
+        self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
+        self._evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
+
+    def close(self) -> None:
+        """End its threads."""
+        self._worlds.shutdown(cancel_futures=True)
+        self._evaluators.shutdown(cancel_futures=True)
+
+    def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
+        """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
+        cameras = self._checked(scene, sensors)
+        return {s.camera: c for s, c in zip(sensors, cameras, strict=True)}
+
+    async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
+        """``fn(*args)`` on the thread that moves worlds without sensors."""
+        return await asyncio.get_running_loop().run_in_executor(self._worlds, fn, *args)
+
+    # --- a change of the world ----------------------------------------------------------------
+
+    async def run(self, transition: Transition) -> EncodedObservation:
+        """Advance, render, evaluate, encode and send; the observation of the new world.
+
+        Evaluation has ended when this returns or raises. Where it raises, nothing has happened but
+        that the change may be on record.
+
+        Raises:
+            QueueFullError: too much waits for the engine.
+        """
+        observation: RenderedObservation | EncodedObservation
+        if transition.cameras:
+            observation = await self._engine.call(
+                self._compute, transition, label="drive", on_result=partial(self.send, transition)
+            )
+        else:
+            observation = await self.on_world_thread(self._compute, transition)
+        return await self._finish(observation)
+
+    def _compute(self, transition: Transition) -> RenderedObservation | EncodedObservation:
+        """The phases of one job, which ends encoded where all images are raw."""
+        timer = transition.timer
+        timer.stage("queue")
+        world = self.advance(transition)
+        sensors = world.due_sensors()
+        cameras = [transition.cameras[s.camera] for s in sensors]
+        timer.stage("world")
+        images: Sequence[RenderedImage] = ()
+        if sensors:
+            evaluation = self._evaluators.submit(self.evaluate, transition, world, sensors, cameras)
+            try:
+                images = self.render(world, sensors, cameras, timer)
+            finally:
+                evaluation.exception()  # waits
+            members, headers = evaluation.result()
+        else:
+            timer.stage("render")
+            members, headers = self.evaluate(transition, world, sensors, cameras)
+        # Of the evaluation only what did not happen beside the rendering.
+        timer.stage("settle")
+        rendered = RenderedObservation(world, images, "obs", members, timer)
+        return rendered if headers is None else self.encode(rendered, headers)
+
+    def advance(self, transition: Transition) -> World:
+        """The new world, as far as images show it."""
+        return transition.change()
+
+    def render(
+        self,
+        world: World,
+        sensors: Sequence[SensorSpec],
+        cameras: Sequence[Camera],
+        timer: StageTimer,
+    ) -> Sequence[RenderedImage]:
+        """Images of a world, its objects deformed first."""
+        if world.deformation is not None:
+            world.deformation.solve()
+            timer.stage("physics")
+        images = self._images(world, sensors, cameras)
+        timer.stage("render")
+        return images
+
+    def evaluate(
+        self,
+        transition: Transition,
+        world: World,
+        sensors: Sequence[SensorSpec],
+        cameras: Sequence[Camera],
+    ) -> tuple[EncodedMembers, list[FrameHeader] | None]:
+        """Complete the world by what images do not show, and put the change on record.
+
+        Returns:
+            The observation without its images, and the headers of these where all are raw.
+        """
+        world.evaluate()
+        if transition.record is not None:
+            transition.record()
+            transition.recorded = True
+        members = pack_members(world.observe().obs_fields())
+        if any(sensor.codec != "raw" for sensor in sensors):
+            return members, None
+        return members, raw_headers(sensors, cameras, world.T_world_vehicle, world.t_us)
+
+    def encode(
+        self, rendered: RenderedObservation, headers: Sequence[FrameHeader]
+    ) -> EncodedObservation:
+        """The message of an instant whose images are all raw."""
+        frames = [with_pixels(h, i.pixels) for h, i in zip(headers, rendered.images, strict=True)]
+        return _with_frames(rendered, frames)
+
+    def send(
+        self, transition: Transition, observation: RenderedObservation | EncodedObservation
+    ) -> None:
+        """Write the observation to the socket, if it is there already and nothing has to wait."""
+        if transition.write is not None and isinstance(observation, EncodedObservation):
+            transition.sent = transition.write(observation.message)
+
+    # --- a view of a world that stays as it is --------------------------------------------------
+
+    async def view(self, world: World, sensors: Sequence[SensorSpec]) -> EncodedObservation:
+        """Images of a committed instant, from cameras of the vehicle; time does not move.
+
+        Raises:
+            ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
+            QueueFullError: too much waits for the engine.
+        """
+        cameras = self._checked(world.scene, sensors)
+        rendered = await self._engine.call(
+            self._compute_view, world, sensors, cameras, StageTimer(), label="view"
+        )
+        return await self._finish(rendered)
+
+    def _compute_view(
+        self,
+        world: World,
+        sensors: Sequence[SensorSpec],
+        cameras: Sequence[Camera],
+        timer: StageTimer,
+    ) -> RenderedObservation:
+        timer.stage("queue")
+        images = self._images(world, sensors, cameras)
+        timer.stage("render")
+        members = pack_members({"t_us": world.t_us, "revision": world.revision})
+        return RenderedObservation(world, images, "view", members, timer)
+
+    async def first_render(self, scene: Scene, state: ScenarioState) -> None:
+        """Render a scene from its first camera, to have everything compiled and in memory."""
+        request = RenderRequest(
+            scene=scene,
+            instances=instances_at(scene, state, scene.start_us),
+            T_world_vehicle=scene.ego.transform(scene.start_us),
+            t_us=scene.start_us,
+            sensors=(SensorSpec(camera=scene.rig.names[0], width=WARM_UP_WIDTH),),
+        )
+        await self._renderer.render(request, stream="warm-up")
+
+    # --- inside ---------------------------------------------------------------------------------
+
+    def _checked(self, scene: Scene, sensors: Sequence[SensorSpec]) -> list[Camera]:
+        cameras = check_sensors(scene.rig, sensors, max_pixels=self._max_pixels)
+        size = sum(
+            modality_of(modality).raw_bytes(camera.width, camera.height)
+            for camera, sensor in zip(cameras, sensors, strict=True)
+            for modality in sensor.modalities
+            if sensor.codec == "raw"
+        )
+        if size > MAX_IMAGE_BYTES:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"{size} bytes of raw images in one message; readers allow {MAX_IMAGE_BYTES}",
+                hint="ask for smaller or fewer images, or for codec 'jpeg' or 'png'",
+            )
+        return cameras
+
+    def _images(
+        self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]
+    ) -> Sequence[RenderedImage]:
+        request = RenderRequest(
+            scene=world.scene,
+            instances=world.instances(),
+            T_world_vehicle=world.T_world_vehicle,
+            t_us=world.t_us,
+            sensors=sensors,
+        )
+        images, _ = self._renderer.render_images(request, cameras)
+        return images
+
+    async def _finish(
+        self, observation: RenderedObservation | EncodedObservation
+    ) -> EncodedObservation:
+        """The observation encoded, and counted once the answer is on its way."""
+        if isinstance(observation, RenderedObservation):
+            frames = await self._renderer.on_encoders(encode_frame, observation.images)
+            (observation,) = await self._renderer.on_encoders(
+                lambda rendered: _with_frames(rendered, frames), [observation]
+            )
+        asyncio.get_running_loop().call_soon(self._count, observation)
+        return observation
+
+    def _count(self, observation: EncodedObservation) -> None:
+        for stage, ms in observation.timing_ms.items():
+            self._metrics.stages.labels(stage).observe(ms / 1e3)
+        for frame in observation.frames:
+            self._metrics.frames.labels("drive", frame.codec).inc()
+
+
+def _with_frames(
+    rendered: RenderedObservation, frames: Sequence[EncodedFrame]
+) -> EncodedObservation:
+    timer = rendered.timer
+    timer.stage("encode")
+    message = pack_with_frames(rendered.kind, rendered.members, frames, timer)
+    return EncodedObservation(rendered.world, frames, message, timer.timing_ms)

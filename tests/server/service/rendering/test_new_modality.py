@@ -1,0 +1,95 @@
+"""A sensor modality is one module with a registration; nothing of the service changes for it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from real2sim_proto import decode
+from real2sim_proto.episode import SensorSpec
+from real2sim_server.edit import ScenarioState, instances_at
+from real2sim_server.render import RenderOutput, select_backend
+from real2sim_server.render.encode import EXACT_CODECS, encode_lossless
+from real2sim_server.render.modalities import SensorModality, register, unregister
+from real2sim_server.scene import Scene
+from real2sim_server.service.engine import Engine
+from real2sim_server.service.http.metrics import Metrics
+from real2sim_server.service.rendering.frames import EncodedFrame, raw_headers
+from real2sim_server.service.rendering.renderer import Renderer, RenderRequest
+from real2sim_server.service.sessions.wire import StageTimer, pack_members, pack_with_frames
+
+
+def opacity(output: RenderOutput) -> NDArray[np.uint8]:
+    levels: NDArray[np.uint8] = (output.alpha * 255 + 0.5).byte().cpu().numpy()
+    return levels
+
+
+@pytest.fixture
+def alpha() -> Iterator[SensorModality]:
+    """Accumulated opacity in 255 levels."""
+    dtype = np.dtype(np.uint8)
+    yield register(
+        SensorModality(
+            name="alpha",
+            dtype=dtype,
+            channels=(),
+            codecs=EXACT_CODECS,
+            pixels=opacity,
+            encode=lambda image, codec, _: encode_lossless(image, codec, name="alpha", dtype=dtype),
+        )
+    )
+    unregister("alpha")
+
+
+def rendered(scene: Scene, codec: str) -> list[EncodedFrame]:
+    """Frames of one camera for the modalities rgb and alpha."""
+    # Not validated: the schema of requests is a public contract and names the public ones.
+    sensor = SensorSpec.model_construct(
+        camera=scene.rig.names[0], modalities=["rgb", "alpha"], codec=codec
+    )
+    request = RenderRequest(
+        scene=scene,
+        instances=instances_at(scene, ScenarioState.of(scene), scene.start_us),
+        T_world_vehicle=scene.ego.transform(scene.start_us),
+        t_us=scene.start_us,
+        sensors=(sensor,),
+    )
+    engine = Engine()
+    engine.start()
+    renderer = Renderer(engine, select_backend("cpu"), Metrics(), max_pixels=10**7)
+    try:
+        return asyncio.run(renderer.render(request)).frames
+    finally:
+        renderer.close()
+        engine.stop()
+
+
+@pytest.mark.parametrize("codec", ["raw", "png", "jpeg"])
+def test_a_registered_modality_is_rendered_and_encoded(alpha, tiny_scene, codec):
+    rgb, frame = rendered(tiny_scene, codec)
+    camera = tiny_scene.rig.cameras[0]
+    assert (rgb.header.fields["modality"], frame.header.fields["modality"]) == ("rgb", "alpha")
+    assert frame.codec == ("raw" if codec == "raw" else "png")
+    assert frame.shape == (camera.height, camera.width)
+    assert frame.header.fields["dtype"] == "uint8"
+
+
+def test_its_frame_is_read_from_the_message_of_an_observation(alpha, tiny_scene):
+    frames = rendered(tiny_scene, "raw")
+    message = pack_with_frames("obs", pack_members({"step": 1}), frames, StageTimer())
+    received = decode(message.joined(3))["frames"][1]
+    levels = np.frombuffer(received["data"], received["dtype"]).reshape(received["shape"])
+    assert received["modality"] == "alpha"
+    assert 0 < levels.max() <= 255
+
+
+def test_the_header_of_its_raw_image_is_known_before_it_is_rendered(alpha, tiny_scene):
+    _, frame = rendered(tiny_scene, "raw")
+    sensor = SensorSpec.model_construct(camera="front", modalities=["alpha"], codec="raw")
+    (header,) = raw_headers([sensor], tiny_scene.rig.cameras[:1], np.eye(4), 0)
+    assert header.fields["shape"] == list(frame.shape)
+    assert len(header.encoded) > 0
