@@ -39,7 +39,7 @@ def drag(url: str, *, scene: str, frames: int) -> tuple[list[float], list[int]]:
         with _view(url, scenario.scenario_id) as socket:
             for k in range(WARM_UP + frames):
                 started = time.perf_counter()
-                header = _look(socket, k)
+                header = _request_frame(socket, k)
                 times.append((time.perf_counter() - started) * 1e3)
                 size = [header["width"], header["height"]]
         client.scenarios.delete(scenario.scenario_id)
@@ -57,11 +57,11 @@ def _view(url: str, scenario_id: str) -> Iterator[ClientConnection]:
         yield socket
 
 
-def _look(socket: ClientConnection, k: int) -> dict[str, Any]:
+def _request_frame(socket: ClientConnection, k: int) -> dict[str, Any]:
     across = REACH * (1 - math.cos(2 * math.pi * k / ROUND)) / 2
     move = {"op": "translate", "object_id": SUBJECT, "y": across, "snap": True}
-    look = {"seq": k, "camera": CAMERA, "t_us": T_US, "width": WIDTH, "operations": [move]}
-    socket.send(json.dumps(look))
+    request = {"seq": k, "camera": CAMERA, "t_us": T_US, "width": WIDTH, "operations": [move]}
+    socket.send(json.dumps(request))
     while True:
         message = socket.recv(timeout=ANSWER_S)
         if isinstance(message, str):

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.sessions import SessionInfo
@@ -44,7 +44,11 @@ class DriveProbe:
 
     def __enter__(self) -> Self:
         self.socket = LeanSocket(self._info.ws_url, subprotocol=DRIVE_SUBPROTOCOL)
-        hello = {"type": "hello", "protocols": [DRIVE_SUBPROTOCOL], "token": self._info.token}
+        hello: dict[str, Any] = {
+            "type": "hello",
+            "protocols": [DRIVE_SUBPROTOCOL],
+            "token": self._info.token,
+        }
         if self._resume is not None:
             token, step = self._resume
             hello["resume"] = {"token": token, "last_step": step}
@@ -86,7 +90,7 @@ class DriveProbe:
         while True:
             received = self.socket.recv(ANSWER_S)
             seconds = time.perf_counter() - started
-            answer = decode(received)
+            answer = decode(cast("bytes", received))
             if answer["type"] == "obs" and answer["id"] == 0:
                 self.pushed = answer
             elif answer["type"] != "progress":
@@ -102,7 +106,7 @@ class DriveProbe:
             if left <= 0:
                 return
             with contextlib.suppress(TimeoutError):
-                answer = decode(self.socket.recv(left))
+                answer = decode(cast("bytes", self.socket.recv(left)))
                 if answer["type"] == "obs":
                     self.pushed = answer
 

@@ -52,7 +52,7 @@ Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Effort:
+class EditBenchOptions:
     """How much is measured: edits on one scenario, Gaussians of its scene, previews of a drag."""
 
     operations: int = 1000
@@ -60,41 +60,41 @@ class Effort:
     previews: int = 200
 
 
-def run(effort: Effort | None = None) -> Figures:
+def run(options: EditBenchOptions | None = None) -> Figures:
     """Edit one scenario many times, kill the worker, and open it again; figures in milliseconds.
 
     ``append`` is the time from sending an edit to its answer, which is on disk by then; ``open``
     that of the first answer about the scenario from a new process, ``describe`` that of later ones;
     ``preview`` the time from asking for a picture of a moved object to having it.
     """
-    effort = effort or Effort()
+    options = options or EditBenchOptions()
     console = Console()
     with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder:
         root = Path(folder)
-        scene = street(SCENE, gaussians=effort.gaussians, width=320, height=214)
+        scene = street(SCENE, gaussians=options.gaussians, width=320, height=214)
         save_scene(scene, root / "scenes" / f"{SCENE}.r2s")
         unpack_street(root / "scenes", f"{DRAGGED}.r2s")
         places = {"scenes": root / "scenes", "data": root}
         with (
-            console.status(f"{effort.operations} edits"),
+            console.status(f"{options.operations} edits"),
             worker_process(**places, log_file=root / "writing.log") as worker,
         ):
-            scenario_id, append = _append(worker.url, effort.operations)
+            scenario_id, append = _append(worker.url, options.operations)
             worker.process.kill()
         opened, described = [], []
         for n in range(OPENINGS):
             with worker_process(**places, log_file=root / f"opening_{n}.log") as worker:
-                times = _open(worker.url, scenario_id, revision=effort.operations)
+                times = _open(worker.url, scenario_id, revision=options.operations)
                 opened.append(times[0])
                 described += times[1:]
                 worker.process.kill()
         with (
-            console.status(f"{effort.previews} previews"),
+            console.status(f"{options.previews} previews"),
             worker_process(**places, log_file=root / "dragging.log") as worker,
         ):
-            preview, size = drag(worker.url, scene=DRAGGED, frames=effort.previews)
+            preview, size = drag(worker.url, scene=DRAGGED, frames=options.previews)
     figures = {
-        "operations": effort.operations,
+        "operations": options.operations,
         "append_ms": percentiles(append),
         "append_last_hundred_ms": percentiles(append[-100:]),
         "open_ms": percentiles(opened),

@@ -47,9 +47,9 @@ class LeanSocket:
         address = urlsplit(url)
         self.socket = socket.create_connection((address.hostname, address.port or 80))
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._held = b""
+        self._buffered = b""
         try:
-            self._shake_hands()
+            self._handshake()
         except BaseException:
             self.socket.close()
             raise
@@ -101,7 +101,7 @@ class LeanSocket:
             pass
         return time.perf_counter() - started
 
-    def _shake_hands(self) -> None:
+    def _handshake(self) -> None:
         self._protocol.send_request(self._protocol.connect())
         self._flush()
         while self._protocol.state is State.CONNECTING and self._protocol.handshake_exc is None:
@@ -116,9 +116,9 @@ class LeanSocket:
 
     def _message(self, timeout_s: float) -> tuple[int, bytes | bytearray]:
         """Opcode and payload of the next message, its frames put together."""
-        if not self._held:
+        if not self._buffered:
             self.socket.settimeout(timeout_s)
-            self._held = self._read(READ)
+            self._buffered = self._read(READ)
         self.socket.settimeout(STALLED_S)
         try:
             opcode, payload = self._frames()
@@ -145,18 +145,18 @@ class LeanSocket:
 
     def _exactly(self, size: int) -> bytearray:
         data = bytearray(size)
-        view, there = memoryview(data), min(size, len(self._held))
-        view[:there], self._held = self._held[:there], self._held[there:]
-        while there < size:
-            if size - there >= READ:
-                count = self.socket.recv_into(view[there:])
+        view, filled = memoryview(data), min(size, len(self._buffered))
+        view[:filled], self._buffered = self._buffered[:filled], self._buffered[filled:]
+        while filled < size:
+            if size - filled >= READ:
+                count = self.socket.recv_into(view[filled:])
                 if not count:
                     raise ConnectionError("the server is gone")
             else:
                 read = self._read(READ)
-                count = min(len(read), size - there)
-                view[there : there + count], self._held = read[:count], read[count:]
-            there += count
+                count = min(len(read), size - filled)
+                view[filled : filled + count], self._buffered = read[:count], read[count:]
+            filled += count
         return data
 
     def _read(self, size: int) -> bytes:

@@ -86,11 +86,11 @@ def _buckets(url: str) -> dict[str, float]:
     return {le: float(count) for le, count in BUCKET.findall(text)}
 
 
-def _quantile_bound(buckets: dict[str, float], share: float) -> float | None:
-    """Milliseconds of the first bucket that holds ``share`` of all samples."""
+def _quantile_bound(buckets: dict[str, float], fraction: float) -> float | None:
+    """Milliseconds of the first bucket that holds ``fraction`` of all samples."""
     total = buckets.get("+Inf", 0.0)
     for le, count in buckets.items():
-        if total and count >= share * total:
+        if total and count >= fraction * total:
             return float(le) * 1e3
     return None
 

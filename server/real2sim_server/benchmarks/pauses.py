@@ -8,7 +8,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
-NOTED_S = 1e-3
+MIN_PAUSE_S = 1e-3
 """Shorter ones are the ordinary ticks of a kernel."""
 START_S = 1.0
 """Long enough that no program that is up already takes the place of one that starts."""
@@ -26,22 +26,22 @@ def pauses(seconds: float) -> dict[str, Any]:
         # Nobody reads before all have started, which keeps every core busy.
         list(pool.map(time.sleep, [START_S] * cores))
         found = list(pool.map(_read_the_clock, [seconds] * cores))
-    noted = [pause for of_core in found for pause in of_core]
+    pauses_seen = [pause for of_core in found for pause in of_core]
     return {
         "cores": cores,
-        "per_second": len(noted) / (cores * seconds),
-        "longest_ms": 1e3 * max(noted, default=0.0),
+        "per_second": len(pauses_seen) / (cores * seconds),
+        "longest_ms": 1e3 * max(pauses_seen, default=0.0),
     }
 
 
 def _read_the_clock(seconds: float) -> list[float]:
-    """Pauses above ``NOTED_S`` [s]."""
-    noted = []
+    """Pauses above ``MIN_PAUSE_S`` [s]."""
+    pauses_seen = []
     before = time.perf_counter()
     end = before + seconds
     while before < end:
         now = time.perf_counter()
-        if now - before > NOTED_S:
-            noted.append(now - before)
+        if now - before > MIN_PAUSE_S:
+            pauses_seen.append(now - before)
         before = now
-    return noted
+    return pauses_seen

@@ -44,7 +44,7 @@ Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Effort:
+class ServeBenchOptions:
     """How much is measured.
 
     Attributes:
@@ -66,50 +66,50 @@ class Effort:
     pause_seconds: float = 3.0
 
 
-def run(effort: Effort | None = None) -> Figures:
+def run(options: ServeBenchOptions | None = None) -> Figures:
     """Measure a worker on a procedural street; print a table and return its figures.
 
     Latencies are in milliseconds, memory in MB (1e6 bytes).
     """
-    effort = effort or Effort()
+    options = options or ServeBenchOptions()
     console = Console()
     with console.status("how often the machine stops a program"):
-        machine = pauses(effort.pause_seconds)
+        machine = pauses(options.pause_seconds)
     with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder:
         root = Path(folder)
-        with console.status(f"making a street of {effort.gaussians} Gaussians"):
-            sizes = {"width": effort.width, "height": effort.height}
-            scene = street(SCENE, gaussians=effort.gaussians, **sizes)
+        with console.status(f"making a street of {options.gaussians} Gaussians"):
+            sizes = {"width": options.width, "height": options.height}
+            scene = street(SCENE, gaussians=options.gaussians, **sizes)
             save_scene(scene, root / "scenes" / f"{SCENE}.r2s")
             unpack_street(root / "scenes", f"{REAL_TIME}.r2s")
         log_file = root / "worker.log"
         with worker_process(scenes=root / "scenes", data=root, log_file=log_file) as worker:
-            figures = _measure(console, effort, url=worker.url, pid=worker.process.pid)
+            figures = _measure(console, options, url=worker.url, pid=worker.process.pid)
     figures["machine"] = machine
     print_report(console, figures)
     return figures
 
 
-def _measure(console: Console, effort: Effort, *, url: str, pid: int) -> Figures:
+def _measure(console: Console, options: ServeBenchOptions, *, url: str, pid: int) -> Figures:
     raw = [{"camera": CAMERA, "codec": "raw"}]
     with real2sim.connect(url) as client:
         with console.status("starting the worker"):
             info = client.wait_ready()
-        setup = {"device": info.device.model_dump(), "cores": os.cpu_count(), **vars(effort)}
+        setup = {"device": info.device.model_dump(), "cores": os.cpu_count(), **vars(options)}
         figures: Figures = {"setup": setup}
         # First, as long as the worker has no freed memory to fill again.
         with console.status(f"memory of {SESSIONS} sessions"):
             figures["memory"] = _memory(client, raw, pid)
         with console.status("drive steps without sensors"):
-            figures["no_sensors"], _ = _drive(client, [], effort.steps, SHORT_STEP_US)
+            figures["no_sensors"], _ = _drive(client, [], options.steps, SHORT_STEP_US)
         with console.status("drive steps without sensors, by the SDK"):
-            figures["no_sensors_sdk"] = _drive_by_sdk(client, effort.steps)
-        with console.status(f"drive steps with one raw camera {effort.width}x{effort.height}"):
-            figures["one_raw_camera"], _ = _drive(client, raw, effort.camera_steps, CAMERA_STEP_US)
+            figures["no_sensors_sdk"] = _drive_by_sdk(client, options.steps)
+        with console.status(f"drive steps with one raw camera {options.width}x{options.height}"):
+            figures["one_raw_camera"], _ = _drive(client, raw, options.camera_steps, CAMERA_STEP_US)
         with console.status("drive steps with three raw cameras on the demo's street"):
-            figures["real_time"] = _real_time(client, effort.real_time_steps)
+            figures["real_time"] = _real_time(client, options.real_time_steps)
         with console.status("the event loop while large pictures are drawn"):
-            figures["event_loop"] = _event_loop(client, url, effort.heavy_seconds)
+            figures["event_loop"] = _event_loop(client, url, options.heavy_seconds)
     return figures
 
 

@@ -23,14 +23,14 @@ import real2sim
 from ..demo.worker import worker_process
 from ..scene.io import save_scene
 from .serve import percentiles, resident_bytes
-from .soak_planners import HABITS, Planner
+from .soak_planners import BEHAVIOURS, SoakPlanner
 from .street import street
 
 SCENE = "street"
 DT_US = 100_000
 CAMERA = {"camera": "front", "codec": "raw", "modalities": ["rgb"]}
 WARM_UP_SHARE = 0.2
-LOOK_EVERY_S = 2.0
+SAMPLE_PERIOD_S = 2.0
 GROWTH_MB = 16.0
 """Memory at the end may be this much above that after warming up; allocators waver that much."""
 
@@ -38,7 +38,7 @@ Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Effort:
+class SoakOptions:
     """How much is soaked.
 
     Attributes:
@@ -77,68 +77,70 @@ class Memory:
         }
 
 
-def run(effort: Effort | None = None) -> Figures:
+def run(options: SoakOptions | None = None) -> Figures:
     """Soak a worker of its own; print a table and return its figures.
 
     ``failures`` names what was not as the protocol says; ``grows`` whether memory grew.
     """
-    effort = effort or Effort()
+    options = options or SoakOptions()
     console = Console()
     with tempfile.TemporaryDirectory(prefix="real2sim-soak-") as folder:
         root = Path(folder)
-        size = {"width": effort.width, "height": effort.width * 2 // 3}
+        size = {"width": options.width, "height": options.width * 2 // 3}
         save_scene(
-            street(SCENE, gaussians=effort.gaussians, **size), root / "scenes" / "street.r2s"
+            street(SCENE, gaussians=options.gaussians, **size), root / "scenes" / "street.r2s"
         )
         places = {"scenes": root / "scenes", "data": root, "log_file": root / "worker.log"}
         with worker_process(**places) as worker, real2sim.connect(worker.url) as client:
             client.wait_ready()
             client.scenes.load(SCENE)
-            figures = _soak(console, client, effort, pid=worker.process.pid)
+            figures = _soak(console, client, options, pid=worker.process.pid)
     _print(console, figures)
     return figures
 
 
-def _soak(console: Console, client: real2sim.Client, effort: Effort, *, pid: int) -> Figures:
-    memory, failures = Memory(), []
-    infos = [client.sessions.create(scene=SCENE) for _ in range(effort.sessions)]
+def _soak(console: Console, client: real2sim.Client, options: SoakOptions, *, pid: int) -> Figures:
+    memory, failures = Memory(), list[str]()
+    infos = [client.sessions.create(scene=SCENE) for _ in range(options.sessions)]
     planners = [
-        Planner(info, habit=habit, sensors=[CAMERA] if k % 2 else [], dt_us=DT_US)
-        for k, (info, habit) in enumerate(zip(infos, habits(effort.sessions), strict=True))
+        SoakPlanner(info, behaviour=behaviour, sensors=[CAMERA] if k % 2 else [], dt_us=DT_US)
+        for k, (info, behaviour) in enumerate(zip(infos, behaviours(options.sessions), strict=True))
     ]
     stop = threading.Event()
     threads = [
-        threading.Thread(target=_drive, args=(p, effort.rate_hz, stop, failures), daemon=True)
+        threading.Thread(target=_drive, args=(p, options.rate_hz, stop, failures), daemon=True)
         for p in planners
     ]
     started = time.monotonic()
     for thread in threads:
         thread.start()
     with console.status("soaking") as status:
-        while (passed := time.monotonic() - started) < effort.minutes * 60:
+        while (passed := time.monotonic() - started) < options.minutes * 60:
             memory.seconds.append(passed)
             memory.mb.append(resident_bytes(pid) / 1e6)
             steps = sum(p.steps for p in planners)
             status.update(f"{passed:.0f} s, {steps} steps, {memory.mb[-1]:.0f} MB")
-            time.sleep(min(LOOK_EVERY_S, effort.minutes * 6))
+            time.sleep(min(SAMPLE_PERIOD_S, options.minutes * 6))
     stop.set()
     for thread in threads:
         thread.join(60)
     for info in infos:
         client.sessions.delete(info.session_id)
-    return _figures(effort, planners, memory, failures)
+    return _figures(options, planners, memory, failures)
 
 
-def habits(sessions: int) -> list[str]:
+def behaviours(sessions: int) -> list[str]:
     """Of each session: every other one is proper, the others take turns in misbehaving."""
-    bad = [name for name, misbehave in HABITS.items() if misbehave is not None]
+    bad = [name for name, inject_fault in BEHAVIOURS.items() if inject_fault is not None]
     return [
         "proper" if k % 4 in {0, 1} else bad[(k // 4 * 2 + k % 4) % len(bad)]
         for k in range(sessions)
     ]
 
 
-def _drive(planner: Planner, rate_hz: float, stop: threading.Event, failures: list[str]) -> None:
+def _drive(
+    planner: SoakPlanner, rate_hz: float, stop: threading.Event, failures: list[str]
+) -> None:
     try:
         with planner:
             due = time.monotonic()
@@ -147,29 +149,29 @@ def _drive(planner: Planner, rate_hz: float, stop: threading.Event, failures: li
                 due = max(due + 1 / rate_hz, time.monotonic() - 1 / rate_hz)
                 stop.wait(max(due - time.monotonic(), 0.0))
     except Exception as error:
-        failures.append(f"{planner.habit}: {type(error).__name__}: {error}")
+        failures.append(f"{planner.behaviour}: {type(error).__name__}: {error}")
 
 
 def _figures(
-    effort: Effort, planners: Sequence[Planner], memory: Memory, failures: Sequence[str]
+    options: SoakOptions, planners: Sequence[SoakPlanner], memory: Memory, failures: Sequence[str]
 ) -> Figures:
-    latencies = [ms for p in planners if p.habit == "proper" for ms in p.latencies_ms]
-    held = memory.figures(effort.minutes * 60 * WARM_UP_SHARE)
+    latencies = [ms for p in planners if p.behaviour == "proper" for ms in p.latencies_ms]
+    memory_figures = memory.figures(options.minutes * 60 * WARM_UP_SHARE)
     return {
-        "setup": vars(effort),
+        "setup": vars(options),
         "steps_answered": sum(p.steps for p in planners),
         "proper_step_ms": percentiles(latencies) if latencies else None,
         "by_habit": {
             name: {
-                "sessions": sum(p.habit == name for p in planners),
-                "steps": sum(p.steps for p in planners if p.habit == name),
-                "misdeeds": sum(p.misdeeds for p in planners if p.habit == name),
+                "sessions": sum(p.behaviour == name for p in planners),
+                "steps": sum(p.steps for p in planners if p.behaviour == name),
+                "misdeeds": sum(p.faults for p in planners if p.behaviour == name),
             }
-            for name in HABITS
+            for name in BEHAVIOURS
         },
         "failures": list(failures),
-        "memory": held,
-        "grows": held["end_mb"] - held["warm_mb"] > GROWTH_MB,
+        "memory": memory_figures,
+        "grows": memory_figures["end_mb"] - memory_figures["warm_mb"] > GROWTH_MB,
     }
 
 
@@ -188,6 +190,3 @@ def _print(console: Console, figures: Figures) -> None:
     )
     for failure in figures["failures"]:
         console.print(f"[red]{failure}[/red]", highlight=False)
-
-
-__all__ = ["Effort", "Memory", "habits", "run"]

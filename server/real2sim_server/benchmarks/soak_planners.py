@@ -17,7 +17,7 @@ from .drive_probe import DriveProbe, action
 DEADLINE_MS = 100
 PUSHED_WITHIN_S = 30.0
 """However busy the machine, a missed deadline is told by then."""
-MISBEHAVES_EVERY = 10
+FAULT_PERIOD = 10
 """Steps from one time to the next."""
 
 Obs = dict[str, Any]
@@ -27,32 +27,32 @@ class SoakError(AssertionError):
     """An answer that is not as the protocol says."""
 
 
-class Planner:
+class SoakPlanner:
     """One controller of one session.
 
     Args:
         info: of its session.
-        habit: key of ``HABITS``.
+        behaviour: key of ``BEHAVIOURS``.
         sensors: of its episodes.
         dt_us: step of the clock.
 
     Attributes:
         steps: answered so far.
-        misdeeds: so far, each answered as it should be.
+        faults: so far, each answered as it should be.
         latencies_ms: of proper steps.
     """
 
     def __init__(
-        self, info: SessionInfo, *, habit: str, sensors: list[dict[str, Any]], dt_us: int
+        self, info: SessionInfo, *, behaviour: str, sensors: list[dict[str, Any]], dt_us: int
     ) -> None:
-        self.info, self.habit = info, habit
-        self.steps = self.misdeeds = 0
+        self.info, self.behaviour = info, behaviour
+        self.steps = self.faults = 0
         self.latencies_ms: list[float] = []
         self._sensors, self._dt_us = sensors, dt_us
         self._probe = DriveProbe(info)
         self._obs: Obs = {}
 
-    def __enter__(self) -> Planner:
+    def __enter__(self) -> SoakPlanner:
         self._probe.__enter__()
         self._reset()
         return self
@@ -68,21 +68,21 @@ class Planner:
         """
         if self._obs["terminated"] or self._obs["truncated"]:
             self._reset()
-        misbehave = HABITS[self.habit]
-        if misbehave is not None and self._obs["step"] % MISBEHAVES_EVERY == MISBEHAVES_EVERY - 1:
-            misbehave(self)
-            self.misdeeds += 1
+        inject_fault = BEHAVIOURS[self.behaviour]
+        if inject_fault is not None and self._obs["step"] % FAULT_PERIOD == FAULT_PERIOD - 1:
+            inject_fault(self)
+            self.faults += 1
         else:
             self._go_on()
 
     def _reset(self) -> None:
-        deadline = {"deadline_ms": DEADLINE_MS} if self.habit in {"hangs", "late"} else {}
+        deadline = {"deadline_ms": DEADLINE_MS} if self.behaviour in {"hangs", "late"} else {}
         self._obs, _ = self._probe.reset(self._sensors, dt_us=self._dt_us, **deadline)
         self._probe.pushed = None
 
     def _go_on(self) -> None:
         answer, seconds = self._probe.ask(action(self._obs))
-        if answer["type"] == "error" and self.habit in {"hangs", "late"}:
+        if answer["type"] == "error" and self.behaviour in {"hangs", "late"}:
             # A busy machine may make any planner miss a deadline; the clock went on without it.
             self._require(answer, "STALE_STEP")
             self._catch_up()
@@ -93,7 +93,7 @@ class Planner:
     def _moved_to(self, answer: Obs) -> None:
         if answer["type"] != "obs" or answer["step"] != self._obs["step"] + 1:
             raise SoakError(
-                f"{self.habit}: step {self._obs['step']} was answered by {_short(answer)}"
+                f"{self.behaviour}: step {self._obs['step']} was answered by {_short(answer)}"
             )
         self._obs = answer
         self.steps += 1
@@ -101,13 +101,13 @@ class Planner:
     def _catch_up(self) -> None:
         pushed = self._probe.pushed
         if pushed is None or pushed["step"] <= self._obs["step"]:
-            raise SoakError(f"{self.habit}: no observation came although the clock went on")
+            raise SoakError(f"{self.behaviour}: no observation came although the clock went on")
         self.steps += pushed["step"] - self._obs["step"]
         self._obs = pushed
 
     def _require(self, answer: Obs, code: str) -> None:
         if answer["type"] != "error" or answer["code"] != code or answer["fatal"]:
-            raise SoakError(f"{self.habit}: {code} expected, got {_short(answer)}")
+            raise SoakError(f"{self.behaviour}: {code} expected, got {_short(answer)}")
 
     # --- misdeeds ---------------------------------------------------------------------------
 
@@ -173,14 +173,14 @@ def _short(answer: Obs) -> str:
     return ", ".join(f"{k} {answer[k]}" for k in ("type", "step", "code", "detail") if k in answer)
 
 
-HABITS: dict[str, Callable[[Planner], None] | None] = {
+BEHAVIOURS: dict[str, Callable[[SoakPlanner], None] | None] = {
     "proper": None,
-    "hangs": Planner.hang,
-    "late": Planner.be_late,
-    "twice": Planner.answer_twice,
-    "out of order": Planner.answer_out_of_order,
-    "NaN": Planner.answer_nan,
-    "wrong length": Planner.answer_too_short,
-    "drops": Planner.drop,
+    "hangs": SoakPlanner.hang,
+    "late": SoakPlanner.be_late,
+    "twice": SoakPlanner.answer_twice,
+    "out of order": SoakPlanner.answer_out_of_order,
+    "NaN": SoakPlanner.answer_nan,
+    "wrong length": SoakPlanner.answer_too_short,
+    "drops": SoakPlanner.drop,
 }
 """What planners do once in ten steps."""

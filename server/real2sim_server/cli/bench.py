@@ -86,7 +86,7 @@ def soak(
     """Many sessions side by side, misbehaving planners among them; every answer, and memory."""
     from ..benchmarks import soak
 
-    figures = soak.run(soak.Effort(sessions=sessions, minutes=minutes, rate_hz=rate))
+    figures = soak.run(soak.SoakOptions(sessions=sessions, minutes=minutes, rate_hz=rate))
     write_json(json, figures)
     if figures["failures"]:
         raise SoakFailedError(f"{len(figures['failures'])} planners were let down; see above")
@@ -103,4 +103,4 @@ def edit(
     """Time of an edit, and of opening a scenario that has had many."""
     from ..benchmarks import edit
 
-    write_json(json, edit.run(edit.Effort(operations=operations)))
+    write_json(json, edit.run(edit.EditBenchOptions(operations=operations)))

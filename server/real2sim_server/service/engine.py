@@ -101,7 +101,7 @@ class _LoopFuture:
 
 
 @dataclass(eq=False)
-class _Job:
+class _EngineJob:
     run: Callable[[], Any]
     label: str
     future: Future[Any] | _LoopFuture
@@ -135,7 +135,7 @@ class Engine:
         self.on_failure: Callable[[], object] = lambda: None
         self._threads = threads
         self._on_job = on_job
-        self._jobs: deque[_Job] = deque()
+        self._jobs: deque[_EngineJob] = deque()
         self._changed = threading.Condition()
         self._accepting = False
         self._running: str | None = None
@@ -260,8 +260,8 @@ class Engine:
 
     def _submit(
         self, run: Callable[[], Any], label: str, future: Future[Any] | _LoopFuture
-    ) -> _Job:
-        job = _Job(run, label, future)
+    ) -> _EngineJob:
+        job = _EngineJob(run, label, future)
         with self._changed:
             if self._failure is not None:
                 raise DeviceLostError(f"the device was lost: {self._failure}")
@@ -278,7 +278,7 @@ class Engine:
             self._changed.notify()
         return job
 
-    def _drop(self, job: _Job) -> None:
+    def _drop(self, job: _EngineJob) -> None:
         job.future.cancel()
         with self._changed:
             self._discard_cancelled()
@@ -287,7 +287,7 @@ class Engine:
         if any(job.future.cancelled() for job in self._jobs):
             self._jobs = deque(job for job in self._jobs if not job.future.cancelled())
 
-    def _take_all(self) -> deque[_Job]:
+    def _take_all(self) -> deque[_EngineJob]:
         waiting, self._jobs = self._jobs, deque()
         return waiting
 
@@ -299,7 +299,7 @@ class Engine:
             # The job holds arguments and result; an idle engine must not keep them alive.
             del job
 
-    def _next(self) -> _Job | None:
+    def _next(self) -> _EngineJob | None:
         with self._changed:
             while True:
                 self._last_tick = time.monotonic()
@@ -309,7 +309,7 @@ class Engine:
                     return None
                 self._changed.wait(IDLE_TICK_S)
 
-    def _run(self, job: _Job) -> None:
+    def _run(self, job: _EngineJob) -> None:
         started = time.perf_counter()
         self._running = job.label
         try:
@@ -354,7 +354,7 @@ def _lower_priority() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
-def _fail(jobs: Iterable[_Job], error: EngineError) -> None:
+def _fail(jobs: Iterable[_EngineJob], error: EngineError) -> None:
     for job in jobs:
         if job.future.set_running_or_notify_cancel():
             job.future.set_exception(error)

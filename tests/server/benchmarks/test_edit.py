@@ -11,7 +11,7 @@ pytestmark = pytest.mark.network
 
 @pytest.mark.slow
 def test_a_short_run_finds_all_edits_again_after_kills(capsys):
-    figures = edit.run(edit.Effort(operations=40, gaussians=20_000))
+    figures = edit.run(edit.EditBenchOptions(operations=40, gaussians=20_000))
 
     assert json.loads(json.dumps(figures)) == figures
     assert figures["append_ms"]["count"] == 40

@@ -39,7 +39,7 @@ def test_pauses_are_those_of_all_cores():
 
 @pytest.mark.slow
 def test_a_short_run_gives_all_figures_as_json(capsys):
-    effort = serve.Effort(
+    options = serve.ServeBenchOptions(
         gaussians=100_000,
         steps=50,
         camera_steps=5,
@@ -47,7 +47,7 @@ def test_a_short_run_gives_all_figures_as_json(capsys):
         real_time_steps=3,
         pause_seconds=0.2,
     )
-    figures = serve.run(effort)
+    figures = serve.run(options)
     assert json.loads(json.dumps(figures)) == figures
     assert figures["no_sensors"]["count"] == 50
     assert figures["one_raw_camera"]["p50_by_stage_ms"]["render"] > 0

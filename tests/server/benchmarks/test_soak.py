@@ -7,15 +7,15 @@ import json
 import pytest
 
 from real2sim_server.benchmarks import soak
-from real2sim_server.benchmarks.soak_planners import HABITS
+from real2sim_server.benchmarks.soak_planners import BEHAVIOURS
 
 pytestmark = pytest.mark.network
 
 
 def test_every_way_to_misbehave_is_among_16_sessions_and_half_are_proper():
-    habits = soak.habits(16)
-    assert set(habits) == set(HABITS)
-    assert habits.count("proper") == 8
+    behaviours = soak.behaviours(16)
+    assert set(behaviours) == set(BEHAVIOURS)
+    assert behaviours.count("proper") == 8
 
 
 def test_memory_is_judged_from_after_warming_up():
@@ -27,9 +27,9 @@ def test_memory_is_judged_from_after_warming_up():
 
 @pytest.mark.slow
 def test_a_short_soak_answers_every_step(capsys):
-    figures = soak.run(soak.Effort(sessions=16, minutes=0.5, rate_hz=5.0))
+    figures = soak.run(soak.SoakOptions(sessions=16, minutes=0.5, rate_hz=5.0))
     assert json.loads(json.dumps(figures)) == figures
     assert figures["failures"] == []
     assert all(row["steps"] > 0 for row in figures["by_habit"].values())
-    assert sum(row["misdeeds"] for row in figures["by_habit"].values()) >= len(HABITS) - 1
+    assert sum(row["misdeeds"] for row in figures["by_habit"].values()) >= len(BEHAVIOURS) - 1
     assert "steps answered" in capsys.readouterr().out

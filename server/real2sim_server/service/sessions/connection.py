@@ -44,7 +44,7 @@ from .messages import (
 from .observers import ObserverQueue
 from .registry import Sessions
 from .session import Session, controller_taken
-from .wire import Message, pack_message
+from .wire import EncodedMessage, pack_message
 
 HANDSHAKE_TIMEOUT_S = 10.0
 PROGRESS_S = 1.0
@@ -249,7 +249,7 @@ class Connection:
                     await self._socket.close(NORMAL_CLOSURE)
                     return
 
-    async def _answer(self, received: ReceivedMessage, role: str) -> Message | None:
+    async def _answer(self, received: ReceivedMessage, role: str) -> EncodedMessage | None:
         """The answer; None where it has been sent already."""
         try:
             _check_role(received.message, role)
@@ -257,7 +257,7 @@ class Connection:
         except Exception as error:
             return self._error_message(_as_service_error(error))
 
-    async def _dispatch(self, received: ReceivedMessage, role: str) -> Message | None:
+    async def _dispatch(self, received: ReceivedMessage, role: str) -> EncodedMessage | None:
         message, session = received.message, self._session
         match message:
             case Action():
@@ -284,7 +284,7 @@ class Connection:
             case _:
                 assert_never(message)
 
-    async def _act(self, action: Action, content: bytes) -> Message | None:
+    async def _act(self, action: Action, content: bytes) -> EncodedMessage | None:
         """Check an action, and let it pass the rest of the step pipeline."""
         session, waited_us = self._session, self._deadline_timer.waited_us
         if action.step == session.lockstep.step:
@@ -301,7 +301,7 @@ class Connection:
                 write=partial(self._write_at_once, action.id),
             )
 
-    def _check(self, action: Action, content: bytes) -> Message | None:
+    def _check(self, action: Action, content: bytes) -> EncodedMessage | None:
         """Whether this action is due; the answer to it where it was given before.
 
         Raises:
@@ -310,7 +310,7 @@ class Connection:
         self._session.check_open()
         return self._session.lockstep.cached_answer(action.step, content)
 
-    async def _change(self, message: Agent | Snapshot | Restore | Fork) -> Message:
+    async def _change(self, message: Agent | Snapshot | Restore | Fork) -> EncodedMessage:
         """Changes other than steps and edits; the session's lock is held."""
         session, stepper = self._session, self._sessions.stepper
         match message:
@@ -333,7 +333,7 @@ class Connection:
             case _:
                 assert_never(message)
 
-    async def _edit(self, edit: Edit) -> Message:
+    async def _edit(self, edit: Edit) -> EncodedMessage:
         session = self._session
         async with session.lock:
             session.check_open()
@@ -345,7 +345,7 @@ class Connection:
         fields = {"revision": revision, "created": list(outcome.created), "warnings": warnings}
         return pack_message("edited", fields)
 
-    async def _finish(self, role: str) -> Message:
+    async def _finish(self, role: str) -> EncodedMessage:
         """The result; a controller that says bye ends the session."""
         session = self._session
         scores = await self._sessions.scores(session)
@@ -377,13 +377,13 @@ class Connection:
             return read_message(data)
         return await asyncio.to_thread(read_message, data)
 
-    def _write_at_once(self, message_id: int, message: Message) -> bool:
+    def _write_at_once(self, message_id: int, message: EncodedMessage) -> bool:
         """Write a message if nothing has to be waited for; whether it is written."""
         if self._sending.locked():
             return False
         return try_send_parts(self._socket, message.parts(message_id))
 
-    async def _send(self, message: Message, message_id: int = 0) -> None:
+    async def _send(self, message: EncodedMessage, message_id: int = 0) -> None:
         # Whoever ends the session may send too.
         async with self._sending:
             await send_parts(self._socket, message.parts(message_id))
@@ -395,7 +395,7 @@ class Connection:
                 await self._send(self._error_message(error, fatal=True), message_id)
                 await self._socket.close(POLICY_VIOLATION, error.code.value)
 
-    def _error_message(self, error: ServiceError, *, fatal: bool = False) -> Message:
+    def _error_message(self, error: ServiceError, *, fatal: bool = False) -> EncodedMessage:
         fields: dict[str, Any] = {
             "code": error.code.value,
             "detail": error.detail,

@@ -11,11 +11,11 @@ import structlog
 
 from .session import Session
 from .step import Stepper
-from .wire import Message
+from .wire import EncodedMessage
 
 log = structlog.get_logger(__name__)
 
-Send = Callable[[Message], Awaitable[None]]
+Send = Callable[[EncodedMessage], Awaitable[None]]
 
 
 class DeadlineTimer:

@@ -51,7 +51,7 @@ from ..rendering.frames import (
     with_pixels,
 )
 from ..rendering.renderer import Renderer, RenderRequest, check_sensors
-from .wire import EncodedMembers, Message, StageTimer, pack_members, pack_with_frames
+from .wire import EncodedMembers, EncodedMessage, StepTimer, pack_members, pack_with_frames
 
 T = TypeVar("T")
 
@@ -80,8 +80,8 @@ class Transition:
     change: Callable[[], World]
     cameras: Mapping[str, Camera]
     record: Callable[[], object] | None = None
-    write: Callable[[Message], bool] | None = None
-    timer: StageTimer = field(default_factory=StageTimer)
+    write: Callable[[EncodedMessage], bool] | None = None
+    timer: StepTimer = field(default_factory=StepTimer)
     recorded: bool = False
     sent: bool = False
 
@@ -101,7 +101,7 @@ class RenderedObservation:
     images: Sequence[RenderedImage]
     kind: str
     members: EncodedMembers
-    timer: StageTimer
+    timer: StepTimer
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class EncodedObservation:
 
     world: World
     frames: Sequence[EncodedFrame]
-    message: Message
+    message: EncodedMessage
     timing_ms: Mapping[str, float]
 
 
@@ -208,7 +208,7 @@ class StepPipeline:
         world: World,
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
-        timer: StageTimer,
+        timer: StepTimer,
     ) -> Sequence[RenderedImage]:
         """Images of a world, its objects deformed first."""
         if world.deformation is not None:
@@ -264,7 +264,7 @@ class StepPipeline:
         """
         cameras = self._checked(world.scene, sensors)
         rendered = await self._engine.call(
-            self._compute_view, world, sensors, cameras, StageTimer(), label="view"
+            self._compute_view, world, sensors, cameras, StepTimer(), label="view"
         )
         return await self._finish(rendered)
 
@@ -273,7 +273,7 @@ class StepPipeline:
         world: World,
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
-        timer: StageTimer,
+        timer: StepTimer,
     ) -> RenderedObservation:
         timer.stage("queue")
         images = self._images(world, sensors, cameras)

@@ -19,7 +19,7 @@ from ..http.problems import ServiceError
 from ..storage.store import SessionRow
 from .lockstep import LockStep, not_reset
 from .observers import ObserverQueue
-from .wire import Message
+from .wire import EncodedMessage
 
 CloseWithError = Callable[[ServiceError], Awaitable[None]]
 """Tells a connection that its session is over, and ends it."""
@@ -68,11 +68,11 @@ class Session:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     world: World | None = None
     cameras: dict[str, Camera] = field(default_factory=dict)
-    lockstep: LockStep[Message] = field(default_factory=LockStep)
+    lockstep: LockStep[EncodedMessage] = field(default_factory=LockStep)
     events: list[Event] = field(default_factory=list)
     next_seq: int = 0
     snapshots: dict[str, World] = field(default_factory=dict)
-    newest: Message | None = None
+    newest: EncodedMessage | None = None
     late: bool = False
     expires_at: float | None = None
     controller: object | None = None
@@ -139,7 +139,7 @@ class Session:
         if self.controller is not None:
             raise controller_taken(self.session_id)
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: EncodedMessage) -> None:
         """The newest observation, for all observers; never waits."""
         self.newest = message
         for queue in self.observers:

@@ -31,7 +31,7 @@ from ..http.problems import ServiceError
 from ..storage.store import SessionEntry, Store, now_us
 from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
-from .wire import Message
+from .wire import EncodedMessage
 
 LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
@@ -54,7 +54,7 @@ class Stepper:
         self._pipeline = pipeline
         self._store = store
 
-    async def reset(self, session: Session, spec: ResetSpec) -> Message:
+    async def reset(self, session: Session, spec: ResetSpec) -> EncodedMessage:
         """Begin an episode; its first observation.
 
         Raises:
@@ -92,8 +92,8 @@ class Stepper:
         payload: bytes,
         *,
         latency_us: int = 0,
-        write: Callable[[Message], bool] | None = None,
-    ) -> Message | None:
+        write: Callable[[EncodedMessage], bool] | None = None,
+    ) -> EncodedMessage | None:
         """Take the action that is due; the next observation, None where it is written already.
 
         Args:
@@ -118,7 +118,7 @@ class Stepper:
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
         return None if written else observation.message
 
-    async def step_without_action(self, session: Session) -> Message:
+    async def step_without_action(self, session: Session) -> EncodedMessage:
         """Go on without the action that is due, by the episode's fallback; the observation.
 
         That action is stale from here on.
@@ -129,7 +129,7 @@ class Stepper:
         session.lockstep.skip(1, over=observation.world.over)
         return observation.message
 
-    async def stop(self, session: Session, reason: str) -> Message:
+    async def stop(self, session: Session, reason: str) -> EncodedMessage:
         """End the episode where it is; the present observation with the reason."""
         now = session.running_world()
         record = ("stop", now.steps, stop_payload(reason))
@@ -147,7 +147,7 @@ class Stepper:
         change: Callable[[], World],
         payload: bytes,
         *,
-        write: Callable[[Message], bool] | None = None,
+        write: Callable[[EncodedMessage], bool] | None = None,
     ) -> tuple[EncodedObservation, bool]:
         record = ("action", session.running_world().steps, payload)
         observation, written = await self._observe(
@@ -219,7 +219,7 @@ class Stepper:
         session.snapshots[name] = now
         return now
 
-    async def restore(self, session: Session, name: str) -> Message:
+    async def restore(self, session: Session, name: str) -> EncodedMessage:
         """Go back to a snapshot; its observation.
 
         Raises:
@@ -248,7 +248,7 @@ class Stepper:
         cameras: Mapping[str, Camera],
         record: LogRecord,
         *,
-        write: Callable[[Message], bool] | None = None,
+        write: Callable[[EncodedMessage], bool] | None = None,
     ) -> tuple[EncodedObservation, bool]:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])

@@ -18,7 +18,7 @@ FRAMES: bytes = msgpack.packb("frames")
 
 
 @dataclass(eq=False)
-class StageTimer:
+class StepTimer:
     """Milliseconds by stage; each stage ends where the next one begins."""
 
     timing_ms: dict[str, float] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class EncodedMembers:
 
 
 @dataclass(frozen=True, eq=False)
-class Message:
+class EncodedMessage:
     """An encoded message that lacks only its id, so that one encoding serves all who get it.
 
     Attributes:
@@ -70,15 +70,15 @@ def pack_members(fields: Mapping[str, Any]) -> EncodedMembers:
     return EncodedMembers(len(fields), pack_pairs(fields))
 
 
-def pack_message(kind: str, fields: Mapping[str, Any]) -> Message:
+def pack_message(kind: str, fields: Mapping[str, Any]) -> EncodedMessage:
     """A message of plain values and arrays."""
     members = pack_members(fields)
-    return Message(_head(kind, members.count), (members.encoded,))
+    return EncodedMessage(_head(kind, members.count), (members.encoded,))
 
 
 def pack_with_frames(
-    kind: str, members: EncodedMembers, frames: Sequence[EncodedFrame], watch: StageTimer
-) -> Message:
+    kind: str, members: EncodedMembers, frames: Sequence[EncodedFrame], watch: StepTimer
+) -> EncodedMessage:
     """A message with the members ``frames`` and ``timing`` besides ``members``.
 
     What it takes to send the parts is not in ``timing``, for that comes later.
@@ -88,7 +88,7 @@ def pack_with_frames(
         parts += [frame.header.encoded, frame.data]
     watch.stage("pack")
     parts.append(pack_pairs({"timing": watch.timing_ms}))
-    return Message(_head(kind, members.count + 2), tuple(parts))
+    return EncodedMessage(_head(kind, members.count + 2), tuple(parts))
 
 
 @functools.cache

@@ -150,23 +150,23 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(
     assert [(e.seq, e.kind) for e in entries(site, info)] == [(0, "reset"), (1, "action")]
 
 
-def test_a_step_on_its_way_is_on_record_and_told_to_nobody(site, join, monkeypatch):
+def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join, monkeypatch):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA])
     session, renderer, seen = site.session(info), site.worker.renderer, []
-    draw = renderer.draw
+    render_images = renderer.render_images
 
-    def look(*given: object) -> object:
+    def check_log(*given: object) -> object:
         give_up = time.monotonic() + 30
         while len(entries(site, info)) < 2 and time.monotonic() < give_up:
             time.sleep(0.001)
         seen.append([e.kind for e in entries(site, info)])
         seen.append([e.kind for e in asyncio.run(site.worker.sessions.entries(session))])
-        return draw(*given)
+        return render_images(*given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(renderer, "draw", look)
+        patch.setattr(renderer, "render_images", check_log)
         planner.act(0)
     assert seen == [["reset", "action"], ["reset"]]
 

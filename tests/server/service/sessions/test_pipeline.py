@@ -1,0 +1,73 @@
+"""A step passes the named phases, in the order that the pipeline states."""
+
+from __future__ import annotations
+
+import re
+import threading
+
+import pytest
+
+from real2sim_server.service.sessions import pipeline
+from real2sim_server.service.sessions.connection import Connection
+from real2sim_server.service.sessions.pipeline import StepPipeline
+
+pytestmark = pytest.mark.network
+
+CAMERA = {"camera": "front", "width": 160, "codec": "raw"}
+PHASES = re.findall(r"(?m)^``(\w+)``", pipeline.__doc__ or "")
+"""As the module's docstring states them."""
+
+
+@pytest.fixture
+def passed(monkeypatch) -> list[tuple[str, str]]:
+    """(phase, thread) of every phase that begins."""
+    phases: list[tuple[str, str]] = []
+
+    def note(owner: type, method: str, phase: str) -> None:
+        original = getattr(owner, method)
+
+        def noted(*given, **options):
+            phases.append((phase, threading.current_thread().name))
+            return original(*given, **options)
+
+        monkeypatch.setattr(owner, method, noted)
+
+    for phase in ("receive", "check"):
+        note(Connection, f"_{phase}", phase)
+    for phase in ("advance", "render", "evaluate", "encode", "send"):
+        note(StepPipeline, phase, phase)
+    return phases
+
+
+def test_the_phases_are_those_of_the_docstring():
+    assert PHASES == ["receive", "check", "advance", "render", "evaluate", "encode", "send"]
+
+
+def test_an_action_with_raw_images_passes_every_phase_once(planner, passed):
+    planner.reset(sensors=[CAMERA])
+    passed.clear()
+    assert planner.act(0)["step"] == 1
+    seen = [phase for phase, _ in passed if phase != "receive"]
+    # Evaluation begins beside the rendering.
+    assert sorted(seen[2:4]) == ["evaluate", "render"]
+    assert [seen[0], seen[1], *seen[4:]] == ["check", "advance", "encode", "send"]
+
+
+def test_the_engine_renders_while_another_thread_evaluates(planner, passed):
+    planner.reset(sensors=[CAMERA])
+    passed.clear()
+    planner.act(0)
+    threads = dict(passed)
+    assert threads["advance"] == threads["render"] == threads["encode"] == "engine"
+    assert threads["evaluate"].startswith("evaluate")
+    assert threads["check"] == threads["send"] != "engine"
+
+
+def test_a_world_without_sensors_leaves_the_engine_alone(planner, passed):
+    planner.reset(sensors=[])
+    passed.clear()
+    planner.act(0)
+    threads = dict(passed)
+    assert threads["advance"] == threads["evaluate"]
+    assert threads["advance"].startswith("worlds")
+    assert "render" not in threads
