@@ -35,8 +35,8 @@ class Settings(BaseSettings):
         threads: of numba and torch; 0 for one per core.
         scene_memory_bytes: budget of resident scenes.
         max_sessions: open sessions; more are refused at creation.
-        session_idle_seconds: sessions that nobody uses or is connected to leave the memory after
-            this time; they are rebuilt from their logs when somebody asks for them.
+        session_idle_seconds: unused sessions without connections leave the memory after this time;
+            they are rebuilt from their logs on demand.
         queue_length: jobs that may wait for the engine; more are refused.
         max_request_bytes, max_upload_bytes: body of a request, and of an uploaded splat file.
         max_pixels_per_step: pixels over all cameras of one observation or render.

@@ -80,7 +80,7 @@ class _LoopFuture:
         self._on_loop(self._fail, error)
 
     def _on_loop(self, resolve: Callable[[Any], None], value: Any) -> None:
-        # Nobody waits on a loop that has been closed meanwhile.
+        # A loop that was closed has no waiters left.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(resolve, value)
 
@@ -241,7 +241,7 @@ class Engine:
 
     @property
     def seconds_since_tick(self) -> float:
-        """Age of the last sign of life; grows while one job runs."""
+        """Time since the thread last looked for a job; grows while one runs [s]."""
         return time.monotonic() - self._last_tick
 
     @property
@@ -322,7 +322,7 @@ class Engine:
             job.future.set_result(result)
         finally:
             self._running = None
-        # Whoever waits has been woken, and gets the interpreter before books are kept.
+        # The awaiting thread has been woken, and gets the interpreter before metrics are updated.
         time.sleep(0)
         if self._on_job is not None:
             self._on_job(job.label, started - job.queued_at, time.perf_counter() - started)

@@ -63,7 +63,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def listen(listener: socket.socket) -> None:
-    """Accept connections on a bound socket. Raises AddressError: somebody else was faster."""
+    """Accept connections on a bound socket. Raises AddressError: it was taken since."""
     host, port = listener.getsockname()[:2]
     try:
         listener.listen(2048)

@@ -63,7 +63,7 @@ def run(settings: Settings) -> int:
     worker: Worker = app.state.worker
     print(_announcement(worker, url_of(settings.host, listener)), file=sys.stderr, flush=True)
     server = uvicorn.Server(server_config(app, settings))
-    # A lost device poisons the process: it ends, so that whoever supervises it starts a new one.
+    # A lost device poisons the process: it ends, so that its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
     # The server stops gracefully at a signal and then raises it once more for us.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -124,7 +124,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
 
 
 def _announcement(worker: Worker, url: str) -> str:
-    """What whoever starts a worker is told first."""
+    """The first lines of a worker's output."""
     settings, device = worker.settings, worker.device
     return (
         f"Real2Sim worker {settings.worker_id} on {url} ({device.backend}: {device.reason}); "

@@ -53,7 +53,7 @@ def secrets_equal(given: str | None, expected: str) -> bool:
 
 def matches_any_secret(given: str | None, *secrets: str | None) -> bool:
     """Whether ``given`` is one of ``secrets``; None is no secret."""
-    # All are compared, so that the time tells nothing.
+    # All are compared, so that the duration reveals nothing.
     matches = [secrets_equal(given, secret) for secret in secrets if secret is not None]
     return any(matches)
 

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class ClientDisconnectedError(Exception):
-    """Nobody waits for the answer any more."""
+    """The client has closed the connection before its answer."""
 
 
 async def cancel_on_disconnect(request: Request, work: Coroutine[Any, Any, T]) -> T:
@@ -50,7 +50,7 @@ def uncancellable(
     """A coroutine function that goes to its end even when its caller is cancelled meanwhile.
 
     For changes that are on record before they take effect in memory: one without the other would
-    refuse every later change. The caller is held until then, and with it the locks it has.
+    refuse every later change. The caller waits until then, and keeps its locks.
     """
 
     @functools.wraps(method)

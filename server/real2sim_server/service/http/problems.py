@@ -1,6 +1,6 @@
 """Every error as an RFC 9457 problem document.
 
-Routes and the classes below them raise :class:`ServiceError`; errors of the lower rooms are
+Routes and the classes below them raise :class:`ServiceError`; errors of lower packages are
 translated here and nowhere else.
 """
 
@@ -82,11 +82,11 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (SceneError, ErrorCode.INVALID_OPERATION, None),
     (PhysicsError, ErrorCode.INVALID_REQUEST, None),
 )
-"""Errors of other rooms that a client is told in their own words; the first that fits counts."""
+"""Errors of other packages whose messages are sent as they are; the first that fits counts."""
 
 
 def service_error(error: Exception) -> ServiceError:
-    """What a client is told about ``error``. Unexpected ones become INTERNAL and say nothing."""
+    """The error as clients get it. Unexpected ones become INTERNAL and reveal nothing."""
     if isinstance(error, ServiceError):
         return error
     if isinstance(error, EditError):

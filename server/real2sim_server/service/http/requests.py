@@ -1,4 +1,4 @@
-"""What surrounds every request: its id, its log line, its duration, its last line of defence."""
+"""What surrounds every request: its id, its log line, its duration, uncaught errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RequestContext:
     """ASGI middleware, outermost of ours.
 
     Takes the request id from ``X-Request-Id`` or makes one, sends it back, binds it for logs,
-    measures the request, and answers INTERNAL for what nobody else caught.
+    measures the request, and answers INTERNAL for uncaught errors.
     """
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:

@@ -31,7 +31,7 @@ SHORT, LONG = 126, 127
 
 
 async def send_parts(websocket: WebSocket, parts: Sequence[Part]) -> None:
-    """Send one binary message. Raises WebSocketDisconnect when the client is gone."""
+    """Send one binary message. Raises WebSocketDisconnect once the client has disconnected."""
     if websocket.application_state is WebSocketState.DISCONNECTED:
         raise WebSocketDisconnect
     if not try_send_parts(websocket, parts):

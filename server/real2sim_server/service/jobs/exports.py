@@ -32,7 +32,7 @@ class VideoSource:
     """What a video shows.
 
     Attributes:
-        scene: gives cameras, sky and the way of the vehicle.
+        scene: gives cameras, sky and the ego trajectory.
         instances: what is drawn at an instant [us]; called off the event loop.
         span: first and last instant that can be shown [us].
     """
@@ -49,7 +49,7 @@ async def export_video(
 
     Raises:
         ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST; TIME_OUT_OF_RANGE.
-        JobCancelled: nobody wants it any more.
+        JobCancelled: the job was cancelled.
     """
     times = frame_times(video_source, request)
     sensor = SensorSpec(camera=request.camera, width=request.width, codec="raw")
@@ -78,7 +78,7 @@ async def export_video(
 async def _render_frame(
     renderer: Renderer, render_request: RenderRequest, context: JobContext
 ) -> EncodedFrame:
-    """The frame, drawn when those who wait for an answer leave room."""
+    """The frame, rendered when interactive requests leave room in the queue."""
     while True:
         try:
             return (await renderer.render(render_request, stream="export")).frames[0]

@@ -35,7 +35,7 @@ UNKNOWN_EVENTS = 1_000_000
 """More events than a job has: its end is newer than any progress that was sent but not stored."""
 
 MAX_FINISHED_JOBS = 64
-"""Ended jobs kept in memory; others are read from the store."""
+"""Ended jobs in memory; others are read from the store."""
 
 log = structlog.get_logger(__name__)
 
@@ -69,17 +69,17 @@ class JobContext:
         """Say how far it is, 0 to 1, and what it is doing.
 
         Raises:
-            JobCancelled: nobody wants the result any more.
+            JobCancelled: the job was cancelled.
         """
         self.check()
         self._report(min(1.0, max(0.0, share)), stage)
 
     def cancelled(self) -> bool:
-        """Whether nobody wants the result any more."""
+        """Whether the job was cancelled."""
         return self._cancelled.is_set()
 
     def check(self) -> None:
-        """Raise JobCancelled when nobody wants the result any more."""
+        """Raises JobCancelled once the job is cancelled."""
         if self._cancelled.is_set():
             raise JobCancelled
 
@@ -325,7 +325,7 @@ class Jobs:
 
     async def _become(self, job: _Job, info: JobInfo) -> None:
         info = info.model_copy(update={"event": job.info.event + 1})
-        # On record first: what a client was told is true after a crash as well.
+        # Stored first: what a client was sent is true after a crash as well.
         await self._log.update(info)
         job.info = info
         job.events.append(info)
@@ -339,7 +339,7 @@ class Jobs:
         moved = {"progress": share, "stage": stage, "event": now.event + 1}
         job.info = now.model_copy(update=moved)
         job.events.append(job.info)
-        asyncio.ensure_future(_notify_readers(job))  # noqa: RUF006, wakes readers and is gone at once
+        asyncio.ensure_future(_notify_readers(job))  # noqa: RUF006, ends as soon as the readers are woken
 
     async def _wait_until_over(self, job: _Job) -> None:
         async with job.changed:

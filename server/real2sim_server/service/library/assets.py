@@ -166,10 +166,10 @@ class AssetLibrary:
 
     @contextmanager
     def removing(self, asset_id: str) -> Iterator[None]:
-        """Nobody finds the asset while the block runs; it stays on disk until :meth:`remove`.
+        """Hide the asset from lookups while the block runs; it stays on disk until :meth:`remove`.
 
         Raises:
-            ServiceError: UNKNOWN_ASSET, also where somebody else withholds it.
+            ServiceError: UNKNOWN_ASSET, also while it is being removed.
         """
         self.get(asset_id)
         with self._lock:
@@ -181,7 +181,7 @@ class AssetLibrary:
                 self._removing.discard(asset_id)
 
     def remove(self, asset_id: str) -> None:
-        """Delete a withheld asset; its id may be given again."""
+        """Delete a hidden asset; its id may be given again."""
         with self._lock:
             # Renamed first: a crash must not leave half a bundle under its name.
             trash = self.folder / f".removed-{secrets.token_hex(6)}"

@@ -38,7 +38,7 @@ class _Resident:
 class SceneCache:
     """Scenes of the scene folder, loaded when they are needed and evicted when memory is.
 
-    One scene object serves all its users. A session pins its scene; scenes that nobody pins leave
+    One scene object serves all its users. A session pins its scene; unpinned scenes leave
     memory in the order of their last use. Belongs to the event loop: its methods are not for
     other threads.
 
@@ -147,7 +147,7 @@ class SceneCache:
     # --- using ------------------------------------------------------------------------------
 
     async def get(self, name: str) -> Scene:
-        """The scene, loaded if need be. Whoever holds it keeps it alive; it is not pinned.
+        """The scene, loaded if need be. A reference keeps it alive; it is not pinned.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, SCENE_BROKEN, or OUT_OF_MEMORY.

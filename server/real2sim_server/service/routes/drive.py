@@ -1,4 +1,4 @@
-"""The drive socket's door: who may not come in is told by HTTP."""
+"""Opens the drive socket; a handshake that fails is answered by HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a single frame is asked for with, the same for scenes and scenarios."""
+"""Query and headers of a single frame, the same for scenes and scenarios."""
 
 from __future__ import annotations
 

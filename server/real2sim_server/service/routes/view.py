@@ -1,4 +1,4 @@
-"""The door of the view socket: browsers cannot send headers, so the first message has the token."""
+"""Opens the view socket: browsers cannot send headers, so the first message has the token."""
 
 from __future__ import annotations
 

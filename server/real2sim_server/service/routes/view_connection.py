@@ -26,7 +26,7 @@ from ..rendering.renderer import RenderRequest
 from ..worker import Worker
 
 REVISION_CHECK_S = 1.0
-"""How often an idle view looks whether somebody else changed the scenario."""
+"""How often an idle view checks the revision of its scenario."""
 PICK_WIDTH = 640
 
 Fraction = Annotated[float, Field(ge=0, le=1)]

@@ -1,4 +1,4 @@
-"""Scenarios in memory: rebuilt from the store when asked for, changed by one at a time."""
+"""Scenarios in memory: rebuilt from the store on demand, one change at a time each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..storage.store import ScenarioRow, Store
 from .snapshots import Snapshots
 
 MAX_CACHED_SCENARIOS = 256
-"""Scenarios kept ready; others are rebuilt from the store when they are asked for."""
+"""Scenarios in memory; others are rebuilt from the store on demand."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class CachedScenario:
 
 
 class ScenarioCache:
-    """The scenarios asked for last. Belongs to the event loop."""
+    """The most recently used scenarios. Belongs to the event loop."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class ScenarioCache:
         self._opening: dict[str, asyncio.Lock] = {}
 
     def evict(self, scenario_id: str) -> None:
-        """Hold it no more; who asks for it next gets it from the store."""
+        """Forget it; the next request reads it from the store."""
         self._cached.pop(scenario_id, None)
 
     async def wait_for_changes(self) -> None:
@@ -68,7 +68,7 @@ class ScenarioCache:
         while True:
             cached = await self.get(scenario_id)
             async with cached.lock:
-                # Whoever had the lock before may have dropped or deleted it.
+                # The previous holder of the lock may have evicted or deleted it.
                 if self._cached.get(scenario_id) is cached:
                     yield cached
                     return
@@ -112,7 +112,7 @@ class ScenarioCache:
         return CachedScenario(row, scenario, summary)
 
     def put(self, cached: CachedScenario) -> None:
-        """Hold a scenario; the ones not asked for the longest go, unless they are being edited."""
+        """Add a scenario and evict the least recently used, unless they are being edited."""
         self._cached[cached.row.scenario_id] = cached
         if len(self._cached) > MAX_CACHED_SCENARIOS:
             for key in [k for k, h in self._cached.items() if not h.lock.locked()][

@@ -141,7 +141,7 @@ class Scenarios:
             await self._store.delete_scenario(scenario_id)
 
     async def flush(self) -> None:
-        """Wait for what is still written behind the answers; none may be asked for after."""
+        """Wait for snapshots that are still being written; no calls may follow."""
         await self._snapshots.flush()
 
     # --- reading ----------------------------------------------------------------------------

@@ -54,7 +54,7 @@ class Snapshots:
         return scenario
 
     def save_if_due(self, scenario_id: str, revision: int, state: ScenarioState) -> None:
-        """Let ``state`` be kept when the last snapshot is old; returns at once."""
+        """Save ``state`` in the background when the last snapshot is old."""
         if revision - self._revisions.get(scenario_id, 0) < INTERVAL:
             return
         self._revisions[scenario_id] = revision
@@ -63,11 +63,11 @@ class Snapshots:
         task.add_done_callback(self._writing.discard)
 
     def discard(self, scenario_id: str) -> None:
-        """Of a scenario that is gone."""
+        """Forget the revision of a deleted scenario."""
         self._revisions.pop(scenario_id, None)
 
     async def flush(self) -> None:
-        """Wait until everything offered is kept."""
+        """Wait until everything is saved."""
         await asyncio.gather(*self._writing)
 
     async def _read(

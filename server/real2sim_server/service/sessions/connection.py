@@ -105,7 +105,7 @@ class Connection:
         self._deadline_timer = DeadlineTimer(session, sessions.stepper, self._send)
 
     async def serve(self) -> None:
-        """Serve until one of both leaves. A client that vanishes disturbs nobody."""
+        """Serve until one of both leaves. A client that vanishes is no error."""
         session = self._session
         try:
             hello = await self._handshake()
@@ -224,7 +224,7 @@ class Connection:
                 await forwarding
 
     async def _forward(self, queue: ObserverQueue) -> None:
-        # A client that left is noticed by whoever receives from it.
+        # The receiving side notices a client that has left.
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 await self._send(await queue.take())
@@ -384,7 +384,7 @@ class Connection:
         return try_send_parts(self._socket, message.parts(message_id))
 
     async def _send(self, message: EncodedMessage, message_id: int = 0) -> None:
-        # Whoever ends the session may send too.
+        # The end of the session is sent from elsewhere.
         async with self._sending:
             await send_parts(self._socket, message.parts(message_id))
 

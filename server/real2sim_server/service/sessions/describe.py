@@ -1,4 +1,4 @@
-"""What the wire says about a session."""
+"""Sessions as the wire has them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .session import Session
 
 
 def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionInfo:
-    """A session; the token is told to its maker only."""
+    """A session; only its creator gets the token."""
     world, row = session.world, session.row
     created = datetime.fromtimestamp(row.created_us / 1e6, UTC)
     return SessionInfo(

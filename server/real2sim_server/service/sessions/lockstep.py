@@ -1,4 +1,4 @@
-"""Rule 1 of the drive socket: the clock moves only on the action that answers its observation."""
+"""Lock step: the clock moves only on the action that answers its observation."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class LockStep(Generic[A]):
         """The episode ends without a step; the last answer can still be had again."""
         self.over = True
 
-    def taken(self, content: bytes, answer: A) -> None:
-        """Say what the last step was answered with, after it was lived through again."""
+    def restore_answer(self, content: bytes, answer: A) -> None:
+        """Restore the answer to the last step, after a replay."""
         self._last = (content, answer)
 
     def cached_answer(self, step: int, content: bytes) -> A | None:

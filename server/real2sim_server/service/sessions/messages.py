@@ -41,7 +41,7 @@ class BadMessageError(Exception):
     """A message that is refused before anybody looks at what it wants.
 
     Attributes:
-        error: what the client is told.
+        error: sent to the client.
         message_id: of the message, as far as it could be read.
         fatal: whether there is no sense in going on.
     """

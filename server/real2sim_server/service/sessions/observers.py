@@ -1,4 +1,4 @@
-"""What observers still have to be sent."""
+"""Observations that are still to be sent to observers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KEPT = 4
 
 
 class ObserverQueue:
-    """A few observations on their way to one observer. Whoever puts one in never waits.
+    """A few observations on their way to one observer. Putting one in never waits.
 
     Attributes:
         dropped: observations that the observer was too slow for.

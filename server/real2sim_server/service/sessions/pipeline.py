@@ -67,11 +67,11 @@ class Transition:
     Attributes:
         change: makes the new world, complete as far as images show it, and leaves the present one
             alone; runs off the event loop.
-        cameras: of the world's sensors, by name, at the sizes asked for.
+        cameras: of the world's sensors, by name, at the sizes they name.
         record: writes the log entry of the change; runs off the event loop, once the new world is
             evaluated. None where it is in the log already.
         write: hands a message to the socket if nothing has to be waited for; whether it did. None
-            where nobody waits for the observation. Runs on the event loop; nothing fails after it.
+            where no action waits for it. Runs on the event loop; nothing fails after it.
         timer: of the stages.
         recorded: whether ``record`` is done.
         sent: whether ``write`` is done.

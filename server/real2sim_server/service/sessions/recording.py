@@ -22,12 +22,12 @@ MAX_FRAMES_BYTES = 512 * 1024 * 1024
 
 
 async def recording_of(sessions: Sessions, session: Session, *, frames: bool) -> bytes:
-    """The recording of the running episode: lived through again from the session's log.
+    """The recording of the running episode: replayed from the session's log.
 
     Args:
         sessions: has the log.
         session: whose episode.
-        frames: whether its sensors are drawn once more; raw images are kept as png.
+        frames: whether its sensors are rendered again; raw images are stored as png.
 
     Raises:
         ServiceError: NOT_RESET, or PAYLOAD_TOO_LARGE for more than 512 MiB of images.
@@ -64,13 +64,13 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
 async def _frames(
     pipeline: StepPipeline, start: EpisodeStart, entries: Iterable[Entry]
 ) -> Mapping[str, bytes]:
-    replayer, kept, total = Replayer.on(start.scene, start.state), dict[str, bytes](), 0
+    replayer, images, total = Replayer.on(start.scene, start.state), dict[str, bytes](), 0
     for entry in entries:
         world = await pipeline.on_world_thread(replayer.apply, entry)
         if entry.kind not in {"reset", "action"}:
             continue
         for frame in await _drawn(pipeline, world):
-            kept[_name(frame, world.steps)] = bytes(frame.data)
+            images[_name(frame, world.steps)] = bytes(frame.data)
             total += len(frame.data)
         if total > MAX_FRAMES_BYTES:
             raise ServiceError(
@@ -78,7 +78,7 @@ async def _frames(
                 f"the images of {world.steps} steps take more than {MAX_FRAMES_BYTES} bytes",
                 hint="record without frames and draw them later: real2sim replay --frames",
             )
-    return kept
+    return images
 
 
 async def _drawn(pipeline: StepPipeline, world: World) -> list[EncodedFrame]:

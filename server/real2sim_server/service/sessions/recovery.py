@@ -23,8 +23,8 @@ async def rebuild(
 ) -> Session:
     """The session as it was when its last entry took effect.
 
-    Everything is lived through again without rendering but the last step, whose answer its client
-    may never have got: it is drawn, so that asking once more gets it.
+    Everything is replayed without rendering but the last step, whose answer its client may never
+    have got: it is rendered, so that the same action sent again gets it.
 
     Args:
         row: of the session.
@@ -48,7 +48,7 @@ async def rebuild(
         session.begin(observation.world, cameras)
         session.lockstep.reset(observation.world.steps, over=observation.world.over)
         if not decode(last.payload).get("missed"):
-            session.lockstep.taken(_content(last), observation.message)
+            session.lockstep.restore_answer(_content(last), observation.message)
         session.newest = observation.message
         return session
     world = await pipeline.on_world_thread(replayer.apply, last)
@@ -61,7 +61,7 @@ async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> Sce
     """Objects of a scenario as they were at a revision.
 
     Raises:
-        ServiceError: UNKNOWN_SCENARIO when it is gone.
+        ServiceError: UNKNOWN_SCENARIO where it was deleted.
     """
     view = await scenarios.view(scenario_id)
     if view.revision == revision:

@@ -36,7 +36,7 @@ from .session import EpisodeStart, Session
 from .step import Stepper
 
 RETRY_AFTER_S = 5
-SWEEP_S = 5.0
+IDLE_CHECK_S = 5.0
 
 log = structlog.get_logger(__name__)
 
@@ -49,7 +49,7 @@ class SessionLimits:
         worker_id: first part of session ids.
         max_sessions: open at one time.
         idle_seconds: without use and without connection, after which a session leaves the memory;
-            whoever asks for it later gets it rebuilt from its log.
+            a later request rebuilds it from its log.
     """
 
     worker_id: str
@@ -108,15 +108,15 @@ class Sessions:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
-        """Idle sessions are put aside for the length of the block; open ones end with it."""
-        sweeping = asyncio.create_task(self._sweep(), name="idle-sessions")
+        """Idle sessions are evicted for the length of the block; open ones end with it."""
+        evicting = asyncio.create_task(self._evict_idle(), name="idle-sessions")
         try:
             yield self
         finally:
             self.draining = True
-            sweeping.cancel()
+            evicting.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await sweeping
+                await evicting
             self.pipeline.close()
 
     # --- life -------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ class Sessions:
                 "given",
                 hint="name exactly one: POST /v1/sessions?scene=... or ?scenario=...",
             )
-        with self._place():
+        with self._reserved_slot():
             row, start = await self._start(scene, scenario)
             try:
                 session = Session(row, start)
@@ -193,7 +193,7 @@ class Sessions:
             ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET.
         """
         world = session.running_world()
-        with self._place():
+        with self._reserved_slot():
             row = replace(
                 session.row,
                 session_id=f"{self._limits.worker_id}.{secrets.token_hex(8)}",
@@ -252,24 +252,24 @@ class Sessions:
             self._scene_cache.unpin(session.row.scene)
             await self._store.close_session(session.session_id, reason=reason)
         for close in session.close_callbacks:
-            # Nobody waits for clients that are slow to listen.
+            # Not awaited: clients may be slow to read.
             closing = asyncio.ensure_future(close(session.closed))
             self._closing.add(closing)
             closing.add_done_callback(self._closing.discard)
         log.info("session closed", session_id=session.session_id, reason=reason)
 
     def evict(self, session: Session) -> None:
-        """Free the memory of a session that nobody is connected to; :meth:`find` brings it back."""
+        """Free the memory of a session without connections; :meth:`find` rebuilds it."""
         if self._open.pop(session.session_id, None) is None:
             return
-        # Whoever has found it a moment ago must not move a world that is being rebuilt.
+        # A request that has just found it must not move a world that is being rebuilt.
         session.closed = ServiceError(
             ErrorCode.QUEUE_FULL,
-            f"session {session.session_id!r} was put aside just now because nobody used it",
+            f"session {session.session_id!r} has just left the memory because it was idle",
             hint="send it again: the session is rebuilt from its log",
         )
         self._scene_cache.unpin(session.row.scene)
-        log.info("session put aside", session_id=session.session_id)
+        log.info("session evicted", session_id=session.session_id)
 
     async def warm_up(self, session: Session) -> None:
         """Draw the session's scene once, so that no observation waits for a first render."""
@@ -281,8 +281,8 @@ class Sessions:
     # --- inside -----------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _place(self) -> Iterator[None]:
-        """Holds a place for a session in creation."""
+    def _reserved_slot(self) -> Iterator[None]:
+        """Reserves a slot for a session in creation."""
         if self.draining:
             raise ServiceError(ErrorCode.DRAINING, "the worker is stopping")
         if self.full:
@@ -300,7 +300,7 @@ class Sessions:
             self._in_creation -= 1
 
     async def _rebuilt(self, row: SessionRow) -> Session:
-        """The session of a row; whoever asks while it is being rebuilt waits for the same."""
+        """The session of a row; concurrent requests wait for the same rebuild."""
         task = self._rebuilding.get(row.session_id)
         if task is None:
             task = asyncio.create_task(self._rebuild(row))
@@ -309,7 +309,7 @@ class Sessions:
         return await asyncio.shield(task)
 
     async def _rebuild(self, row: SessionRow) -> Session:
-        with self._place():
+        with self._reserved_slot():
             pinned = await self._scene_cache.pin(row.scene)
             try:
                 summary = await self._scene_cache.summary(row.scene)
@@ -360,10 +360,10 @@ class Sessions:
             self._bare_states[scene] = state
         return state
 
-    async def _sweep(self) -> None:
+    async def _evict_idle(self) -> None:
         idle = self._limits.idle_seconds
         while True:
-            await asyncio.sleep(min(SWEEP_S, idle / 2))
+            await asyncio.sleep(min(IDLE_CHECK_S, idle / 2))
             for session in self:
                 unused = time.monotonic() - session.used_at
                 if unused > idle and not session.connected and not session.lock.locked():

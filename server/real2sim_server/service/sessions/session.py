@@ -47,9 +47,9 @@ class Session:
     Attributes:
         row: as it is in the store; holds id and token.
         start: scene and objects at step 0.
-        lock: held by whoever changes the session.
+        lock: held during any change of the session.
         world: the committed instant; never changed in place, so readers need no lock.
-        cameras: of the episode's sensors at the sizes asked for, by name.
+        cameras: of the episode's sensors at the sizes they name, by name.
         lockstep: which action is due.
         events: since the last answer to a REST step.
         next_seq: of the session's log.
@@ -58,7 +58,7 @@ class Session:
         late: whether the planner has missed the deadline of the due action, and the clock waits.
         expires_at: monotonic time at which the episode is cut off [s]; None for never.
         controller: the connection that drives, if there is one.
-        observers: what the connections that look on still have to be sent.
+        observers: queues of the connections that look on.
         close_callbacks: one for each open connection.
         closed: why the session is over; None while it is not.
     """
@@ -135,7 +135,7 @@ class Session:
             raise self.closed
 
     def check_no_controller(self) -> None:
-        """Raises ServiceError: CONTROLLER_TAKEN while somebody drives by socket."""
+        """Raises ServiceError: CONTROLLER_TAKEN while a controller is connected."""
         if self.controller is not None:
             raise controller_taken(self.session_id)
 

@@ -43,7 +43,7 @@ STEPS_AT_ONCE = 20
 
 
 class Stepper:
-    """Moves the worlds of sessions; for whoever holds the session's lock.
+    """Moves the worlds of sessions; the caller holds the session's lock.
 
     Args:
         pipeline: makes observations of changed worlds.
@@ -68,7 +68,7 @@ class Stepper:
         return observation.message
 
     async def restart(self, session: Session, spec: ResetSpec) -> None:
-        """Begin an episode of which nobody needs the first observation. Raises like reset()."""
+        """Begin an episode without rendering its first observation. Raises like reset()."""
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         await self._record(session, [("reset", 0, reset_payload(spec))])

@@ -15,7 +15,7 @@ UNFINISHED = (JobState.QUEUED.value, JobState.RUNNING.value)
 
 
 class JobLog:
-    """What is kept of jobs beyond the life of the process.
+    """Jobs beyond the life of the process.
 
     Args:
         store: open while this is used.

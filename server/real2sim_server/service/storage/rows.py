@@ -1,4 +1,4 @@
-"""What the store keeps, row by row."""
+"""Rows of the store."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class SessionRow:
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """One thing that happened to a session.
+    """One entry of a session's log.
 
     Attributes:
         seq: position in the session's log, from 0.
@@ -74,11 +74,11 @@ class SessionEntry:
 
 @dataclass(frozen=True)
 class StoredReply:
-    """An answer kept for a request that may be repeated with the same Idempotency-Key.
+    """An answer stored for a request that may be repeated with the same Idempotency-Key.
 
     Attributes:
         key: the header's value together with the call it was sent to.
-        fingerprint: SHA-256 of what was asked; another one under the same key is refused.
+        fingerprint: SHA-256 of the request; another one under the same key is refused.
     """
 
     key: str

@@ -1,4 +1,4 @@
-"""Durable memory of a worker: scenarios, sessions, and answers that may be asked for again."""
+"""Durable memory of a worker: scenarios, sessions, and stored answers."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ class Store:
     """SQLAlchemy Core on one thread of its own, so that the event loop never waits for a disk.
 
     One thread is enough: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which has
-    one writer at a time anyway, and the order of appends is the order of the calls. Who computes
-    on another thread may write from there, by :meth:`record` and :meth:`record_revision`: to be
-    woken by a thread and to wake another one takes longer than an append.
+    one writer at a time anyway, and the order of appends is the order of the calls. Code that
+    computes on another thread may write from there, by :meth:`record` and
+    :meth:`record_revision`: to be woken by a thread and to wake another one takes longer than an
+    append.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
@@ -136,7 +137,7 @@ class Store:
             revision: next of its log.
             entry: JSON values; ``kind`` among them.
             created_us: wall clock [us].
-            reply: kept for a repeated request.
+            reply: stored for a repeated request.
 
         Raises:
             ConflictError: the revision exists, or the scenario does not.
@@ -155,7 +156,7 @@ class Store:
         """Keep it in place of an older one of its scenario.
 
         Raises:
-            ConflictError: the scenario is gone.
+            ConflictError: the scenario was deleted.
         """
         await self._write(
             Write(sa.delete(t.scenario_snapshots).where(_snapshot_of(row.scenario_id))),
@@ -251,7 +252,7 @@ class Store:
         headers = json.loads(row["headers"])
         return StoredReply(key, row["fingerprint"], row["status"], headers, row["body"])
 
-    # --- whatever else is kept here ---------------------------------------------------------
+    # --- other tables -------------------------------------------------------------------
 
     async def read(self, query: sa.Select[Any]) -> list[dict[str, Any]]:
         """Rows of a query."""
@@ -296,7 +297,7 @@ class Store:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[sa.Connection]:
-        """A transaction of its own, committed at the end; for whoever holds the lock of writers."""
+        """A transaction of its own, committed at the end; the caller holds the write lock."""
         if self._writer is None:
             with self._connected().begin() as connection:
                 yield connection
