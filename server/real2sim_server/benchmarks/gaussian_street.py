@@ -27,7 +27,7 @@ SH_C0 = 0.28209479177387814
 
 
 @dataclass(frozen=True, eq=False)
-class Surfels:
+class StreetSurfels:
     """Discs: centres [N, 3] [m], unit normals [N, 3], colours [N, 3] in [0, 1]."""
 
     centres: Float
@@ -68,7 +68,7 @@ def street_scene(
     length *= 1.02 * for_background / len(background.centres)
     background = background_surfels(rng, length)
     kept = rng.permutation(len(background.centres))[:for_background]
-    background = Surfels(*(part[kept] for part in vars(background).values()))
+    background = StreetSurfels(*(part[kept] for part in vars(background).values()))
     focal = 900.0 * width / 960
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     mount = T_VEHICLE_OPTICAL.copy()
@@ -81,7 +81,7 @@ def street_scene(
     )
 
 
-def background_surfels(rng: np.random.Generator, length: float) -> Surfels:
+def background_surfels(rng: np.random.Generator, length: float) -> StreetSurfels:
     """Road, pavements, facades and trees from x = -10 m to ``length`` - 10 m."""
     side = ROAD_WIDTH / 2 + PAVEMENT_WIDTH
     parts = [road(rng, length)]
@@ -95,16 +95,16 @@ def background_surfels(rng: np.random.Generator, length: float) -> Surfels:
     return joined(parts)
 
 
-def road(rng: np.random.Generator, length: float) -> Surfels:
+def road(rng: np.random.Generator, length: float) -> StreetSurfels:
     """Asphalt with a dashed line in the middle and a solid one on each side."""
     plane = patch([-10, -ROAD_WIDTH / 2, 0], [length, 0, 0], [0, ROAD_WIDTH, 0])
     plane = painted(plane, rng, (0.23, 0.23, 0.25), 0.03)
     x, y = plane.centres[:, 0], plane.centres[:, 1]
     line = (np.abs(y) < 0.12) & (x % 9 < 4) | (np.abs(np.abs(y) - 6.5) < 0.1)
-    return Surfels(plane.centres, plane.normals, np.where(line[:, None], 0.85, plane.colors))
+    return StreetSurfels(plane.centres, plane.normals, np.where(line[:, None], 0.85, plane.colors))
 
 
-def facade(rng: np.random.Generator, length: float, y: float) -> Surfels:
+def facade(rng: np.random.Generator, length: float, y: float) -> StreetSurfels:
     """Houses of different colours with rows of dark windows, facing the street."""
     wall = patch([-10, y, 0], [length, 0, 0], [0, 0, FACADE_HEIGHT])
     x, z = wall.centres[:, 0], wall.centres[:, 2]
@@ -113,21 +113,21 @@ def facade(rng: np.random.Generator, length: float, y: float) -> Surfels:
     window = (x % 3 > 1) & (x % 3 < 2.2) & (z % 3.2 > 1) & (z % 3.2 < 2.6)
     colors = np.where(window[:, None], (0.12, 0.16, 0.22), colors)
     colors = colors + rng.normal(0, 0.03, colors.shape)
-    return Surfels(wall.centres, wall.normals, colors.clip(0, 1))
+    return StreetSurfels(wall.centres, wall.normals, colors.clip(0, 1))
 
 
-def tree(rng: np.random.Generator, foot: Float) -> Surfels:
+def tree(rng: np.random.Generator, foot: Float) -> StreetSurfels:
     """A trunk, and leaves throughout a ball."""
     angles, heights = rng.uniform(0, 2 * np.pi, 120), rng.uniform(0, 3, 120)
     outwards = np.stack([np.cos(angles), np.sin(angles), np.zeros(120)], -1)
-    trunk = Surfels(
+    trunk = StreetSurfels(
         foot + 0.18 * outwards + np.stack([0 * heights, 0 * heights, heights], -1),
         outwards,
         np.full((120, 3), (0.3, 0.22, 0.15)),
     )
     normals = unit(rng.normal(size=(2000, 3)))
     radii = CROWN_RADIUS * rng.uniform(0.4, 1, (2000, 1))
-    leaves = Surfels(
+    leaves = StreetSurfels(
         foot + np.array([0, 0, 4.6]) + radii * unit(rng.normal(size=(2000, 3))),
         normals,
         np.array([0.2, 0.35, 0.12]) * rng.uniform(0.5, 1.4, (2000, 1)),
@@ -135,7 +135,7 @@ def tree(rng: np.random.Generator, foot: Float) -> Surfels:
     return joined([trunk, leaves])
 
 
-def car_surfels(rng: np.random.Generator) -> Surfels:
+def car_surfels(rng: np.random.Generator) -> StreetSurfels:
     """The shell of a car about its own centre: five sides of a body and of a cabin."""
     body = shell(np.array([0, 0, -0.25]), CAR_SIZE * (1, 1, 0.6))
     cabin = shell(np.array([-0.2, 0, 0.45]), CAR_SIZE * (0.5, 0.85, 0.4))
@@ -144,7 +144,7 @@ def car_surfels(rng: np.random.Generator) -> Surfels:
     )
 
 
-def shell(centre: Float, size: Float) -> Surfels:
+def shell(centre: Float, size: Float) -> StreetSurfels:
     """All sides but the lower one of a box."""
     low, (a, b, c) = centre - size / 2, np.diag(size)
     return joined(
@@ -170,31 +170,33 @@ def parked_cars(car: GaussianCloud, length: float) -> list[Instance]:
     return instances
 
 
-def patch(corner: Float | list[float], u: Float | list[float], v: Float | list[float]) -> Surfels:
+def patch(
+    corner: Float | list[float], u: Float | list[float], v: Float | list[float]
+) -> StreetSurfels:
     """Discs on a grid of SPACING over the parallelogram ``corner + [0, 1] u + [0, 1] v``."""
     start, along, across = (np.asarray(value, dtype=np.float64) for value in (corner, u, v))
     steps = [max(1, round(np.linalg.norm(edge) / SPACING)) for edge in (along, across)]
     s, t = np.meshgrid(*((np.arange(n) + 0.5) / n for n in steps), indexing="ij")
     centres = start + s.reshape(-1, 1) * along + t.reshape(-1, 1) * across
     normal = unit(np.cross(along, across))
-    return Surfels(centres, np.broadcast_to(normal, centres.shape), np.zeros_like(centres))
+    return StreetSurfels(centres, np.broadcast_to(normal, centres.shape), np.zeros_like(centres))
 
 
 def painted(
-    surfels: Surfels, rng: np.random.Generator, rgb: tuple[float, float, float], noise: float
-) -> Surfels:
+    surfels: StreetSurfels, rng: np.random.Generator, rgb: tuple[float, float, float], noise: float
+) -> StreetSurfels:
     """The same discs in one colour with noise."""
     colors = np.array(rgb) + rng.normal(0, noise, surfels.centres.shape)
-    return Surfels(surfels.centres, surfels.normals, colors.clip(0, 1))
+    return StreetSurfels(surfels.centres, surfels.normals, colors.clip(0, 1))
 
 
-def joined(parts: list[Surfels]) -> Surfels:
+def joined(parts: list[StreetSurfels]) -> StreetSurfels:
     """All discs in one."""
     columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return Surfels(*(np.concatenate(column) for column in columns))
+    return StreetSurfels(*(np.concatenate(column) for column in columns))
 
 
-def surfels_to_cloud(surfels: Surfels, rng: np.random.Generator) -> GaussianCloud:
+def surfels_to_cloud(surfels: StreetSurfels, rng: np.random.Generator) -> GaussianCloud:
     """Discs as Gaussians with spherical harmonics of degree 1."""
     n = len(surfels.centres)
     sh = np.zeros((n, 4, 3))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._files import atomic_file
 from ..logs import DrivingLog, open_log
 from ..scene import Scene
 from ..scene.io import save_scene
@@ -233,7 +234,6 @@ def _write_preview(scene: Scene, log: DrivingLog, out: Path, frame: int) -> Path
     done, data = cv2.imencode(".png", np.ascontiguousarray(pair[..., ::-1]))
     if not done:
         raise ReconstructError(f"{path}: the preview could not be encoded")
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(data.tobytes())
-    temporary.replace(path)
+    with atomic_file(path) as file:
+        file.write(data.tobytes())
     return path

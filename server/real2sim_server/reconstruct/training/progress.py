@@ -76,13 +76,13 @@ class RateMeter:
         return rate
 
 
-class StageTimer:
+class StepTimer:
     """Adds the seconds of a block to a stage."""
 
     def __init__(self, stages: dict[str, float]) -> None:
         self._stages = stages
 
-    def __call__(self, name: str) -> StageTimer:
+    def __call__(self, name: str) -> StepTimer:
         """For ``with``: the block's seconds count as those of ``name``."""
         self._name = name
         return self

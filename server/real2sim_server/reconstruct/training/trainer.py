@@ -25,7 +25,7 @@ from .model import RenderedView, SceneModel
 from .object_masks import box_mask
 from .operations import step_generator
 from .optimizer import SelectiveAdam
-from .progress import OnTraining, RateMeter, RunningMeans, StageTimer, TrainingProgress
+from .progress import OnTraining, RateMeter, RunningMeans, StepTimer, TrainingProgress
 from .schedule import TrainOptions, from_values, learning_rates_at
 from .visibility import OcclusionPruning
 
@@ -105,7 +105,7 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """One iteration; the terms of its loss."""
         i = self.iteration
-        timed = StageTimer(self.running.stages)
+        timed = StepTimer(self.running.stages)
         with timed("data"):
             view = self.views.view(self.views.index_at(i), self.options.divisor(i))
             self.views.prefetch(i)

@@ -46,7 +46,7 @@ Viewpoint = tuple[Camera, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Visibility:
+class GaussianVisibility:
     """How much of N Gaussians some views show, and how deep behind what they show these lie.
 
     Attributes:
@@ -69,7 +69,7 @@ class Visibility:
 
 
 @torch.no_grad()
-def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Visibility:
+def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> GaussianVisibility:
     """What ``viewpoints`` show of each Gaussian of ``model``.
 
     Where training shows vehicles mirrored, both sides count: what is hidden on one is learnt on
@@ -92,7 +92,9 @@ def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Visibility
             visible[rows] += counted
             unoccluded[rows] += alone
             depth_sums[rows] += counted * (_depths(instance, viewmat) - surface)
-    return Visibility(visible / unoccluded.clamp(min=1e-9), depth_sums / visible.clamp(min=1e-9))
+    return GaussianVisibility(
+        visible / unoccluded.clamp(min=1e-9), depth_sums / visible.clamp(min=1e-9)
+    )
 
 
 def blending_weights(
@@ -194,7 +196,7 @@ def _to_camera(instance: Instance, viewmat: Tensor) -> Tensor:
 def prune_hidden(
     gaussians: Gaussians,
     optimizer: SelectiveAdam,
-    seen: Visibility,
+    seen: GaussianVisibility,
     *,
     background_limits: VisibilityLimits,
     object_limits: VisibilityLimits,

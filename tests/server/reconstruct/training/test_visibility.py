@@ -12,7 +12,7 @@ from real2sim_server.reconstruct.training.densify import DensifyOptions, Visibil
 from real2sim_server.reconstruct.training.gaussians import Gaussians, concatenate
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.reconstruct.training.visibility import (
-    Visibility,
+    GaussianVisibility,
     hidden_sky,
     occluded_priors,
     prune_hidden,
@@ -76,7 +76,7 @@ def model_of(
 def dropped(
     gaussians: Gaussians,
     optimizer: SelectiveAdam,
-    seen: Visibility,
+    seen: GaussianVisibility,
     *,
     object_limits: VisibilityLimits = LIMITS.object_limits,
 ) -> Gaussians:
@@ -143,7 +143,7 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     optimizer: SelectiveAdam = marked(gaussians)
     fractions = torch.full((len(gaussians),), 0.03)
     fractions[:5] = 0.001
-    seen = Visibility(fractions, torch.zeros(len(gaussians)))
+    seen = GaussianVisibility(fractions, torch.zeros(len(gaussians)))
     left = dropped(gaussians, optimizer, seen, object_limits=VisibilityLimits(fraction=0.05))
     assert left.counts == (COUNTS[0] - 5, 0, 0)
     torch.testing.assert_close(optimizer.first["means"], left.means.detach())
@@ -154,7 +154,7 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
     gaussians = some_gaussians()
     fractions, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
     depths[2], depths[3], fractions[3] = 0.5, 0.5, 0.5
-    seen = Visibility(fractions, depths)
+    seen = GaussianVisibility(fractions, depths)
     left = dropped(gaussians, marked(gaussians), seen)
     kept = [i for i in range(len(gaussians)) if i != 2]
     torch.testing.assert_close(left.means, gaussians.means[kept])
@@ -162,7 +162,7 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
 
 def test_inside_of_objects_goes_at_less_depth_and_more_share_than_in_the_background():
     gaussians = some_gaussians()
-    seen = Visibility(*(torch.full((len(gaussians),), value) for value in (0.2, 0.25)))
+    seen = GaussianVisibility(*(torch.full((len(gaussians),), value) for value in (0.2, 0.25)))
     left = dropped(gaussians, marked(gaussians), seen, object_limits=LIMITS.last_object_limits)
     assert left.counts == (COUNTS[0], 0, 0)
 
