@@ -40,6 +40,7 @@ def mean_of_a_picture(package: Path) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_constant_changed_in_another_file_changes_the_picture_of_the_next_process(
     package: Path,
 ) -> None:
