@@ -4,7 +4,7 @@ from .apply import EditOutcome, apply_operations, replay_operations
 from .compose import cloud_of, compose, instances_at
 from .errors import EditError
 from .ground_inpainting import vacated_parking
-from .scenario import LogEntry, Planned, Scenario
+from .scenario import LogEntry, PlannedEntry, Scenario
 from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
 from .tracks import PackedTracks, PlacedObjects
@@ -18,7 +18,7 @@ __all__ = [
     "ObjectState",
     "PackedTracks",
     "PlacedObjects",
-    "Planned",
+    "PlannedEntry",
     "Scenario",
     "ScenarioState",
     "apply_operations",

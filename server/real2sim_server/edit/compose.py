@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 KEPT_BACKGROUNDS = 4
 """Backgrounds with erased regions that are kept for each scene; one costs 4 bytes a Gaussian, and
-that of its colours too where parked objects are gone."""
+that of its colours too where parked objects were moved."""
 
 
 def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance]:

@@ -1,4 +1,4 @@
-"""Errors of the edit room."""
+"""Errors of the edit package."""
 
 from __future__ import annotations
 

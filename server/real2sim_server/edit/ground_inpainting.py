@@ -20,11 +20,11 @@ from .state import ObjectState, ScenarioState
 from .tracks import Float
 
 PARKED = 0.5
-"""An object whose recorded places are all within this of each other is parked; tracks of things
+"""An object whose recorded places are all within this of each other is parked; tracks of objects
 that stand still waver by some decimetres [m]."""
 
 AWAY = 0.5
-"""An object this far from its parking place leaves it to be seen [m]."""
+"""An object this far from its parking place uncovers the ground there [m]."""
 
 MARGIN = 0.25
 """Colours reach this far beyond a box [m]."""
@@ -43,7 +43,7 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
 
     Args:
         state: knows what was recorded.
-        poses: ``T_world_object`` [4, 4] of all objects that exist, by id; where an edit or a blow
+        poses: ``T_world_object`` [4, 4] of all objects that exist, by id; where an edit or impact
             has brought them.
     """
     return tuple(

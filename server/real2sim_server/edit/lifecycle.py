@@ -105,25 +105,25 @@ def replace_appearance(
 @operation(Delete)
 def delete(state: ScenarioState, operation: Delete) -> AppliedOperation:
     """Leave a tombstone."""
-    thing, inverse = operation.object_id, Restore(object_id=operation.object_id)
-    if thing in state.regions or thing in state.colliders:
-        if thing in state.tombstones:
-            raise invalid_operation(f"{thing!r} is deleted already", hint="leave the delete out")
-        return AppliedOperation(replace(state, tombstones=state.tombstones | {thing}), inverse)
-    return object_changed(state, replace(require_object(state, thing), deleted=True), inverse)
+    target, inverse = operation.object_id, Restore(object_id=operation.object_id)
+    if target in state.regions or target in state.colliders:
+        if target in state.tombstones:
+            raise invalid_operation(f"{target!r} is deleted already", hint="leave the delete out")
+        return AppliedOperation(replace(state, tombstones=state.tombstones | {target}), inverse)
+    return object_changed(state, replace(require_object(state, target), deleted=True), inverse)
 
 
 @operation(Restore)
 def restore(state: ScenarioState, operation: Restore) -> AppliedOperation:
     """Take a tombstone away."""
-    thing, inverse = operation.object_id, Delete(object_id=operation.object_id)
-    if thing in state.tombstones:
-        return AppliedOperation(replace(state, tombstones=state.tombstones - {thing}), inverse)
-    found = state.objects.get(thing)
-    if found is None and not state.has_id(thing):
-        require_object(state, thing)
+    target, inverse = operation.object_id, Delete(object_id=operation.object_id)
+    if target in state.tombstones:
+        return AppliedOperation(replace(state, tombstones=state.tombstones - {target}), inverse)
+    found = state.objects.get(target)
+    if found is None and not state.has_id(target):
+        require_object(state, target)
     if found is None or not found.deleted:
-        raise invalid_operation(f"{thing!r} is not deleted", hint="leave the restore out")
+        raise invalid_operation(f"{target!r} is not deleted", hint="leave the restore out")
     return object_changed(state, replace(found, deleted=False), inverse)
 
 

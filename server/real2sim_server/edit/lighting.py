@@ -14,7 +14,7 @@ from ..scene.spherical_harmonics import SH_C0
 Colour = tuple[float, float, float]
 
 AROUND = 20.0
-"""Background this far around the ego's path tells the light [m]."""
+"""Background this far around the ego's path gives the ambient light [m]."""
 
 HEIGHTS = (-2.0, 6.0)
 """And this far below and above it: the street, not the tree tops [m]."""
@@ -54,7 +54,7 @@ def mean_colour(cloud: GaussianCloud) -> Colour | None:
 def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
     """Factors on the colours of an asset that bring it into the light of ``scene``.
 
-    Where the light is known that the asset was seen in, they are the ratio of the two ambient
+    Where the light is known that the asset was recorded in, they are the ratio of the two ambient
     colours. Else its brightness is brought to that of the scene's own objects; its tint stays.
 
     Args:
@@ -68,10 +68,10 @@ def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) 
         return (red, green, blue)
     own = mean_colour(cloud)
     others = [mean_colour(o.cloud) for o in scene.objects.values()]
-    seen = [_luma(colour) for colour in others if colour is not None]
-    if own is None or not seen:
+    lumas = [_luma(colour) for colour in others if colour is not None]
+    if own is None or not lumas:
         return (1.0, 1.0, 1.0)
-    factor = _bounded(float(np.median(seen)) / max(_luma(own), 1e-3))
+    factor = _bounded(float(np.median(lumas)) / max(_luma(own), 1e-3))
     return (factor, factor, factor)
 
 

@@ -156,7 +156,7 @@ def shifted(
     *,
     weights: Float | None = None,
 ) -> Trajectory:
-    """The trajectory shifted [m], at each pose by the share in ``weights`` [T].
+    """The trajectory shifted [m], at each pose by the fraction in ``weights`` [T].
 
     Raises:
         EditError: INVALID_OPERATION when it leaves what the wire can carry.

@@ -42,7 +42,7 @@ class LogEntry:
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
+class PlannedEntry:
     """An entry that may be stored, and what it leads to once committed."""
 
     entry: LogEntry
@@ -123,7 +123,7 @@ class Scenario:
         *,
         base_revision: int | None = None,
         who: str = "",
-    ) -> Planned:
+    ) -> PlannedEntry:
         """What ``operations`` would lead to.
 
         Args:
@@ -137,9 +137,9 @@ class Scenario:
         """
         self._refuse_stale(base_revision)
         outcome = apply_operations(self.state, operations)
-        return Planned(self._entry("edit", tuple(operations), None, who), outcome)
+        return PlannedEntry(self._entry("edit", tuple(operations), None, who), outcome)
 
-    def plan_undo(self, *, base_revision: int | None = None, who: str = "") -> Planned:
+    def plan_undo(self, *, base_revision: int | None = None, who: str = "") -> PlannedEntry:
         """What taking back the last edit in effect would lead to.
 
         Raises:
@@ -151,14 +151,14 @@ class Scenario:
         edit = self._done[-1]
         state = self._state_after(len(self._done) - 1)
         outcome = EditOutcome(state=state, created=(), inverse=tuple(edit.operations), warnings=())
-        return Planned(self._entry("undo", (), edit.revision, who), outcome)
+        return PlannedEntry(self._entry("undo", (), edit.revision, who), outcome)
 
     def plan_redo(
         self,
         *,
         base_revision: int | None = None,
         who: str = "",
-    ) -> Planned:
+    ) -> PlannedEntry:
         """What bringing back the last undone edit would lead to.
 
         Raises:
@@ -172,16 +172,16 @@ class Scenario:
             )
         edit = self._undone[-1]
         outcome = apply_operations(self.state, edit.operations)
-        return Planned(self._entry("redo", (), edit.revision, who), outcome)
+        return PlannedEntry(self._entry("redo", (), edit.revision, who), outcome)
 
-    def commit(self, planned: Planned) -> EditOutcome:
+    def commit(self, planned: PlannedEntry) -> EditOutcome:
         """Let a planned entry take effect; the outcome.
 
         Raises:
             EditError: STALE_REVISION when another entry was committed since it was planned.
         """
         self._append(planned.entry)
-        # Kept for undo, but nobody is likely to look into it soon.
+        # Kept for undo, but unlikely to be needed soon.
         self.state.forget_tracks()
         self.state = planned.outcome.state
         self._keep(len(self._done), self.state)

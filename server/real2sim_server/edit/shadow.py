@@ -76,8 +76,8 @@ def _decal(level: int, device: str) -> GaussianCloud:
     )
     inside = np.clip((0.5 - np.maximum(np.abs(x), np.abs(y))) / 0.2, 0.0, 1.0)
     corner = np.clip((0.62 - np.hypot(x, y)) / 0.2, 0.0, 1.0)
-    share = (inside * inside * (3 - 2 * inside) * corner).ravel()
-    count = len(share)
+    shade = (inside * inside * (3 - 2 * inside) * corner).ravel()
+    count = len(shade)
     means = np.stack([x.ravel(), y.ravel(), np.zeros(count)], axis=1)
     spread = [0.7 / columns, 0.7 / rows, 0.004]
     colour = (torch.tensor(COLOUR) - 0.5) / SH_C0
@@ -85,7 +85,7 @@ def _decal(level: int, device: str) -> GaussianCloud:
         means=torch.from_numpy(means).float(),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         scales=torch.tensor(spread).repeat(count, 1),
-        opacities=torch.from_numpy(share * DARKNESS * level / LEVELS).float(),
+        opacities=torch.from_numpy(shade * DARKNESS * level / LEVELS).float(),
         sh=colour.expand(count, 1, 3).contiguous(),
     )
     return decal.to(device)

@@ -39,8 +39,8 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         packed: the bytes.
 
     Raises:
-        EditError: UNKNOWN_ASSET where an object shows an asset that is gone; INVALID_OPERATION
-            for bytes that hold no state of this scene.
+        EditError: UNKNOWN_ASSET where an object shows one that is not in the library;
+            INVALID_OPERATION for bytes that hold no state of this scene.
     """
     try:
         document = decode(packed, max_bytes=MAX_BYTES)

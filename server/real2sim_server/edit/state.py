@@ -1,4 +1,4 @@
-"""What a scenario looks like at one revision: objects without their Gaussians."""
+"""State of a scenario at one revision: objects without their Gaussians."""
 
 from __future__ import annotations
 

@@ -34,12 +34,12 @@ def poses_at(t_us, ends, times, knots):
     for k in range(count):
         j = after[k]
         i = j if times[j] == t_us else j - 1
-        share = (t_us - times[i]) / (times[j] - times[i]) if i < j else 0.0
+        fraction = (t_us - times[i]) / (times[j] - times[i]) if i < j else 0.0
         for c in range(3):
-            positions[k, c] = (1 - share) * knots[i, c] + share * knots[j, c]
+            positions[k, c] = (1 - fraction) * knots[i, c] + fraction * knots[j, c]
             velocities[k, c] = knots[i, 7 + c]
-        if share > 0 and knots[i, 10] != 0:
-            _slerp(knots[i], knots[j], share, quaternions[k])
+        if fraction > 0 and knots[i, 10] != 0:
+            _slerp(knots[i], knots[j], fraction, quaternions[k])
         else:
             quaternions[k] = knots[i, 3:7]
         _put(positions[k], quaternions[k], transforms[k])
@@ -67,7 +67,7 @@ def _covering(t_us, ends, times):
 
 
 @kernel
-def _slerp(start, end, share, found):
+def _slerp(start, end, fraction, found):
     """Quaternion [4] between two knots, on the shorter arc; as ``scene.rotation.slerp``."""
     dot = 0.0
     for c in range(3, 7):
@@ -75,7 +75,7 @@ def _slerp(start, end, share, found):
     sign = -1.0 if dot < 0 else 1.0
     angle = math.acos(min(abs(dot), 1.0))
     sine = math.sin(angle)
-    a, b = 1 - share, share
+    a, b = 1 - fraction, fraction
     if sine >= 1e-6:
         a, b = math.sin(a * angle) / sine, math.sin(b * angle) / sine
     squares = 0.0

@@ -113,10 +113,10 @@ def sample_poses(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[F
     after = np.searchsorted(times, clipped, side="left")
     before = np.maximum(after - 1, 0)
     span = np.maximum(times[after] - times[before], 1)
-    share = np.where(after > before, (clipped - times[before]) / span, 0.0)
+    fraction = np.where(after > before, (clipped - times[before]) / span, 0.0)
     p, q = trajectory.positions, trajectory.quaternions
-    positions = (1 - share)[:, None] * p[before] + share[:, None] * p[after]
-    quaternions = slerp(q[before], q[after], share)
+    positions = (1 - fraction)[:, None] * p[before] + fraction[:, None] * p[after]
+    quaternions = slerp(q[before], q[after], fraction)
     known = times[after] == clipped
     positions[known], quaternions[known] = p[after[known]], q[after[known]]
     return positions, quaternions

@@ -1,4 +1,4 @@
-"""What a person should look at after an edit: overlaps, floating objects, objects far outside."""
+"""Validation of an edit: warnings of overlaps, floating objects, objects far outside."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def shifted(transform, ahead, up):
 
 @kernel
 def within_reach(T_world_box, size, transforms, sizes):
-    """Numbers [H] int64 of the boxes whose enclosing ball meets that of one box, of K boxes.
+    """Numbers [H] int64 of the boxes whose enclosing sphere intersects that of one box, of K boxes.
 
     Args:
         T_world_box: [4, 4] float64.

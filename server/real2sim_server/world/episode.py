@@ -1,4 +1,4 @@
-"""Whether an episode can run as asked, and its clock."""
+"""Validation of a reset, and the clock of its episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things that happen in a step."""
+"""Events of a step."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Questions to a path, each answered in one call.
+"""Queries of a path, each in one call.
 
 All take the path as ``knots`` [P, 11] float64, one row a pose: its distance from the start [m],
 position x, y, z [m], heading (continuous) [rad], floor normal [3], and for the segment to the next
-pose the two parts of the complex number whose product with (p - start) has the share of the
+pose the two parts of the complex number whose product with (p - start) has the fraction of the
 segment that lies before p's foot as its real part, and p's distance to the left as its imaginary
 part, both in lengths of the segment; last the square of that length [m^2].
 """
@@ -27,10 +27,10 @@ PIECE = 4.0
 """Curvature is taken over pieces of this length [m]."""
 
 REACH = 80
-"""Whoever is ahead is looked for in as many metres, at points one metre apart."""
+"""The leading object is searched for in as many metres, at points one metre apart."""
 
 SIDE = 0.3
-"""Room beside a box that counts as in the way [m]."""
+"""Clearance beside a box that counts as in the way [m]."""
 
 
 @kernel
@@ -48,23 +48,31 @@ def nearest_point(knots, x, y, near_s):
         floor.
     """
     segments = len(knots) - 1
-    k, share, offset = 0, 0.0, math.inf
+    k, f, offset = 0, 0.0, math.inf
     if not math.isnan(near_s):
         first = max(_first_not_before(knots, near_s - NEAR_BEHIND) - 1, 0)
         last = min(max(_first_not_before(knots, near_s + NEAR_AHEAD), first + 1), segments)
-        k, share, offset = _foot(knots, x, y, first, last)
+        k, f, offset = _foot(knots, x, y, first, last)
     if not abs(offset) <= LOST:
-        k, share, offset = _foot(knots, x, y, 0, segments)
-    a, b, rest = knots[k], knots[k + 1], 1.0 - share
-    if (k == 0 and share == 0.0) or (k == segments - 1 and share == 1.0):
+        k, f, offset = _foot(knots, x, y, 0, segments)
+    a, b, rest = knots[k], knots[k + 1], 1.0 - f
+    if (k == 0 and f == 0.0) or (k == segments - 1 and f == 1.0):
         offset = ((x - a[1]) * a[9] + (y - a[2]) * a[8]) * math.sqrt(a[10])
-    ux, uy, uz = rest * a[5] + share * b[5], rest * a[6] + share * b[6], rest * a[7] + share * b[7]
+    ux, uy, uz = (
+        rest * a[5] + f * b[5],
+        rest * a[6] + f * b[6],
+        rest * a[7] + f * b[7],
+    )
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     return (
-        rest * a[0] + share * b[0],
+        rest * a[0] + f * b[0],
         offset,
-        (rest * a[1] + share * b[1], rest * a[2] + share * b[2], rest * a[3] + share * b[3]),
-        rest * a[4] + share * b[4],
+        (
+            rest * a[1] + f * b[1],
+            rest * a[2] + f * b[2],
+            rest * a[3] + f * b[3],
+        ),
+        rest * a[4] + f * b[4],
         (ux / length, uy / length, uz / length),
     )
 
@@ -141,7 +149,7 @@ def next_in_strip(knots, s, box, bodies, own):
         own: row of the box itself.
 
     Returns:
-        Gap from bumper to bumper [m], infinite where nobody is ahead, and speed along the path
+        Gap from bumper to bumper [m], infinite where there is none, and speed along the path
         [m/s].
     """
     offset, length, width = box
@@ -207,9 +215,9 @@ def _along(knots, s, column):
 
 @kernel
 def _foot(knots, x, y, first, last):
-    """Nearest segment from ``first`` to before ``last``, share of it, and the distance from there,
-    positive on the left [m]."""
-    nearest, least, share, left = first, math.inf, 0.0, 0.0
+    """Nearest segment from ``first`` to before ``last``, fraction of it, and the distance from
+    there, positive on the left [m]."""
+    nearest, least, fraction, left = first, math.inf, 0.0, 0.0
     for k in range(first, last):
         dx, dy = x - knots[k, 1], y - knots[k, 2]
         along = dx * knots[k, 8] - dy * knots[k, 9]
@@ -218,5 +226,5 @@ def _foot(knots, x, y, first, last):
         beyond = along - foot
         square = (beyond * beyond + across * across) * knots[k, 10]
         if square < least:
-            nearest, least, share, left = k, square, foot, across
-    return nearest, share, math.copysign(math.sqrt(least), left)
+            nearest, least, fraction, left = k, square, foot, across
+    return nearest, fraction, math.copysign(math.sqrt(least), left)

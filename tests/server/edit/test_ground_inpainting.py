@@ -45,7 +45,7 @@ def test_small_moves_and_moves_of_what_was_driving_leave_no_place(tiny_scene, st
     assert vacated_parking(state, poses_of(state, tiny_scene.start_us)) == ()
 
 
-def test_a_blow_that_pushes_a_parked_object_away_uncovers_its_place(tiny_scene, state):
+def test_an_impact_that_pushes_a_parked_object_away_uncovers_its_place(tiny_scene, state):
     poses = poses_of(state, tiny_scene.start_us)
     pushed = poses[PARKED].copy()
     pushed[0, 3] += 1.0

@@ -1,4 +1,4 @@
-"""What impacts leave behind: struck bodies are drawn deformed, and always alike."""
+"""Deformation after impacts: what is drawn of an object, always alike."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def bits(cloud: GaussianCloud) -> str:
 # --- in the world -----------------------------------------------------------------------------
 
 
-def test_a_struck_car_is_drawn_dented_where_it_was_struck(crash_scene, moving):
+def test_an_impacted_car_is_drawn_deformed_where_it_was_hit(crash_scene, moving):
     scene = crash_scene(car=moving(20, 0, z=0.75), other=moving(20, 5, z=0.75))
     world = world_of(scene)
     drive_until_contact(world)
@@ -119,9 +119,9 @@ def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_sce
     scene, spec = crash_scene(car=moving(20, 0.4, z=0.75)), ResetSpec(**GO_ON)
     entries = [Entry("reset", 0, reset_payload(spec))]
     entries += [Entry("action", k, action_payload(COAST)) for k in range(25)]
-    told = Replayer.on(scene, ScenarioState.of(scene))
+    replayer = Replayer.on(scene, ScenarioState.of(scene))
     for entry in entries:
-        world = told.apply(entry)
+        world = replayer.apply(entry)
     fork = world.fork()
     again = Replayer.on(scene, ScenarioState.of(scene))
     for entry in entries:
@@ -141,7 +141,7 @@ def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_sce
         ("car", 1.0, {}),
     ],
 )
-def test_what_is_switched_off_alive_or_struck_slowly_is_not_dented(
+def test_what_is_switched_off_alive_or_hit_slowly_is_not_deformed(
     crash_scene, moving, category, speed, spec
 ):
     scene = crash_scene(category, speed=speed, car=moving(5.5 + 1.5 * speed, 0, z=0.75))
@@ -175,12 +175,12 @@ def crasher(x: float, y: float, vx: float, *, yaw: float = 0.0, mass: float = MA
 @pytest.mark.parametrize(("mass", "y"), [(1500.0, 0.0), (3000.0, 0.0), (1500.0, 0.7)])
 def test_momentum_of_both_stays_and_delta_v_is_that_of_the_rigid_exchange(mass, y):
     first, second = crasher(-4.15, y, 10.0), crasher(0.0, 0.0, 0.0, mass=mass)
-    struck, hit = crash.simulate_impact(first, second)
-    total = MASS * struck.delta_v + mass * hit.delta_v
+    front, hit = crash.simulate_impact(first, second)
+    total = MASS * front.delta_v + mass * hit.delta_v
     np.testing.assert_allclose(total, 0.0, atol=1e-3 * MASS * 10)
     if y == 0.0:
         rigid = 1.1 * mass / (MASS + mass) * 10.0
-        assert -struck.delta_v[0] == pytest.approx(rigid, rel=0.12)
+        assert -front.delta_v[0] == pytest.approx(rigid, rel=0.12)
 
 
 def test_both_dents_together_are_as_deep_as_the_mutual_stiffness_says():
@@ -190,5 +190,5 @@ def test_both_dents_together_are_as_deep_as_the_mutual_stiffness_says():
     assert depth == pytest.approx((2 * energy / 405e3) ** 0.5, rel=0.35)
 
 
-def test_bodies_that_pass_each_other_leave_no_dents():
+def test_bodies_that_pass_each_other_are_not_deformed():
     assert crash.simulate_impact(crasher(-4.0, 2.5, 10.0), crasher(0.0, 0.0, 0.0)) is None

@@ -163,7 +163,7 @@ def test_a_rear_end_at_10_metres_a_second_gives_the_delta_v_of_theory(
     assert crash.value == pytest.approx(theory, rel=0.1)
 
 
-def test_both_cars_move_on_and_the_struck_one_comes_to_rest(make_world, moving):
+def test_both_cars_move_on_and_the_one_that_was_hit_comes_to_rest(make_world, moving):
     world = rear_end(make_world, moving)
     drive_until_contact(world)
     total = MASS * (world.motion.speed + agent_of(world)["velocity"][0])
@@ -182,7 +182,7 @@ def test_the_energy_that_is_lost_is_reported_with_an_estimate_of_crush(make_worl
     assert 0.3 < event.data["crush"] < 0.6
 
 
-def test_a_car_struck_off_centre_turns_and_so_does_the_ego(make_world, moving):
+def test_a_car_hit_off_centre_turns_and_so_does_the_ego(make_world, moving):
     world = make_world(car=moving(20, 1.2, z=0.8), spec=GO_ON)
     drive_until_contact(world)
     for _ in range(10):
@@ -192,7 +192,7 @@ def test_a_car_struck_off_centre_turns_and_so_does_the_ego(make_world, moving):
     assert abs(world.motion.yaw) > 0.02
 
 
-def test_a_struck_car_strikes_the_next(make_world, moving):
+def test_a_car_that_was_hit_hits_the_next(make_world, moving):
     world = make_world(car=moving(20, 0, z=0.8), next=moving(24.5, 0, z=0.8), spec=GO_ON)
     pairs = []
     for _ in range(40):

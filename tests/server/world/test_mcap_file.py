@@ -58,21 +58,25 @@ def test_the_same_episode_is_the_same_file(recording):
 
 def test_every_instant_has_the_pose_of_the_vehicle(recording, messages):
     assert len(messages["/tf"]) == len(recording.instants) == 13
-    for instant, (schema, log_time, told) in zip(recording.instants, messages["/tf"], strict=True):
+    for instant, (schema, log_time, body) in zip(recording.instants, messages["/tf"], strict=True):
         assert schema == "foxglove.FrameTransform"
         assert log_time == instant.t_us * 1000
-        assert told["timestamp"]["sec"] * 1_000_000 + told["timestamp"]["nsec"] // 1000 == (
+        assert body["timestamp"]["sec"] * 1_000_000 + body["timestamp"]["nsec"] // 1000 == (
             instant.t_us
         )
-        assert told["translation"] == {"x": instant.ego.x, "y": instant.ego.y, "z": instant.ego.z}
-        yaw = 2 * math.atan2(told["rotation"]["z"], told["rotation"]["w"])
+        assert body["translation"] == {
+            "x": instant.ego.x,
+            "y": instant.ego.y,
+            "z": instant.ego.z,
+        }
+        yaw = 2 * math.atan2(body["rotation"]["z"], body["rotation"]["w"])
         assert yaw == pytest.approx(instant.ego.yaw, abs=1e-12)
 
 
 def test_objects_are_boxes_where_they_were(recording, messages):
-    last, (schema, _, told) = recording.instants[-1], messages["/scene"][-1]
+    last, (schema, _, body) = recording.instants[-1], messages["/scene"][-1]
     assert schema == "foxglove.SceneUpdate"
-    entities = {e["id"]: e for e in told["entities"]}
+    entities = {e["id"]: e for e in body["entities"]}
     assert set(entities) == {"ego", "car", "other"}
     (cube,) = entities["other"]["cubes"]
     row = last.others.ids.index("other")
@@ -86,9 +90,9 @@ def test_plans_contacts_scores_and_images_are_there(recording, messages):
     contacts = [c[2]["object_id"] for c in messages["/contact"]]
     assert contacts == [c.object_id for i in recording.instants for c in i.contacts] != []
     assert messages["/metrics"][-1][2]["collisions"] == recording.accumulators()[-1].collisions > 0
-    ((schema, log_time, told),) = messages["/camera/front/rgb"]
-    assert (schema, told["format"]) == ("foxglove.CompressedImage", "jpeg")
-    assert base64.b64decode(told["data"]) == PICTURE
+    ((schema, log_time, body),) = messages["/camera/front/rgb"]
+    assert (schema, body["format"]) == ("foxglove.CompressedImage", "jpeg")
+    assert base64.b64decode(body["data"]) == PICTURE
     assert log_time == recording.instants[2].t_us * 1000
 
 

@@ -62,8 +62,8 @@ def entries(steps: int = 40, **spec) -> list[Entry]:
         if step == 5:
             log.append(Entry("edit", step, edit_payload([Translate(object_id="parked", y=-0.5)])))
         if step == 8:
-            told = agent_payload("car", [6_500_000, 8_000_000], [(45, 3.5, 0), (50, 1.5, -0.2)])
-            log.append(Entry("agent", step, told))
+            payload = agent_payload("car", [6_500_000, 8_000_000], [(45, 3.5, 0), (50, 1.5, -0.2)])
+            log.append(Entry("agent", step, payload))
         if step == 20:
             log.append(Entry("snapshot", step, name_payload("here")))
         plan = None if step % 7 == 3 else plan_at(step)

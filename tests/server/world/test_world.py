@@ -304,7 +304,7 @@ def test_a_step_can_be_drawn_before_it_is_evaluated(make_world, moving):
     assert world.metrics()["collisions"] > 0
 
 
-def test_judging_again_changes_nothing(make_world):
+def test_evaluating_again_changes_nothing(make_world):
     world = make_world()
     events = world.step()
     before = observed(world)

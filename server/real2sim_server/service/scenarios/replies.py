@@ -12,7 +12,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.operations import OPERATIONS, Insert, Operation, Replace
 from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 
-from ...edit import AssetLookup, LogEntry, Planned, Scenario, ScenarioState
+from ...edit import AssetLookup, LogEntry, PlannedEntry, Scenario, ScenarioState
 from ...scene.io import SceneSummary
 from ..http.problems import ServiceError
 from ..http.responses import etag
@@ -133,7 +133,9 @@ def asset_hashes(entries: Iterable[LogEntry], assets: AssetLookup | None) -> dic
     return {name: getattr(asset, "content_hash", "") for name, asset in found.items() if asset}
 
 
-def operation_result(planned: Planned, *, revision: int, dry_run: bool = False) -> OperationResult:
+def operation_result(
+    planned: PlannedEntry, *, revision: int, dry_run: bool = False
+) -> OperationResult:
     """The answer to a change."""
     return OperationResult(
         revision=revision,

@@ -19,7 +19,7 @@ from real2sim_proto.scenarios import (
     ScenarioInfo,
 )
 
-from ...edit import AssetLookup, EditError, LogEntry, Planned, Scenario, ScenarioState
+from ...edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
 from ...scene.io import SceneSummary
 from ..http.disconnects import uncancellable
 from ..http.idempotency import IdempotentRequest
@@ -295,7 +295,7 @@ class Scenarios:
     async def _change(
         self,
         scenario_id: str,
-        plan: Callable[[Scenario], Planned],
+        plan: Callable[[Scenario], PlannedEntry],
         expected: int | None,
         *,
         dry_run: bool = False,
@@ -307,7 +307,7 @@ class Scenarios:
                 self._metrics.edit_conflicts.inc()
                 raise stale_revision(scenario, expected)
 
-            def change() -> tuple[Planned, OperationResult]:
+            def change() -> tuple[PlannedEntry, OperationResult]:
                 # Overlap checks of large batches take milliseconds; they need no device.
                 planned = plan(scenario)
                 revision = scenario.revision if dry_run else planned.entry.revision

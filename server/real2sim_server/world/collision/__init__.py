@@ -1,1 +1,1 @@
-"""Collisions: who touches whom, impulses exchanged, and what they leave."""
+"""Collisions: contacts, impulses, motion after impacts, and deformation."""

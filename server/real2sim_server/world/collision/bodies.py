@@ -40,7 +40,7 @@ class ImpactedObject:
     pose: AgentPose
     present: bool = True
 
-    def advance(self, seen: Surroundings) -> Self:
+    def advance(self, surroundings: Surroundings) -> Self:
         """Itself: the collision step moves it together with all bodies that it may hit."""
         return self
 

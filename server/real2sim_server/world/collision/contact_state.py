@@ -46,7 +46,7 @@ class StepMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """Who touches whom at one instant of an episode.
+    """What is in contact at one instant of an episode.
 
     Attributes:
         spec: of the episode.

@@ -1,4 +1,4 @@
-"""Deformation of objects after impacts: what is drawn of them, solved by the MPM when asked for.
+"""Deformation of objects after impacts: what is drawn of them, solved by the MPM on demand.
 
 The impulse stays the authority for motion: it costs microseconds, so an episode without cameras
 never waits for the MPM, and every device computes the same. The deformation is solved when a
@@ -222,7 +222,7 @@ class _DeformedObject:
 
 
 class _ImpactSolution:
-    """An impact, and its deformation of both bodies, solved when first asked for."""
+    """An impact, and its deformation of both bodies, solved on demand."""
 
     def __init__(
         self, impact: Impact, before_impact: tuple[_DeformedObject | None, _DeformedObject | None]
@@ -238,8 +238,8 @@ class _ImpactSolution:
             if self._outcomes is None:
                 found = self._solve()
                 kept = [
-                    dent if old is not None else None
-                    for dent, old in zip(found, self._before_impact, strict=True)
+                    outcome if old is not None else None
+                    for outcome, old in zip(found, self._before_impact, strict=True)
                 ]
                 self._outcomes = kept[0], kept[1]
             return self._outcomes

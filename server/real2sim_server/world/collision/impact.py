@@ -67,7 +67,7 @@ class Impact:
         return math.sqrt(2 * max(self.energy, 0.0) / MUTUAL_STIFFNESS)
 
     def event_data(self) -> dict[str, float]:
-        """What an event of the wire tells of it."""
+        """Data of its event on the wire."""
         return {
             "relative_speed": self.relative_speed,
             "approach_speed": self.approach_speed,

@@ -42,18 +42,18 @@ def delayed_commands(line, waiting):
 
 
 @func
-def push_command(line, waiting, asked):
+def push_command(line, waiting, command):
     """Puts a command at the head of those on their way; how many they are now.
 
     Args:
         line: [W, 2] float64, commands newest first; the last drops out where it is full.
         waiting: rows of it in use.
-        asked: the command now.
+        command: the command now.
     """
     waiting = min(waiting + 1, len(line))
     for k in range(waiting - 1, 0, -1):
         line[k, 0], line[k, 1] = line[k - 1, 0], line[k - 1, 1]
-    line[0, 0], line[0, 1] = asked.acceleration, asked.steering
+    line[0, 0], line[0, 1] = command.acceleration, command.steering
     return waiting
 
 

@@ -78,7 +78,7 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
         state: nine floats of a :class:`.state.PlanarState`.
         pending: [W, 2] float64, commands on their way to the wheels, newest first.
         law: kind, knots and turn rate of its plan, seconds since that began, and the command to
-            hold, which trackers do not look at.
+            hold, which trackers ignore.
         vehicle: the members of a :class:`.vehicle.Vehicle`.
 
     Returns:
@@ -95,8 +95,8 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
         schedule = prepare_tracker(kind - 1, start, PlanCurve(knots, turn_rate), since, parameters)
     now = start
     for k in range(substeps):
-        asked = _command(law, now, since + k * h, parameters, (*schedule, k * h))
-        waiting = push_command(line, waiting, asked)
+        command = _command(law, now, since + k * h, parameters, (*schedule, k * h))
+        waiting = push_command(line, waiting, command)
         outputs = actuator_outputs(line, waiting, now, parameters, h)
         now = step_vehicle(parameters.model, now, outputs, parameters, h)
     return _numbers(now, start.speed, substeps * h), delayed_commands(line, waiting)

@@ -74,8 +74,8 @@ def _steering_onto(point, state, vehicle):
     dx, dy = state.x - point.x, state.y - point.y
     across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
     # Where the vehicle really goes: with slipping tyres not quite where it points.
-    course = state.yaw + math.atan2(state.lateral_speed, max(state.speed, 1.0))
-    off = wrapped(course - point.yaw)
+    direction = state.yaw + math.atan2(state.lateral_speed, max(state.speed, 1.0))
+    off = wrapped(direction - point.yaw)
     scale = max(HEADWAY * state.speed, SHORTEST)
     curvature = point.curvature - across / scale**2 - math.sqrt(2.0) * off / scale
     rolling = math.atan(vehicle.wheelbase * curvature)

@@ -1,4 +1,4 @@
-"""What moves, and what is asked of it."""
+"""State of the vehicle, and commands to it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class PlanarState(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the driver asks for: acceleration [m/s^2] and road-wheel angle [rad]."""
+    """A command: acceleration [m/s^2] and road-wheel angle [rad]."""
 
     acceleration: float
     steering: float

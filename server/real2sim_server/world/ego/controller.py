@@ -20,7 +20,7 @@ from .reference import PlannedTrajectory, Pose, ReferenceTrajectory
 from .trackers import make_tracker
 
 Plan = TrajectoryPlan | Control | PoseCommand
-Planned = PlannedTrajectory | Control | PoseCommand
+WorldPlan = PlannedTrajectory | Control | PoseCommand
 
 LOG_SPACING_US = 100_000
 """Where there is no plan, the log is followed by poses this far apart at most [us]."""
@@ -67,7 +67,7 @@ class Teleport:
         return teleported(motion, self.pose, self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
-        """Brakes: whoever is put somewhere has no driver."""
+        """Brakes: a teleported vehicle has no controller."""
         return Command(-EMERGENCY_BRAKING, motion.steering)
 
 
@@ -81,7 +81,7 @@ class PendingPlan:
     """
 
     from_us: int
-    plan: Planned
+    plan: WorldPlan
 
     @property
     def trajectory(self) -> PlannedTrajectory | None:
@@ -165,7 +165,7 @@ class EgoController:
             current = replace(current, controller=log, since_us=t_us)
         return current
 
-    def _controller_of(self, plan: Planned, motion: Motion, t_us: int) -> Controller:
+    def _controller_of(self, plan: WorldPlan, motion: Motion, t_us: int) -> Controller:
         match plan:
             case PlannedTrajectory():
                 return self._tracker(motion, t_us, plan.after(t_us))
@@ -202,7 +202,7 @@ def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) ->
     )
 
 
-def _in_world(plan: Plan, motion: Motion) -> Planned:
+def _in_world(plan: Plan, motion: Motion) -> WorldPlan:
     if not isinstance(plan, TrajectoryPlan):
         return plan
     frame = (motion.x, motion.y, motion.yaw) if plan.frame == "vehicle" else None

@@ -21,7 +21,7 @@ from ..driving import (
 from ..path import Float
 
 SLOW = 0.1
-"""Below this speed the steering angle cannot be told from the motion [m/s]."""
+"""Below this speed the steering angle cannot be derived from the motion [m/s]."""
 
 NO_PLAN = np.empty((0, 6))
 NOTHING_PENDING = np.empty((0, 2))

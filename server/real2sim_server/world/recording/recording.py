@@ -7,7 +7,7 @@ The file is a zip archive:
 - ``instants.msgpack``: what the scores need of every step, and a digest of its observation;
 - ``context.msgpack``: what stays the same for the scores;
 - ``state.msgpack``: how the scenario differed from the scene, where it began from one;
-- ``frames/<camera>/<step>.jpg`` and ``.png``: images, where they were asked for.
+- ``frames/<camera>/<step>.jpg`` and ``.png``: images, where requested.
 
 Everything but the frames is the same bytes for the same episode.
 """
@@ -96,7 +96,7 @@ class Recording:
 
         Raises:
             EditError: UNKNOWN_ASSET.
-            RecordingError: it began from a scenario, and an old file does not tell how that was.
+            RecordingError: it began from a scenario, and an old file does not hold its state.
         """
         initial = ScenarioState.of(scene, assets=assets)
         if self.state is not None:

@@ -120,12 +120,12 @@ def _differentiate(times, poses, first, speeds, rates):
         while k < len(times) - 1 and times[k] * 1e-6 < at:
             k += 1
         start, end = times[k - 1] * 1e-6, times[k] * 1e-6
-        share = (at - start) / (end - start)
-        rest = 1 - share
+        fraction = (at - start) / (end - start)
+        rest = 1 - fraction
         before = x, y, yaw
-        x = poses[k - 1, 0] * rest + poses[k, 0] * share
-        y = poses[k - 1, 1] * rest + poses[k, 1] * share
-        yaw = poses[k - 1, 2] * rest + poses[k, 2] * share
+        x = poses[k - 1, 0] * rest + poses[k, 0] * fraction
+        y = poses[k - 1, 1] * rest + poses[k, 1] * fraction
+        yaw = poses[k - 1, 2] * rest + poses[k, 2] * fraction
         if i:
             vx, vy = (x - before[0]) / PLAN_STEP, (y - before[1]) / PLAN_STEP
             speeds[i - 1] = math.sqrt(vx * vx + vy * vy)

@@ -1,4 +1,4 @@
-"""How two boxes met."""
+"""The side of the ego on which a contact began."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def side_of_contact(
     box: tuple[float, float, float, float, float],
     speed: float,
 ) -> Side:
-    """How two boxes met, after nuPlan's ``CollisionType``.
+    """The side of the ego on which two boxes came into contact, after nuPlan's ``CollisionType``.
 
     Args:
         ego_box, box: centre x, y [m], yaw [rad], length, width [m].
-        ego_speed, speed: before they met [m/s].
+        ego_speed, speed: before the contact [m/s].
     """
     if abs(ego_speed) <= STOPPED:
         return "stopped_ego"
@@ -37,13 +37,13 @@ def side_of_contact(
         (x + u * cos - v * sin, y + u * sin + v * cos)
         for u, v in ((length / 2, half), (length / 2, -half))
     ]
-    return "front" if _segment_meets(bumper[0], bumper[1], box) else "lateral"
+    return "front" if _segment_intersects(bumper[0], bumper[1], box) else "lateral"
 
 
-def _segment_meets(
+def _segment_intersects(
     a: tuple[float, float], b: tuple[float, float], box: tuple[float, float, float, float, float]
 ) -> bool:
-    """Whether a segment meets a box: clipped against its two slabs."""
+    """Whether a segment intersects a box: clipped against its two slabs."""
     x, y, yaw, length, width = box
     cos, sin = math.cos(yaw), math.sin(yaw)
     first, last = 0.0, 1.0

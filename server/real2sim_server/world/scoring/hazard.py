@@ -10,7 +10,7 @@ from .hazard_kernels import STEP, first_overlap_step
 from .instant import Instant, ScoringContext
 
 STANDSTILL = 5e-3
-"""Below this speed nobody asks for the time to collision (NAVSIM) [m/s]."""
+"""Below this speed the time to collision is not defined (NAVSIM) [m/s]."""
 
 NEVER = math.inf
 
@@ -18,7 +18,7 @@ NEVER = math.inf
 def time_to_collision(
     instant: Instant, context: ScoringContext, *, off_lane: bool, hit: frozenset[str]
 ) -> float:
-    """First time [s] in steps of 0.1 s up to 3 s at which the ego box meets an object's.
+    """First time [s] in steps of 0.1 s up to 3 s at which the ego box overlaps an object's.
 
     All keep their velocities. Objects ahead count; when the ego is in several lanes or off the
     road, all that are not behind it (nuPlan, NAVSIM).

@@ -1,4 +1,4 @@
-"""When a box first meets others by constant velocity, in one call."""
+"""First overlap of a box with others at constant velocity, in one call."""
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def first_overlap_step(ego, size, centre_ahead, everywhere, others, ignored):
         ignored: [K] bool, objects that do not count.
 
     Returns:
-        Number of steps; -1 where they do not meet.
+        Number of steps; -1 where they do not overlap.
     """
     x, y, yaw, forward, lateral, z = ego
     centres, yaws, sizes, velocities = others

@@ -16,7 +16,7 @@ from ..path import Float
 from .road_kernels import DENSITY, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
-"""How ego and object met, after nuPlan's collision types."""
+"""Side of the ego on which a contact began, after nuPlan's collision types."""
 
 VRU = frozenset({"pedestrian", "cyclist", "motorcycle", "bicycle", "person"})
 VEHICLES = frozenset({"car", "vehicle", "van", "truck", "bus", "trailer", "tram"})
@@ -69,8 +69,8 @@ class ContactRecord:
     Attributes:
         object_id: None for the background.
         category: of the object; ``background``.
-        side: how they met.
-        relative_speed, ego_speed, object_speed: when they met [m/s].
+        side: of the ego.
+        relative_speed, ego_speed, object_speed: when the contact began [m/s].
         impulse: on the ego [N s]; zeros where no momentum is exchanged.
         begun: whether the contact began in this step.
     """

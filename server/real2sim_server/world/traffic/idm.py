@@ -28,7 +28,7 @@ SLOWEST_DESIRED = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Idm:
-    """Keeps to its recorded path, at a desired speed or behind whoever is ahead.
+    """Keeps to its recorded path, at a desired speed or behind its leader.
 
     a = a_max [1 - (v/v0)^4 - (s*/s)^2] with s* = s0 + max(0, v T + v dv / (2 sqrt(a_max b)))
     (Treiber, Hennecke & Helbing 2000, Phys. Rev. E 62, eqs. 1 to 3). In bends v0 is what the

@@ -1,4 +1,4 @@
-"""Who is ahead on a path."""
+"""The leading object on a path."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from .driver import AgentPose, Surroundings
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Moves along its trajectory in time; sees nobody. In the world while its trajectory lasts."""
+    """Moves along its trajectory in time and is in the world while that lasts; observes nothing."""
 
     subject: ObjectState
     pose: AgentPose
@@ -35,7 +35,7 @@ class Replay:
 
 @dataclass(frozen=True, eq=False)
 class ConstantVelocity:
-    """Goes on as it moved when it began, at its height and with its heading; sees nobody."""
+    """Goes on as it moved when it began, at its height and with its heading; observes nothing."""
 
     subject: ObjectState
     pose: AgentPose

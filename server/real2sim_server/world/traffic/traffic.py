@@ -22,7 +22,7 @@ from .drivers import begin_driver
 from .external import External
 
 MOVING = 2.0
-"""Objects that cover less than this in the recording stand; nobody drives them [m]."""
+"""Objects that cover less than this in the recording stand and get no driver [m]."""
 
 DRIVEN = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle", "cyclist"})
 """Categories that a default driver drives; pedestrians keep to the log."""
@@ -33,7 +33,7 @@ class Traffic:
     """Objects of an episode at one instant. Immutable; objects without a driver repeat the log.
 
     Attributes:
-        spec: who drives whom.
+        spec: driver by object.
         drivers: by object id; of objects that have appeared.
         agents: poses of all objects.
         reacting: whether objects that repeated the log have begun to drive by IDM.
@@ -50,7 +50,7 @@ class Traffic:
 
         Args:
             state: all objects.
-            spec: who drives them.
+            spec: their drivers.
             surroundings: the start; its ``others`` are where the log has them.
 
         Raises:
@@ -118,7 +118,7 @@ class Traffic:
         """Objects after an externally driven one got a plan.
 
         Raises:
-            WorldError: INVALID_ACTION when nobody may drive it, or its plan is over already.
+            WorldError: INVALID_ACTION when it is not driven externally, or its plan is over.
         """
         driver = self.drivers.get(object_id)
         if not isinstance(driver, External):

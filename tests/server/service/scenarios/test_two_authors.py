@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from real2sim_proto.scenarios import HistoryEntry
-from real2sim_server.edit import EditError, Planned, Scenario, ScenarioState
+from real2sim_server.edit import EditError, PlannedEntry, Scenario, ScenarioState
 from real2sim_server.service.scenarios.replies import ScenarioView, replayed
 
 NAMES = ("anna", "bert")
@@ -73,7 +73,7 @@ class Author:
         answer = self.http.get(f"{self.url}/operations", params={"after": self.own.revision})
         self.learn(answer.json()["entries"])
 
-    def _planned(self, entry: HistoryEntry) -> Planned:
+    def _planned(self, entry: HistoryEntry) -> PlannedEntry:
         match entry.kind:
             case "edit":
                 return self.own.plan_edit(entry.operations)
