@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-from real2sim import connect
+from real2sim import Client, ReplyTimeoutError, connect
 from real2sim.planners import FollowRoute
 
 from ..console import console, print_figures, write_json
@@ -21,6 +21,7 @@ from .worker import worker_process
 SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
 STEP_US = 100_000
+QUIET_S, WARM_UP_S = 5.0, 600.0
 
 
 def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
@@ -38,7 +39,7 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
     with worker_process(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
         with connect(worker.url) as client:
             with clock("start the worker"):
-                client.wait_ready()
+                wait_ready(client)
                 client.scenes.load(SCENE)
             with clock("edit over REST"):
                 scenario = client.scenarios.create(scene=SCENE, name="demo")
@@ -59,7 +60,7 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
         write_json(out / "summary.json", figures)
         _report(out, drive, clock)
         if leave_serving:
-            _stay(worker.url, scenario.scenario_id)
+            _keep_serving(worker.url, scenario.scenario_id)
 
 
 class StageTimer:
@@ -75,6 +76,25 @@ class StageTimer:
         with console.status(stage) if console.is_terminal else nullcontext():
             yield
         self.seconds[stage] = time.perf_counter() - start
+
+
+def wait_ready(client: Client) -> None:
+    """Wait for the worker, and say what it does where that takes long.
+
+    Raises:
+        ReplyTimeoutError: it is not ready after ten minutes.
+    """
+    try:
+        client.wait_ready(timeout=QUIET_S)
+    except ReplyTimeoutError as error:
+        console.print(
+            f"the worker is not ready yet ({error.hint}); its first start on a machine compiles "
+            "kernels for about a minute, later ones read them from disk",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+        client.wait_ready(timeout=WARM_UP_S)
 
 
 def _prepare_street(out: Path, steps: int, clock: StageTimer, *, from_log: bool) -> Path:
@@ -130,7 +150,7 @@ def _report(out: Path, drive: FilmedDrive, clock: StageTimer) -> None:
     )
 
 
-def _stay(url: str, scenario_id: str) -> None:
+def _keep_serving(url: str, scenario_id: str) -> None:
     preview = f"{url}/v1/scenarios/{scenario_id}/preview?camera=front"
     operations = '{"operations": [{"op": "rotate", "object_id": "car_1", "angle": 0.26}]}'
     console.print(

@@ -21,17 +21,23 @@ class WorkerStartError(RuntimeError):
 
 @dataclass(frozen=True)
 class WorkerProcess:
-    """A running `real2sim serve`."""
+    """A running `real2sim serve`.
+
+    Attributes:
+        url: where it listens.
+        process: that runs it.
+        log_file: what it prints.
+    """
 
     url: str
     process: subprocess.Popen[bytes]
     log_file: Path
 
-    def wait_until_it_answers(self, seconds: float) -> None:
+    def wait_listening(self, seconds: float) -> None:
         """Wait for the port to open; whether the worker is ready is for it to say.
 
         Raises:
-            WorkerStartError: it ended or did not listen in time, with its last words.
+            WorkerStartError: it ended, or did not listen in time; with the last line of its log.
         """
         port = int(self.url.rsplit(":", 1)[1])
         deadline = time.monotonic() + seconds
@@ -69,7 +75,7 @@ def worker_process(*, scenes: Path, data: Path, log_file: Path) -> Iterator[Work
         )
         try:
             worker = WorkerProcess(f"http://127.0.0.1:{port}", process, log_file)
-            worker.wait_until_it_answers(START_S)
+            worker.wait_listening(START_S)
             yield worker
         finally:
             _stop(process)

@@ -29,7 +29,7 @@ def start(scenes_dir, tmp_path):
             log_file = tmp_path / f"worker_{len(runs)}.log"
             worker = worker_process(scenes=scenes_dir, data=tmp_path / "data", log_file=log_file)
             runs.append(stack.enter_context(worker))
-            runs[-1].wait_until_it_answers(60)
+            runs[-1].wait_listening(60)
             client = httpx2.Client(base_url=runs[-1].url, trust_env=False, timeout=60)
             return stack.enter_context(client)
 

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import pytest
+
+from real2sim import ReplyTimeoutError
+from real2sim_server.demo.run import wait_ready
+
+
+class Worker:
+    """Ready after some calls of ``wait_ready``."""
+
+    def __init__(self, refusals: int) -> None:
+        self.refusals = refusals
+
+    def wait_ready(self, timeout: float) -> None:
+        self.refusals -= 1
+        if self.refusals >= 0:
+            raise ReplyTimeoutError("ready worker", timeout, hint="warming up kernels")
+
+
+def test_a_long_start_is_explained_by_what_the_worker_does(capsys):
+    wait_ready(Worker(refusals=1))
+    assert "warming up kernels" in capsys.readouterr().out
+
+
+def test_a_quick_start_needs_no_words(capsys):
+    wait_ready(Worker(refusals=0))
+    assert capsys.readouterr().out == ""
+
+
+def test_a_worker_that_is_never_ready_is_an_error():
+    with pytest.raises(ReplyTimeoutError):
+        wait_ready(Worker(refusals=2))
