@@ -7,13 +7,13 @@ Two decorators, bare or with options of ``numba.njit``, which are handed through
 ``@func``
     What only kernels and other funcs call. Compiled with them and kept as part of them.
 
-    from .._numba import func, kernel
+    from .._numba import PARALLEL_LOOPS, func, kernel
 
     @func
     def squared(x):
         return x * x
 
-    @kernel(nogil=True, parallel=True)
+    @kernel(nogil=True, parallel=PARALLEL_LOOPS)
     def norms(points): ...
 
 Both divide as NumPy does (``error_model="numpy"``) unless told otherwise. A family of kernels that
@@ -46,8 +46,18 @@ from typing import Any
 import numpy as np
 from numba import njit, types
 from numba.core.caching import FunctionCache
+from numba.core.cpu_options import ParallelOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
+
+PARALLEL_LOOPS = ParallelOptions(  # type: ignore[no-untyped-call]
+    {"comprehension": False, "reduction": False, "numpy": False, "setitem": False}
+)
+"""For ``parallel=``: threads share the loops over ``prange`` and nothing else.
+
+With ``parallel=True`` every statement on an array becomes a parallel loop too, each compiled on its
+own; for the small arrays between loops that costs seconds of compiling and gains nothing.
+"""
 
 
 def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
@@ -92,6 +102,12 @@ def fingerprint(compiled: Any) -> str:
     return digest.hexdigest()
 
 
+def is_on_disk(compiled: Any) -> bool:
+    """Whether an earlier run left machine code of a kernel, as its sources are now."""
+    cache = getattr(compiled, "_cache", None)
+    return not isinstance(cache, _KernelCache) or cache.holds_any()
+
+
 class _KernelCache(FunctionCache):
     """Numba's disk cache of one function, with a key that nothing slips through."""
 
@@ -101,6 +117,11 @@ class _KernelCache(FunctionCache):
 
     def _index_key(self, sig: tuple[Any, ...], codegen: Any) -> tuple[Any, ...]:
         return sig, codegen.magic_tuple(), self._fingerprint, tuple(_tuple_fields(sig))
+
+    def holds_any(self) -> bool:
+        """Whether anything is kept under the present fingerprint, for whatever signature."""
+        kept = self._cache_file._load_index()  # type: ignore[no-untyped-call]
+        return any(self._fingerprint in key for key in kept)
 
     @functools.cached_property
     def _fingerprint(self) -> str:

@@ -65,9 +65,12 @@ def generated(typingctx, x):
 
 RUN = """
 import json
+from real2sim_server._numba import is_on_disk
 from small.kernels import computed
 from small.parts import Pair
-print(json.dumps([computed(Pair(1.0, 3.0)), sum(computed.stats.cache_misses.values())]))
+there = is_on_disk(computed)
+result = computed(Pair(1.0, 3.0))
+print(json.dumps([result, sum(computed.stats.cache_misses.values()), there]))
 """
 
 BEFORE = 2.0 * 2.0 + 1000.0 + 100.0 + 10_000.0
@@ -110,7 +113,8 @@ def run(folder: Path, seed: int = 0) -> tuple[float, str]:
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-    result, misses = json.loads(done.stdout)
+    result, misses, there = json.loads(done.stdout)
+    assert there == (misses == 0)
     return result, "compiled" if misses else "kept"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import time
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from .._files import atomic_file
 from ..render.backends.base import Backend
 from ..render.backends.reference import ReferenceBackend
 from ..render.backends.select import describe_backends, select_backend
@@ -37,7 +35,7 @@ IMAGE_SETS = (("rgb", "RGB"), ("rgb_depth_instance", "RGB + depth + ids"))
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class RenderCase:
     """One picture to draw."""
 
     name: str
@@ -68,7 +66,7 @@ class Case:
             backend=backend,
         )
 
-    def reduced(self) -> Case:
+    def reduced(self) -> RenderCase:
         """Every n-th Gaussian, in a smaller picture."""
         step = -(-self.gaussian_count // REDUCED_GAUSSIANS)
         K = self.K.copy()
@@ -97,15 +95,13 @@ class Timing:
 def run(
     *,
     splat: Path | None = None,
-    json_path: Path | None = None,
     backend: str = "auto",
     repetitions: int = 10,
 ) -> dict[str, Any]:
-    """Measure, print a table and write the figures as JSON where a path is given.
+    """Measure, print a table and return the figures.
 
     Args:
         splat: for the first case; default is the test-data folder's biker, where it is at hand.
-        json_path: written atomically.
         backend: as in rasterize().
         repetitions: draws of each picture, after one that warms up.
     """
@@ -121,9 +117,6 @@ def run(
         console.print(table)
     for note in result["notes"]:
         console.print(note, highlight=False)
-    if json_path is not None:
-        with atomic_file(json_path) as file:
-            file.write(json.dumps(result, indent=2).encode())
     return result
 
 
@@ -153,11 +146,11 @@ def bench_render(
     return {"backend": chosen.name, "device": reason, "cases": rows, "notes": notes}
 
 
-def _cases(splat: Path | None, street_gaussians: int) -> tuple[list[Case], list[str]]:
+def _cases(splat: Path | None, street_gaussians: int) -> tuple[list[RenderCase], list[str]]:
     street = street_scene(street_gaussians)
     camera = street.camera
     cases = [
-        Case(
+        RenderCase(
             name="street",
             instances=street.instances,
             viewmat=camera.viewmat(street.T_world_vehicle),
@@ -174,7 +167,7 @@ def _cases(splat: Path | None, street_gaussians: int) -> tuple[list[Case], list[
     return [splat_case(path), *cases], []
 
 
-def splat_case(path: Path) -> Case:
+def splat_case(path: Path) -> RenderCase:
     """An asset at 1920x1280 on white, seen along its +z from 1.6 times its y extent away."""
     cloud = read_splats(path)
     low, high = cloud.means.amin(0).double().numpy(), cloud.means.amax(0).double().numpy()
@@ -182,11 +175,11 @@ def splat_case(path: Path) -> Case:
     viewmat = np.eye(4)
     viewmat[:3, 3] = -eye
     K = np.array([[1600.0, 0, 960], [0, 1600, 640], [0, 0, 1]])
-    return Case(path.name, [Instance(cloud)], viewmat, K, 1920, 1280)
+    return RenderCase(path.name, [Instance(cloud)], viewmat, K, 1920, 1280)
 
 
 def _measure(
-    case: Case, backend: Backend, repetitions: int, progress: Callable[[str], None]
+    case: RenderCase, backend: Backend, repetitions: int, progress: Callable[[str], None]
 ) -> dict[str, Any]:
     progress(case.name)
     rgb = _time(lambda: case.draw(backend, images=False), repetitions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -27,7 +27,7 @@ def render(
     """Milliseconds by stage and Gaussians per second, as ratio to the plain reference."""
     from ..benchmarks import render
 
-    write_json(json, render.run(splat=splat))
+    _report(json, render.run(splat=splat))
 
 
 @command("reconstruct", group=app)
@@ -39,7 +39,7 @@ def reconstruct(*, json: JsonFile = None) -> None:
     stages = {f"{name} [ms]": ms for name, ms in figures["stage_ms"].items()}
     others = {name: value for name, value in figures.items() if name != "stage_ms"}
     print_figures("training", others | stages)
-    write_json(json, figures)
+    _report(json, figures)
 
 
 @command("physics", group=app)
@@ -56,7 +56,7 @@ def physics(
     with progress("measuring") as report:
         figures = physics.run(peers=peers, on_progress=report)
     print_figures("particle-substeps per second", physics.as_rows(figures))
-    write_json(json, figures)
+    _report(json, figures)
 
 
 @command("serve", group=app)
@@ -64,7 +64,7 @@ def serve(*, json: JsonFile = None) -> None:
     """Latency of a drive step, share of rendering, lag of the event loop, memory per session."""
     from ..benchmarks import serve
 
-    write_json(json, serve.run())
+    _report(json, serve.run())
 
 
 @command("world", group=app)
@@ -72,7 +72,7 @@ def world(*, json: JsonFile = None) -> None:
     """Time of a step of the world alone: vehicle, traffic, contact, scores; also uncompiled."""
     from ..benchmarks import world
 
-    write_json(json, world.run())
+    _report(json, world.run())
 
 
 @command("soak", group=app)
@@ -87,7 +87,7 @@ def soak(
     from ..benchmarks import soak
 
     figures = soak.run(soak.SoakOptions(sessions=sessions, minutes=minutes, rate_hz=rate))
-    write_json(json, figures)
+    _report(json, figures)
     if figures["failures"]:
         raise SoakFailedError(f"{len(figures['failures'])} planners were let down; see above")
     if figures["grows"]:
@@ -103,4 +103,13 @@ def edit(
     """Time of an edit, and of opening a scenario that has had many."""
     from ..benchmarks import edit
 
-    write_json(json, edit.run(edit.EditBenchOptions(operations=operations)))
+    _report(json, edit.run(edit.EditBenchOptions(operations=operations)))
+
+
+def _report(path: Path | None, figures: dict[str, Any]) -> None:
+    """Say what the figures were measured with, and write both where a path is given."""
+    from ..benchmarks.environment import environment
+
+    measured_with = environment()
+    print_figures("measured with", measured_with)
+    write_json(path, {**figures, "environment": measured_with})

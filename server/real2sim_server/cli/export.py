@@ -35,7 +35,7 @@ def export(
     refuse_existing(out, overwrite=overwrite)
     loaded = load_scene(scene)
     # export_scene itself refuses formats and objects that it does not know, with those there are.
-    files = export_scene(loaded, out, format=file_format, t_us=t_us, objects=objects or None)  # type: ignore[arg-type]
+    files = export_scene(loaded, out, format=file_format, t_us=t_us, objects=objects or None)
     figures: dict[str, object] = {
         "files": [str(file) for file in files],
         "bytes": sum(file.stat().st_size for file in files),

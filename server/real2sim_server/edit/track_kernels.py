@@ -41,7 +41,8 @@ def poses_at(t_us, ends, times, knots):
         if fraction > 0 and knots[i, 10] != 0:
             _slerp(knots[i], knots[j], fraction, quaternions[k])
         else:
-            quaternions[k] = knots[i, 3:7]
+            for c in range(4):
+                quaternions[k, c] = knots[i, 3 + c]
         _put(positions[k], quaternions[k], transforms[k])
     return known, positions, quaternions, velocities, transforms
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
+
+from .._numba import PARALLEL_LOOPS, kernel
 
 SOLID_ALPHA = 0.5
 """A pixel below this alpha counts as nothing hit."""
@@ -36,7 +38,7 @@ def solid_depth(depth: Tensor, alpha: Tensor) -> NDArray[np.float32]:
     return kept
 
 
-@njit(parallel=True, cache=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def _round_to_bytes(values, levels):
     for i in prange(values.shape[0]):
         value = values[i]
@@ -45,7 +47,7 @@ def _round_to_bytes(values, levels):
         levels[i] = np.uint8(np.int32(clamped * np.float32(255) + np.float32(0.5)))
 
 
-@njit(parallel=True, cache=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def _keep_solid(depth, alpha, kept):
     for i in prange(depth.shape[0]):
         kept[i] = depth[i] if alpha[i] >= np.float32(SOLID_ALPHA) else np.float32(0)

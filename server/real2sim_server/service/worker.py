@@ -19,7 +19,6 @@ from real2sim_proto.scenes import DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
 from ..settings import Settings
-from ..world import warm_up
 from .engine import Engine
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
@@ -34,6 +33,7 @@ from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .storage.job_log import JobLog
 from .storage.store import Store
+from .warm_up import warm_up
 
 LAG_PERIOD_S = 0.1
 
@@ -171,8 +171,7 @@ class Worker:
     async def _warm_up(self) -> None:
         started = time.perf_counter()
         try:
-            await self.renderer.warm_up()
-            await asyncio.to_thread(warm_up)
+            await warm_up(self.renderer.warm_up)
         except Exception as error:
             log.exception("warm-up failed")
             self.waiting_for = {f"warm-up failed: {error}"}

@@ -8,7 +8,7 @@ from .events import Event
 from .observation import Observation
 from .path import LoggedPath
 from .scoring import Score, metrics_version
-from .warm_up import warm_up
+from .warm_up import kernels_on_disk, warm_up
 from .world import World
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "World",
     "WorldError",
     "agent_fields",
+    "kernels_on_disk",
     "metrics_version",
     "warm_up",
 ]

@@ -37,16 +37,15 @@ def test_street_fills_the_picture_with_road_cars_and_sky() -> None:
     assert len(out.instance.int().unique()) > 6
 
 
-def test_report_is_printed_and_written(
+def test_report_is_printed_and_returned_as_plain_values(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(bench, "REDUCED_GAUSSIANS", 300)
     monkeypatch.setenv("REAL2SIM_TEST_DATA", str(tmp_path))
-    path = tmp_path / "bench.json"
     small = street_scene(120_000)
     monkeypatch.setattr(bench, "street_scene", lambda count: small)
-    result = bench.run(json_path=path, backend="cpu", repetitions=1)
-    assert json.loads(path.read_text()) == result
+    result = bench.run(backend="cpu", repetitions=1)
+    assert json.loads(json.dumps(result)) == result
     (street,) = result["cases"]
     assert street["gaussians"] == 120_000
     assert street["reduced"]["reference_ms"] > 0

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from real2sim_server.render import RenderError, describe_backends, select_backend
-from real2sim_server.render.backends.cpu.kernel import source_fingerprint
 
 
 @pytest.fixture(autouse=True)
@@ -45,17 +44,3 @@ def test_every_backend_is_described_with_a_reason_and_a_remedy_where_needed() ->
     for status in statuses:
         assert status.reason
         assert bool(status.remedy) != status.usable
-
-
-def test_kernel_cache_follows_every_source_file(
-    monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("backends") / "cpu"
-    folder.mkdir()
-    (folder.parent / "base.py").write_text("a = 1")
-    monkeypatch.setattr("real2sim_server.render.backends.cpu.kernel.FOLDER", folder)
-    fingerprints = set()
-    for text in ("b = 1", "b = 2", "b = 1"):
-        (folder / "records.py").write_text(text)
-        fingerprints.add(source_fingerprint.__wrapped__())
-    assert len(fingerprints) == 2

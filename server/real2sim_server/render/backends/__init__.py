@@ -1,6 +1,20 @@
 """Ways to rasterize, one module each, behind one Protocol."""
 
 from .base import Backend, RasterRequest
-from .select import BackendStatus, describe_backends, select_backend
+from .select import (
+    BackendStatus,
+    RegisteredBackend,
+    describe_backends,
+    register_backend,
+    select_backend,
+)
 
-__all__ = ["Backend", "BackendStatus", "RasterRequest", "describe_backends", "select_backend"]
+__all__ = [
+    "Backend",
+    "BackendStatus",
+    "RasterRequest",
+    "RegisteredBackend",
+    "describe_backends",
+    "register_backend",
+    "select_backend",
+]

@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import logging
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +14,6 @@ import torch
 from ..types import RenderError
 from .base import Backend
 
-BACKENDS = ("cpu", "cuda", "reference")
 _log = logging.getLogger(__name__)
 
 
@@ -22,7 +22,7 @@ class BackendStatus:
     """Whether a backend can be used here.
 
     Attributes:
-        name: ``cpu``, ``cuda`` or ``reference``.
+        name: by which it is asked for.
         usable: whether select_backend() would return it.
         reason: why, or why not.
         remedy: what to do to make it usable; empty when it is.
@@ -34,46 +34,69 @@ class BackendStatus:
     remedy: str = ""
 
 
+@dataclass(frozen=True)
+class RegisteredBackend:
+    """A backend that can be asked for by name.
+
+    Attributes:
+        status: whether it can be used here; imports and starts nothing that takes long.
+        make: the backend; called once, and only where it is usable.
+        preference: ``auto`` takes the usable backend with the largest; 0 is never taken so.
+    """
+
+    status: Callable[[], BackendStatus]
+    make: Callable[[], Backend]
+    preference: int = 0
+
+
+def register_backend(backend: RegisteredBackend) -> None:
+    """Add a backend from outside of the package.
+
+    Raises:
+        ValueError: its name is taken.
+    """
+    name = backend.status().name
+    if name in BACKENDS or name == "auto":
+        raise ValueError(f"a backend {name!r} is registered already")
+    BACKENDS[name] = backend
+
+
 @functools.cache
 def select_backend(name: str = "auto") -> Backend:
     """The one backend of that name, made on first use.
 
     Args:
-        name: ``cpu``, ``cuda``, ``reference``, or ``auto``: cuda where it is usable, else cpu.
+        name: of a registered backend (``cpu``, ``cuda``, ``reference``), or ``auto``: cuda where
+            it is usable, else cpu.
 
     Raises:
         RenderError: unknown, or not usable here; the message says what to do.
     """
     if name == "auto":
-        status = _cuda_status()
-        chosen = "cuda" if status.usable else "cpu"
-        _log.info("render backend %s chosen: %s", chosen, status.reason)
-        return select_backend(chosen)
+        return select_backend(_preferred())
     if name not in BACKENDS:
-        raise RenderError(f"unknown backend {name!r}; allowed are 'auto' and {list(BACKENDS)}")
-    for status in describe_backends():
-        if status.name == name and not status.usable:
-            raise RenderError(f"backend {name!r} is not usable: {status.reason}; {status.remedy}")
-    return _make(name)
+        raise RenderError(f"unknown backend {name!r}; allowed are 'auto' and {sorted(BACKENDS)}")
+    status = BACKENDS[name].status()
+    if not status.usable:
+        raise RenderError(f"backend {name!r} is not usable: {status.reason}; {status.remedy}")
+    return BACKENDS[name].make()
 
 
 def describe_backends() -> list[BackendStatus]:
     """Status of every backend, best first."""
-    return [_cuda_status(), _cpu_status(), BackendStatus("reference", True, "plain torch, slow")]
+    return [backend.status() for backend in _by_preference()]
 
 
-def _make(name: str) -> Backend:
-    if name == "cuda":
-        from .cuda.backend import CudaBackend
+def _by_preference() -> list[RegisteredBackend]:
+    return sorted(BACKENDS.values(), key=lambda backend: -backend.preference)
 
-        return CudaBackend()
-    if name == "cpu":
-        from .cpu.backend import CpuBackend
 
-        return CpuBackend()
-    from .reference import ReferenceBackend
-
-    return ReferenceBackend()
+def _preferred() -> str:
+    """Name of the best usable backend; says in the log why the best one of all is not."""
+    statuses = [backend.status() for backend in _by_preference() if backend.preference]
+    chosen = next((status for status in statuses if status.usable), statuses[-1])
+    _log.info("render backend %s chosen: %s", chosen.name, statuses[0].reason)
+    return chosen.name
 
 
 def _cpu_status() -> BackendStatus:
@@ -109,3 +132,31 @@ def _cuda_status() -> BackendStatus:
             "install the CUDA toolkit, or a gsplat wheel built for this torch",
         )
     return BackendStatus("cuda", True, f"gsplat on {torch.cuda.get_device_name()}")
+
+
+def _make_cpu() -> Backend:
+    from .cpu.backend import CpuBackend
+
+    return CpuBackend()
+
+
+def _make_cuda() -> Backend:
+    from .cuda.backend import CudaBackend
+
+    return CudaBackend()
+
+
+def _make_reference() -> Backend:
+    from .reference import ReferenceBackend
+
+    return ReferenceBackend()
+
+
+BACKENDS: dict[str, RegisteredBackend] = {
+    "cuda": RegisteredBackend(_cuda_status, _make_cuda, preference=2),
+    "cpu": RegisteredBackend(_cpu_status, _make_cpu, preference=1),
+    "reference": RegisteredBackend(
+        lambda: BackendStatus("reference", True, "plain torch, slow"), _make_reference
+    ),
+}
+"""By name. Modules are imported when their backend is made: each needs libraries of its own."""

@@ -11,6 +11,9 @@ from ...scene import GaussianCloud
 from ..types import Instance, RasterOptions, Sky
 from .base import RasterRequest
 
+MANY = 5_000
+"""More Gaussians than a backend treats as one block."""
+
 
 def warm_up_requests() -> Iterator[RasterRequest]:
     """One request for each combination that could be compiled on its own."""
@@ -21,12 +24,14 @@ def warm_up_requests() -> Iterator[RasterRequest]:
         opacities=torch.full((2,), 0.5),
         sh=torch.zeros(2, 16, 3),
     )
+    many = cloud.select(torch.zeros(MANY, dtype=torch.int64))
     covars = (0.01 * torch.eye(3)).repeat(2, 1, 1)
     K = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], dtype=torch.float64)
     for depth, instance in ((False, False), (True, True)):
         yield RasterRequest(
             instances=(
                 Instance(cloud),
+                Instance(many),
                 Instance(cloud, T_world_object=np.eye(4), instance_id=1, covars=covars),
             ),
             viewmats=torch.eye(4, dtype=torch.float64)[None],

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from ..._files import atomic_file, atomic_folder
 from ...geometry.rotation import Float
@@ -16,13 +16,8 @@ from ..cloud import GaussianCloud
 from ..errors import SceneError
 from ..scene import Scene, SceneObject
 from .export_gltf import write_gltf
-from .splats import UpAxis, format_to_write, upright, write_splats
-
-ExportFormat = Literal["ply", "compressed.ply", "spz", "splat", "gltf"]
-FORMAT_NAMES: tuple[str, ...] = get_args(ExportFormat)
-
-UP_AXES: dict[str, UpAxis] = {"spz": "y"}
-"""Where users of a format agree on an axis that points up; else the scene's own, z."""
+from .formats import FORMATS, UpAxis
+from .splats import format_to_write, upright, write_splats
 
 INDEX_NAME = "objects.json"
 INDEX_FORMAT = "real2sim-objects"
@@ -32,7 +27,7 @@ def export_scene(
     scene: Scene,
     out: str | PathLike[str],
     *,
-    format: ExportFormat,
+    format: str,
     t_us: int | None = None,
     objects: Iterable[str] | None = None,
     up_axis: UpAxis | None = None,
@@ -48,11 +43,11 @@ def export_scene(
     Args:
         scene: what to write.
         out: file to write, or folder where objects become files of their own.
-        format: one of ``FORMAT_NAMES``.
+        format: ``gltf``, or the suffix of a splat format without its dot.
         t_us: instant to bake [us]; objects that do not exist then are left out.
         objects: ids of objects to write besides the background; default all.
         up_axis: axis of the files that points up, ``z``, ``y`` or ``-y``, as in
-            ``import_splats``; default ``y`` for spz, which prescribes it, else ``z``. glTF is
+            ``import_splats``; default is the format's: ``y`` for spz, else ``z``. glTF is
             always y up.
 
     Returns:
@@ -63,8 +58,10 @@ def export_scene(
             does not fit, or values that are not finite or that the format cannot hold.
         OSError: a file cannot be written.
     """
-    if format not in FORMAT_NAMES:
-        raise SceneError(f"export format {format!r}; allowed are {', '.join(FORMAT_NAMES)}")
+    splat_formats = {known.suffix[1:]: known for known in FORMATS}
+    if format not in {*splat_formats, "gltf"}:
+        names = ", ".join([*splat_formats, "gltf"])
+        raise SceneError(f"export format {format!r}; allowed are {names}")
     chosen = _chosen(scene, objects)
     if t_us is not None:
         _check_time(scene, t_us)
@@ -76,7 +73,7 @@ def export_scene(
         _check_file(path, ".glb")
         write_gltf(scene, path, objects=chosen, t_us=t_us)
         return (path,)
-    turn = invert_transform(upright(up_axis or UP_AXES.get(format, "z"), 0.0))
+    turn = invert_transform(upright(up_axis or splat_formats[format].up_axis, 0.0))
     if t_us is None:
         return _write_folder(scene, chosen, path, f".{format}", turn)
     _check_file(path, f".{format}")

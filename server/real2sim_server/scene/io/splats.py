@@ -16,11 +16,9 @@ from ..cloud import GaussianCloud
 from ..errors import BundleError, SceneError
 from ..scene import Scene
 from ..trajectory import Trajectory
-from .formats import FORMATS, SplatFormat, inria_ply
+from .formats import FORMATS, SplatFormat, UpAxis, inria_ply, suffixes
 
 HEAD_BYTES = 1 << 16
-
-UpAxis = Literal["z", "y", "-y"]
 
 _ROTATIONS: dict[str, list[list[float]]] = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -79,8 +77,7 @@ def format_to_write(path: Path) -> SplatFormat:
     for splat_format in FORMATS:
         if path.name.lower().endswith(splat_format.suffix):
             return splat_format
-    endings = ", ".join(f.suffix for f in FORMATS)
-    raise SceneError(f"{path}: no splat format ends so; allowed are {endings}")
+    raise SceneError(f"{path}: no splat format ends so; allowed are {', '.join(suffixes())}")
 
 
 def write_ply(cloud: GaussianCloud, path: str | PathLike[str]) -> None:

@@ -19,6 +19,7 @@ from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.base import Identifier
 
 from ...render import encode_image
+from ...scene.io.formats import suffixes
 from ..http.problems import ServiceError
 from ..http.responses import info_response
 from ..library.assets import LibraryAsset, extract_object, import_asset
@@ -27,7 +28,6 @@ from ..library.thumbnails import draw_thumbnail
 from ..worker import Worker, WorkerOf
 
 UPLOAD_PATH = "/v1/assets"
-SPLAT_SUFFIXES = (".compressed.ply", ".ply", ".spz", ".splat")
 
 _UPLOAD_SCHEMA = AssetUpload.model_json_schema()
 _BODY: dict[str, Any] = {
@@ -179,7 +179,7 @@ def _stored(file: UploadFile, folder: Path) -> Path:
     """The upload as a hidden file: readers map files into memory, and tell formats by suffix."""
     folder.mkdir(parents=True, exist_ok=True)
     given = Path(file.filename or "upload.ply").name.lower()
-    ending = next((suffix for suffix in SPLAT_SUFFIXES if given.endswith(suffix)), ".ply")
+    ending = next((suffix for suffix in suffixes() if given.endswith(suffix)), ".ply")
     stored = folder / f".upload-{secrets.token_hex(6)}{ending}"
     with stored.open("xb") as target:
         shutil.copyfileobj(file.file, target, 1 << 20)

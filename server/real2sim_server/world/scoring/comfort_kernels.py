@@ -22,7 +22,9 @@ def push_sample(samples, speed, yaw, window):
     """Samples [n, 2] of speed and yaw with one more at their end, the last ``window`` of them."""
     kept = min(len(samples), window - 1)
     found = np.empty((kept + 1, 2))
-    found[:kept] = samples[len(samples) - kept :]
+    first = len(samples) - kept
+    for k in range(kept):
+        found[k, 0], found[k, 1] = samples[first + k, 0], samples[first + k, 1]
     found[kept, 0], found[kept, 1] = speed, yaw
     return found
 
@@ -32,7 +34,8 @@ def windowed_sum(values, value, window):
     """Values [n] with one more at their end, the last ``window`` of them; and their sum."""
     kept = min(len(values), window - 1)
     found = np.empty(kept + 1)
-    found[:kept] = values[len(values) - kept :]
+    for k in range(kept):
+        found[k] = values[len(values) - kept + k]
     found[kept] = value
     total = 0.0
     for v in found:

@@ -128,7 +128,7 @@ def test_a_failing_export_leaves_nothing(scene, tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"format": "obj"}, "export format 'obj'; allowed are ply, compressed.ply, spz"),
+        ({"format": "obj"}, "export format 'obj'; allowed are compressed.ply, ply, spz"),
         ({"t_us": 10**9}, "t_us=1000000000 is outside scene 'street'; allowed are 7 to 400007"),
         ({"objects": "car_3"}, "must be a list of ids, not the text 'car_3'"),
         ({"objects": ["car_9"]}, "no object 'car_9'"),

@@ -15,7 +15,6 @@ from real2sim_server.scene.io import (
     save_scene,
     write_ply,
 )
-from real2sim_server.scene.io.formats import FORMATS
 
 
 @pytest.fixture
@@ -35,11 +34,6 @@ def test_a_file_of_no_known_format_is_refused_with_those_there_are(tmp_path, dat
 def test_what_cannot_be_opened_is_refused(tmp_path, name):
     with pytest.raises(BundleError, match="cannot be read"):
         read_splats(tmp_path / name)
-
-
-def test_formats_have_names_of_their_own():
-    assert len({f.name for f in FORMATS}) == len(FORMATS)
-    assert not any(f.recognises(b"") for f in FORMATS)
 
 
 def test_a_scene_of_a_file_is_ready_to_be_seen(ply, tmp_path):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from ...._numba import PARALLEL_LOOPS
 from .kernel import inlined, kernel
 from .lanes import LANES
 from .records import (
@@ -47,7 +48,7 @@ F32 = np.float32
 HALF = F32(0.5)
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, background, images):
     """Blend tiles [first_tile, last_tile) into Images.
 
@@ -131,7 +132,7 @@ def blend_half(pixels, half, record, start, rest, extras):
 
 @inlined()
 def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
-    """Put the background behind the tile and write it to the"""
+    """Put the background behind the tile and write it to the images."""
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
         for column in range(min(TILE, width - x0)):

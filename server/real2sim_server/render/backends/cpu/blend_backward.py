@@ -15,6 +15,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from ...._numba import PARALLEL_LOOPS
 from .blend import HALF, LOOK_AHEAD, TASKS
 from .kernel import inlined, kernel
 from .lanes import LANES
@@ -60,7 +61,7 @@ class Losses(NamedTuple):
     depth: NDArray[np.float32]
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def open_pixels(images, losses, behind, tiles_x, pixels):
     """Write the state from which the walk backwards starts.
 
@@ -114,7 +115,7 @@ def open_pixel(images, losses, behind, y, x, pixels, place):
     pixels[place + BY_ALPHA * LANES] = by_alpha
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def blend_tiles_backward(values, lists, slots, starts, tiles_x, shape, pixels, gradients, used):
     """Walk all tiles and write the gradients of each record in each tile to its slot.
 

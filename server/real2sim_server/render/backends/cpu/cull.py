@@ -15,11 +15,12 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from ...._numba import PARALLEL_LOOPS
 from ....scene import GaussianCloud
 from ..base import Placement, RasterRequest
 from .kernel import kernel
 from .project_lanes import REACH_MAX
-from .records import CHUNK, View
+from .records import CHUNK, CameraParameters
 
 SLACK = 0.1
 """Images are widened by this [px] against rounding."""
@@ -84,7 +85,7 @@ def all_chunks(request: RasterRequest) -> list[Chunks]:
 
 
 def seen_chunks(
-    request: RasterRequest, placement: Placement, views: Sequence[View]
+    request: RasterRequest, placement: Placement, views: Sequence[CameraParameters]
 ) -> list[list[Chunks]]:
     """Numbers of the chunks that may be seen, by camera and instance."""
     if not request.instances:
@@ -113,7 +114,9 @@ def seen_chunks(
     return seen
 
 
-def _planes(view: View) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _planes(
+    view: CameraParameters,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Six half spaces of the camera frame outside of which nothing is seen.
 
     What place_eight tests, times depth: for x + reach > 0 that is
@@ -142,7 +145,7 @@ def _planes(view: View) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArr
     return table[:, :3], table[:, 3], table[:, 4]
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def bound_chunks(means, scales, bounds):
     """Write centre and half size of each chunk's box, and its largest scale, to ``bounds``."""
     for chunk in prange(bounds.shape[0]):

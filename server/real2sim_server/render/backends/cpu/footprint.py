@@ -40,8 +40,6 @@ SLACK = F32(0.01)
 """Boxes and ranges are widened by this [px] against rounding; the blending decides exactly."""
 FIELD = 12
 FIELD_MASK = (1 << FIELD) - 1
-MAX_TILES = FIELD_MASK
-"""Most tiles in a row or column of an image."""
 SMALL = 4
 ROW_MASK = (1 << SMALL) - 1
 
@@ -55,9 +53,9 @@ def footprints_of_eight(typingctx, planes, lanes, view, found):  # type: ignore[
     """Write the footprints of eight records to ``found`` [8] int64.
 
     Args:
-        planes: see cpu_project_lanes.
+        planes: see :mod:`.project_lanes`.
         lanes: bits of those that are in question.
-        view: View.
+        view: CameraParameters.
 
     Returns:
         Bits of those that may touch a tile.

@@ -15,7 +15,7 @@ from ...types import Instance
 from ..base import CLAMP_MARGIN, Placement, RasterRequest
 from .cull import Chunks, arrays_of
 from .project import project_cluster, project_small_cluster
-from .records import CHUNK, RECORD, Cluster, Records, View
+from .records import CHUNK, RECORD, CameraParameters, Cluster, Records
 
 NO_COVARS = np.zeros((0, 3, 3), np.float32)
 NO_COEFFICIENTS = np.zeros((0, 0, 3), np.float32)
@@ -104,7 +104,7 @@ def array_of(tensor: torch.Tensor) -> NDArray[np.float32]:
     return tensor.detach().cpu().contiguous().numpy()
 
 
-def view_of(request: RasterRequest, camera: int) -> View:
+def view_of(request: RasterRequest, camera: int) -> CameraParameters:
     """Camera and options as the kernels take them."""
     options, width, height = request.options, request.width, request.height
     K = request.Ks[camera].detach().cpu().numpy()
@@ -128,7 +128,7 @@ def view_of(request: RasterRequest, camera: int) -> View:
         "antialiased": options.rasterize_mode == "antialiased",
         "blur": options.eps2d**0.5,
     }
-    return View(**{name: np.float32(value) for name, value in numbers.items()})
+    return CameraParameters(**{name: np.float32(value) for name, value in numbers.items()})
 
 
 @contextmanager

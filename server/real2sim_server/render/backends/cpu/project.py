@@ -15,6 +15,7 @@ import math
 import numpy as np
 from numba import prange
 
+from ...._numba import PARALLEL_LOOPS
 from .footprint import footprints_of_eight
 from .kernel import inlined, kernel
 from .lanes import LANES
@@ -40,9 +41,9 @@ FIELDS = tuple(
 FASTMATH = {"contract", "nsz", "arcp"}
 
 
-@kernel(parallel=True, fastmath=FASTMATH)
+@kernel(parallel=PARALLEL_LOOPS, fastmath=FASTMATH)
 def project_cluster(cluster, view, base, chunks, records):
-    """Write records of those Gaussians of one Cluster that a View may see.
+    """Write records of those Gaussians of one Cluster that a CameraParameters may see.
 
     Args:
         base: first record of this cluster, a multiple of CHUNK.
@@ -78,7 +79,7 @@ def project_chunk(cluster, view, start, planes, found, values, footprints, depth
     """Write the records of CHUNK Gaussians from ``start`` on to the region from ``first`` on.
 
     Args:
-        planes, found: work space, see cpu_project_lanes and footprints_of_eight.
+        planes, found: work space, see :mod:`.project_lanes` and footprints_of_eight.
 
     Returns:
         Records written.

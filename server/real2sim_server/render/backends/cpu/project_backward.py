@@ -17,6 +17,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from ...._numba import PARALLEL_LOOPS
 from .blend_backward import SLOT
 from .kernel import inlined, kernel
 from .project import FASTMATH
@@ -68,7 +69,7 @@ class SlotSums(NamedTuple):
     spans: NDArray[np.int32]
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def project_backward(cluster, view, base, records, slots, screen_scale, out, placement):
     """Add the gradients of one cluster as seen by one camera.
 

@@ -63,7 +63,7 @@ class Cluster(NamedTuple):
     tones: NDArray[np.float32]
 
 
-class View(NamedTuple):
+class CameraParameters(NamedTuple):
     """Camera and options as float32 numbers.
 
     Attributes:
@@ -96,7 +96,7 @@ class Records(NamedTuple):
 
     Attributes:
         values: [M, RECORD] float32.
-        footprints: [M] int64, see cpu_footprint; they fit a cache where the records do not.
+        footprints: [M] int64, see :mod:`.footprint`; they fit a cache where the records do not.
         depths: [M] float32, depth of the centres [m].
         counts: [M / CHUNK] int64, records in use of each region.
     """

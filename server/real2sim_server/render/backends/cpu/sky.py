@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
+from ...._numba import PARALLEL_LOOPS
 from .kernel import inlined, kernel
 
 F32 = np.float32
@@ -20,7 +21,7 @@ TASKS = 16
 """Rows are dealt to this many tasks in turn; rows of open sky cost more than others."""
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def add_sky(faces, matrix, rgb, alpha):
     """Add ``(1 - alpha) * sky`` to ``rgb``.
 

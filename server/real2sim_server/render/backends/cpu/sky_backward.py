@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
+from ...._numba import PARALLEL_LOOPS
 from .kernel import inlined, kernel
 from .sky import HALF, ONE, ZERO, bilinear, pixel_direction, texel_coordinates
 
@@ -20,7 +21,7 @@ F32, I32 = np.float32, np.int32
 OWNER = I32(TASKS - 1)
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def sample_sky(faces, matrix, behind, rows, places):
     """Colour of the sky at all pixels, and where on the faces they look.
 
@@ -44,7 +45,7 @@ def sample_sky(faces, matrix, behind, rows, places):
             places[y, x, 1] = column
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def sky_backward(rows, places, alpha, by_rgb, gradient):
     """Add the gradients of one camera's picture by the faces.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from ...._numba import PARALLEL_LOOPS
 from .kernel import kernel
 from .records import CHUNK, Records
 
@@ -41,7 +42,7 @@ def sort_records(records: Records, regions: int, pairs: Pairs, scratch: Pairs) -
     return pairs[:total]
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def gather_pairs(keys, counts, ends, pairs):
     """Pack (key - smallest key) and record index; return the smallest and largest key.
 
@@ -53,16 +54,18 @@ def gather_pairs(keys, counts, ends, pairs):
         for i in range(region * CHUNK, region * CHUNK + counts[region]):
             lows[region] = min(lows[region], keys[i])
             highs[region] = max(highs[region], keys[i])
-    low = lows.min()
+    low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
+    for region in range(ends.shape[0]):
+        low, high = min(low, lows[region]), max(high, highs[region])
     for region in prange(ends.shape[0]):
         target = ends[region] - counts[region]
         for i in range(counts[region]):
             index = region * CHUNK + i
             pairs[target + i] = (np.uint64(keys[index] - low) << np.uint64(32)) | np.uint64(index)
-    return np.int64(low), np.int64(highs.max())
+    return np.int64(low), np.int64(high)
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def radix_pass(source, target, total, shift, width):
     """Stable counting sort of ``source[:total]`` by ``width`` bits from ``shift`` on."""
     size = 1 << width

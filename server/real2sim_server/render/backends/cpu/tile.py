@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from ...._numba import PARALLEL_LOOPS
 from .footprint import tile_columns, tile_rows
 from .kernel import kernel
 from .simd import prefetch
@@ -21,7 +22,7 @@ LOOK_AHEAD = 24
 LOW_BITS = np.uint64(0xFFFFFFFF)
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def count_tiles(values, footprints, order, tiles_x, ordered_footprints, counts):
     """Count the records of each chunk in each tile.
 
@@ -61,7 +62,7 @@ def tile_starts(counts, first_tile, last_tile, starts):
     starts[last_tile] = position
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def scatter_tiles(values, ordered_footprints, order, tiles_x, first_row, last_row, cursors, lists):
     """Write record indices of tile rows [first_row, last_row) to ``lists`` int32."""
     total = order.shape[0]

@@ -13,12 +13,13 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from ...._numba import PARALLEL_LOOPS
 from .footprint import tile_columns, tile_rows
 from .kernel import kernel
 from .tile import LOW_BITS, TILE_CHUNKS
 
 
-@kernel(parallel=True)
+@kernel(parallel=PARALLEL_LOOPS)
 def scatter_slots(values, footprints, order, tiles_x, first_slots, cursors, lists, slots, spans):
     """Like scatter_tiles for the whole picture, and number the places by record.
 

@@ -13,7 +13,7 @@ from ...._files import atomic_file
 from ...cloud import GaussianCloud
 from ...errors import BundleError
 from ...spherical_harmonics import SH_C0
-from .types import build_cloud, host_array
+from .types import UpAxis, build_cloud, host_array
 
 RECORD = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
@@ -34,6 +34,7 @@ class AntimatterSplat:
     name = "antimatter15 .splat"
     suffix = ".splat"
     has_signature = False
+    up_axis: UpAxis = "z"
 
     def recognises(self, head: bytes) -> bool:
         """Never: there is no header."""

@@ -11,7 +11,7 @@ from ...._files import atomic_file
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
 from ..ply import read_ply_elements
-from .types import build_cloud, column, columns, require_properties
+from .types import UpAxis, build_cloud, column, columns, require_properties
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -32,6 +32,7 @@ class InriaPly:
     name = "INRIA ply"
     suffix = ".ply"
     has_signature = True
+    up_axis: UpAxis = "z"
 
     def recognises(self, head: bytes) -> bool:
         """Whether ``head`` is that of a PLY file; the compressed kind is asked before."""

@@ -20,7 +20,7 @@ from ...errors import BundleError
 from ...spherical_harmonics import SH_C0
 from ..ply import read_ply_elements
 from .morton import morton_order
-from .types import build_cloud, columns, host_array, require_properties
+from .types import UpAxis, build_cloud, columns, host_array, require_properties
 
 CHUNK_SIZE = 256
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -52,6 +52,7 @@ class PlayCanvasPly:
     name = "PlayCanvas compressed ply"
     suffix = ".compressed.ply"
     has_signature = True
+    up_axis: UpAxis = "z"
 
     def recognises(self, head: bytes) -> bool:
         """Whether ``head`` is that of a PLY file with packed positions."""

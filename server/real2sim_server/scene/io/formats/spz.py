@@ -15,7 +15,7 @@ from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError, SceneError
 from .spz_container import Header, Streams, is_spz, read_streams, write_streams
-from .types import build_cloud, host_array
+from .types import UpAxis, build_cloud, host_array
 
 COLOUR_SCALE = 0.15
 """Coefficients of the first harmonic per full range of a byte."""
@@ -52,6 +52,7 @@ class Spz:
     name = "spz"
     suffix = ".spz"
     has_signature = True
+    up_axis: UpAxis = "y"
 
     def __init__(self, *, version: int = 3) -> None:
         if version not in (3, 4):

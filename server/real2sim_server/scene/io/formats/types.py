@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError
+
+UpAxis = Literal["z", "y", "-y"]
+"""Axis of a file that points up: ``y`` as in glTF (z forward), ``-y`` as in OpenCV and COLMAP."""
 
 SMALLEST_SCALE = 1e-20
 """Scales whose exponential underflows are lifted to this [m], since a scale is positive."""
@@ -31,6 +34,10 @@ class SplatFormat(Protocol):
     @property
     def has_signature(self) -> bool:
         """Whether the content tells the format; the others are told by ``suffix``."""
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """Axis that users of the format agree on to point up; else the scene's own, ``z``."""
 
     def recognises(self, head: bytes) -> bool:
         """Whether a file that starts with ``head`` (up to 64 KiB) is of this format.

@@ -1,0 +1,66 @@
+"""Every bench says what it was measured with."""
+
+import json
+import platform
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from real2sim_server import benchmarks
+from real2sim_server.benchmarks import (
+    edit,
+    environment,
+    physics,
+    reconstruct,
+    render,
+    serve,
+    soak,
+    world,
+)
+from real2sim_server.cli import bench
+
+MODULES = {
+    module.__name__.rpartition(".")[2]: module
+    for module in (edit, physics, reconstruct, render, serve, soak, world)
+}
+FIGURES = {"failures": [], "grows": False, "stage_ms": {}}
+
+
+def test_versions_are_those_of_the_libraries_in_use():
+    found = environment.environment()
+    assert found["python"] == platform.python_version()
+    assert found["numpy"] == np.__version__
+    assert found["numba"] == numba.__version__
+    assert found["torch"] == torch.__version__
+    assert found["cpu"]
+    assert found["cpu_threads"] >= 1
+
+
+def test_a_library_that_is_absent_is_named(monkeypatch):
+    monkeypatch.setattr(environment, "LIBRARIES", ("no-such-library",))
+    assert environment.environment()["no-such-library"] == "not installed"
+
+
+def test_every_bench_is_known_here():
+    folder = Path(benchmarks.__file__).parent
+    named = {info.name for info in bench.app.registered_commands}
+    assert named == set(MODULES)
+    assert all((folder / f"{name}.py").is_file() for name in named)
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_every_bench_writes_and_prints_what_it_was_measured_with(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(MODULES[name], "run", lambda *args, **options: {**FIGURES, "figure": 1})
+    monkeypatch.setattr(physics, "as_rows", lambda figures: {})
+    path = tmp_path / "figures.json"
+    done = CliRunner().invoke(bench.app, [name, "--json", str(path)])
+    assert done.exit_code == 0, done.output
+    written = json.loads(path.read_text())
+    assert written["figure"] == 1
+    assert written["environment"] == environment.environment()
+    assert "measured with" in done.output
+    assert np.__version__ in done.output
