@@ -6,8 +6,9 @@ import pytest
 from real2sim_server.demo.run import CAMERAS, SCENE, STEP_US
 from real2sim_server.demo.street import DURATION_S, SHIPPED, unpack_street
 from real2sim_server.reconstruct.evaluation import mean_psnr, psnr, render_logged_view
-from real2sim_server.scene.io import load_scene
+from real2sim_server.scene.io import load_scene, read_packed
 from real2sim_server.synthetic import SyntheticConfig, generate_log
+from real2sim_server.synthetic.traffic import plan_drive
 
 COMPARED_FRAMES = (3, 20, 37, 50)
 
@@ -61,3 +62,12 @@ def test_its_sky_is_that_of_its_provenance(views_and_truth):
     skies = [(view, image, sky) for view, image, sky in views_and_truth if np.mean(sky) > 0.02]
     assert len(skies) >= len(COMPARED_FRAMES)
     assert mean_psnr(psnr(*item) for item in skies) >= 28
+
+
+def test_it_ships_with_the_true_ground_of_its_provenance(street):
+    assert read_packed(SHIPPED).stored_ground is not None
+    course = plan_drive(SyntheticConfig.from_values(street.provenance["config"])).street
+    s, d = np.meshgrid(np.arange(0.0, 70.0, 0.5), np.arange(-5.25, 3.5, 0.25))
+    heights = street.ground.height_at(course.point(s, d).reshape(-1, 2))
+    assert np.sqrt((heights**2).mean()) < 0.01
+    assert np.abs(heights).max() < 0.05
