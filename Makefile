@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+SOURCES := proto client server tests scripts docs/conf.py
 PYTEST := $(BIN)/python -m pytest -q
 
 # What a change breaks first: the contract, the SDK, the layers, and the packages whose tests
@@ -25,13 +26,15 @@ test-slow: $(STAMP)
 	$(PYTEST) -n 0 --run-slow -m "slow or gpu or ray"
 
 lint: $(STAMP)
-	$(BIN)/ruff check proto client server tests
-	$(BIN)/ruff format --check proto client server tests
-	$(BIN)/mypy -p real2sim_proto -p real2sim
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/python scripts/unasync.py --check
+	$(BIN)/mypy -p real2sim_proto -p real2sim -p real2sim_server
 
 format: $(STAMP)
-	$(BIN)/ruff check --fix proto client server tests
-	$(BIN)/ruff format proto client server tests
+	$(BIN)/python scripts/unasync.py
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
 
 schema: $(STAMP)
 	$(BIN)/python -m real2sim_proto.schema proto/schema
@@ -39,6 +42,10 @@ schema: $(STAMP)
 
 coverage: $(STAMP)
 	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile --cov --cov-report=html:out/coverage --cov-report=term
+
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -j auto -d out/doctrees docs site
 
 bench: $(STAMP)
 	$(BIN)/real2sim bench render --json out/bench_render.json

@@ -73,7 +73,7 @@ def calibrate(
     with slopes on them: where no step along the slope helps, slopes are taken over several stairs.
 
     Args:
-        solver: at its start, with guesses; its state is not changed.
+        solver: at its start, with initial values; its state is not changed.
         observed: [T, N, 3] positions after ``every``, 2 ``every``, ... substeps [m].
         parameters: names out of PARAMETERS.
         dt: substep [s], small enough for all that is tried.
@@ -81,7 +81,7 @@ def calibrate(
         steps: tried at most, rejected ones included.
 
     Raises:
-        SolverError: for names or shapes that do not fit, or guesses that already diverge.
+        SolverError: for names or shapes that do not fit, or initial values that already diverge.
     """
     names = tuple(dict.fromkeys(parameters))
     target = _checked(solver, observed, names)
@@ -90,7 +90,7 @@ def calibrate(
     off = (path(logs) - target).reshape(-1)
     history, rejected, refused, damping = [_size(off)], 0, 0, DAMPING
     if not math.isfinite(history[0]):
-        raise SolverError(f"the guesses blow up with dt of {dt!r} s; take a shorter one")
+        raise SolverError(f"the initial values diverge with dt of {dt!r} s; take a shorter one")
     J = jacobian(path, logs)
     for _ in range(steps):
         if history[-1] < REACHED or refused >= PATIENCE * (len(SPANS) + 1):

@@ -206,7 +206,7 @@ class Solver:
         Raises:
             SolverError: for a duration that is not positive or needs too many substeps.
             ParticleError: when particles leave the reach of the grid.
-            UnstableError: when it blows up and smaller substeps do not help. After any error the
+            UnstableError: when it diverges and smaller substeps do not help. After any error the
                 solver stands at the last good state.
         """
         if not (math.isfinite(duration) and duration > 0):

@@ -113,9 +113,9 @@ def test_retiming_to_the_same_microsecond_is_refused(state):
     ],
 )
 def test_what_snaps_stands_on_the_ground(state, operation):
-    snapped = apply_operations(state, [operation]).state.objects["parked"]
+    standing = apply_operations(state, [operation]).state.objects["parked"]
 
-    bottoms = box_corners(snapped.trajectory.transform(0), snapped.scaled_size)[:4, 2]
+    bottoms = box_corners(standing.trajectory.transform(0), standing.scaled_size)[:4, 2]
     np.testing.assert_allclose(bottoms, 0, atol=0.01)
 
 

@@ -51,7 +51,7 @@ def apply_contact(
 
 @device_function
 def record_impulse(impulse: Any, slip: Any, other: Any, at: Any, fraction: Any, total: Any) -> None:
-    """Add an impulse at a place, what it rubbed and what it did; see ``base.TOTALS``."""
+    """Add an impulse at a place, the friction work and the work it did; see ``base.TOTALS``."""
     px, py, pz = impulse
     total[0] += px
     total[1] += py

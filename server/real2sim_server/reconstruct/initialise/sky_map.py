@@ -39,7 +39,7 @@ class SkySamples:
         """Take the pixels of ``view`` that show neither a Gaussian nor a tracked object."""
         texels, u, v = self._texels_in(view)
         row, column = (v / DEPTH_DOWNSCALE).astype(np.int64), (u / DEPTH_DOWNSCALE).astype(np.int64)
-        free = uncovered(view)[row, column] & (self._counts[texels] < SLOTS)
+        free = uncovered_pixels(view)[row, column] & (self._counts[texels] < SLOTS)
         texels, u, v = texels[free], u[free], v[free]
         colours = _bilinear(view.image, u, v)
         slot = self._counts[texels]
@@ -80,7 +80,7 @@ class SkySamples:
         return np.asarray(chosen.astype(np.float32) / 255)
 
 
-def uncovered(view: ProjectedView) -> NDArray[np.bool_]:
+def uncovered_pixels(view: ProjectedView) -> NDArray[np.bool_]:
     """[H / 2, W / 2] bool: no Gaussian and no object there; pinholes closed."""
     import cv2
 

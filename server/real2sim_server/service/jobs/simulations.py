@@ -42,7 +42,7 @@ class Simulations:
         """Begin a rollout of the scenario as it is now.
 
         Raises:
-            ServiceError: as scenarios, residency and jobs do; INVALID_REQUEST, UNKNOWN_OBJECT or
+            ServiceError: as scenarios, scene cache and jobs do; INVALID_REQUEST, UNKNOWN_OBJECT or
                 TIME_OUT_OF_RANGE for what cannot be simulated.
         """
         view = await self._scenarios.view(scenario_id)

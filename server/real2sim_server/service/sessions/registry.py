@@ -139,7 +139,7 @@ class Sessions:
             ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
 
         Raises:
-            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; as residency and scenarios
+            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; as scene cache and scenarios
                 do.
             WorldError: the episode cannot run as asked.
         """
