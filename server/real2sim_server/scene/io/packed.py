@@ -1,5 +1,9 @@
 """Packed scenes: one small file for sending and shipping, about a third of a bundle's bytes.
 
+A format of its own beside the bundle, because the two ask for opposite things: a bundle is mapped
+into memory as it lies and keeps every bit, a packed scene travels (the demo's street is one) and is
+read once. Splat files of other programs hold no tracks, cameras, sky or provenance.
+
 A packed scene is quantised: centres to 1/65535 of their cloud's extent, axes to 1/3276 of a power
 of e, rotations to 1/127, opacities to 1/255, colours to half precision and the rest of the
 spherical harmonics to 1/127 of their largest, heights of the ground to a millimetre. To work with
