@@ -145,7 +145,8 @@ def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningWorker]:
         backend="cpu",
         log_level="error",
     )
-    with running_worker(settings) as running:
+    # A machine without compiled kernels takes a while to be ready.
+    with running_worker(settings, timeout_s=280.0) as running:
         yield running
 
 
