@@ -51,7 +51,7 @@ from ..rendering.frames import (
     with_pixels,
 )
 from ..rendering.renderer import Renderer, RenderRequest, check_sensors
-from .wire import EncodedMembers, EncodedMessage, StepTimer, pack_members, pack_with_frames
+from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
 
 T = TypeVar("T")
 
@@ -81,7 +81,7 @@ class Transition:
     cameras: Mapping[str, Camera]
     record: Callable[[], object] | None = None
     write: Callable[[EncodedMessage], bool] | None = None
-    timer: StepTimer = field(default_factory=StepTimer)
+    timer: PhaseTimer = field(default_factory=PhaseTimer)
     recorded: bool = False
     sent: bool = False
 
@@ -101,7 +101,7 @@ class RenderedObservation:
     images: Sequence[RenderedImage]
     kind: str
     members: EncodedMembers
-    timer: StepTimer
+    timer: PhaseTimer
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,7 @@ class StepPipeline:
         world: World,
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
-        timer: StepTimer,
+        timer: PhaseTimer,
     ) -> Sequence[RenderedImage]:
         """Images of a world, its objects deformed first."""
         if world.deformation is not None:
@@ -264,7 +264,7 @@ class StepPipeline:
         """
         cameras = self._checked(world.scene, sensors)
         rendered = await self._engine.call(
-            self._compute_view, world, sensors, cameras, StepTimer(), label="view"
+            self._compute_view, world, sensors, cameras, PhaseTimer(), label="view"
         )
         return await self._finish(rendered)
 
@@ -273,7 +273,7 @@ class StepPipeline:
         world: World,
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
-        timer: StepTimer,
+        timer: PhaseTimer,
     ) -> RenderedObservation:
         timer.stage("queue")
         images = self._images(world, sensors, cameras)

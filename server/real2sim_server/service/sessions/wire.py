@@ -18,7 +18,7 @@ FRAMES: bytes = msgpack.packb("frames")
 
 
 @dataclass(eq=False)
-class StepTimer:
+class PhaseTimer:
     """Milliseconds by stage; each stage ends where the next one begins."""
 
     timing_ms: dict[str, float] = field(default_factory=dict)
@@ -77,7 +77,7 @@ def pack_message(kind: str, fields: Mapping[str, Any]) -> EncodedMessage:
 
 
 def pack_with_frames(
-    kind: str, members: EncodedMembers, frames: Sequence[EncodedFrame], watch: StepTimer
+    kind: str, members: EncodedMembers, frames: Sequence[EncodedFrame], watch: PhaseTimer
 ) -> EncodedMessage:
     """A message with the members ``frames`` and ``timing`` besides ``members``.
 

@@ -20,7 +20,7 @@ from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.rendering.frames import EncodedFrame, raw_headers
 from real2sim_server.service.rendering.renderer import Renderer, RenderRequest
-from real2sim_server.service.sessions.wire import StepTimer, pack_members, pack_with_frames
+from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 
 
 def opacity(output: RenderOutput) -> NDArray[np.uint8]:
@@ -80,7 +80,7 @@ def test_a_registered_modality_is_rendered_and_encoded(alpha, tiny_scene, codec)
 
 def test_its_frame_is_read_from_the_message_of_an_observation(alpha, tiny_scene):
     frames = rendered(tiny_scene, "raw")
-    message = pack_with_frames("obs", pack_members({"step": 1}), frames, StepTimer())
+    message = pack_with_frames("obs", pack_members({"step": 1}), frames, PhaseTimer())
     received = decode(message.joined(3))["frames"][1]
     levels = np.frombuffer(received["data"], received["dtype"]).reshape(received["shape"])
     assert received["modality"] == "alpha"

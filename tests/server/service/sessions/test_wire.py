@@ -21,7 +21,7 @@ from real2sim_server.service.rendering.frames import (
     with_pixels,
 )
 from real2sim_server.service.sessions.wire import (
-    StepTimer,
+    PhaseTimer,
     pack_members,
     pack_message,
     pack_with_frames,
@@ -44,7 +44,7 @@ def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) 
 def view(frames: int, codec: str = "raw") -> bytes:
     encoded = [encode_frame(image(codec)) for _ in range(frames)]
     fields = {"t_us": 7, "revision": 2}
-    return pack_with_frames("view", pack_members(fields), encoded, StepTimer()).joined(5)
+    return pack_with_frames("view", pack_members(fields), encoded, PhaseTimer()).joined(5)
 
 
 @given(st.integers(min_value=0, max_value=2**53))
