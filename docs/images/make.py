@@ -180,7 +180,8 @@ def save(name: str, image: np.ndarray, *, width: int) -> None:
     height = round(image.shape[0] * width / image.shape[1])
     if image.shape[1] > width:
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(HERE / name), image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 85] if name.endswith(".jpg") else []
+    cv2.imwrite(str(HERE / name), image, quality)
     print(HERE / name)
 
 
