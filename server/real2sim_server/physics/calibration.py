@@ -22,7 +22,7 @@ from .solver import Solver
 PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")
 """What may be fitted: factors on what the solver was given, all positive."""
 DAMPING = 1e-3
-"""Of the first step, as a share of each parameter's own curvature (Marquardt 1963)."""
+"""Of the first step, as a fraction of each parameter's own curvature (Marquardt 1963)."""
 DAMPING_MIN = 1e-12
 CALMER, BOLDER = 5.0, 0.2
 """What damping is multiplied by after a step that was rejected, and after one that was kept."""
@@ -35,7 +35,7 @@ SPANS = (0.1, 0.03, 0.01)
 REACHED = 1e-9
 """Residuals below this are rounding [m]."""
 FLAT = 1e-12
-"""A parameter whose curvature is below this share of the largest is left where it is."""
+"""A parameter whose curvature is below this fraction of the largest is left where it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Calibration:
 
     Attributes:
         factors: by parameter, on the value the solver was given.
-        uncertainty: by parameter, what one factor may be wrong by, as a share, when observations
+        uncertainty: by parameter, what one factor may be wrong by, as a fraction, when observations
             are wrong by ``residual[-1]``; infinite for what they say nothing about.
         residual: root mean square distance to what was observed [m], at the start and after each
             step that was kept; it never rises.

@@ -17,7 +17,7 @@ from .materials import Material
 
 PRECISIONS: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
 BODIES_MAX = 4096
-"""What the grid's block keys have room for."""
+"""As many as the grid's block keys can tell apart."""
 BYTES_PER_PARTICLE = {"single": 900, "double": 1400}
 """Peak while solving, saved state and float64 copies included; measured."""
 

@@ -1,4 +1,4 @@
-"""Rebound by dissipation: viscosity is fitted so that a body bounces as asked.
+"""Rebound by dissipation: viscosity is fitted so that a body bounces as requested.
 
 An elastic body on a grid bounces too well, never too badly, so taking energy away is enough and
 nothing is ever injected. Kelvin-Voigt damping of the first mode, omega = pi c / 2L, gives
@@ -33,7 +33,7 @@ IMPACTS_MAX = 14
 
 @dataclass(frozen=True, eq=False)
 class RestitutionFit:
-    """What was asked, what was reached, and with what.
+    """What was requested, what was reached, and with what.
 
     Attributes:
         body: the body with the fitted viscosity in all its materials.

@@ -121,7 +121,7 @@ class Energies:
         kinetic, elastic, gravity: present energy; gravity is 0 at the world origin.
         friction_heat: dissipated by friction since the start.
         collider_work: done on bodies by moving colliders since the start.
-        dissipated: gone since the start into viscous and plastic flow, inelastic touch and the
+        dissipated: lost since the start to viscous and plastic flow, inelastic contact and the
             transfers between particles and grid.
     """
 

@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Filling:
-    """How a body was filled, to be looked at before it is simulated.
+    """How a body was filled, for inspection before it is simulated.
 
     Attributes:
         particles: Gaussians and interior, in the object's frame.

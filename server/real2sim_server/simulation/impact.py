@@ -28,7 +28,7 @@ from .presets import VEHICLES, preset_of
 PARTICLES = 2000
 """Of one body, about; more would take longer than a step of a closed loop may take."""
 FINEST = 0.1
-"""Spacing of particles that is never gone below [m]."""
+"""Spacing of particles that is the smallest taken [m]."""
 STIFFNESS_SCALE = 0.12
 """Stiffness of the ends against the vehicle preset, which is fitted to the front of one modern car.
 With it two mean cars together crush as their mutual stiffness of 405 kN/m has it (Bonugli et al.
@@ -100,7 +100,7 @@ class ImpactResult:
     Attributes:
         body: as it is afterwards.
         displacements: [F, N, 3] float32 of particles from rest, object frame [m]; every
-            ``FRAME_S`` from the first touch on, the last one for good.
+            ``FRAME_S`` from first contact on, the last one for good.
         delta_v: [3] change of the velocity of its centre of mass [m/s].
         depth: how far particles were moved by this impact at most [m].
     """
@@ -171,7 +171,7 @@ def simulate_impact(
 ) -> tuple[ImpactResult, ImpactResult | None] | None:
     """Let a body run into another, or into what does not yield.
 
-    They are moved back along their ways until they just do not touch. Momentum of both together
+    They are moved along their ways until they are just not in contact. Momentum of both together
     stays; what they exchange is left to the solver.
 
     Args:
@@ -209,7 +209,7 @@ def _mean_velocity(impact_bodies: Sequence[ImpactBody]) -> Float:
 def _free_path(
     first: ImpactBody, second: ImpactBody | Box, along: Float, cell: float
 ) -> float | None:
-    """How far ``first`` can go [m] until surfaces are about to touch; None where it misses."""
+    """How far ``first`` can go [m] until contact; None where it misses."""
     side = np.cross([0.0, 0.0, 1.0], along)
     across = np.stack([side / np.linalg.norm(side), np.cross(along, side)])
     own = first.positions

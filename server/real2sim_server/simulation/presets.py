@@ -115,8 +115,8 @@ BUMPER_FOAM = Snow(
     hardening=7.0,
     viscosity=1e3,
 )
-"""Gives way first, so that even a slow touch costs energy; what it stores before it yields is what
-cars of published tests jump back with at walking pace."""
+"""Gives way first, so that even a slow contact costs energy; what it stores before it yields is
+what cars of published tests jump back with at walking pace."""
 CRUMPLE = Snow(
     young=2.4e7,
     poisson=0.1,

@@ -19,13 +19,13 @@ STEP = 0.005
 NEAR_CELLS = 3.0
 """Bodies are activated when something comes this near."""
 ROAD_CELLS = 0.4
-"""On its wheels a body is near the road all the time; it touches when springs are through."""
+"""On its wheels a body is near the road all the time; contact begins when springs are through."""
 APPROACH_MIN = 1e-3
 """Bodies approach each other when speed times distance is beyond this [m^2/s]."""
 HIT_DELTA_V = 0.3
 """A vehicle was hit when something has changed its velocity by more [m/s]."""
 TYRES = "tyres"
-"""What the road does through tyres is booked under this name."""
+"""Name under which the contact log keeps what the road does through tyres."""
 
 
 class HybridSimulator:

@@ -141,10 +141,10 @@ def require_separation(
 def _particles_overlap(a: DeformableBody, b: DeformableBody) -> bool:
     from scipy.spatial import cKDTree
 
-    mine = apply_transform(a.T_world_object, a.shape.positions)
-    theirs = apply_transform(b.T_world_object, b.shape.positions)
-    near, _ = cKDTree(theirs).query(mine, distance_upper_bound=a.spacing)
-    return int(np.isfinite(near).sum()) > OVERLAP_FRACTION * len(mine)
+    own = apply_transform(a.T_world_object, a.shape.positions)
+    other = apply_transform(b.T_world_object, b.shape.positions)
+    near, _ = cKDTree(other).query(own, distance_upper_bound=a.spacing)
+    return int(np.isfinite(near).sum()) > OVERLAP_FRACTION * len(own)
 
 
 def _spawn_body(

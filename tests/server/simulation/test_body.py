@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from real2sim_server.physics import FixedCorotated, Solver, SolverOptions, box_particles
 from real2sim_server.physics.validation.check import placed as at
-from real2sim_server.simulation.body import BodyMode, DeformableBody
+from real2sim_server.simulation.body import SETTLE_TIME, SLEEP_TIME, BodyMode, DeformableBody
 from real2sim_server.simulation.rigid import rotation_of
 
 
@@ -71,3 +73,46 @@ def test_a_body_put_to_sleep_stands_still_and_is_rigid():
     assert body.mode == BodyMode.SLEEPING
     assert body.state is None
     assert body.kinetic_energy == 0
+
+
+def solved(**options) -> DeformableBody:
+    """A body that a solver has just taken over."""
+    body = thrown(**options)
+    body.update_from_solver(activated(body).state("box"))
+    return body
+
+
+def test_a_body_that_moves_as_a_whole_may_become_rigid_but_not_sleep():
+    body = solved()
+    body.update_timers(SETTLE_TIME)
+    assert not body.may_rigidify
+    body.update_timers(SETTLE_TIME)
+    assert body.may_rigidify
+    assert not body.may_sleep
+
+
+def test_a_body_that_hardly_moves_may_sleep_after_the_sleep_time():
+    body = solved(velocity=np.zeros(3), angular_velocity=np.zeros(3))
+    body.update_timers(SLEEP_TIME)
+    assert not body.may_sleep
+    body.update_timers(SETTLE_TIME)
+    assert body.may_sleep
+
+
+def test_a_body_that_vibrates_is_not_settled():
+    body = solved(velocity=np.zeros(3), angular_velocity=np.zeros(3))
+    rng = np.random.default_rng(0)
+    body.state = replace(body.state, velocities=rng.normal(size=body.state.velocities.shape))
+    body.update_timers(1.0)
+    assert body.residual_speed() > 0.5
+    assert not body.may_rigidify
+
+
+def test_a_body_keeps_the_shape_it_is_given_and_its_centre_of_mass():
+    dented = solved()
+    dented.rigidify()
+    pose = dented.T_world_object
+    again = thrown(T_world_object=pose, shape=dented.shape)
+    np.testing.assert_allclose(again.T_world_object, pose, atol=1e-12)
+    np.testing.assert_allclose(again.motion.centre, dented.motion.centre, atol=1e-12)
+    assert again.local_positions() is dented.shape.positions

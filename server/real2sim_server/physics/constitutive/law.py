@@ -1,4 +1,4 @@
-"""Which constitutive laws there are, and what each of them needs to be kept of a particle.
+"""Which constitutive laws there are, and what each of them keeps of a particle.
 
 The functions themselves are in :mod:`.stress`, compiled, and once more in plain torch in
 ``backends.reference.stress``. Both choose by the code of a law, so a new law is a record here, a
@@ -50,7 +50,7 @@ SNOW = ConstitutiveLaw(
     plastic=True,
     parameters=("critical_compression", "critical_stretch", "hardening"),
 )
-LAWS = {
+CONSTITUTIVE_LAWS = {
     law.code: law
     for law in (FIXED_COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW)
 }
@@ -63,7 +63,7 @@ def require_known(law: object, owner: str) -> ConstitutiveLaw:
     Raises:
         MaterialError: for anything else, with what is allowed.
     """
-    if not isinstance(law, ConstitutiveLaw) or LAWS.get(law.code) != law:
+    if not isinstance(law, ConstitutiveLaw) or CONSTITUTIVE_LAWS.get(law.code) != law:
         name = law.name if isinstance(law, ConstitutiveLaw) else law
         raise MaterialError(
             f"unknown constitutive law {name!r} of {owner}; allowed are {allowed_laws()}"
@@ -77,7 +77,7 @@ def law_of_code(code: float) -> ConstitutiveLaw:
     Raises:
         MaterialError: when there is none, with what is allowed.
     """
-    law = LAWS.get(int(code)) if code == int(code) else None
+    law = CONSTITUTIVE_LAWS.get(int(code)) if code == int(code) else None
     if law is None:
         raise MaterialError(f"unknown constitutive law {code!r}; allowed are {allowed_laws()}")
     return law
@@ -85,4 +85,4 @@ def law_of_code(code: float) -> ConstitutiveLaw:
 
 def allowed_laws() -> str:
     """Names of all laws, for a person."""
-    return ", ".join(law.name for law in LAWS.values())
+    return ", ".join(law.name for law in CONSTITUTIVE_LAWS.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW = range(6)
-"""Codes of constitutive laws in column LAW; what they stand for says :mod:`.law`."""
+"""Codes of constitutive laws in column LAW; see :mod:`.law`."""
 LAW, MU, LAMBDA, VISCOSITY, A, B, C, PLASTIC = range(8)
 """Columns. A, B and C are read by law. VISCOSITY above 0 damps; PLASTIC above 0 keeps F_total."""
 MATERIAL_ROW = 8

@@ -1,4 +1,4 @@
-"""Contact at one node: of a body with an obstacle, of two bodies; the same for every device.
+"""Contact at one node: of a body with a collider, of two bodies; the same for every device.
 
 Arrays are rows of one node: velocity and mass [4], first moment of volume and volume [4], and the
 totals [TOTALS] of one touch.
@@ -37,7 +37,7 @@ def resolve_node_collider(
 def apply_contact(
     node: Any, n: Any, u: Any, friction: Any, separable: Any, at: Any, total: Any
 ) -> None:
-    """Touch of a node with an obstacle that moves at ``u``; adds to the touch's totals."""
+    """Touch of a node with a collider that moves at ``u``; adds to the touch's totals."""
     relative = (node[0] - u[0], node[1] - u[1], node[2] - u[2])
     after = coulomb(relative, n, friction, separable)
     change = (after[0] - relative[0], after[1] - relative[1], after[2] - relative[2])

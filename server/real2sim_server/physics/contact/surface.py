@@ -1,4 +1,4 @@
-"""Contact at one grid node: where surfaces are, and what a touch does to velocities."""
+"""Contact at one grid node: where surfaces are, and what contact does to velocities."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from ..numerics.device import F32, ONE, TINY, ZERO, device_function
 
 REACH = F32(1.5)
-"""Half width of the spline: a node sees matter up to this many cells away."""
+"""Half width of the spline: a node sees particles up to this many cells away."""
 _ENTRIES = 256
 STICKS = F32(1e6)
 """Stands for infinite friction, which times no pressure would be no number."""
 
 
 def _half_space_tables() -> Any:
-    """What a node sees of matter that fills u > surface, as the surface passes it [cells].
+    """What a node sees of a body that fills u > surface, as the surface passes it [cells].
 
     Two tables at even steps: surface by centroid in [0, 1.5], and first moment by filled fraction.
     """
@@ -37,7 +37,7 @@ def _half_space_tables() -> Any:
 
 SURFACE, FLAT_MOMENT = _half_space_tables()
 OPPOSED = F32(0.5)
-"""Surfaces meet only where the cosine between their normals is beyond this; else they pass by."""
+"""Surfaces are in contact only where the cosine between their normals is beyond this."""
 
 
 @device_function
@@ -78,10 +78,10 @@ def face_score(moment: Any, filled: Any) -> Any:
 
 @device_function
 def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
-    """Relative velocity after a touch: no approach along ``n``, Coulomb friction across it.
+    """Relative velocity after contact: no approach along ``n``, Coulomb friction across it.
 
     Args:
-        v: velocity relative to the obstacle, three numbers.
+        v: velocity relative to the other, three numbers.
         n: unit normal out of the collider_rows.
         friction: Coulomb coefficient; from STICKS on nothing slides.
         separable: false keeps the normal velocity at zero when it points away, too.

@@ -1,4 +1,4 @@
-"""What all materials share: checked parameters, a constitutive law, a name under which it is found.
+"""What a material is: checked parameters, a constitutive law, a name under which it is found.
 
 Stress is Kirchhoff stress tau of the elastic deformation gradient F; mu = E / 2(1 + nu),
 lambda = E nu / (1 + nu)(1 - 2 nu). Every material may be damped by Kelvin-Voigt viscosity:

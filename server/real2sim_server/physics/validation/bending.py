@@ -1,4 +1,4 @@
-"""A clamped beam: how far it bends, and how fast it swings (Euler and Bernoulli)."""
+"""A clamped beam: how far it bends, and how fast it oscillates (Euler and Bernoulli)."""
 
 from __future__ import annotations
 
@@ -40,15 +40,17 @@ def cantilever(backend: str) -> list[Check]:
     i = int(np.flatnonzero(falls)[0])
     fraction = heights[i] / (heights[i] - heights[i + 1])
     half = times[i] + fraction * (times[i + 1] - times[i])
-    swing = heights.max() * np.sin(2 * np.pi * exact * times)
-    curve = ReferenceCurve(times.tolist(), heights.tolist(), swing.tolist(), "time [s]", "tip [m]")
+    oscillation = heights.max() * np.sin(2 * np.pi * exact * times)
+    curve = ReferenceCurve(
+        times.tolist(), heights.tolist(), oscillation.tolist(), "time [s]", "tip [m]"
+    )
     return [Check("cantilever: frequency", 0.5 / half, exact, 0.05 * exact, "Hz", curve)]
 
 
 def loaded_beam(backend: str, *, length: float | None = None) -> list[Check]:
     """A weight on the tip bends the beam by P L^3 / 3 E I, its own by what a line load does.
 
-    Let go at rest it swings about that bend: the mean from rest to the lowest point. Shear adds
+    Let go at rest it oscillates about that bend: the mean from rest to the lowest point. Shear adds
     (P + q L / 2) L / k G A with k = 5/6 (Timoshenko). On the reference, which is slow, the beam is
     half as long by default.
     """
@@ -64,15 +66,17 @@ def loaded_beam(backend: str, *, length: float | None = None) -> list[Check]:
     shape = a**2 * (6 * L**2 - 4 * L * a + a**2) / (24 * BENDING)
     shear = (tip_mass * a + LINE_DENSITY * (L * a - a**2 / 2)) * gravity / SHEARING
     exact = point + LINE_DENSITY * gravity * shape + shear
-    # Rayleigh's estimate is near enough to know when to look for the lowest point.
+    # Rayleigh's estimate is near enough to know when to expect the lowest point.
     swinging = tip_mass + 33 / 140 * LINE_DENSITY * L
     half = math.pi * math.sqrt(swinging * a**3 / (3 * BENDING))
     solver = solve([body], [_clamp()], backend=backend, dx=DX, gravity=(0, 0, -gravity))
     times, heights = _follow_tip(solver, tip, half / 60, 1.15 * half)
     lowest = int(np.argmin(heights))
     bend = -float(np.trapezoid(heights[: lowest + 1], times[: lowest + 1]) / times[lowest])
-    swing = -exact * (1 - np.cos(np.pi * times / times[lowest]))
-    curve = ReferenceCurve(times.tolist(), heights.tolist(), swing.tolist(), "time [s]", "tip [m]")
+    oscillation = -exact * (1 - np.cos(np.pi * times / times[lowest]))
+    curve = ReferenceCurve(
+        times.tolist(), heights.tolist(), oscillation.tolist(), "time [s]", "tip [m]"
+    )
     return [Check("cantilever: bend under load", bend, exact, 0.05 * exact, "m", curve)]
 
 

@@ -16,7 +16,7 @@ from ..solver import Solver, SolverOptions
 
 @dataclass(frozen=True)
 class ReferenceCurve:
-    """What a case looked like on its way, for the page.
+    """A measured quantity over time or space beside its theory, for the page.
 
     Attributes:
         x, measured, expected: of one length; ``expected`` may hold NaN where theory is silent.

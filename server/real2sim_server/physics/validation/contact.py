@@ -16,7 +16,7 @@ from .check import Check, ReferenceCurve, block, placed, solve
 
 GRAVITY = 9.81
 RUBBER = FixedCorotated(young=2e5, poisson=0.2, viscosity=200)
-"""Damped, so that a block that is set down comes to rest and stays in touch."""
+"""Damped, so that a block that is set down comes to rest and stays in contact."""
 
 
 def incline(backend: str, *, duration: float = 5.0) -> list[Check]:
@@ -204,10 +204,10 @@ def rolling_ball(backend: str) -> list[Check]:
     Being elastic it winds up and down a little while it sticks, so means over that count.
     """
     radius, speed = 0.5, 2.0
-    matter = ball_particles(radius, spacing=0.05, density=1000)
+    particles = ball_particles(radius, spacing=0.05, density=1000)
     ball = Body(
         name="ball",
-        particles=matter.moved(placed(0, 0, radius)),
+        particles=particles.moved(placed(0, 0, radius)),
         material=FixedCorotated(young=1e7, poisson=0.3, density=1000, viscosity=3000),
         velocity=(speed, 0, 0),
         friction=0.5,
@@ -219,7 +219,7 @@ def rolling_ball(backend: str) -> list[Check]:
         solver.step(0.01)
         state = solver.state("ball")
         speeds.append(float(state.velocity[0]))
-        rims.append(radius * float(state.angular_momentum[1] / matter.inertia[1, 1]))
+        rims.append(radius * float(state.angular_momentum[1] / particles.inertia[1, 1]))
     lost, rolling = speed - float(np.mean(speeds)), speed * 5 / 7
     return [
         Check("rolling ball: speed lost", lost, speed * 2 / 7, 0.05 * speed, "m/s"),

@@ -69,13 +69,13 @@ def _row(check: Check) -> str:
 def _margin(check: Check) -> str:
     """A dot between the two ends of the tolerance; at the rim when outside."""
     off = check.measured - check.expected
-    share = off / check.tolerance if check.tolerance > 0 else math.copysign(2, off) * (off != 0)
-    share = 1.15 if math.isnan(share) else min(max(share, -1.15), 1.15)
-    x = MARGIN_WIDTH / 2 * (1 + share / 1.2)
+    error = off / check.tolerance if check.tolerance > 0 else math.copysign(2, off) * (off != 0)
+    error = 1.15 if math.isnan(error) else min(max(error, -1.15), 1.15)
+    x = MARGIN_WIDTH / 2 * (1 + error / 1.2)
     low, high = (MARGIN_WIDTH / 2 * (1 + s / 1.2) for s in (-1, 1))
     colour = "#1a7f37" if check.passed else "#b3261e"
     return (
-        f"<svg width='{MARGIN_WIDTH}' height='14' role='img' aria-label='{share:.2f} tolerances'>"
+        f"<svg width='{MARGIN_WIDTH}' height='14' role='img' aria-label='{error:.2f} tolerances'>"
         f"<line x1='{low:.1f}' x2='{high:.1f}' y1='7' y2='7' stroke='#8b949e'/>"
         f"<line x1='{MARGIN_WIDTH / 2}' x2='{MARGIN_WIDTH / 2}' y1='3' y2='11' stroke='#8b949e'/>"
         f"<circle cx='{x:.1f}' cy='7' r='4' fill='{colour}'/></svg>"

@@ -28,7 +28,7 @@ RGB_ONLY = RasterOptions(depth=False, instance=False)
 FILM_RATE = 15.0
 STILLS = 5
 CLEAR = 0.8
-"""Of the distance from a near view to what it looks at."""
+"""Of the distance from a near view to its focus."""
 WALL_HALF_WIDTH, WALL_DOWN, WALL_UP = 1.3, 0.7, 0.9
 """What is drawn of a virtual wall, around the focus [m]."""
 

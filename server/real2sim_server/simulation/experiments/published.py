@@ -68,7 +68,7 @@ def block_car(
         mass: of the whole car [kg]; the column has its fraction.
         x: of its middle [m].
         speed: [m/s].
-        heading: which way it looks.
+        heading: which way its front points, 1 or -1 along x.
     """
     preset = preset_of("vehicle")
     fraction = float(np.prod(COLUMN) / np.prod(MALIBU_SIZE[1:]))

@@ -36,13 +36,13 @@ ROAD_FRICTION = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A simulation and where to look.
+    """A simulation and its camera.
 
     Attributes:
         name: ``wall``, ``pair`` or ``drop``.
         options: what to simulate.
-        subjects: objects to look at.
-        focus: [3] point of the world to look at from near by [m].
+        subjects: objects that are shown.
+        focus: [3] point of the world that the near camera faces [m].
         side: [3] direction from the focus to a near-by viewer, unit.
         distance: of that viewer [m].
     """
@@ -184,7 +184,7 @@ def _pair(request: _Request) -> Experiment:
         rest = [s for s in chosen if s not in runners]
         standing = tuple(sorted(rest, key=lambda s: -visibilities[s.object_id].rear)[:count])
     objects: dict[str, ObjectPhysics] = {}
-    meeting = []
+    midpoints = []
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
         own = runner.trajectory.transform(start_us)
         forward = _level(own[:3, 0])
@@ -195,7 +195,7 @@ def _pair(request: _Request) -> Experiment:
         target[2, 3] += (hit.scaled_size[2] - runner.scaled_size[2]) / 2
         objects[runner.object_id] = ObjectPhysics(velocity=speed * forward, T_world_object=own)
         objects[hit.object_id] = ObjectPhysics(velocity=(0, 0, 0), T_world_object=target)
-        meeting.append((own[:3, 3] + target[:3, 3]) / 2)
+        midpoints.append((own[:3, 3] + target[:3, 3]) / 2)
     options = SimulateOptions(
         preset=request.preset,
         objects=objects,
@@ -204,7 +204,7 @@ def _pair(request: _Request) -> Experiment:
         gravity=(0.0, 0.0, 0.0),
     )
     view = _viewer(request.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
-    return Experiment("pair", options, tuple(objects), meeting[0], view, 9.0)
+    return Experiment("pair", options, tuple(objects), midpoints[0], view, 9.0)
 
 
 def _drop(request: _Request) -> Experiment:

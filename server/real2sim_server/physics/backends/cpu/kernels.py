@@ -1,4 +1,4 @@
-"""The substep on the CPU: blocks scatter to tiles, fields collect and touch, blocks gather."""
+"""The substep on the CPU: blocks scatter to tiles, fields add up and touch, blocks gather."""
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
 # ruff: noqa: PLR0917
@@ -47,7 +47,7 @@ def scatter_blocks(dt: Any, state: Any, layout: Any, work: Any, params: Any) -> 
 
 @inner()
 def scatter_block(block: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> None:
-    """Add the particles of one block to its tile, and their moments where they are asked for."""
+    """Add the particles of one block to its tile, and their moments where contact needs them."""
     tile = work.tiles[block]
     tile[:] = ZERO
     begin, end = layout.block_start[block], layout.block_start[block + 1]

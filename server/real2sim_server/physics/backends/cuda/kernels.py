@@ -140,12 +140,12 @@ def add_volumes(block, thread, state, layout, tile):
         for a in range(3):
             for b in range(3):
                 for c in range(3):
-                    share = wx[a] * wy[b] * wz[c] * state.volume[p]
+                    volume = wx[a] * wy[b] * wz[c] * state.volume[p]
                     node = first + (a * SIDE + b) * SIDE + c
-                    cuda.atomic.add(tile, (node, 0), share * (f[0] - F32(a)))
-                    cuda.atomic.add(tile, (node, 1), share * (f[1] - F32(b)))
-                    cuda.atomic.add(tile, (node, 2), share * (f[2] - F32(c)))
-                    cuda.atomic.add(tile, (node, 3), share)
+                    cuda.atomic.add(tile, (node, 0), volume * (f[0] - F32(a)))
+                    cuda.atomic.add(tile, (node, 1), volume * (f[1] - F32(b)))
+                    cuda.atomic.add(tile, (node, 2), volume * (f[2] - F32(c)))
+                    cuda.atomic.add(tile, (node, 3), volume)
 
 
 @device_function

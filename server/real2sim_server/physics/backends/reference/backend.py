@@ -77,10 +77,10 @@ class ReferenceSimulation:
     def _record(self, contact: NodeContact) -> None:
         totals = self._by_body if contact.by_body else self._by_collider
         moment = torch.linalg.cross(contact.at, contact.impulse)
-        share = 0.5 if contact.by_body else 1.0
-        heat = -share * (contact.impulse * contact.slip).sum()
+        fraction = 0.5 if contact.by_body else 1.0
+        friction_work = -fraction * (contact.impulse * contact.slip).sum()
         work = (contact.impulse * contact.velocity).sum()
-        row = torch.cat([contact.impulse.sum(0), moment.sum(0), torch.stack([heat, work])])
+        row = torch.cat([contact.impulse.sum(0), moment.sum(0), torch.stack([friction_work, work])])
         totals[contact.body, contact.other] += row.numpy()
 
     def measure(self) -> Measure:

@@ -183,10 +183,10 @@ def _to_grid(
 
 def surface_offset(centroid: Tensor) -> Tensor:
     """Where surfaces lie, from centroid offsets [cells]; see ``contact.surface``."""
-    return _look_up(SURFACE_TABLE, centroid / 1.5)
+    return _interpolate(SURFACE_TABLE, centroid / 1.5)
 
 
-def _look_up(table: Tensor, at: Tensor) -> Tensor:
+def _interpolate(table: Tensor, at: Tensor) -> Tensor:
     """Linear interpolation in a table over [0, 1]."""
     last = len(table) - 1
     scaled = at.clamp(0, 1) * last
@@ -246,7 +246,7 @@ def _resolve_body_contact(
 
 
 def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Contact normals [U, 3] from a to b, and where [U] the surfaces look at each other."""
+    """Contact normals [U, 3] from a to b, and where [U] the surfaces face each other."""
     size_a, size_b = moment_a[:, :3].norm(dim=-1), moment_b[:, :3].norm(dim=-1)
     out_of_a = -moment_a[:, :3] / size_a.clamp(min=1e-30)[:, None]
     into_b = moment_b[:, :3] / size_b.clamp(min=1e-30)[:, None]
@@ -255,9 +255,9 @@ def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
     return n, (out_of_a * into_b).sum(-1) >= float(OPPOSED)
 
 
-def _face_score(size: Tensor, share: Tensor) -> Tensor:
+def _face_score(size: Tensor, fraction: Tensor) -> Tensor:
     """How well first moments tell normals; see ``contact.surface``."""
-    flat = _look_up(FLAT_TABLE, share).clamp(min=1e-3)
+    flat = _interpolate(FLAT_TABLE, fraction).clamp(min=1e-3)
     return (size / flat) ** 2 * size
 
 
