@@ -157,27 +157,19 @@ def _spawn_body(
     colliders: Sequence[Collider],
     gravity: Float,
 ) -> DeformableBody:
-    size = subject.scaled_size
-    wheels = preset.wheels and subject.category in VEHICLES
     particles = object_particles(scene, subject, preset, start_us, mass=physics.mass)
-    materials, regions_of = preset.build(subject.category, size[0])
+    materials, regions_of = preset.build(subject.category, subject.scaled_size[0])
     regions = regions_of(particles.positions[:, 0])
     if physics.material is not None:
         materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
     if preset.by_density and physics.mass is None:
         particles = particles.with_mass(materials[0].density * float(particles.volumes.sum()))
     pose = _pose(subject, physics, start_us)
-    recorded = subject.trajectory.velocity(start_us) if physics.velocity is None else None
-    velocity = _vector(physics.velocity, recorded, f"velocity of {subject.object_id!r}", SPEED_MAX)
-    name = f"angular_velocity of {subject.object_id!r}"
-    spin = _vector(physics.angular_velocity, np.zeros(3), name, SPIN_MAX)
+    velocity, spin = _velocities(subject, physics, start_us)
     tyres = None
-    if wheels:
-        weight = particles.mass * float(np.linalg.norm(gravity))
-        standing = float(np.linalg.norm(velocity)) < 0.1
-        brake = physics.brake if physics.brake is not None else float(standing)
-        centre = particles.centre_of_mass
-        tyres = Tyres.of(size, centre, max(weight, 1e-6), brake=brake)
+    if preset.wheels and subject.category in VEHICLES:
+        moving = float(np.linalg.norm(velocity)) >= 0.1
+        tyres = _tyres(subject, particles, gravity, brake=_brake(physics, moving))
         tyres = tyres.standing(pose, colliders, STANDS_WITHIN)
     body = DeformableBody(
         subject.object_id,
@@ -218,6 +210,26 @@ def _pose(subject: PlacedObject, physics: ObjectPhysics, start_us: int) -> Float
     if not is_rigid(pose):
         raise PhysicsError(f"T_world_object of {subject.object_id!r} must be rigid: {pose!r}")
     return pose
+
+
+def _velocities(
+    subject: PlacedObject, physics: ObjectPhysics, start_us: int
+) -> tuple[Float, Float]:
+    """Velocity [m/s] and angular velocity [rad/s] at the start, as given or as recorded."""
+    recorded = subject.trajectory.velocity(start_us) if physics.velocity is None else None
+    velocity = _vector(physics.velocity, recorded, f"velocity of {subject.object_id!r}", SPEED_MAX)
+    name = f"angular_velocity of {subject.object_id!r}"
+    return velocity, _vector(physics.angular_velocity, np.zeros(3), name, SPIN_MAX)
+
+
+def _brake(physics: ObjectPhysics, moving: bool) -> float:
+    return physics.brake if physics.brake is not None else float(not moving)
+
+
+def _tyres(subject: PlacedObject, particles: Particles, gravity: Float, *, brake: float) -> Tyres:
+    weight = particles.mass * float(np.linalg.norm(gravity))
+    centre = particles.centre_of_mass
+    return Tyres.of(subject.scaled_size, centre, max(weight, 1e-6), brake=brake)
 
 
 def _vector(given: object, otherwise: Float | None, name: str, most: float) -> Float:

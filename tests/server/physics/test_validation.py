@@ -16,6 +16,7 @@ from real2sim_server.physics.validation import CASES, Check, ReferenceCurve
 from real2sim_server.physics.validation import table as table_module
 from real2sim_server.physics.validation.page import render_page
 from real2sim_server.physics.validation.table import run_table
+from real2sim_server.simulation.experiments import published
 
 SLOW_ON_CPU = {
     "two_discs",
@@ -126,3 +127,10 @@ def test_the_page_shows_every_line_with_plots_that_are_whole():
     assert len(pictures) == 4
     for picture in pictures:
         ElementTree.fromstring("<svg" + picture)
+
+
+def test_published_crash_figures_run_where_they_are_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(published, "PUBLISHED", {"malibu": fine, "pair": fine})
+    validate(cases="published", json=tmp_path / "table.json")
+    figures = json.loads((tmp_path / "table.json").read_text())
+    assert [case["name"] for case in figures["cases"]] == ["malibu", "pair"]
