@@ -160,7 +160,8 @@ def _near_colliders(blocks: Int, dx: float, colliders: Sequence[Collider]) -> tu
         reach = (BLOCK_REACH + COLLIDER_MARGIN + slack) * dx
         near[:, k] = _distances(row, heights, centres) < reach
     start = np.append(0, np.cumsum(near.sum(axis=1)))
-    return start, np.nonzero(near)[1]
+    # Strided, as nonzero leaves it, it would have kernels compiled once more.
+    return start, np.ascontiguousarray(np.nonzero(near)[1])
 
 
 def _distances(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:
