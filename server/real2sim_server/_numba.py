@@ -45,7 +45,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit, types
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.cpu_options import ParallelOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
@@ -114,6 +114,11 @@ class _KernelCache(FunctionCache):
     def __init__(self, compiled: Dispatcher) -> None:
         super().__init__(compiled.py_func)  # type: ignore[no-untyped-call]
         self._compiled = compiled
+        self._cache_file = _Index(
+            cache_path=self._cache_path,
+            filename_base=self._impl.filename_base,
+            source_stamp=self._impl.locator.get_source_stamp(),
+        )
 
     def _index_key(self, sig: tuple[Any, ...], codegen: Any) -> tuple[Any, ...]:
         return sig, codegen.magic_tuple(), self._fingerprint, tuple(_tuple_fields(sig))
@@ -126,6 +131,19 @@ class _KernelCache(FunctionCache):
     @functools.cached_property
     def _fingerprint(self) -> str:
         return fingerprint(self._compiled)
+
+
+class _Index(IndexDataCacheFile):
+    """What is kept of one function, by key."""
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            kept: dict[Any, str] = super()._load_index()  # type: ignore[no-untyped-call]
+        except (AttributeError, ImportError):
+            # Keys are pickled with the classes of their named tuples, which may have other names
+            # since: then nothing that is kept can be used.
+            return {}
+        return kept
 
 
 def _tuple_fields(signature: Any) -> Iterator[tuple[str, ...]]:

@@ -66,8 +66,7 @@ def generated(typingctx, x):
 RUN = """
 import json
 from real2sim_server._numba import is_on_disk
-from small.kernels import computed
-from small.parts import Pair
+from small.kernels import Pair, computed
 there = is_on_disk(computed)
 result = computed(Pair(1.0, 3.0))
 print(json.dumps([result, sum(computed.stats.cache_misses.values()), there]))
@@ -118,8 +117,8 @@ def run(folder: Path, seed: int = 0) -> tuple[float, str]:
     return result, "compiled" if misses else "kept"
 
 
-def change(package: Path, old: str, new: str) -> None:
-    path = package / "small" / "parts.py"
+def change(package: Path, old: str, new: str, *, file: str = "parts.py") -> None:
+    path = package / "small" / file
     source = path.read_text()
     assert source.count(old) == 1
     path.write_text(source.replace(old, new))
@@ -151,6 +150,12 @@ def test_a_changed_order_of_a_tuples_fields_compiles_anew(package):
     change(package, fields, "    second: float\n    first: float")
     three = 4.0 * 2.0 + 3000.0 + 100.0 + 30_000.0
     assert run(package) == (three, "compiled")
+
+
+def test_a_renamed_tuple_compiles_anew(package):
+    change(package, "class Pair", "class Couple")
+    change(package, "FACTOR, Pair,", "FACTOR, Couple as Pair,", file="kernels.py")
+    assert run(package) == (BEFORE, "compiled")
 
 
 def test_changed_options_of_a_func_compile_anew(package):
