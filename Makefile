@@ -3,15 +3,15 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-SOURCES := proto client server tests scripts docs/conf.py
+SOURCES := proto client server tests scripts docs/conf.py docs/images/make.py
 PYTEST := $(BIN)/python -m pytest -q
 
 # What a change breaks first: the contract, the SDK, the layers, and the packages whose tests
 # compile little. The others belong to `make test`.
-FAST := tests/test_architecture.py tests/proto tests/client \
-	tests/server/geometry tests/server/scene tests/server/edit tests/server/cli
+FAST := tests/test_architecture.py tests/test_vocabulary.py tests/test_docs.py tests/proto \
+	tests/client tests/server/geometry tests/server/scene tests/server/edit tests/server/cli
 
-.PHONY: demo check test test-slow lint format schema coverage bench docs clean
+.PHONY: demo check test test-slow lint lint-studio format schema coverage bench docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
@@ -30,6 +30,12 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/python scripts/unasync.py --check
 	$(BIN)/mypy -p real2sim_proto -p real2sim -p real2sim_server
+
+# The studio's JavaScript; needs Node.js 20.
+lint-studio:
+	npm ci --silent
+	npm run --silent lint
+	npm run --silent format:check
 
 format: $(STAMP)
 	$(BIN)/python scripts/unasync.py
