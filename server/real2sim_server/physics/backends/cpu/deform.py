@@ -8,6 +8,8 @@ one.
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
 # ruff: noqa: PLR0917
+# Numba types intrinsics without their typing context.
+# mypy: disable-error-code="call-arg, unreachable, var-annotated"
 
 from __future__ import annotations
 

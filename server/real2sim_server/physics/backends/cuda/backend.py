@@ -7,7 +7,7 @@ numbers are made by atomics, so the last bits differ from run to run.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import cuda
@@ -54,7 +54,7 @@ class CudaSimulation(BlockSimulation):
     """A model in motion on the device."""
 
     def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
-        self._kernels = kernels_of(model.dtype)
+        self._kernels = kernels_of(cast("Any", model.dtype))
         self._progress = cuda.to_device(np.zeros(3, np.int64))
         super().__init__(model, colliders)
 
