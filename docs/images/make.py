@@ -107,9 +107,11 @@ def studio(work: Path, scenes: Path) -> None:
             args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
         )
         page = browser.new_page(viewport={"width": 1440, "height": 900})
-        link = f"scenario={edited.scenario_id}&camera=front&t={end_us - 100_000}&selected=van_0"
+        link = f"scenario={edited.scenario_id}&camera=front&t={end_us - 150_000}&selected=van_0"
         page.goto(f"{url}/ui/?{link}&run={job.info.job_id}")
+        page.wait_for_selector("body[data-ready=yes]", timeout=120_000)
         page.click("button[data-tab=physics]")
+        page.click("#next")  # the curves are drawn when the time changes on the open page
         page.wait_for_timeout(8_000)
         page.screenshot(path=work / "studio.png")
         browser.close()
@@ -117,7 +119,7 @@ def studio(work: Path, scenes: Path) -> None:
 
 
 def wall(work: Path, scenes: Path) -> None:
-    """``wall.jpg``: a car against a wall at 15.6 m/s."""
+    """``wall.jpg``: a van against a wall at 15.6 m/s."""
     experiment(work, scenes, "wall", "--preset", "vehicle", "--speed", "15.6")
 
 
