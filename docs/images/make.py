@@ -124,7 +124,7 @@ def wall(work: Path, scenes: Path) -> None:
 
 
 def pair(work: Path, scenes: Path) -> None:
-    """``pair.jpg``: a car into a standing van at 3.5 m/s."""
+    """``pair.jpg``: a van into a standing van at 3.5 m/s."""
     experiment(work, scenes, "pair", "--preset", "vehicle")
 
 
