@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,22 @@ def scenes_dir(tmp_path: Path, tiny_scene: Scene) -> Path:
     folder = tmp_path / "scenes"
     save_scene(tiny_scene, folder / "tiny.r2s")
     return folder
+
+
+@pytest.fixture(scope="session")
+def worker_kernels() -> None:
+    """Kernels that a worker needs before it is ready, on disk.
+
+    Where none are there yet one of the processes that run tests compiles them and the others wait;
+    compiling the same in each would take longer than workers are waited for.
+    """
+    from real2sim_server.render.backends import select_backend
+    from real2sim_server.world import warm_up
+
+    with (Path(__file__).parent / ".compiling").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        select_backend("cpu").warm_up()
+        warm_up()
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,9 @@ pytestmark = pytest.mark.network
 
 
 @pytest.fixture(scope="module")
-def worker(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Scene) -> Iterator[RunningWorker]:
+def worker(
+    tmp_path_factory: pytest.TempPathFactory, tiny_scene: Scene, worker_kernels: None
+) -> Iterator[RunningWorker]:
     folder = tmp_path_factory.mktemp("worker")
     save_scene(tiny_scene, folder / "scenes" / "tiny.r2s")
     settings = Settings(

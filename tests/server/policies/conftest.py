@@ -30,7 +30,9 @@ BROKEN = (
 
 
 @pytest.fixture(scope="session")
-def site(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Scene) -> Iterator[RunningWorker]:
+def site(
+    tmp_path_factory: pytest.TempPathFactory, tiny_scene: Scene, worker_kernels: None
+) -> Iterator[RunningWorker]:
     folder = tmp_path_factory.mktemp("policies")
     save_scene(tiny_scene, folder / "scenes" / "tiny.r2s")
     settings = Settings(

@@ -73,6 +73,11 @@ def postgres() -> Iterator[Postgres]:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def kernels(worker_kernels) -> None:
+    """Workers under test are ready at once."""
+
+
+@pytest.fixture(autouse=True, scope="session")
 def quiet_log() -> None:
     _log_from(logging.ERROR)
 
