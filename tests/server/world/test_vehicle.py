@@ -173,7 +173,7 @@ def worst_offset(spec: EgoSpec, speed: float) -> float:
         reference = ReferenceTrajectory(
             motion,
             start_us=k * 100_000,
-            course=PlannedTrajectory.of(times[k:], poses[k:]),
+            trajectory=PlannedTrajectory.of(times[k:], poses[k:]),
             spec=spec,
         )
         motion = make_tracker(reference, spec).advance(motion, 0.0, 100_000)
@@ -212,7 +212,7 @@ def test_trackers_obey_the_limits_of_the_vehicle(tracker):
     reference = ReferenceTrajectory(
         motion,
         start_us=0,
-        course=PlannedTrajectory.of(
+        trajectory=PlannedTrajectory.of(
             [500_000, 1_000_000], [(-20.0, 30.0, 2.0), (60.0, -50.0, -2.0)]
         ),
         spec=spec,
