@@ -50,7 +50,7 @@ from numba.core.cpu_options import ParallelOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
 
-PARALLEL_LOOPS = ParallelOptions(  # type: ignore[no-untyped-call]
+PARALLEL_LOOPS = ParallelOptions(
     {"comprehension": False, "reduction": False, "numpy": False, "setitem": False}
 )
 """For ``parallel=``: threads share the loops over ``prange`` and nothing else.
@@ -114,7 +114,7 @@ class _KernelCache(FunctionCache):
     def __init__(self, compiled: Dispatcher) -> None:
         super().__init__(compiled.py_func)  # type: ignore[no-untyped-call]
         self._compiled = compiled
-        self._cache_file = _Index(
+        self._cache_file = _Index(  # type: ignore[no-untyped-call]
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
             source_stamp=self._impl.locator.get_source_stamp(),
@@ -125,7 +125,7 @@ class _KernelCache(FunctionCache):
 
     def holds_any(self) -> bool:
         """Whether anything is kept under the present fingerprint, for whatever signature."""
-        kept = self._cache_file._load_index()  # type: ignore[no-untyped-call]
+        kept = self._cache_file._load_index()
         return any(self._fingerprint in key for key in kept)
 
     @functools.cached_property

@@ -222,4 +222,5 @@ def frames_of(normals: Float) -> Float:
 
 def unit(vectors: Float) -> Float:
     """Vectors [..., 3] scaled to length 1."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    scaled: Float = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return scaled

@@ -35,7 +35,8 @@ def bottom_centres(T_world_box: Float, size: ArrayLike) -> Float:
     corners = box_corners(T_world_box, size)
     lowest = np.argsort(corners[..., 2], axis=1, kind="stable")[:, :4]
     chosen: Float = np.take_along_axis(corners, lowest[..., None], axis=1)
-    return chosen.mean(axis=1)
+    centres: Float = chosen.mean(axis=1)
+    return centres
 
 
 def box_penetration(

@@ -53,7 +53,9 @@ def matrix_to_quaternion(matrix: ArrayLike) -> Float:
         axis=-2,
     )
     pivot = np.argmax(squares, axis=-1)[..., None, None]
-    q = np.take_along_axis(candidates, np.broadcast_to(pivot, (*pivot.shape[:-1], 4)), axis=-2)
+    q: Float = np.take_along_axis(
+        candidates, np.broadcast_to(pivot, (*pivot.shape[:-1], 4)), axis=-2
+    )
     q = q[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
@@ -88,7 +90,8 @@ def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Float:
     weight_a = np.where(nearly_equal, 1 - t, np.sin((1 - t) * angle) / safe)
     weight_b = np.where(nearly_equal, t, np.sin(t * angle) / safe)
     q = weight_a * a + weight_b * b
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    between: Float = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return between
 
 
 def yaw_quaternion(yaw: ArrayLike) -> Float:
@@ -114,7 +117,7 @@ def is_rotation(matrix: ArrayLike, *, tolerance: float = 1e-3) -> bool:
 def are_rotations(matrices: ArrayLike, *, tolerance: float = 1e-3) -> NDArray[np.bool_]:
     """Which of [..., 3, 3] matrices are rotations, [...] bool; like :func:`is_rotation`."""
     given = np.asarray(matrices, dtype=np.float64)
-    finite = np.isfinite(given).all(axis=(-1, -2))
+    finite = np.asarray(np.isfinite(given).all(axis=(-1, -2)))
     m = np.where(finite[..., None, None], given, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(m @ np.swapaxes(m, -1, -2) - np.eye(3)).max(axis=(-1, -2))

@@ -176,7 +176,7 @@ def _optimise(
                 predicted * weight, poses[rows] * weight, beta=0.05
             )
             optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             optimizer.step()
             schedule.step()
         if on_progress is not None:

@@ -19,8 +19,8 @@ def to_uint8(rgb: Tensor) -> NDArray[np.uint8]:
     Images on a GPU are rounded there and brought over as bytes.
     """
     if rgb.is_cuda:
-        levels = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
-        return levels.cpu().numpy()
+        rounded = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
+        return rounded.cpu().numpy()
     values = np.ascontiguousarray(rgb.detach().numpy())
     levels = np.empty(values.shape, np.uint8)
     _round_to_bytes(values.reshape(-1), levels.reshape(-1))
@@ -39,7 +39,7 @@ def solid_depth(depth: Tensor, alpha: Tensor) -> NDArray[np.float32]:
 
 
 @kernel(parallel=PARALLEL_LOOPS)
-def _round_to_bytes(values, levels):
+def _round_to_bytes(values: NDArray[np.float32], levels: NDArray[np.uint8]) -> None:
     for i in prange(values.shape[0]):
         value = values[i]
         clamped = value if value > np.float32(0) else np.float32(0)
@@ -48,6 +48,8 @@ def _round_to_bytes(values, levels):
 
 
 @kernel(parallel=PARALLEL_LOOPS)
-def _keep_solid(depth, alpha, kept):
+def _keep_solid(
+    depth: NDArray[np.float32], alpha: NDArray[np.float32], kept: NDArray[np.float32]
+) -> None:
     for i in prange(depth.shape[0]):
         kept[i] = depth[i] if alpha[i] >= np.float32(SOLID_ALPHA) else np.float32(0)

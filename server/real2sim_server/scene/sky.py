@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .errors import SceneError
@@ -95,7 +96,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return face, u / major, v / major
 
 
-def face_directions(resolution: int) -> np.ndarray:
+def face_directions(resolution: int) -> NDArray[np.float32]:
     """Unit world directions [6, R, R, 3] float32 of all pixel centres.
 
     Inverse of :func:`face_coordinates`.
@@ -113,4 +114,5 @@ def face_directions(resolution: int) -> np.ndarray:
             np.stack([-v, -u, -one], -1),
         ]
     )
-    return (faces / np.linalg.norm(faces, axis=-1, keepdims=True)).astype(np.float32)
+    directions = faces / np.linalg.norm(faces, axis=-1, keepdims=True)
+    return np.asarray(directions, dtype=np.float32)

@@ -145,7 +145,8 @@ class Trajectory:
         after = int(np.searchsorted(self.times_us, t_us, side="right"))
         after = min(max(after, 1), len(self.times_us) - 1)
         span = float(self.times_us[after] - self.times_us[after - 1]) * 1e-6
-        return (self.positions[after] - self.positions[after - 1]) / span
+        velocity: Float = (self.positions[after] - self.positions[after - 1]) / span
+        return velocity
 
     def moved(self, T_new_fixed: ArrayLike) -> Trajectory:
         """The same motion in another fixed frame, by ``T_new_fixed`` [4, 4]."""

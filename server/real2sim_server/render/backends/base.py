@@ -102,14 +102,18 @@ class Placement:
 
 def place_instances(instances: Sequence[Instance], viewmats: Tensor) -> Placement:
     """Compose ``viewmats`` [C, 4, 4] float64 with the pose and scale of each instance."""
-    like = {"dtype": torch.float64, "device": viewmats.device}
-    identity = torch.eye(4, **like)
+    dtype, device = torch.float64, viewmats.device
+    identity = torch.eye(4, dtype=dtype, device=device)
     poses = [
-        identity if i.T_world_object is None else torch.as_tensor(i.T_world_object, **like)
+        identity
+        if i.T_world_object is None
+        else torch.as_tensor(i.T_world_object, dtype=dtype, device=device)
         for i in instances
     ]
-    T_world_object = torch.stack(poses) if poses else torch.zeros(0, 4, 4, **like)
-    scale = torch.tensor([i.scale for i in instances], **like).reshape(-1, 3)
+    T_world_object = (
+        torch.stack(poses) if poses else torch.zeros(0, 4, 4, dtype=dtype, device=device)
+    )
+    scale = torch.tensor([i.scale for i in instances], dtype=dtype, device=device).reshape(-1, 3)
     T_camera_object = viewmats[:, None] @ T_world_object[None]
     rotation, offset = T_camera_object[..., :3, :3], T_camera_object[..., :3, 3]
     camera_position = -(rotation.mT @ offset[..., None])[..., 0]
@@ -119,7 +123,8 @@ def place_instances(instances: Sequence[Instance], viewmats: Tensor) -> Placemen
 def direction_matrix(request: RasterRequest, camera: int) -> Tensor:
     """``R_world_camera K^-1`` [3, 3] float32: maps (x, y, 1) [px] to a world direction."""
     rotation = request.viewmats[camera, :3, :3].detach()
-    return (rotation.mT @ torch.linalg.inv(request.Ks[camera])).float()
+    inverse: Tensor = torch.linalg.inv(request.Ks[camera])
+    return (rotation.mT @ inverse).float()
 
 
 def pixel_directions(request: RasterRequest, camera: int) -> Tensor:

@@ -120,8 +120,9 @@ class _Splats:
 def _concatenate(parts: list[_Splats], dtype: torch.dtype) -> _Splats:
     if not parts:
         shapes = ((0, 2), (0, 3), (0,), (0, 3), (0,), (0,), (0, 2), (0,))
-        floats = (torch.zeros(shape, dtype=dtype) for shape in shapes)
-        return _Splats(*floats, owners=torch.zeros(0, 2, dtype=torch.int64))
+        empty = [torch.zeros(shape, dtype=dtype) for shape in shapes]
+        owners = torch.zeros(0, 2, dtype=torch.int64)
+        return _Splats(*[*empty, owners])
     columns = zip(*(vars(part).values() for part in parts), strict=True)
     return _Splats(*(torch.cat(column) for column in columns))
 

@@ -38,7 +38,7 @@ def cloud_shapes(gaussians: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 def tensor_hash(tensor: Tensor) -> str:
     """SHA-256 of the bytes of a contiguous CPU tensor, little-endian, row-major."""
-    return hashlib.sha256(tensor.numpy()).hexdigest()
+    return hashlib.sha256(tensor.numpy().data).hexdigest()
 
 
 def tensor_hashes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
@@ -72,7 +72,8 @@ class TensorFile:
         _check_file(path, nbytes)
         try:
             with safe_open(path, framework="pt", device="cpu") as file:
-                self._tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                keys = file.keys()
+                self._tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in keys}
         except (SafetensorError, OSError) as error:
             raise BundleError(f"{path}: no readable safetensors file: {error}") from error
 

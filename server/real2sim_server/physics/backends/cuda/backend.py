@@ -35,7 +35,7 @@ class CudaSolverBackend:
 
     def __init__(self) -> None:
         try:
-            usable = bool(cuda.is_available())  # type: ignore[no-untyped-call]
+            usable = bool(cuda.is_available())
             reason = "no CUDA device was found"
         except Exception as problem:
             usable, reason = False, f"{type(problem).__name__}: {problem}"

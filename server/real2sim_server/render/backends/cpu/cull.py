@@ -146,7 +146,9 @@ def _planes(
 
 
 @kernel(parallel=PARALLEL_LOOPS)
-def bound_chunks(means, scales, bounds):
+def bound_chunks(
+    means: NDArray[np.float32], scales: NDArray[np.float32], bounds: NDArray[np.float64]
+) -> None:
     """Write centre and half size of each chunk's box, and its largest scale, to ``bounds``."""
     for chunk in prange(bounds.shape[0]):
         start, stop = chunk * CHUNK, min(means.shape[0], (chunk + 1) * CHUNK)

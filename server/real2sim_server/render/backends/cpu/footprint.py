@@ -125,13 +125,13 @@ def _side_reach(eight: Planes, top: Lanes, tip: Lanes, side: int) -> Lanes:
 
 
 @inlined()
-def tile_rows(footprint):
+def tile_rows(footprint: Any) -> Any:
     """Range of tile rows."""
     return (footprint >> 2 * FIELD) & FIELD_MASK, (footprint >> 3 * FIELD) & FIELD_MASK
 
 
 @inlined()
-def tile_columns(values, footprint, index, row):
+def tile_columns(values: Any, footprint: Any, index: Any, row: Any) -> Any:
     """Range of tile columns where record ``index`` may touch pixels of a row of tiles."""
     first, last = footprint & FIELD_MASK, (footprint >> FIELD) & FIELD_MASK
     top, bottom = tile_rows(footprint)
@@ -146,7 +146,7 @@ def tile_columns(values, footprint, index, row):
 
 
 @inlined()
-def ellipse_columns(record, row, first, last):
+def ellipse_columns(record: Any, row: Any, first: Any, last: Any) -> Any:
     """Part of the tile columns [first, last) where the ellipse meets pixel centres of a row."""
     y0 = F32(row * TILE) + HALF - record[MEAN_Y]
     y1 = y0 + F32(TILE - 1)
@@ -158,7 +158,7 @@ def ellipse_columns(record, row, first, last):
 
 
 @inlined()
-def side_reach(record, y0, y1, tip, side):
+def side_reach(record: Any, y0: Any, y1: Any, tip: Any, side: Any) -> Any:
     """Outermost dx of the ellipse on one side (``side`` = ±1) for dy in [y0, y1]."""
     dy = min(max(tip, y0), y1)
     dy = min(max(dy, -record[EXTENT_Y]), record[EXTENT_Y])

@@ -78,7 +78,7 @@ class TrainingPasses:
         placement = place_instances(request.instances, request.viewmats.cpu())
         fixed = Placement(*(tensor.detach() for tensor in vars(placement).values()))
         training = TrainingPass(request, fixed)
-        rgb, alpha, depth = _Rasterization.apply(
+        rgb, alpha, depth = _Rasterization.apply(  # type: ignore[no-untyped-call]
             self,
             training,
             placement.linear,

@@ -24,6 +24,7 @@ INTEGERS = ir.VectorType(I32, LANES)
 LONGS = ir.VectorType(I64, LANES)
 MANTISSA_BITS = 23
 ROOT_HALF = int(np.float32(math.sqrt(0.5)).view(np.int32))
+Real = float | np.floating[Any]
 SUFFIXES = {FLOAT: f"v{LANES}f32", DOUBLE: f"v{LANES}f64"}
 
 
@@ -34,29 +35,29 @@ class Lanes:
         self.builder = builder
         self.value = value
 
-    def _lift(self, other: Lanes | float) -> Any:
+    def _lift(self, other: Lanes | Real) -> Any:
         if isinstance(other, Lanes):
             return other.value
         kind = self.value.type
         number = float(np.float32(other)) if kind.element is FLOAT else float(other)
         return ir.Constant(kind, [number] * LANES)
 
-    def __add__(self, other: Lanes | float) -> Lanes:
+    def __add__(self, other: Lanes | Real) -> Lanes:
         return Lanes(self.builder, self.builder.fadd(self.value, self._lift(other)))
 
-    def __sub__(self, other: Lanes | float) -> Lanes:
+    def __sub__(self, other: Lanes | Real) -> Lanes:
         return Lanes(self.builder, self.builder.fsub(self.value, self._lift(other)))
 
-    def __mul__(self, other: Lanes | float) -> Lanes:
+    def __mul__(self, other: Lanes | Real) -> Lanes:
         return Lanes(self.builder, self.builder.fmul(self.value, self._lift(other)))
 
-    def __truediv__(self, other: Lanes | float) -> Lanes:
+    def __truediv__(self, other: Lanes | Real) -> Lanes:
         return Lanes(self.builder, self.builder.fdiv(self.value, self._lift(other)))
 
     def __neg__(self) -> Lanes:
         return Lanes(self.builder, self.builder.fneg(self.value))
 
-    def fused(self, factor: Lanes | float, addend: Lanes | float) -> Lanes:
+    def fused(self, factor: Lanes | Real, addend: Lanes | Real) -> Lanes:
         """self * factor + addend, rounded once where the machine can."""
         return self._call("llvm.fmuladd", self._lift(factor), self._lift(addend))
 
@@ -80,11 +81,11 @@ class Lanes:
         """Next whole number above."""
         return self._call("llvm.ceil")
 
-    def at_least(self, limit: Lanes | float) -> Lanes:
+    def at_least(self, limit: Lanes | Real) -> Lanes:
         """The larger of self and ``limit``; ``limit`` for NaN."""
         return self.where(self.compare(">", limit), limit)
 
-    def at_most(self, limit: Lanes | float) -> Lanes:
+    def at_most(self, limit: Lanes | Real) -> Lanes:
         """The smaller of self and ``limit``; ``limit`` for NaN."""
         return self.where(self.compare("<", limit), limit)
 
@@ -104,11 +105,11 @@ class Lanes:
         )
         return Lanes(self.builder, self.builder.call(function, [self.value, *others]))
 
-    def compare(self, operator: str, other: Lanes | float) -> Any:
+    def compare(self, operator: str, other: Lanes | Real) -> Any:
         """Mask of eight bits; false for NaN."""
         return self.builder.fcmp_ordered(operator, self.value, self._lift(other))
 
-    def where(self, mask: Any, other: Lanes | float) -> Lanes:
+    def where(self, mask: Any, other: Lanes | Real) -> Lanes:
         """Self where ``mask`` holds, else ``other``."""
         return Lanes(self.builder, self.builder.select(mask, self.value, self._lift(other)))
 

@@ -127,6 +127,7 @@ class CudaBackend:
     def _covariances(self, instance: Instance, cloud: GaussianCloud) -> Tensor:
         if instance.covars is not None:
             return instance.covars.to(self.device)
+        covars: Tensor
         covars, _ = gsplat.quat_scale_to_covar_preci(
             cloud.quats, cloud.scales, compute_covar=True, compute_preci=False, triu=False
         )
@@ -155,8 +156,9 @@ class _World:
     @classmethod
     def empty(cls, cameras: int, device: torch.device) -> _World:
         shapes = ((0, 3), (0, 3, 3), (0,), (cameras, 0, 3))
-        floats = (torch.zeros(shape, device=device) for shape in shapes)
-        return cls(*floats, torch.zeros(0, dtype=torch.int32, device=device))
+        floats = [torch.zeros(shape, device=device) for shape in shapes]
+        instance_ids = torch.zeros(0, dtype=torch.int32, device=device)
+        return cls(*[*floats, instance_ids])
 
 
 def _moved(request: RasterRequest, device: torch.device) -> RasterRequest:
