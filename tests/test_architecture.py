@@ -47,6 +47,9 @@ LAYERS = (
 PLAY_THEIR_OWN_USER = {"demo", "policies", "benchmarks", "cli"}
 """Only these use the client SDK, since there the program plays its own user."""
 
+APART = {"logging_setup", "write_openapi"}
+"""Modules of the service for whoever starts a program; only ``serve`` imports one, the logging."""
+
 FORBIDDEN = {
     "real2sim_proto": {"real2sim", SERVER, "torch", "fastapi", "numba", "cv2"},
     "real2sim": {SERVER, "torch", "fastapi", "numba"},
@@ -101,6 +104,13 @@ def server_modules() -> list[str]:
     return [m for m in modules() if m.startswith(f"{SERVER}.")]
 
 
+def service_order() -> list[str]:
+    """Parts of the service, lowest first, as its docstring states them."""
+    source = modules()[f"{SERVER}.service"].read_text(encoding="utf-8")
+    stated = re.findall(r"(?m)^- (``.*?):", ast.get_docstring(ast.parse(source)) or "")
+    return [name for line in stated for name in re.findall(r"``(\w+)``", line)]
+
+
 def circle(edges: dict[str, set[str]]) -> list[str]:
     """Names along one circle of the graph; empty where there is none."""
     try:
@@ -150,6 +160,26 @@ def test_folders_of_a_package_import_each_other_in_no_circle(package):
         }
         edges.setdefault(own, set()).update(others - {own})
     assert not circle(edges)
+
+
+def test_the_service_lists_every_part():
+    parts = {name.split(".")[2] for name in modules() if name.startswith(f"{SERVER}.service.")}
+    assert set(service_order()) == parts - APART
+
+
+@pytest.mark.parametrize("part", service_order())
+def test_a_part_of_the_service_imports_only_those_before_it(part):
+    order = service_order()
+    allowed = {*order[: order.index(part) + 1]} | ({"logging_setup"} if part == "serve" else set())
+    prefix = f"{SERVER}.service."
+    wrong = [
+        f"{module} imports {imported}"
+        for module in modules()
+        if module.startswith(prefix) and module.split(".")[2] == part
+        for imported in imports(module)
+        if imported.startswith(prefix) and imported.split(".")[2] not in allowed
+    ]
+    assert not wrong
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
