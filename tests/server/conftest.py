@@ -106,12 +106,13 @@ def worker_kernels() -> None:
     compiling the same in each would take longer than workers are waited for.
     """
     from real2sim_server.render.backends import select_backend
-    from real2sim_server.world import warm_up
+    from real2sim_server.world import warm_up, warm_up_planning
 
     with (Path(__file__).parent / ".compiling").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         select_backend("cpu").warm_up()
         warm_up()
+        warm_up_planning()
 
 
 @pytest.fixture(scope="session")

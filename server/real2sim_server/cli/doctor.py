@@ -32,7 +32,7 @@ DISTRIBUTIONS = (
 def doctor(
     *,
     warm: Annotated[
-        bool, typer.Option("--warm", help="Compile all kernels into the cache.")
+        bool, typer.Option("--warm", help="Compile all kernels of a worker into the cache.")
     ] = False,
     json: JsonFile = None,
 ) -> None:
@@ -71,10 +71,12 @@ def _inspect_backends() -> tuple[list[dict[str, object]], list[str]]:
 
 
 def _warm_seconds() -> float:
-    from ..render import warm_up
+    from .. import render, world
 
     start = time.perf_counter()
-    warm_up()
+    render.warm_up()
+    world.warm_up()
+    world.warm_up_planning()
     return time.perf_counter() - start
 
 

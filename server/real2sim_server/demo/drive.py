@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from real2sim import DriveSession, Observation
 
 STILLS = 3
+FILM_WIDTH = 960
+"""Of the film; encoding the stills' size would take longer than rendering it."""
 
 
 @dataclass
@@ -65,7 +68,7 @@ def drive_through(
                 f"step {obs.step}   {obs.command}"
             )
             picture = mosaic([obs.image(camera) for camera in cameras], caption)
-            film.add(picture)
+            film.add(_shrunk(picture))
             path.append(obs.ego.position[:2])
             if obs.step in wanted:
                 stills[obs.step] = picture
@@ -81,3 +84,9 @@ def drive_through(
             privileged=True,
         )
     return FilmedDrive(summary=summary, path=np.array(path), stills=stills)
+
+
+def _shrunk(picture: Image) -> Image:
+    height, width = picture.shape[:2]
+    size = FILM_WIDTH, round(height * FILM_WIDTH / width)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

@@ -7,16 +7,18 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from real2sim import Client, ReplyTimeoutError, connect
 from real2sim.planners import FollowRoute
 
 from ..console import console, print_figures, write_json
-from .drive import FilmedDrive, drive_through
 from .edits import StreetEdits, edit_street
 from .pictures import draw_map, write_png
-from .street import UNTRAINED_HZ, build_street, record_street, unpack_street
-from .worker import worker_process
+from .worker import starting_worker
+
+if TYPE_CHECKING:
+    from .drive import FilmedDrive
 
 SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
@@ -35,10 +37,15 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
         leave_serving: keep the worker up until Ctrl-C, and print what to try next.
     """
     clock = StageTimer()
-    scenes = _prepare_street(out, steps, clock, from_log=from_log)
-    with worker_process(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
+    scenes = _clear(out)
+    with starting_worker(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
+        # Loading libraries and unpacking take as long as the worker takes to start.
+        _prepare_street(out, scenes, steps, clock, from_log=from_log)
+        from .drive import drive_through
+
         with connect(worker.url) as client:
             with clock("start the worker"):
+                worker.wait_listening()
                 wait_ready(client)
                 client.scenes.load(SCENE)
             with clock("edit over REST"):
@@ -97,19 +104,29 @@ def wait_ready(client: Client) -> None:
         client.wait_ready(timeout=WARM_UP_S)
 
 
-def _prepare_street(out: Path, steps: int, clock: StageTimer, *, from_log: bool) -> Path:
-    log, scenes = out / "log", out / "scenes"
-    for stale in (log, scenes, out / "worker"):
-        shutil.rmtree(stale, ignore_errors=True)
+def _clear(out: Path) -> Path:
+    """Remove what an earlier demo left; the folder for scenes."""
+    for stale in ("log", "scenes", "worker"):
+        shutil.rmtree(out / stale, ignore_errors=True)
+    scenes = out / "scenes"
+    scenes.mkdir(parents=True)
+    return scenes
+
+
+def _prepare_street(
+    out: Path, scenes: Path, steps: int, clock: StageTimer, *, from_log: bool
+) -> None:
+    from .street import UNTRAINED_HZ, build_street, record_street, unpack_street
+
     if not from_log:
         with clock("unpack the street"):
             unpack_street(scenes, SCENE)
-        return scenes
+        return
+    log = out / "log"
     with clock("record a synthetic drive"):
         record_street(log, duration_s=(steps + 2) * STEP_US * 1e-6, hz=UNTRAINED_HZ)
     with clock("reconstruct it"):
         build_street(log, scenes, SCENE)
-    return scenes
 
 
 def _leave_pictures(out: Path, edits: StreetEdits, drive: FilmedDrive) -> None:

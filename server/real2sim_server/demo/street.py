@@ -12,16 +12,13 @@ import tempfile
 from pathlib import Path
 
 from ..console import staged_progress
-from ..reconstruct import InitialiseOptions, reconstruct
-from ..reconstruct.training.schedule import preset
 from ..scene.io import load_scene, read_packed, save_scene, write_packed
-from ..synthetic import SyntheticConfig, synthesize
 
 SHIPPED = Path(__file__).with_name("street.r2s.zip")
 DURATION_S = 10.4
 """Of the shipped drive: 100 steps of 0.1 s and a little to spare."""
 TRAINING_HZ, UNTRAINED_HZ = 5.0, 2.0
-SMALL = InitialiseOptions(max_background=250_000, max_object=12_000)
+MAX_BACKGROUND, MAX_OBJECT = 250_000, 12_000
 """A third of the usual number of Gaussians: enough for images of this size, and fast to draw."""
 
 
@@ -32,6 +29,8 @@ def unpack_street(scenes: Path, name: str) -> None:
 
 def record_street(log: Path, *, duration_s: float, hz: float) -> None:
     """Write a synthetic drive of the demo's street to the folder ``log``."""
+    from ..synthetic import SyntheticConfig, synthesize
+
     config = SyntheticConfig(frames=int(duration_s * hz) + 2, hz=hz, width=480, height=320)
     with staged_progress() as report:
         synthesize(config, log, on_progress=lambda done, total: report("record", done, total))
@@ -39,12 +38,18 @@ def record_street(log: Path, *, duration_s: float, hz: float) -> None:
 
 def build_street(log: Path, scenes: Path, name: str) -> None:
     """Make the bundle ``name`` from the log without training."""
+    from ..reconstruct import InitialiseOptions, reconstruct
+
+    small = InitialiseOptions(max_background=MAX_BACKGROUND, max_object=MAX_OBJECT)
     with staged_progress() as report:
-        reconstruct(log, scenes / name, options=SMALL, on_progress=report)
+        reconstruct(log, scenes / name, options=small, on_progress=report)
 
 
 def train_street(out: Path) -> None:
     """Record and train the street, and pack it into the file ``out``."""
+    from ..reconstruct import reconstruct
+    from ..reconstruct.training.schedule import preset
+
     folder = Path(tempfile.mkdtemp(prefix="real2sim-street-"))
     try:
         record_street(folder / "log", duration_s=DURATION_S, hz=TRAINING_HZ)

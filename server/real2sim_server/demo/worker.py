@@ -33,7 +33,7 @@ class WorkerProcess:
     process: subprocess.Popen[bytes]
     log_file: Path
 
-    def wait_listening(self, seconds: float) -> None:
+    def wait_listening(self, seconds: float = START_S) -> None:
         """Wait for the port to open; whether the worker is ready is for it to say.
 
         Raises:
@@ -57,7 +57,20 @@ class WorkerProcess:
 
 @contextlib.contextmanager
 def worker_process(*, scenes: Path, data: Path, log_file: Path) -> Iterator[WorkerProcess]:
-    """Start ``real2sim serve`` on a free loopback port; it is stopped when the block ends.
+    """Start ``real2sim serve`` on a free loopback port and wait until it listens there; it is
+    stopped when the block ends. Arguments as of :func:`starting_worker`.
+
+    Raises:
+        WorkerStartError: it ended, or did not listen in time; with the last line of its log.
+    """
+    with starting_worker(scenes=scenes, data=data, log_file=log_file) as worker:
+        worker.wait_listening()
+        yield worker
+
+
+@contextlib.contextmanager
+def starting_worker(*, scenes: Path, data: Path, log_file: Path) -> Iterator[WorkerProcess]:
+    """Like :func:`worker_process`, without waiting: something else can be done meanwhile.
 
     Args:
         scenes: folder of scene bundles.
@@ -74,9 +87,7 @@ def worker_process(*, scenes: Path, data: Path, log_file: Path) -> Iterator[Work
             command, stdout=output, stderr=subprocess.STDOUT, env=environment
         )
         try:
-            worker = WorkerProcess(f"http://127.0.0.1:{port}", process, log_file)
-            worker.wait_listening(START_S)
-            yield worker
+            yield WorkerProcess(f"http://127.0.0.1:{port}", process, log_file)
         finally:
             _stop(process)
 

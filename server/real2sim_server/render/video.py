@@ -1,12 +1,15 @@
 """Videos as files: WebM with VP8, which every browser plays, and MP4 with MPEG-4 Part 2.
 
-Both encoders come with OpenCV.
+Both encoders come with OpenCV. VP8 takes 80 ns a pixel, often longer than the picture took to
+render; so frames are encoded on a thread of their own, in the order they came.
 """
 
 from __future__ import annotations
 
 import secrets
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,10 @@ FOURCC_BY_SUFFIX = {".webm": "VP80", ".mp4": "mp4v"}
 MATROSKA_DOCTYPE = b"\x42\x82\x88matroska"
 WEBM_DOCTYPE = b"\x42\x82\x88webm\0\0\0\0"
 """An EBML string may be padded by zeros (RFC 8794, 7.4)."""
+
+
+WAITING_FRAMES = 16
+"""Frames that may wait for the encoder; whoever adds another waits for the first of them."""
 
 
 class VideoError(OSError):
@@ -45,42 +52,58 @@ class VideoFile:
         container = ".mkv" if path.suffix == ".webm" else path.suffix
         self._temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{container}")
         self._writer: Any = None
+        self._encoder = ThreadPoolExecutor(1, thread_name_prefix="video")
+        self._waiting: deque[Future[None]] = deque()
 
     def add(self, frame: NDArray[np.uint8]) -> None:
         """Append an RGB frame uint8 [H, W, 3]; odd sizes lose their last row or column.
 
+        The frame may be changed afterwards; it is encoded later.
+
         Raises:
             VideoError: the file cannot be written, or OpenCV lacks the encoder.
         """
-        import cv2
-
         height, width = (side // 2 * 2 for side in frame.shape[:2])
         if self._writer is None:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            fourcc = cv2.VideoWriter.fourcc(*FOURCC_BY_SUFFIX[self._path.suffix])
-            name = str(self._temporary)
-            self._writer = cv2.VideoWriter(name, fourcc, self._rate, (width, height))
-            if not self._writer.isOpened():
-                self._writer = None
-                raise VideoError(f"{self._path}: cannot be written, or OpenCV lacks its encoder")
-        self._writer.write(np.ascontiguousarray(frame[:height, :width, ::-1]))
+            self._writer = self._open(width, height)
+        image = frame[:height, :width, ::-1].copy()
+        self._waiting.append(self._encoder.submit(self._writer.write, image))
+        while len(self._waiting) > WAITING_FRAMES:
+            self._waiting.popleft().result()
 
     def close(self) -> None:
         """Finish the file; without a frame there is none."""
-        if self._writer is None:
+        if not self._finish():
             return
-        self._writer.release()
-        self._writer = None
         if self._path.suffix == ".webm":
             _name_webm(self._temporary)
         self._temporary.replace(self._path)
 
     def discard(self) -> None:
         """Leave no file."""
-        if self._writer is not None:
-            self._writer.release()
-            self._writer = None
+        for frame in self._waiting:
+            frame.cancel()
+        self._finish()
         self._temporary.unlink(missing_ok=True)
+
+    def _open(self, width: int, height: int) -> Any:
+        import cv2
+
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        fourcc = cv2.VideoWriter.fourcc(*FOURCC_BY_SUFFIX[self._path.suffix])
+        writer = cv2.VideoWriter(str(self._temporary), fourcc, self._rate, (width, height))
+        if not writer.isOpened():
+            raise VideoError(f"{self._path}: cannot be written, or OpenCV lacks its encoder")
+        return writer
+
+    def _finish(self) -> bool:
+        """Encode what waits and end the thread; whether there is a file."""
+        self._encoder.shutdown(wait=True)
+        self._waiting.clear()
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.release()
+        return writer is not None
 
 
 @contextmanager

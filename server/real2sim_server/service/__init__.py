@@ -4,6 +4,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 
 - ``preflight``: what is refused before anything heavy is loaded.
 - ``storage``: tables and rows of scenarios, sessions, jobs and stored answers.
+- ``warm_up``: kernels compiled or loaded before they are needed.
 - ``engine``: the thread that owns the device, and its queue.
 - ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics, sockets.
 - ``library``: scenes and assets, on disk and in memory.
@@ -11,7 +12,6 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``scenarios``: edited under a lock each, cached, on record before they take effect.
 - ``jobs``: long work: rollouts and videos.
 - ``sessions``: closed loops; ``pipeline`` takes a step from the socket to the bytes of its answer.
-- ``warm_up``: kernels compiled or loaded before the first request.
 - ``worker``: all of it put together once.
 - ``routes``: calls and sockets; ``ui`` is the studio that they serve as files.
 - ``app``, ``serve``: the ASGI application, and the server that runs it.

@@ -33,7 +33,7 @@ from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .storage.job_log import JobLog
 from .storage.store import Store
-from .warm_up import warm_up
+from .warm_up import KernelWarmUp
 
 LAG_PERIOD_S = 0.1
 
@@ -60,6 +60,7 @@ class Worker:
     jobs: Jobs
     simulations: Simulations
     idempotency: Idempotency
+    kernels: KernelWarmUp
     renderer: Renderer
     sessions: Sessions
     backend: Backend
@@ -92,6 +93,7 @@ class Worker:
         assets = AssetLibrary(settings.assets_path)
         scenarios = Scenarios(store, scene_cache, metrics, assets=assets.find)
         jobs = Jobs(JobLog(store, settings.worker_id), settings.jobs_path)
+        kernels = KernelWarmUp()
         renderer = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(
             settings=settings,
@@ -104,6 +106,7 @@ class Worker:
             jobs=jobs,
             simulations=Simulations(jobs, scenarios, scene_cache),
             idempotency=Idempotency(store),
+            kernels=kernels,
             renderer=renderer,
             sessions=Sessions(
                 SessionLimits(
@@ -112,6 +115,7 @@ class Worker:
                 pipeline=StepPipeline(
                     engine, renderer, metrics, max_pixels=settings.max_pixels_per_step
                 ),
+                kernels=kernels,
                 store=store,
                 scene_cache=scene_cache,
                 scenarios=scenarios,
@@ -171,7 +175,7 @@ class Worker:
     async def _warm_up(self) -> None:
         started = time.perf_counter()
         try:
-            await warm_up(self.renderer.warm_up)
+            await self.kernels.run(self.renderer.warm_up)
         except Exception as error:
             log.exception("warm-up failed")
             self.waiting_for = {f"warm-up failed: {error}"}
@@ -179,6 +183,10 @@ class Worker:
         self.waiting_for = set()
         seconds = round(time.perf_counter() - started, 2)
         log.info("ready", backend=self.backend.name, warm_up_s=seconds)
+        try:
+            await self.kernels.run_planning()
+        except Exception:
+            log.exception("warm-up of trackers that plan ahead failed")
 
     async def _watch_loop(self) -> None:
         while True:

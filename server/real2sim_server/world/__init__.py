@@ -8,7 +8,13 @@ from .events import Event
 from .observation import Observation
 from .path import LoggedPath
 from .scoring import Score, metrics_version
-from .warm_up import kernels_on_disk, warm_up
+from .warm_up import (
+    kernels_on_disk,
+    planning_on_disk,
+    plans_ahead,
+    warm_up,
+    warm_up_planning,
+)
 from .world import World
 
 __all__ = [
@@ -24,5 +30,8 @@ __all__ = [
     "agent_fields",
     "kernels_on_disk",
     "metrics_version",
+    "planning_on_disk",
+    "plans_ahead",
     "warm_up",
+    "warm_up_planning",
 ]

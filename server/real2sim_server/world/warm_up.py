@@ -1,4 +1,4 @@
-"""Compiles the kernels of a step and of an edit before the first request."""
+"""Compiles the kernels of a step and of an edit before the first request needs them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from real2sim_proto.plans import TrajectoryPlan
 from .._numba import is_on_disk
 from ..edit import ScenarioState
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
-from .driving import advance_vehicle
+from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
+from .ego.motion import Motion
 from .ego.reference import PlannedTrajectory, ReferenceTrajectory
 from .ego.trackers import make_tracker
 from .world import World
@@ -42,18 +43,39 @@ def warm_up() -> None:
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
     # What only perfect tracking and sliding vehicles call.
-    ego = EgoSpec(tracker="perfect")
-    trajectory = PlannedTrajectory.of([PERIOD_US], [(1.0, 0.0, 0.0)], (0.0, 0.0, 0.0))
-    ahead = ReferenceTrajectory(world.motion, start_us=0, trajectory=trajectory, spec=ego)
-    tracker = make_tracker(ahead, ego)
-    tracker.command(tracker.advance(world.motion, 0.0, PERIOD_US // 2), 0.0)
+    _track(EgoSpec(tracker="perfect"))
     # An edit that brings the cars near each other, for only then their boxes are compared.
     world.apply([Translate(object_id="ahead", x=-9.0)])
 
 
+def warm_up_planning() -> None:
+    """Like :func:`warm_up`, for trackers that plan ahead: they take as long as all the rest, and
+    few sessions have one, see :func:`plans_ahead`."""
+    _track(EgoSpec(tracker="ilqr"))
+
+
 def kernels_on_disk() -> bool:
-    """Whether an earlier run left the kernels that take longest, so that this one need not wait."""
+    """Whether an earlier run left what :func:`warm_up` compiles longest."""
     return is_on_disk(advance_vehicle)
+
+
+def planning_on_disk() -> bool:
+    """Whether an earlier run left what :func:`warm_up_planning` compiles."""
+    return is_on_disk(prepare_schedule)
+
+
+def plans_ahead(ego: EgoSpec) -> bool:
+    """Whether a vehicle needs what :func:`warm_up_planning` compiles."""
+    return KINDS.get(ego.tracker) in PLANNING_AHEAD
+
+
+def _track(ego: EgoSpec) -> None:
+    """Half a step and a command of a tracker."""
+    motion = Motion(0.0, 0.0, 0.0, speed=1.0)
+    trajectory = PlannedTrajectory.of([PERIOD_US], [(1.0, 0.0, 0.0)], (0.0, 0.0, 0.0))
+    ahead = ReferenceTrajectory(motion, start_us=0, trajectory=trajectory, spec=ego)
+    tracker = make_tracker(ahead, ego)
+    tracker.command(tracker.advance(motion, 0.0, PERIOD_US // 2), 0.0)
 
 
 def _street() -> Scene:

@@ -59,3 +59,16 @@ def test_a_film_that_breaks_off_leaves_the_one_before(tmp_path):
 def test_other_containers_are_refused(tmp_path):
     with pytest.raises(VideoError, match=r"\.webm or \.mp4"):
         write(tmp_path / "film.avi")
+
+
+def test_a_frame_may_be_changed_once_it_is_added(tmp_path):
+    frame = np.full((48, 64, 3), 200, np.uint8)
+    with video_file(tmp_path / "film.webm", frames_per_second=10.0) as video:
+        for _ in range(40):
+            frame[:] = 200
+            video.add(frame)
+            frame[:] = 0
+    film = cv2.VideoCapture(str(tmp_path / "film.webm"))
+    read = [film.read() for _ in range(41)]
+    assert [more for more, _ in read] == [True] * 40 + [False]
+    assert min(image.mean() for more, image in read if more) > 180

@@ -22,6 +22,7 @@ from real2sim_server.world.driving import (
     GRAVITY,
     ILQR,
     LQR,
+    NO_SCHEDULE,
     PURSUIT,
     Command,
     PlanarState,
@@ -29,6 +30,7 @@ from real2sim_server.world.driving import (
     curve_at,
     driver_command,
     plan_curve,
+    prepare_schedule,
     vehicle_parameters,
 )
 from real2sim_server.world.driving.curve import PlanCurve
@@ -169,7 +171,7 @@ def straight_plan(speed: float):
 def test_the_regulator_has_the_gains_of_the_riccati_equation():
     speed, off = 12.0, 1e-4
     knots, turn_rate = straight_plan(speed)
-    driver = (LQR, knots, turn_rate, 1.0, (0.0, 0.0))
+    driver = (LQR, knots, turn_rate, 1.0, (0.0, 0.0), NO_SCHEDULE)
     chain, push = np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]])
 
     def gains(scale: float) -> np.ndarray:
@@ -197,7 +199,7 @@ def test_pursuit_steers_the_arc_through_a_place_of_the_plan(offset, ahead):
     speed = 12.0
     knots, turn_rate = straight_plan(speed)
     state = state_of(x=speed * ahead, y=offset, speed=speed)
-    driver = (PURSUIT, knots, turn_rate, ahead, (0.0, 0.0))
+    driver = (PURSUIT, knots, turn_rate, ahead, (0.0, 0.0), NO_SCHEDULE)
     _, steering = driver_command(tuple(state), driver, tuple(VEHICLE))
 
     curvature = math.tan(steering) / VEHICLE.wheelbase
@@ -257,7 +259,8 @@ def some_drives() -> list[list[float]]:
                 state, pending = tuple(state_of(speed=8.0, y=0.5)), NOTHING
                 curve = plan_curve(state, *_at_zero(some_plan(rng, 10)), vehicle)
                 for k in range(5):
-                    driver = (kind, *curve, 0.1 * k, (0.0, 0.0))
+                    driver = (kind, *curve, 0.1 * k, (0.0, 0.0), NO_SCHEDULE)
+                    driver = (*driver[:-1], prepare_schedule(state, driver, vehicle))
                     state, pending = advance_vehicle(state, pending, driver, vehicle, 100_000)
                 found.append([*state, *pending.ravel().tolist()])
     return found

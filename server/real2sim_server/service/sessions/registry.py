@@ -28,6 +28,7 @@ from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store, now_us
+from ..warm_up import KernelWarmUp
 from .describe import session_info
 from .log import entries_of
 from .pipeline import StepPipeline
@@ -63,6 +64,7 @@ class Sessions:
     Args:
         limits: how many, and for how long.
         pipeline: draws what sessions look like.
+        kernels: what episodes wait for before they begin.
         store: where they and their logs are written before they take effect.
         scene_cache: keeps their scenes in memory.
         scenarios: what they may begin from.
@@ -74,13 +76,14 @@ class Sessions:
         limits: SessionLimits,
         *,
         pipeline: StepPipeline,
+        kernels: KernelWarmUp,
         store: Store,
         scene_cache: SceneCache,
         scenarios: Scenarios,
         metrics: Metrics,
     ) -> None:
         self.pipeline = pipeline
-        self.stepper = Stepper(pipeline, store)
+        self.stepper = Stepper(pipeline, kernels, store)
         self.draining = False
         self._limits = limits
         self._store = store

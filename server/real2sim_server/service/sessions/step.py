@@ -29,6 +29,7 @@ from ...world.recording.replay import (
 )
 from ..http.problems import ServiceError
 from ..storage.store import SessionEntry, Store, now_us
+from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
 from .wire import EncodedMessage
@@ -47,11 +48,13 @@ class Stepper:
 
     Args:
         pipeline: makes observations of changed worlds.
+        kernels: what episodes wait for before they begin.
         store: takes the logs of the sessions.
     """
 
-    def __init__(self, pipeline: StepPipeline, store: Store) -> None:
+    def __init__(self, pipeline: StepPipeline, kernels: KernelWarmUp, store: Store) -> None:
         self._pipeline = pipeline
+        self._kernels = kernels
         self._store = store
 
     async def reset(self, session: Session, spec: ResetSpec) -> EncodedMessage:
@@ -61,6 +64,7 @@ class Stepper:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
+        await self._kernels.ready(spec.ego)
         record = ("reset", 0, reset_payload(spec))
         observation, _ = await self._observe(session, _beginning(session, spec), cameras, record)
         session.begin(observation.world, cameras)
@@ -70,6 +74,7 @@ class Stepper:
     async def restart(self, session: Session, spec: ResetSpec) -> None:
         """Begin an episode without rendering its first observation. Raises like reset()."""
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
+        await self._kernels.ready(spec.ego)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         await self._record(session, [("reset", 0, reset_payload(spec))])
         session.begin(world, cameras)
@@ -77,6 +82,7 @@ class Stepper:
     async def begin(self, session: Session, spec: ResetSpec) -> None:
         """Like restart(), for a session that is not in the store yet: record it once it is."""
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
+        await self._kernels.ready(spec.ego)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
 

@@ -5,9 +5,17 @@ Everything here takes and gives floats, tuples and arrays. :mod:`.entries` is wh
 """
 
 from .curve import MOVING
-from .entries import advance_vehicle, curve_at, driver_command, plan_curve, world_poses
+from .entries import (
+    NO_SCHEDULE,
+    advance_vehicle,
+    curve_at,
+    driver_command,
+    plan_curve,
+    prepare_schedule,
+    world_poses,
+)
 from .state import Command, PlanarState
-from .trackers import HOLD, ILQR, KINDS, LQR, PURSUIT
+from .trackers import HOLD, ILQR, KINDS, LQR, PLANNING_AHEAD, PURSUIT
 from .vehicle import GRAVITY, VehicleParameters
 from .vehicle_models import VEHICLE_MODELS, VehicleModel, vehicle_parameters
 
@@ -18,6 +26,8 @@ __all__ = [
     "KINDS",
     "LQR",
     "MOVING",
+    "NO_SCHEDULE",
+    "PLANNING_AHEAD",
     "PURSUIT",
     "VEHICLE_MODELS",
     "Command",
@@ -28,6 +38,7 @@ __all__ = [
     "curve_at",
     "driver_command",
     "plan_curve",
+    "prepare_schedule",
     "vehicle_parameters",
     "world_poses",
 ]

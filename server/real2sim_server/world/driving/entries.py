@@ -10,11 +10,14 @@ from ..._numba import func, kernel
 from .actuators import actuator_outputs, delay_line, delayed_commands, push_command
 from .curve import PlanCurve, at, curve_through, heading
 from .state import Command, PlanarState
-from .trackers import HOLD, prepare_tracker, tracker_command
+from .trackers import HOLD, tracker_command, tracker_schedule
 from .vehicle import VehicleParameters
 from .vehicle_models import step_vehicle
 
 SUBSTEP_US = 10_000
+
+NO_SCHEDULE = np.empty((0, 0)), np.empty((0, 0))
+"""Of trackers that do not plan ahead."""
 
 
 @kernel
@@ -66,6 +69,24 @@ def curve_at(curve, t):
 
 
 @kernel
+def prepare_schedule(state, law, vehicle):
+    """The schedule of a tracker that plans ahead, from a state on; arguments as in
+    :func:`advance_vehicle`.
+
+    Apart from it, since planning ahead takes most of the time that all of this takes to compile,
+    and few drives plan ahead.
+
+    Returns:
+        Two float64 arrays of two dimensions, see :class:`.trackers.Tracker`.
+    """
+    kind, knots, turn_rate, since, _, _ = law
+    curve = PlanCurve(knots, turn_rate)
+    return tracker_schedule(
+        kind - 1, PlanarState(*state), curve, since, VehicleParameters(*vehicle)
+    )
+
+
+@kernel
 def advance_vehicle(state, pending, law, vehicle, dt_us):
     """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
 
@@ -77,22 +98,19 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
     Args:
         state: nine floats of a :class:`.state.PlanarState`.
         pending: [W, 2] float64, commands on their way to the wheels, newest first.
-        law: kind, knots and turn rate of its plan, seconds since that began, and the command to
-            hold, which trackers ignore.
+        law: kind, knots and turn rate of its plan, seconds since that began, the command to hold,
+            which trackers ignore, and the schedule: of :func:`prepare_schedule` for trackers that
+            plan ahead, else :data:`NO_SCHEDULE`.
         vehicle: the members of a :class:`.vehicle.Vehicle`.
 
     Returns:
         State and commands on their way, in the form in which they came.
     """
-    kind, knots, turn_rate, since, _ = law
+    since, schedule = law[3], law[5]
     substeps = -(-dt_us // SUBSTEP_US)
     h = dt_us * 1e-6 / substeps
     start, parameters = PlanarState(*state), VehicleParameters(*vehicle)
     line, waiting = delay_line(pending, parameters, h)
-    if kind == HOLD:
-        schedule = np.empty((0, 0)), np.empty((0, 0))
-    else:
-        schedule = prepare_tracker(kind - 1, start, PlanCurve(knots, turn_rate), since, parameters)
     now = start
     for k in range(substeps):
         command = _command(law, now, since + k * h, parameters, (*schedule, k * h))
@@ -113,7 +131,7 @@ def driver_command(state, law, vehicle):
 
 @func
 def _command(law, state, t, vehicle, schedule):
-    kind, knots, turn_rate, _, (acceleration, steering) = law
+    kind, knots, turn_rate, _, (acceleration, steering), _ = law
     if kind == HOLD:
         return Command(acceleration, steering)
     curve = PlanCurve(knots, turn_rate)

@@ -22,27 +22,27 @@ class Tracker(NamedTuple):
     """Makes the vehicle follow a plan; both are made by :func:`real2sim_server._numba.func`.
 
     Attributes:
-        prepare: ``prepare(state, curve, since, vehicle)``, once a call for a clock step, ``since``
-            seconds after the plan began: a schedule, two float64 arrays of two dimensions.
         command: ``command(state, curve, t, vehicle, schedule)``, the :class:`.state.Command` of a
             substep, ``t`` seconds after the plan began; ``schedule`` is what was prepared (it may
             be empty) and the seconds since then.
+        prepare: ``prepare(state, curve, since, vehicle)``, once a clock step, ``since`` seconds
+            after the plan began: a schedule, two float64 arrays of two dimensions. None for
+            trackers that do not plan ahead.
     """
 
-    prepare: Any
     command: Any
+    prepare: Any = None
 
 
 @func
-def no_schedule(_state, _curve, _since, _vehicle):  # type: ignore[no-untyped-def]
-    """Of trackers that do not plan ahead."""
+def _no_schedule(_state, _curve, _since, _vehicle):  # type: ignore[no-untyped-def]
     return np.empty((0, 0)), np.empty((0, 0))
 
 
 TRACKERS: Mapping[str, Tracker] = {
-    "pursuit": Tracker(no_schedule, pursue),
-    "lqr": Tracker(no_schedule, regulate),
-    "ilqr": Tracker(ilqr.prepare, ilqr.follow_schedule),
+    "pursuit": Tracker(pursue),
+    "lqr": Tracker(regulate),
+    "ilqr": Tracker(ilqr.follow_schedule, ilqr.prepare),
 }
 """By the name of ``EgoSpec.tracker``."""
 
@@ -54,5 +54,8 @@ KINDS: Mapping[str, int] = {name: k for k, name in enumerate(TRACKERS, start=1)}
 
 PURSUIT, LQR, ILQR = KINDS["pursuit"], KINDS["lqr"], KINDS["ilqr"]
 
-prepare_tracker = choice([tracker.prepare for tracker in TRACKERS.values()])
+PLANNING_AHEAD = frozenset(KINDS[name] for name, tracker in TRACKERS.items() if tracker.prepare)
+"""Kinds of trackers with a schedule."""
+
 tracker_command = choice([tracker.command for tracker in TRACKERS.values()])
+tracker_schedule = choice([tracker.prepare or _no_schedule for tracker in TRACKERS.values()])

@@ -13,9 +13,12 @@ from ...geometry.rotation import quaternion_yaw
 from ...scene import Trajectory
 from ..driving import (
     HOLD,
+    NO_SCHEDULE,
+    PLANNING_AHEAD,
     Command,
     advance_vehicle,
     driver_command,
+    prepare_schedule,
     vehicle_parameters,
 )
 from ..path import Float
@@ -76,9 +79,11 @@ class ControlLaw(NamedTuple):
     turn_rate: float = 0.0
     hold: tuple[float, float] = (0.0, 0.0)
 
-    def arguments(self, since: float) -> tuple[int, Float, float, float, tuple[float, float]]:
+    def arguments(
+        self, since: float, schedule: tuple[Float, Float] = NO_SCHEDULE
+    ) -> tuple[int, Float, float, float, tuple[float, float], tuple[Float, Float]]:
         """The law ``since`` seconds after its plan began, as :mod:`.driving` takes it."""
-        return self.kind, self.knots, self.turn_rate, since, self.hold
+        return self.kind, self.knots, self.turn_rate, since, self.hold, schedule
 
 
 def constant_law(command: Command) -> ControlLaw:
@@ -100,7 +105,10 @@ def advance_motion(
     """
     pending = np.array(motion.pending) if motion.pending else NOTHING_PENDING
     vehicle = tuple(vehicle_parameters(spec))
-    state, waiting = advance_vehicle(motion.numbers, pending, law.arguments(since), vehicle, dt_us)
+    numbers, arguments = motion.numbers, law.arguments(since)
+    if law.kind in PLANNING_AHEAD:
+        arguments = law.arguments(since, prepare_schedule(numbers, arguments, vehicle))
+    state, waiting = advance_vehicle(numbers, pending, arguments, vehicle, dt_us)
     delayed = tuple(Command(*row) for row in waiting.tolist())
     return Motion._make((*state, delayed))
 

@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import savgol_coeffs
 
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
@@ -86,6 +85,8 @@ def comfort_window(dt: float) -> int:
 @lru_cache(maxsize=16)
 def _coefficients(window: int, dt: float) -> Float:
     """Weights [3, window] of value, first and second derivative in the middle."""
+    from scipy.signal import savgol_coeffs  # takes a second to load
+
     order = min(ORDER, window - 2)
     rows = [savgol_coeffs(window, order, deriv=k, delta=dt, use="dot") for k in range(3)]
     return np.stack(rows)
