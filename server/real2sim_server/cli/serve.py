@@ -26,6 +26,7 @@ def serve(
     """Start a worker. Settings not given here come from REAL2SIM_* variables."""
     from pydantic import ValidationError
 
+    from ..service.first_run import begin_compiling
     from ..service.preflight import check_start
     from ..settings import Settings
 
@@ -46,6 +47,7 @@ def serve(
         raise CommandError(f"setting {name}: {first['msg']} (given: {first['input']!r})") from error
     # Before the worker's libraries are loaded, which takes seconds.
     check_start(settings)
+    begin_compiling()
     from ..service import serve as worker
 
     if code := worker.run(settings):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
-import sys
+import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager
 
 import structlog
 
@@ -15,17 +15,18 @@ from real2sim_proto.episode import EgoSpec
 
 from ..world import kernels_on_disk, planning_on_disk, plans_ahead, warm_up_planning
 from ..world import warm_up as warm_up_world
+from .first_run import LOWEST_PRIORITY, compile_beside, take_begun
 
 log = structlog.get_logger(__name__)
 
-LOWEST_PRIORITY = 19
+POLL_S = 0.05
 
 
 class KernelWarmUp:
     """Gets the kernels of one worker ready, those first that every session needs.
 
-    Numba compiles one function at a time in a process. So on the first run a second process
-    compiles beside this one, which then loads what the other left on disk.
+    On the first run a second process compiles beside this one, which then loads what the other left
+    on disk, see :mod:`.first_run`.
     """
 
     def __init__(self) -> None:
@@ -46,7 +47,8 @@ class KernelWarmUp:
         """
         try:
             if not planning_on_disk():
-                async with _compiled_beside("warm_up_planning", niceness=LOWEST_PRIORITY):
+                beside = compile_beside("warm_up_planning", niceness=LOWEST_PRIORITY)
+                async with _awaited(beside):
                     pass
             await asyncio.to_thread(warm_up_planning)
         finally:
@@ -58,10 +60,11 @@ class KernelWarmUp:
             await self._planning.wait()
 
     async def _run_first(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
-        if not kernels_on_disk() and (os.cpu_count() or 1) > 1:
+        begun = take_begun()
+        if begun is not None or (not kernels_on_disk() and (os.cpu_count() or 1) > 1):
             log.info("compiling kernels, on the first run only")
             with _no_collections():
-                async with _compiled_beside("warm_up"):
+                async with _awaited(begun or compile_beside("warm_up")):
                     await warm_up_renderer()
         else:
             await warm_up_renderer()
@@ -69,22 +72,16 @@ class KernelWarmUp:
 
 
 @asynccontextmanager
-async def _compiled_beside(function: str, *, niceness: int = 0) -> AsyncIterator[None]:
-    """A process runs a function of the world's warm-up while the block runs, and is waited for.
-    Its failure is left to those who load its work."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-c", _PROGRAM, function, str(niceness)),
-        stdout=asyncio.subprocess.DEVNULL,
-        stderr=asyncio.subprocess.DEVNULL,
-    )
+async def _awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
+    """A process beside the block, which is waited for at its end and does not outlive it."""
     try:
         yield
-        await process.wait()
+        while process.poll() is None:
+            await asyncio.sleep(POLL_S)
     finally:
-        if process.returncode is None:
-            with suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
+        if process.poll() is None:
+            process.kill()
+            process.wait()
 
 
 @contextmanager
@@ -98,12 +95,3 @@ def _no_collections() -> Iterator[None]:
         if enabled:
             gc.enable()
             gc.collect()
-
-
-_PROGRAM = """
-import gc, os, sys
-gc.disable()
-os.nice(int(sys.argv[2]))
-import real2sim_server.world
-getattr(real2sim_server.world, sys.argv[1])()
-"""

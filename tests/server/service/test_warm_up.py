@@ -2,13 +2,15 @@ from __future__ import annotations
 
 import asyncio
 import time
+from fnmatch import fnmatch
 
 import pytest
 
 from real2sim_proto.episode import EgoSpec
-from real2sim_server.service import warm_up
+from real2sim_server.service import first_run, warm_up
 from real2sim_server.service.warm_up import KernelWarmUp
 from real2sim_server.world import plans_ahead
+from real2sim_server.world.driving import advance_vehicle
 
 
 async def nothing() -> None:
@@ -81,8 +83,46 @@ def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypat
     monkeypatch.setattr(warm_up, "kernels_on_disk", lambda: False)
     monkeypatch.setattr(warm_up, "warm_up_world", lambda: None)
     left = tmp_path / "left"
-    monkeypatch.setattr(warm_up, "_PROGRAM", f"open({str(left)!r}, 'w').write('done')")
+    monkeypatch.setattr(first_run, "_PROGRAM", f"open({str(left)!r}, 'w').write('done')")
 
     asyncio.run(KernelWarmUp().run(nothing))
 
     assert left.read_text() == "done"
+
+
+@pytest.mark.parametrize("kept", [[], ["world/entries.advance_vehicle-69.py311.nbi"]])
+def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
+    monkeypatch, tmp_path, kept
+):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(first_run, "_PROGRAM", "")
+    for name in kept:
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+
+    first_run.begin_compiling()
+
+    process = first_run.take_begun()
+    assert (process is None) == bool(kept)
+    assert process is None or process.wait(timeout=30) == 0
+
+
+def test_what_names_the_kernel_on_disk_names_it_as_numba_does():
+    index = advance_vehicle._cache._impl.filename_base
+    assert fnmatch(f"{index}.py311.nbi", first_run.KEPT)
+
+
+def test_a_worker_that_ends_early_takes_the_second_process_with_it(monkeypatch):
+    monkeypatch.setattr(first_run, "_PROGRAM", "import time; time.sleep(60)")
+    process = first_run.compile_beside("warm_up")
+    monkeypatch.setattr(first_run, "_begun", [process])
+
+    async def ended_early() -> None:
+        task = asyncio.ensure_future(KernelWarmUp().run(nothing))
+        await asyncio.sleep(0.1)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(ended_early())
+    assert process.returncode is not None
