@@ -19,6 +19,9 @@ from .validation import validate_edit
 OPERATION_MODULES = (lifecycle, motion, properties)
 """Importing them registers their operations, see :mod:`.operation`."""
 
+MAX_OBJECTS = 4096
+"""Objects of a scenario, without deleted ones; streets have some hundreds."""
+
 
 @dataclass(frozen=True, eq=False)
 class EditOutcome:
@@ -47,13 +50,15 @@ def apply_operations(state: ScenarioState, operations: Sequence[Operation]) -> E
 
     Raises:
         EditError: UNKNOWN_OBJECT, UNKNOWN_ASSET or INVALID_OPERATION, naming the place in the
-            batch.
+            batch; also for more than MAX_OBJECTS objects.
     """
     changes: list[AppliedOperation] = []
     after = state
     for index, operation in enumerate(operations):
         change = _apply_one(after, operation, index)
         after = change.state
+        if change.created is not None:
+            _check_number(after, operation, index)
         changes.append(change)
     touched = dict.fromkeys(c.touched for c in changes if c.touched is not None)
     return EditOutcome(
@@ -80,6 +85,19 @@ def _apply_one(state: ScenarioState, operation: Operation, index: int) -> Applie
     except SceneError as error:
         where = f"operation {index} ({_named(operation)}): {error}"
         raise EditError(ErrorCode.INVALID_OPERATION, where, index=index) from error
+
+
+def _check_number(state: ScenarioState, operation: Operation, index: int) -> None:
+    """Only of new edits: a log that went further is replayed as it is."""
+    if len(state.objects) <= MAX_OBJECTS:
+        return
+    if sum(not found.deleted for found in state.objects.values()) > MAX_OBJECTS:
+        raise EditError(
+            ErrorCode.INVALID_OPERATION,
+            f"operation {index}: a scenario has {MAX_OBJECTS} objects at most",
+            hint="delete objects that are not needed",
+            index=index,
+        )
 
 
 def _named(operation: Operation) -> str:

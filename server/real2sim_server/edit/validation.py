@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,12 @@ OUTSIDE_MAP = 100.0
 
 NAMED_OVERLAPS = 5
 
+REMEMBERED_RANGES = 4
+"""Ranges of time whose samples are kept for each trajectory, 26 kB each at most."""
 REMEMBERED = 512
-"""Objects whose sampled trajectories are kept, 26 kB each at most."""
+
+_Samples = tuple[Float, NDArray[np.bool_]]
+_samples: WeakKeyDictionary[Trajectory, dict[tuple[int, int], _Samples]] = WeakKeyDictionary()
 
 
 def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[EditWarning]:
@@ -50,10 +55,18 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
         yield from _outside_map(subject, state.extent, transforms)
 
 
-@lru_cache(maxsize=REMEMBERED)
-def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> tuple[Float, NDArray[np.bool_]]:
-    """The trajectory at the sample times of that range; remembered, for few objects move."""
-    return sample(trajectory, _sample_times(start_us, end_us))
+def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> _Samples:
+    """The trajectory at the sample times of that range; remembered as long as the trajectory is
+    there, for few objects move. (A cache of so many entries would drop each of them just before it
+    is asked for, once a scenario has one object more.)"""
+    by_range = _samples.setdefault(trajectory, {})
+    found = by_range.get((start_us, end_us))
+    if found is None:
+        while len(by_range) >= REMEMBERED_RANGES:
+            # Scenarios share trajectories, and are edited on several threads.
+            by_range.pop(next(iter(by_range), (0, 0)), None)
+        found = by_range[start_us, end_us] = sample(trajectory, _sample_times(start_us, end_us))
+    return found
 
 
 @lru_cache(maxsize=REMEMBERED)

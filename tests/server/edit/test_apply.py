@@ -17,6 +17,7 @@ from real2sim_proto.operations import (
     Translate,
 )
 from real2sim_server.edit import EditError, ObjectState, ScenarioState, apply_operations
+from real2sim_server.edit.apply import replay_operations
 from real2sim_server.geometry.box import box_corners
 
 
@@ -224,3 +225,22 @@ def test_a_scene_and_its_summary_give_the_same_state(summary, state):
 
     assert list(ScenarioState.of(as_mapping).objects) == list(state.objects)
     assert [o.instance_id for o in state.objects.values()] == [1, 2, 3, 4]
+
+
+def test_a_scenario_has_so_many_objects_at_most_and_deleted_ones_do_not_count(state, monkeypatch):
+    present = sum(not found.deleted for found in state.objects.values())
+    monkeypatch.setattr("real2sim_server.edit.apply.MAX_OBJECTS", present + 1)
+    full = apply_operations(state, [Duplicate(object_id="parked", x=9)]).state
+
+    with pytest.raises(EditError, match=f"{present + 1} objects at most") as refused:
+        apply_operations(full, [Duplicate(object_id="parked", x=18)])
+    assert (refused.value.code, refused.value.index) == ("INVALID_OPERATION", 0)
+
+    room = [Delete(object_id="turning"), Duplicate(object_id="parked", x=18)]
+    assert len(apply_operations(full, room).created) == 1
+
+
+def test_a_log_from_before_the_limit_is_replayed_whole(state, monkeypatch):
+    monkeypatch.setattr("real2sim_server.edit.apply.MAX_OBJECTS", 1)
+    after = replay_operations(state, [Duplicate(object_id="parked", x=9)])
+    assert "parked_copy1" in after.objects

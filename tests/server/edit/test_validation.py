@@ -8,6 +8,7 @@ import pytest
 from real2sim_proto.base import Pose
 from real2sim_proto.operations import Delete, Duplicate, Insert, Rotate, Scale, SetPose, Translate
 from real2sim_server.edit import apply_operations
+from real2sim_server.edit.tracks import sample
 from real2sim_server.scene import Ground
 
 
@@ -95,3 +96,19 @@ def test_a_floating_asset_is_reported_against_the_ground(state_with_assets):
 @pytest.mark.parametrize(("y", "expected"), [(90, []), (150, [("outside_map", "parked")])])
 def test_objects_far_from_everything_recorded_are_reported(state, y, expected):
     assert warnings(state, Translate(object_id="parked", y=y)) == expected
+
+
+def test_in_a_large_scenario_no_trajectory_is_sampled_again_for_each_edit(state, monkeypatch):
+    """With 600 overlapping copies; the cost of a batch grows with them and does not leap."""
+    copies = [Duplicate(object_id="parked", new_id=f"copy_{k}", x=0.01) for k in range(600)]
+    crowded = apply_operations(state, copies).state
+    sampled = []
+
+    def counted(trajectory, times):
+        sampled.append(trajectory)
+        return sample(trajectory, times)
+
+    monkeypatch.setattr("real2sim_server.edit.validation.sample", counted)
+    apply_operations(crowded, [Duplicate(object_id="parked", new_id="one_more", x=0.02)])
+
+    assert len(sampled) <= 1
