@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -59,6 +59,7 @@ def render_cameras(
     options: RasterOptions = DEFAULT_OPTIONS,
     modalities: Sequence[str] | None = None,
     backend: str | Backend = "auto",
+    between: Callable[[], object] | None = None,
 ) -> list[Frame]:
     """Frames of ``cameras`` in their order; cameras of one size are drawn in one call.
 
@@ -71,6 +72,7 @@ def render_cameras(
         modalities: images that the frames have, and with them the switches of ``options``; None
             for rgb and what those switches say.
         backend: draws.
+        between: called between pieces of the work, see RasterRequest.
 
     Raises:
         RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for a modality
@@ -98,6 +100,7 @@ def render_cameras(
             sky=sky,
             options=options,
             backend=backend,
+            between=between,
         )
         frames.update(zip(members, _frames(group, vehicle, output, modalities), strict=True))
     return [frames[index] for index in range(len(cameras))]

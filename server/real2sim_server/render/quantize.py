@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
@@ -13,29 +15,54 @@ SOLID_ALPHA = 0.5
 """A pixel below this alpha counts as nothing hit."""
 
 
-def to_uint8(rgb: Tensor) -> NDArray[np.uint8]:
+PIECE = 1 << 21
+"""Numbers that are converted in one go: a few milliseconds."""
+
+
+def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDArray[np.uint8]:
     """RGB [..., H, W, 3] float32 as uint8: clamped to [0, 1], halves rounded up, NaN to 0.
 
     Images on a GPU are rounded there and brought over as bytes.
+
+    Args:
+        rgb: of any number of images.
+        between: called between pieces of the work.
     """
     if rgb.is_cuda:
         rounded = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
         return rounded.cpu().numpy()
     values = np.ascontiguousarray(rgb.detach().numpy())
     levels = np.empty(values.shape, np.uint8)
-    _round_to_bytes(values.reshape(-1), levels.reshape(-1))
+    given, result = values.reshape(-1), levels.reshape(-1)
+    for piece in _pieces(len(given), between):
+        _round_to_bytes(given[piece], result[piece])
     return levels
 
 
-def solid_depth(depth: Tensor, alpha: Tensor) -> NDArray[np.float32]:
-    """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA."""
+def solid_depth(
+    depth: Tensor, alpha: Tensor, *, between: Callable[[], object] | None = None
+) -> NDArray[np.float32]:
+    """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA; ``between`` is called
+    between pieces of the work."""
     if depth.is_cuda:
         return depth.where(alpha >= SOLID_ALPHA, 0.0).cpu().numpy()
     values = np.ascontiguousarray(depth.detach().numpy())
     kept = np.empty_like(values)
     cover = np.ascontiguousarray(alpha.detach().numpy())
-    _keep_solid(values.reshape(-1), cover.reshape(-1), kept.reshape(-1))
+    given, covers, result = values.reshape(-1), cover.reshape(-1), kept.reshape(-1)
+    for piece in _pieces(len(given), between):
+        _keep_solid(given[piece], covers[piece], result[piece])
     return kept
+
+
+def _pieces(length: int, between: Callable[[], object] | None) -> Iterator[slice]:
+    """All of it, or what is done between two calls of ``between``."""
+    if between is None:
+        yield slice(None)
+        return
+    for first in range(0, length, PIECE):
+        yield slice(first, first + PIECE)
+        between()
 
 
 @kernel(parallel=PARALLEL_LOOPS)

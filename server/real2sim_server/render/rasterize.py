@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ def rasterize(
     options: RasterOptions = DEFAULT_OPTIONS,
     backend: str | Backend = "auto",
     check_values: bool = True,
+    between: Callable[[], object] | None = None,
 ) -> RenderOutput:
     """Draw instances from C cameras of one size, with the semantics of gsplat 1.5.3.
 
@@ -58,6 +59,7 @@ def rasterize(
         backend: ``auto``, ``cpu``, ``cuda``, ``reference``, or a Backend.
         check_values: False for callers that make new clouds for every call, which would be checked
             each time, and answer for their values themselves.
+        between: called between pieces of the work, see RasterRequest.
 
     Raises:
         RenderError: for anything that is not as said above; nothing is drawn then.
@@ -70,6 +72,7 @@ def rasterize(
         height=height,
         sky=sky,
         options=options,
+        between=between,
     )
     _check_cameras(request)
     _check_options(options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -101,6 +102,7 @@ class RenderOutput:
             to 0.5 or below; 0 where it never does. None when not asked for.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
         screen: sizes and gradients on the image; None when not asked for or without gradients.
+        between: of the request; for what is done with large images afterwards.
     """
 
     rgb: Tensor
@@ -109,6 +111,7 @@ class RenderOutput:
     instance: Tensor | None
     timing_ms: dict[str, float] = field(default_factory=dict)
     screen: ScreenStatistics | None = None
+    between: Callable[[], object] | None = None
 
 
 __all__ = ["Instance", "RasterOptions", "RenderError", "RenderOutput", "ScreenStatistics", "Sky"]

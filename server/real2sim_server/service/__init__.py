@@ -6,7 +6,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``first_run``: a second process that compiles, begun before anything heavy is loaded.
 - ``storage``: tables and rows of scenarios, sessions, jobs and stored answers.
 - ``warm_up``: kernels compiled or loaded before they are needed.
-- ``engine``: the thread that owns the device, and its queue.
+- ``lanes``, ``engine``: the thread that owns the device, and whose turn it is.
 - ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics, sockets.
 - ``library``: scenes and assets, on disk and in memory.
 - ``rendering``: render requests, and images as frames of the wire.

@@ -8,13 +8,14 @@ import os
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import structlog
+
+from .lanes import Lane, Lanes
 
 T = TypeVar("T")
 
@@ -109,13 +110,15 @@ class _EngineJob:
 
 
 class Engine:
-    """Runs jobs one after the other, in the order they came, on a thread of its own.
+    """Runs jobs one after the other on a thread of its own.
 
     Everything that computes runs here, so that kernels never compete for cores and the event loop
-    never waits for them. Jobs are plain functions; their exceptions travel to the caller.
+    never waits for them. Jobs are plain functions; their exceptions travel to the caller. Jobs of a
+    lane run in the order they came, lanes take turns, see :class:`.lanes.Lanes`. A long job calls
+    :meth:`give_way` between its pieces, and more urgent ones run there and then.
 
     Args:
-        queue_length: jobs that may wait.
+        queue_length: jobs that may wait in each lane.
         threads: of torch and numba, 0 for one per core.
         on_job: called on the engine thread after each job with its label, the seconds it waited
             and the seconds it ran.
@@ -135,7 +138,8 @@ class Engine:
         self.on_failure: Callable[[], object] = lambda: None
         self._threads = threads
         self._on_job = on_job
-        self._jobs: deque[_EngineJob] = deque()
+        self._jobs: Lanes[_EngineJob] = Lanes(queue_length)
+        self._began = 0.0
         self._changed = threading.Condition()
         self._accepting = False
         self._running: str | None = None
@@ -161,7 +165,7 @@ class Engine:
         """
         with self._changed:
             self._accepting = False
-            dropped = deque() if drain else self._take_all()
+            dropped = [] if drain else self._jobs.take_all()
             self._changed.notify_all()
         _fail(dropped, EngineStoppedError("the worker stopped before this job's turn"))
         if self._thread.ident is not None:
@@ -176,6 +180,7 @@ class Engine:
         fn: Callable[..., T],
         *args: Any,
         label: str = "work",
+        lane: Lane = Lane.VIEW,
         on_result: Callable[[T], object] | None = None,
         **kwargs: Any,
     ) -> T:
@@ -187,15 +192,16 @@ class Engine:
         Args:
             fn: with ``args`` and ``kwargs``.
             label: for metrics and messages.
+            lane: with what it takes turns.
             on_result: called with the result on the event loop, before the awaiting task is woken.
 
         Raises:
-            QueueFullError: ``queue_length`` jobs wait already.
+            QueueFullError: ``queue_length`` jobs of the lane wait already.
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
         awaited = _LoopFuture(on_result)
-        job = self._submit(lambda: fn(*args, **kwargs), label, awaited)
+        job = self._submit(lambda: fn(*args, **kwargs), label, lane, awaited)
         try:
             result: T = await awaited.outcome
             return result
@@ -219,13 +225,26 @@ class Engine:
         if threading.current_thread() is self._thread:
             return fn(*args, **kwargs)
         future: Future[T] = Future()
-        job = self._submit(lambda: fn(*args, **kwargs), label, future)
+        job = self._submit(lambda: fn(*args, **kwargs), label, Lane.VIEW, future)
         try:
             return future.result(timeout_s)
         except TimeoutError:
             if not future.done():
                 self._drop(job)
             raise
+
+    def give_way(self) -> None:
+        """Run what is more urgent than the running job and whose turn it is.
+
+        For long jobs, between two of their pieces. Does nothing on other threads.
+        """
+        if threading.current_thread() is not self._thread:
+            return
+        self._charge()
+        while (job := self._next_more_urgent()) is not None:
+            self._start(job)
+            del job
+        self._began = time.perf_counter()
 
     # --- state ------------------------------------------------------------------------------
 
@@ -259,7 +278,7 @@ class Engine:
     # --- inside -----------------------------------------------------------------------------
 
     def _submit(
-        self, run: Callable[[], Any], label: str, future: Future[Any] | _LoopFuture
+        self, run: Callable[[], Any], label: str, lane: Lane, future: Future[Any] | _LoopFuture
     ) -> _EngineJob:
         job = _EngineJob(run, label, future)
         with self._changed:
@@ -267,14 +286,14 @@ class Engine:
                 raise DeviceLostError(f"the device was lost: {self._failure}")
             if not self._accepting:
                 raise EngineStoppedError("the engine does not take jobs: it is stopping")
-            if len(self._jobs) >= self.queue_length:
+            if self._jobs.waiting(lane) >= self.queue_length:
                 self._discard_cancelled()
-            if len(self._jobs) >= self.queue_length:
+            if self._jobs.waiting(lane) >= self.queue_length:
                 raise QueueFullError(
-                    f"{len(self._jobs)} jobs wait for the engine, {self.queue_length} may; "
-                    f"it runs {self._running!r}"
+                    f"{self._jobs.waiting(lane)} jobs wait for the engine, {self.queue_length} "
+                    f"may; it runs {self._running!r}"
                 )
-            self._jobs.append(job)
+            self._jobs.append(job, lane)
             self._changed.notify()
         return job
 
@@ -284,18 +303,12 @@ class Engine:
             self._discard_cancelled()
 
     def _discard_cancelled(self) -> None:
-        if any(job.future.cancelled() for job in self._jobs):
-            self._jobs = deque(job for job in self._jobs if not job.future.cancelled())
-
-    def _take_all(self) -> deque[_EngineJob]:
-        waiting, self._jobs = self._jobs, deque()
-        return waiting
+        self._jobs.discard(lambda job: job.future.cancelled())
 
     def _work(self) -> None:
-        _lower_priority()
+        lower_priority(NICENESS)
         while (job := self._next()) is not None:
-            if job.future.set_running_or_notify_cancel():
-                self._run(job)
+            self._start(job)
             # The job holds arguments and result; an idle engine must not keep them alive.
             del job
 
@@ -303,15 +316,37 @@ class Engine:
         with self._changed:
             while True:
                 self._last_tick = time.monotonic()
-                if self._jobs:
-                    return self._jobs.popleft()
+                if (job := self._jobs.begin_next()) is not None:
+                    return job
                 if not self._accepting:
                     return None
                 self._changed.wait(IDLE_TICK_S)
 
+    def _next_more_urgent(self) -> _EngineJob | None:
+        with self._changed:
+            self._last_tick = time.monotonic()
+            return self._jobs.begin_more_urgent()
+
+    def _start(self, job: _EngineJob) -> None:
+        """Run a job that is wanted still, and count its time."""
+        self._began = time.perf_counter()
+        try:
+            if job.future.set_running_or_notify_cancel():
+                self._run(job)
+        finally:
+            self._charge()
+            with self._changed:
+                self._jobs.end()
+
+    def _charge(self) -> None:
+        now = time.perf_counter()
+        with self._changed:
+            self._jobs.charge(now - self._began)
+        self._began = now
+
     def _run(self, job: _EngineJob) -> None:
         started = time.perf_counter()
-        self._running = job.label
+        interrupted, self._running = self._running, job.label
         try:
             result = job.run()
         except BaseException as error:
@@ -321,7 +356,7 @@ class Engine:
         else:
             job.future.set_result(result)
         finally:
-            self._running = None
+            self._running = interrupted
         # The awaiting thread has been woken, and gets the interpreter before metrics are updated.
         time.sleep(0)
         if self._on_job is not None:
@@ -332,7 +367,7 @@ class Engine:
         with self._changed:
             self._failure = error
             self._accepting = False
-            waiting = self._take_all()
+            waiting = self._jobs.take_all()
         _fail(waiting, DeviceLostError(f"the device was lost: {error}"))
         self.on_failure()
 
@@ -348,10 +383,15 @@ def set_thread_counts(threads: int) -> None:
     torch.set_num_threads(count)
 
 
-def _lower_priority() -> None:
-    """Of the calling thread and of those that kernels will start from it; Linux can do that."""
+def lower_priority(niceness: int) -> None:
+    """Of the calling thread and of those that kernels will start from it; Linux can do that.
+
+    Only the superuser may raise a priority: what is lower already stays as it is.
+    """
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        thread = threading.get_native_id()
+        if os.getpriority(os.PRIO_PROCESS, thread) < niceness:
+            os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
 
 def _fail(jobs: Iterable[_EngineJob], error: EngineError) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from real2sim_server.render import Instance, RenderOutput, rasterize
 from real2sim_server.render.backends.base import place_instances
 from real2sim_server.render.backends.cpu.inputs import cluster_of, places_of
+from real2sim_server.render.quantize import solid_depth, to_uint8
 from real2sim_server.scene import GaussianCloud, Sky
 
 K = np.array([[[200.0, 0, 100], [0, 200, 75], [0, 0, 1]]])
@@ -32,9 +34,11 @@ def scene() -> list[Instance]:
     return [Instance(cloud), Instance(cloud.select(torch.arange(5000)), np.eye(4), 3)]
 
 
-def draw(instances: list[Instance]) -> RenderOutput:
+def draw(instances: list[Instance], *, between: Callable[[], object] | None = None) -> RenderOutput:
     sky = Sky(torch.linspace(0, 1, 6 * 4 * 4 * 3).reshape(6, 4, 4, 3))
-    return rasterize(instances, np.eye(4)[None], K, 200, 150, sky=sky, backend="cpu")
+    return rasterize(
+        instances, np.eye(4)[None], K, 200, 150, sky=sky, backend="cpu", between=between
+    )
 
 
 def digest(output: RenderOutput) -> str:
@@ -87,6 +91,32 @@ def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: igno
     whole = digest(draw(instances))
     monkeypatch.setattr("real2sim_server.render.backends.cpu.backend.LIST_BUDGET", 2000)
     assert digest(draw(instances)) == whole
+
+
+def test_a_picture_drawn_in_pieces_is_the_same_whatever_is_drawn_between(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr("real2sim_server.render.backends.cpu.backend.PIECE_PIXELS", 4000)
+    instances = scene()
+    whole, other = digest(draw(instances)), digest(draw(instances[1:]))
+    between = []
+
+    def draw_another() -> None:
+        between.append(digest(draw(instances[1:])))
+
+    assert digest(draw(instances, between=draw_another)) == whole
+    assert len(between) > 15
+    assert set(between) == {other}
+
+
+def test_bytes_and_depths_made_in_pieces_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr("real2sim_server.render.quantize.PIECE", 777)
+    output, pieces = draw(scene()), []
+    assert output.depth is not None
+    whole = to_uint8(output.rgb), solid_depth(output.depth, output.alpha)
+    levels = to_uint8(output.rgb, between=lambda: pieces.append("rgb"))
+    depths = solid_depth(output.depth, output.alpha, between=lambda: pieces.append("depth"))
+    assert np.array_equal(levels, whole[0])
+    assert np.array_equal(depths, whole[1])
+    assert (pieces.count("rgb"), pieces.count("depth")) == (116, 39)
 
 
 def test_clouds_are_read_where_they_lie() -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import threading
 import time
 
@@ -13,6 +15,7 @@ from real2sim_server.service.engine import (
     EngineStoppedError,
     QueueFullError,
 )
+from real2sim_server.service.lanes import Lane
 
 
 @pytest.fixture
@@ -314,3 +317,103 @@ def test_jobs_are_reported_with_their_label_and_durations():
     assert label == "nap"
     assert ran >= 0.02
     assert waited >= 0
+
+
+def test_a_long_job_gives_way_to_a_step_between_its_pieces(make_engine):
+    engine, order = make_engine(), []
+    piece, asked = threading.Event(), threading.Event()
+
+    def film() -> None:
+        order.append("film begins")
+        piece.set()
+        assert asked.wait(10)
+        engine.give_way()
+        order.append("film ends")
+
+    async def ask() -> None:
+        filming = asyncio.ensure_future(engine.call(film, lane=Lane.BULK))
+        assert await asyncio.to_thread(piece.wait, 10)
+        others = [
+            asyncio.ensure_future(engine.call(order.append, lane.name, lane=lane))
+            for lane in (Lane.BULK, Lane.DRIVE)
+        ]
+        await asyncio.sleep(0)
+        asked.set()
+        await asyncio.gather(filming, *others)
+
+    asyncio.run(ask())
+    assert order == ["film begins", "DRIVE", "film ends", "BULK"]
+
+
+def test_a_step_that_fails_leaves_the_job_that_gave_way(make_engine):
+    engine, piece, asked = make_engine(), threading.Event(), threading.Event()
+
+    def film() -> str:
+        piece.set()
+        assert asked.wait(10)
+        engine.give_way()
+        return "filmed"
+
+    async def ask() -> None:
+        filming = asyncio.ensure_future(engine.call(film, lane=Lane.BULK, label="film"))
+        assert await asyncio.to_thread(piece.wait, 10)
+        step = asyncio.ensure_future(engine.call(divmod, 1, 0, lane=Lane.DRIVE))
+        await asyncio.sleep(0)
+        asked.set()
+        with pytest.raises(ZeroDivisionError):
+            await step
+        assert await filming == "filmed"
+
+    asyncio.run(ask())
+    assert engine.running is None
+
+
+def test_giving_way_on_another_thread_runs_nothing(make_engine):
+    engine, gate, ran = make_engine(), Gate(), []
+
+    async def ask() -> None:
+        first = asyncio.ensure_future(engine.call(gate.job, lane=Lane.BULK))
+        await until_entered(gate)
+        step = asyncio.ensure_future(engine.call(ran.append, "step", lane=Lane.DRIVE))
+        await asyncio.sleep(0)
+        engine.give_way()
+        assert ran == []
+        gate.open()
+        await asyncio.gather(first, step)
+
+    asyncio.run(ask())
+    assert ran == ["step"]
+
+
+def test_a_full_lane_leaves_room_in_the_others(make_engine):
+    engine, gate = make_engine(queue_length=1), Gate()
+
+    async def ask() -> None:
+        first = asyncio.ensure_future(engine.call(gate.job, lane=Lane.BULK))
+        await until_entered(gate)
+        bulk = asyncio.ensure_future(engine.call(int, lane=Lane.BULK))
+        await asyncio.sleep(0)
+        with pytest.raises(QueueFullError):
+            await engine.call(int, lane=Lane.BULK)
+        step = asyncio.ensure_future(engine.call(int, "5", lane=Lane.DRIVE))
+        await asyncio.sleep(0)
+        gate.open()
+        assert await step == 5
+        await asyncio.gather(first, bulk)
+
+    asyncio.run(ask())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="niceness of threads is of Linux")
+def test_a_process_of_low_priority_starts_its_engine_at_that_priority():
+    code = (
+        "import os; os.nice(15)\n"
+        "from real2sim_server.service.engine import Engine\n"
+        "os.setpriority = lambda *_: (_ for _ in ()).throw(PermissionError('not the superuser'))\n"
+        "engine = Engine(); engine.start()\n"
+        "print(engine.call_sync(int, '7')); engine.stop()"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ran.stdout == "7\n", ran.stderr

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -32,6 +32,8 @@ class RasterRequest:
         width, height: size of all images [px].
         sky: what is seen behind everything, or None for ``options.background``.
         options: the rest.
+        between: called between pieces of the work, each of some 10 ms, on the calling thread. It
+            may rasterize something else with the same backend. None: the work is done in one go.
     """
 
     instances: tuple[Instance, ...]
@@ -41,6 +43,7 @@ class RasterRequest:
     height: int
     sky: Sky | None
     options: RasterOptions
+    between: Callable[[], object] | None = None
 
     @property
     def cameras(self) -> int:

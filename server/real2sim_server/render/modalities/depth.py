@@ -17,7 +17,7 @@ def _pixels(output: RenderOutput) -> NDArray[np.float32]:
 
     if output.depth is None:
         raise RenderError("the pass has drawn no depth")
-    return solid_depth(output.depth, output.alpha)
+    return solid_depth(output.depth, output.alpha, between=output.between)
 
 
 def _encode(image: NDArray[Any], codec: str, _quality: int) -> bytes:

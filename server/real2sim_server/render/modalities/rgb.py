@@ -15,7 +15,7 @@ from .base import SensorModality, register
 def _pixels(output: RenderOutput) -> NDArray[np.uint8]:
     from ..quantize import to_uint8
 
-    return to_uint8(output.rgb)
+    return to_uint8(output.rgb, between=output.between)
 
 
 def _encode(image: NDArray[Any], codec: str, quality: int) -> bytes:

@@ -20,6 +20,7 @@ from ...scene import BundleError, Scene
 from ...scene.io import SceneSummary, load_scene
 from ..engine import Engine
 from ..http.problems import ServiceError
+from ..lanes import Lane
 from .scene_catalog import Listing, SceneCatalog
 
 T = TypeVar("T")
@@ -219,7 +220,7 @@ class SceneCache:
         started = time.monotonic()
         try:
             scene = await self.on_disk_thread(lambda: load_scene(summary.path))
-            scene = await self._engine.call(scene.to, self.device, label="load")
+            scene = await self._engine.call(scene.to, self.device, label="load", lane=Lane.BULK)
         except BundleError as error:
             reason = self.catalog.public(error)
             listing = Listing(name, summary.path, None, reason)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar, get_args
 
 import numpy as np
@@ -19,15 +20,21 @@ from real2sim_proto.episode import SensorSpec
 from ...render import Backend, Instance, RasterOptions, render_cameras, warm_up
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
-from ..engine import Engine
+from ..engine import Engine, lower_priority
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
+from ..lanes import Lane
 from .frames import EncodedFrame, RenderedImage, encode_frame
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 ENCODER_THREADS = 2
+BULK_NICENESS = 10
+"""Of the thread that encodes large pictures; the engine's is less, see there."""
+
+VIEW_PIXELS = 2_000_000
+"""Requests of more pixels wait behind those that somebody looks at."""
 DEFAULT_OPTIONS = RasterOptions()
 
 
@@ -80,10 +87,17 @@ class Renderer:
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._encoders = ThreadPoolExecutor(ENCODER_THREADS, thread_name_prefix="encode")
+        self._bulk_encoders = ThreadPoolExecutor(
+            1,
+            thread_name_prefix="encode-bulk",
+            initializer=lower_priority,
+            initargs=(BULK_NICENESS,),
+        )
 
     def close(self) -> None:
         """End the encoder threads."""
         self._encoders.shutdown(cancel_futures=True)
+        self._bulk_encoders.shutdown(cancel_futures=True)
 
     async def warm_up(self) -> None:
         """Render and encode something in every form, so that no first frame waits for it."""
@@ -99,27 +113,40 @@ class Renderer:
         """
         cameras = check_sensors(request.scene.rig, request.sensors, max_pixels=self._max_pixels)
         submitted = time.perf_counter()
+        lane = _lane(cameras, stream)
         images, render_ms = await self._engine.call(
-            self.render_images, request, cameras, label="render"
+            partial(self.render_images, request, cameras, between=self._engine.give_way),
+            label="render",
+            lane=lane,
         )
         queue_ms = (time.perf_counter() - submitted) * 1e3 - render_ms
         started = time.perf_counter()
-        frames = await self.on_encoders(encode_frame, images)
+        frames = await self.on_encoders(encode_frame, images, lane=lane)
         encode_ms = (time.perf_counter() - started) * 1e3
         timing = {"queue": queue_ms, "render": render_ms, "encode": encode_ms}
         self._count(frames, timing, stream)
         return RenderedFrames(frames, timing)
 
-    async def on_encoders(self, fn: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    async def on_encoders(
+        self, fn: Callable[[T], R], items: Iterable[T], *, lane: Lane = Lane.DRIVE
+    ) -> list[R]:
         """``fn`` of each item, in order, on the encoder threads."""
         loop = asyncio.get_running_loop()
-        work = [loop.run_in_executor(self._encoders, fn, item) for item in items]
+        encoders = self._bulk_encoders if lane is Lane.BULK else self._encoders
+        work = [loop.run_in_executor(encoders, fn, item) for item in items]
         return await asyncio.gather(*work)
 
     def render_images(
-        self, request: RenderRequest, cameras: Sequence[Camera]
+        self,
+        request: RenderRequest,
+        cameras: Sequence[Camera],
+        *,
+        between: Callable[[], object] | None = None,
     ) -> tuple[list[RenderedImage], float]:
-        """Images of all sensors, and the milliseconds it took; on the engine thread."""
+        """Images of all sensors, and the milliseconds it took; on the engine thread.
+
+        ``between`` is called between pieces of the work.
+        """
         started = time.perf_counter()
         rendered: dict[int, list[RenderedImage]] = {}
         for options, members in _passes(request.sensors).items():
@@ -131,6 +158,7 @@ class Renderer:
                 options=options,
                 modalities=_modalities(request.sensors[i] for i in members),
                 backend=self._backend,
+                between=between,
             )
             for i, frame in zip(members, frames, strict=True):
                 sensor, pose, K = request.sensors[i], frame.T_world_camera, cameras[i].K
@@ -148,6 +176,12 @@ class Renderer:
             self._metrics.stages.labels(stage).observe(ms / 1e3)
         for frame in frames:
             self._metrics.frames.labels(stream, frame.codec).inc()
+
+
+def _lane(cameras: Sequence[Camera], stream: str) -> Lane:
+    """With what a request takes turns: nobody waits for the frames of a film."""
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return Lane.BULK if stream == "export" or pixels > VIEW_PIXELS else Lane.VIEW
 
 
 def _passes(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, list[int]]:

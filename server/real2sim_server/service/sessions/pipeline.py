@@ -42,6 +42,7 @@ from ...world import World
 from ..engine import Engine
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
+from ..lanes import Lane
 from ..rendering.frames import (
     EncodedFrame,
     FrameHeader,
@@ -169,7 +170,11 @@ class StepPipeline:
         observation: RenderedObservation | EncodedObservation
         if transition.cameras:
             observation = await self._engine.call(
-                self._compute, transition, label="drive", on_result=partial(self.send, transition)
+                self._compute,
+                transition,
+                label="drive",
+                lane=Lane.DRIVE,
+                on_result=partial(self.send, transition),
             )
         else:
             observation = await self.on_world_thread(self._compute, transition)
@@ -276,7 +281,7 @@ class StepPipeline:
         timer: PhaseTimer,
     ) -> RenderedObservation:
         timer.stage("queue")
-        images = self._images(world, sensors, cameras)
+        images = self._images(world, sensors, cameras, between=self._engine.give_way)
         timer.stage("render")
         members = pack_members({"t_us": world.t_us, "revision": world.revision})
         return RenderedObservation(world, images, "view", members, timer)
@@ -311,7 +316,12 @@ class StepPipeline:
         return cameras
 
     def _images(
-        self, world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]
+        self,
+        world: World,
+        sensors: Sequence[SensorSpec],
+        cameras: Sequence[Camera],
+        *,
+        between: Callable[[], object] | None = None,
     ) -> Sequence[RenderedImage]:
         request = RenderRequest(
             scene=world.scene,
@@ -320,7 +330,7 @@ class StepPipeline:
             t_us=world.t_us,
             sensors=sensors,
         )
-        images, _ = self._renderer.render_images(request, cameras)
+        images, _ = self._renderer.render_images(request, cameras, between=between)
         return images
 
     async def _finish(

@@ -2,18 +2,23 @@
 
 One camera at a time: every cluster is projected where it lies, the records are sorted by depth,
 dealt to tiles and blended. Work space grows to what was needed and is kept.
+
+A request that may be interrupted is worked on in pieces; what is drawn in between has a work space
+of its own. The pieces change no bit: tiles and rows know nothing of each other.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...types import RenderOutput
+from ...types import RenderOutput, Sky
 from ..base import (
     Placement,
     RasterRequest,
@@ -36,14 +41,18 @@ LIST_BUDGET = 1 << 26
 """Entries of tile lists held at once; larger pictures are made in bands of tile rows."""
 
 
+PIECE_PIXELS = 1 << 18
+"""Pixels blended, or given a sky, in one piece of work, where a request may be interrupted."""
+
+
 class CpuBackend:
-    """Rasterizer for any CPU. One call at a time; further ones wait."""
+    """Rasterizer for any CPU. One call at a time; those of other threads wait."""
 
     name = "cpu"
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._space = Workspace()
+        self._lock = threading.RLock()
+        self._idle_spaces: list[Workspace] = []
         self._training = TrainingPasses(self._lock)
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
@@ -57,19 +66,21 @@ class CpuBackend:
         instance = np.empty(shape if options.instance else (shape[0], 0, 0), np.uint16)
         timing: dict[str, float] = dict.fromkeys(("project", "sort", "tile", "blend", "sky"), 0.0)
         placement = place_instances(request.instances, request.viewmats.detach().cpu())
-        with self._lock:
+        with self._work_space() as space:
             with timed(timing, "project"):
                 views = [view_of(request, c) for c in range(request.cameras)]
                 seen = seen_chunks(request, placement, views)
             for c in range(request.cameras):
                 images = Images(rgb[c], alpha[c], depth[c], instance[c])
-                self._draw(request, placement, c, chunks=seen[c], images=images, timing=timing)
+                drawing = _Drawing(request, c, images, space, timing)
+                drawing.draw(placement, seen[c])
         return RenderOutput(
             rgb=torch.from_numpy(rgb),
             alpha=torch.from_numpy(alpha),
             depth=torch.from_numpy(depth) if options.depth else None,
             instance=torch.from_numpy(instance) if options.instance else None,
             timing_ms=timing,
+            between=request.between,
         )
 
     def warm_up(self) -> None:
@@ -77,61 +88,95 @@ class CpuBackend:
         for request in warm_up_requests():
             self.rasterize(request)
 
-    def _draw(
-        self,
-        request: RasterRequest,
-        placement: Placement,
-        camera: int,
-        *,
-        chunks: Sequence[Chunks],
-        images: Images,
-        timing: dict[str, float],
-    ) -> None:
-        with timed(timing, "project"):
-            records, regions = project(request, placement, camera, chunks, self._space)
-        with timed(timing, "sort"):
-            pairs = self._space.array("pairs", (int(records.counts[:regions].sum()),), np.uint64)
-            scratch = self._space.array("pairs_scratch", pairs.shape, np.uint64)
-            order = sort_records(records, regions, pairs, scratch)
-        self._blend(request, records, order, images, timing)
-        if request.sky is not None:
-            with timed(timing, "sky"):
-                matrix = array_of(direction_matrix(request, camera))
-                add_sky(array_of(request.sky.faces), matrix, images.rgb, images.alpha)
+    @contextmanager
+    def _work_space(self) -> Iterator[Workspace]:
+        """Space that nobody else uses, also not who interrupts the block on its own thread."""
+        with self._lock:
+            space = self._idle_spaces.pop() if self._idle_spaces else Workspace()
+            try:
+                yield space
+            finally:
+                self._idle_spaces.append(space)
 
-    def _blend(
-        self,
-        request: RasterRequest,
-        records: Records,
-        order: NDArray[np.uint64],
-        images: Images,
-        timing: dict[str, float],
-    ) -> None:
+
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """One camera of a request on its way to ``images``.
+
+    Attributes:
+        space: to work in.
+        timing: gets milliseconds by stage.
+    """
+
+    request: RasterRequest
+    camera: int
+    images: Images
+    space: Workspace
+    timing: dict[str, float]
+
+    def draw(self, placement: Placement, chunks: Sequence[Chunks]) -> None:
+        """Project, sort, blend and add the sky."""
+        with timed(self.timing, "project"):
+            records, regions = project(self.request, placement, self.camera, chunks, self.space)
+        self._pause()
+        with timed(self.timing, "sort"):
+            pairs = self.space.array("pairs", (int(records.counts[:regions].sum()),), np.uint64)
+            scratch = self.space.array("pairs_scratch", pairs.shape, np.uint64)
+            order = sort_records(records, regions, pairs, scratch)
+        self._pause()
+        self._blend(records, order)
+        if self.request.sky is not None:
+            self._add_sky(self.request.sky)
+
+    def _pause(self) -> None:
+        """The end of a piece."""
+        if self.request.between is not None:
+            self.request.between()
+
+    def _blend(self, records: Records, order: NDArray[np.uint64]) -> None:
+        request, space = self.request, self.space
         tiles_x, tiles_y = -(-request.width // TILE), -(-request.height // TILE)
         background = (0.0, 0.0, 0.0) if request.sky is not None else request.options.background
         behind = np.array(background, np.float32)
-        starts = self._space.array("starts", (tiles_x * tiles_y + 1,), np.int64)
-        with timed(timing, "tile"):
-            cursors = self._space.array("cursors", (TILE_CHUNKS, tiles_x * tiles_y), np.int64)
-            footprints = self._space.array("ordered_footprints", order.shape, np.int64)
+        starts = space.array("starts", (tiles_x * tiles_y + 1,), np.int64)
+        with timed(self.timing, "tile"):
+            cursors = space.array("cursors", (TILE_CHUNKS, tiles_x * tiles_y), np.int64)
+            footprints = space.array("ordered_footprints", order.shape, np.int64)
             count_tiles(records.values, records.footprints, order, tiles_x, footprints, cursors)
-            bands = _bands(cursors.sum(0).reshape(tiles_y, tiles_x).sum(1))
+            bands = _bands(cursors.sum(0).reshape(tiles_y, tiles_x).sum(1), self._rows(TILE))
         for first, last in bands:
+            self._pause()
             tiles = first * tiles_x, last * tiles_x
-            with timed(timing, "tile"):
+            with timed(self.timing, "tile"):
                 tile_starts(cursors, *tiles, starts)
-                lists = self._space.array("lists", (int(starts[tiles[1]]),), np.int32)
+                lists = space.array("lists", (int(starts[tiles[1]]),), np.int32)
                 rows = first, last
                 scatter_tiles(records.values, footprints, order, tiles_x, *rows, cursors, lists)
-            with timed(timing, "blend"):
-                blend_tiles(records.values, lists, starts, tiles_x, *tiles, behind, images)
+            with timed(self.timing, "blend"):
+                blend_tiles(records.values, lists, starts, tiles_x, *tiles, behind, self.images)
+
+    def _add_sky(self, sky: Sky) -> None:
+        matrix, images = array_of(direction_matrix(self.request, self.camera)), self.images
+        step = self._rows(1)
+        for first in range(0, self.request.height, step):
+            self._pause()
+            rows = slice(first, first + step)
+            with timed(self.timing, "sky"):
+                add_sky(array_of(sky.faces), matrix, first, images.rgb[rows], images.alpha[rows])
+
+    def _rows(self, height: int) -> int:
+        """Rows of that height [px] in one piece; all of them where nobody interrupts."""
+        if self.request.between is None:
+            return -(-self.request.height // height)
+        return max(1, PIECE_PIXELS // (self.request.width * height))
 
 
-def _bands(row_totals: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Ranges of tile rows whose lists fit LIST_BUDGET together, at least one row each."""
+def _bands(row_totals: NDArray[np.int64], most: int) -> Iterator[tuple[int, int]]:
+    """Ranges of at most ``most`` tile rows whose lists fit LIST_BUDGET together, at least one row
+    each."""
     first, held = 0, 0
     for row, total in enumerate(row_totals):
-        if row > first and held + total > LIST_BUDGET:
+        if row > first and (held + total > LIST_BUDGET or row - first >= most):
             yield first, row
             first, held = row, 0
         held += int(total)

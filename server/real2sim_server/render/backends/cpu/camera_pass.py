@@ -63,7 +63,7 @@ def draw_camera(
     if request.sky is not None:
         with timed(timing, "sky"):
             matrix = array_of(direction_matrix(request, camera))
-            add_sky(array_of(request.sky.faces), matrix, images.rgb, images.alpha)
+            add_sky(array_of(request.sky.faces), matrix, 0, images.rgb, images.alpha)
     return seen
 
 

@@ -68,7 +68,7 @@ class TrainingPasses:
         lock: held while kernels run; shared with the passes that carry none.
     """
 
-    def __init__(self, lock: threading.Lock) -> None:
+    def __init__(self, lock: threading.RLock) -> None:
         self.lock = lock
         self.space = Workspace()
         self._idle: list[Workspace] = []

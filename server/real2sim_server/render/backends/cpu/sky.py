@@ -22,12 +22,13 @@ TASKS = 16
 
 
 @kernel(parallel=PARALLEL_LOOPS)
-def add_sky(faces, matrix, rgb, alpha):
-    """Add ``(1 - alpha) * sky`` to ``rgb``.
+def add_sky(faces, matrix, first, rgb, alpha):
+    """Add ``(1 - alpha) * sky`` to rows of ``rgb``.
 
     Args:
         faces: [6, R, R, 3] float32 in C order, as in Sky.
         matrix: [3, 3] float32 ``R_world_camera K^-1``, maps (x, y, 1) [px] to directions.
+        first: row of the image that the given rows begin with.
         rgb: [H, W, 3] float32, added to.
         alpha: [H, W] float32.
     """
@@ -39,7 +40,7 @@ def add_sky(faces, matrix, rgb, alpha):
         corners = np.empty(width, np.int32)
         columns, rows = np.empty(width, np.float32), np.empty(width, np.float32)
         for row in range(task, height, TASKS):
-            y = F32(row) + HALF
+            y = F32(first + row) + HALF
             for x in range(width):
                 direction = pixel_direction(matrix, F32(x) + HALF, y)
                 corners[x], rows[x], columns[x] = texel_corner(direction, faces.shape[1])
