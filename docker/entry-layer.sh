@@ -11,6 +11,8 @@ if [ -n "$missing" ]; then
     apt-get install -y -qq --no-install-recommends $missing
     rm -rf /var/lib/apt/lists/*
 fi
-useradd --system --create-home --home-dir /var/lib/real2sim real2sim 2>/dev/null || true
+groupadd --gid 10001 real2sim 2>/dev/null || true
+useradd --uid 10001 --gid 10001 --no-log-init --create-home --home-dir /var/lib/real2sim real2sim \
+    2>/dev/null || true
 mkdir -p /var/lib/real2sim /var/cache/real2sim/numba /scenes
 chown -R real2sim:real2sim /var/lib/real2sim /var/cache/real2sim /scenes

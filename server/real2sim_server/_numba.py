@@ -34,6 +34,7 @@ Out of its sight stays what Numba finds by type or by registration and not by na
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import re
@@ -41,11 +42,17 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from types import CellType, CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit, types
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core import config
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserProvidedCacheLocator,
+)
 from numba.core.cpu_options import ParallelOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
@@ -108,8 +115,35 @@ def is_on_disk(compiled: Any) -> bool:
     return not isinstance(cache, _KernelCache) or cache.holds_any()
 
 
+class _ReadOnlyCacheLocator(UserProvidedCacheLocator):
+    """A folder of NUMBA_CACHE_DIR that cannot be written, as in an image whose root is read-only.
+
+    Numba would pass it over, with all that it holds, and compile everything at each start.
+    """
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        if not config.CACHE_DIR:  # type: ignore[attr-defined]
+            return None
+        locator = cls(py_func, py_file)
+        try:
+            locator.ensure_cache_path()  # type: ignore[no-untyped-call]
+        except OSError:
+            return locator
+        return None
+
+
+class _KernelFiles(CompileResultCacheImpl):
+    _locator_classes: ClassVar = [  # type: ignore[misc]
+        _ReadOnlyCacheLocator,
+        *CompileResultCacheImpl._locator_classes,
+    ]
+
+
 class _KernelCache(FunctionCache):
     """Numba's disk cache of one function, with a key that nothing slips through."""
+
+    _impl_class = _KernelFiles
 
     def __init__(self, compiled: Dispatcher) -> None:
         super().__init__(compiled.py_func)  # type: ignore[no-untyped-call]
@@ -122,6 +156,11 @@ class _KernelCache(FunctionCache):
 
     def _index_key(self, sig: tuple[Any, ...], codegen: Any) -> tuple[Any, ...]:
         return sig, codegen.magic_tuple(), self._fingerprint, tuple(_tuple_fields(sig))
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep machine code; where it cannot be written, the next start compiles it again."""
+        with contextlib.suppress(OSError):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     def holds_any(self) -> bool:
         """Whether anything is kept under the present fingerprint, for whatever signature."""

@@ -95,7 +95,22 @@ def package(compiled, tmp_path):
     return tmp_path
 
 
-def run(folder: Path, seed: int = 0, *, other_signature: bool = False) -> tuple[float, str]:
+READ_ONLY = """
+import tempfile
+def refuse(*args, **options):
+    raise OSError(30, "Read-only file system")
+tempfile.TemporaryFile = refuse  # by which Numba finds out whether a folder can be written
+"""
+
+
+def run(
+    folder: Path,
+    seed: int = 0,
+    *,
+    other_signature: bool = False,
+    cache: Path | None = None,
+    before: str = "",
+) -> tuple[float, str]:
     """What the kernel gave, and whether it was kept; ``is_on_disk`` looks at no signature."""
     environment = {
         **os.environ,
@@ -104,8 +119,10 @@ def run(folder: Path, seed: int = 0, *, other_signature: bool = False) -> tuple[
         "PYTHONDONTWRITEBYTECODE": "1",
     }
     environment.pop("NUMBA_CACHE_DIR", None)
+    if cache is not None:
+        environment["NUMBA_CACHE_DIR"] = str(cache)
     done = subprocess.run(
-        [sys.executable, "-c", RUN],
+        [sys.executable, "-c", before + RUN],
         check=False,
         env=environment,
         capture_output=True,
@@ -123,6 +140,18 @@ def change(package: Path, old: str, new: str, *, file: str = "parts.py") -> None
     source = path.read_text()
     assert source.count(old) == 1
     path.write_text(source.replace(old, new))
+
+
+def test_kernels_that_an_image_brings_along_are_used_from_a_folder_that_is_read_only(package):
+    cache = package / "cache"
+    assert run(package, cache=cache) == (BEFORE, "compiled")
+    assert run(package, cache=cache, before=READ_ONLY) == (BEFORE, "kept")
+
+
+def test_a_kernel_that_cannot_be_kept_is_compiled_each_time(package):
+    cache = package / "cache"
+    for _ in range(2):
+        assert run(package, cache=cache, before=READ_ONLY) == (BEFORE, "compiled")
 
 
 def test_a_kernel_is_compiled_once(package):

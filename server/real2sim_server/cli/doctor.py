@@ -34,6 +34,9 @@ def doctor(
     warm: Annotated[
         bool, typer.Option("--warm", help="Compile all kernels of a worker into the cache.")
     ] = False,
+    warmed: Annotated[
+        bool, typer.Option("--warmed", help="Fail if a worker had kernels to compile.")
+    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Say what this machine can do, what is missing, and how to mend it."""
@@ -45,11 +48,15 @@ def doctor(
     if not missing:
         backends, more = _inspect_backends()
         advice += more
-    if warm and not missing:
-        findings["kernels compiled in"] = f"{_warm_seconds():.1f} s"
+    compiled: list[str] = []
+    if (warm or warmed) and not missing:
+        seconds, compiled = _warm_up()
+        findings["kernels ready in"] = f"{seconds:.1f} s, {len(compiled)} compiled"
+    if warmed and compiled:
+        advice.append(f"real2sim doctor --warm  # compiles {', '.join(sorted(compiled)[:8])}")
     _print(findings, backends, advice)
     write_json(json, {"findings": findings, "backends": backends, "advice": advice})
-    if missing:
+    if missing or (warmed and compiled):
         raise typer.Exit(1)
 
 
@@ -70,14 +77,20 @@ def _inspect_backends() -> tuple[list[dict[str, object]], list[str]]:
     return rows, [f"{b.name}: {b.remedy}" for b in described if b.remedy]
 
 
-def _warm_seconds() -> float:
+def _warm_up() -> tuple[float, list[str]]:
+    """Seconds until the kernels of a worker are ready, and names of those that were compiled."""
+    from numba.core import event
+
     from .. import render, world
 
     start = time.perf_counter()
-    render.warm_up()
-    world.warm_up()
-    world.warm_up_planning()
-    return time.perf_counter() - start
+    with event.install_recorder("numba:compile") as recorder:
+        render.warm_up()
+        world.warm_up()
+        world.warm_up_planning()
+    began = (found for _, found in recorder.buffer if found.is_start)
+    names = {found.data["dispatcher"].__name__ for found in began}
+    return time.perf_counter() - start, sorted(names)
 
 
 def _print(findings: dict[str, str], backends: list[dict[str, object]], advice: list[str]) -> None:

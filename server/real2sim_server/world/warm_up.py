@@ -44,6 +44,10 @@ def warm_up() -> None:
         world.observe()
     # What only perfect tracking and sliding vehicles call.
     _track(EgoSpec(tracker="perfect"))
+    # What edits, views and rollouts ask of the ground.
+    scene.ground.height(0.0, 0.0)
+    scene.ground.height_at([[0.0, 0.0]])
+    scene.ground.normal_at([[0.0, 0.0]])
     # An edit that brings the cars near each other, for only then their boxes are compared.
     world.apply([Translate(object_id="ahead", x=-9.0)])
 

@@ -157,13 +157,13 @@ def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join,
     session, renderer, seen = site.session(info), site.worker.renderer, []
     render_images = renderer.render_images
 
-    def check_log(*given: object) -> object:
+    def check_log(*given: object, **options: object) -> object:
         give_up = time.monotonic() + 30
         while len(entries(site, info)) < 2 and time.monotonic() < give_up:
             time.sleep(0.001)
         seen.append([e.kind for e in entries(site, info)])
         seen.append([e.kind for e in asyncio.run(site.worker.sessions.entries(session))])
-        return render_images(*given)
+        return render_images(*given, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(renderer, "render_images", check_log)
