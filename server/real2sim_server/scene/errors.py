@@ -4,6 +4,7 @@ SceneError
 ├── TimeOutOfRangeError   a pose was asked for outside a trajectory
 ├── UnknownObjectError    an object id the scene does not have
 └── BundleError           a file that is not a readable scene or splat file
+    └── BundleTooLargeError   one that would take more memory than it may
 """
 
 from __future__ import annotations
@@ -26,3 +27,7 @@ class UnknownObjectError(SceneError, KeyError):
 
 class BundleError(SceneError, ValueError):
     """A file or folder that cannot be read as a scene, with the place and the reason."""
+
+
+class BundleTooLargeError(BundleError):
+    """A file that would take more memory than it may, however small it is itself."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ...geometry.rotation import Float
@@ -20,6 +18,7 @@ from ...scene.errors import SceneError
 from ...scene.io.formats.types import build_cloud
 from ...scene.spherical_harmonics import rotate_sh
 from ..options import ReconstructError
+from .torch_file import TorchFileError, read_torch_file
 
 
 class CheckpointError(ReconstructError):
@@ -89,46 +88,21 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """The tensors and numbers of a ``torch.save`` file, on the CPU.
 
     Only tensors, containers, numbers and NumPy scalars are built; any other object in the file is
-    refused, since reading it would run code from the file.
+    refused, since reading it would run code from the file. It is read in a process of its own, see
+    :mod:`.torch_file`.
 
     Raises:
         CheckpointError: not there, no checkpoint, damaged, or with other objects inside.
     """
     try:
-        with torch.serialization.safe_globals(_numpy_scalars()):
-            state = torch.load(path, map_location="cpu", weights_only=True)
+        state = read_torch_file(path)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except pickle.UnpicklingError as error:
-        found = _unsafe_objects(path)
-        if not found:
-            raise CheckpointError(f"{path}: no checkpoint of torch, or damaged") from error
-        raise CheckpointError(
-            f"{path}: holds objects besides tensors and numbers ({', '.join(found[:5])}); "
-            "reading them would run code from the file. Save it again with tensors only, in the "
-            "program it comes from"
-        ) from error
-    # Damage shows as almost any error, depending on where it is.
-    except Exception as error:
-        raise CheckpointError(f"{path}: no checkpoint of torch, or damaged: {error}") from error
+    except TorchFileError as error:
+        raise CheckpointError(f"{path}: {error}") from error
     if not isinstance(state, dict):
         raise CheckpointError(f"{path}: holds a {type(state).__name__}, a checkpoint is a dict")
     return state
-
-
-def _numpy_scalars() -> list[Any]:
-    """What the numbers in checkpoints that are not final are made of; harmless to build."""
-    scalar = np._core.multiarray.scalar  # type: ignore[attr-defined]
-    numbers = [np.dtype, *(type(np.dtype(kind)) for kind in ("f8", "f4", "i8", "i4", "?"))]
-    old_name = (scalar, "numpy.core.multiarray.scalar")
-    return [scalar, old_name, *numbers]
-
-
-def _unsafe_objects(path: Path) -> list[str]:
-    try:
-        return sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path))
-    except Exception:  # the file may be of an old kind, or no checkpoint at all
-        return []
 
 
 def table(path: Path, state: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -15,6 +15,9 @@ from ..errors import BundleError
 MAX_HEADER_BYTES = 1 << 20
 """Longer headers are refused: none of the known writers comes near."""
 
+MAX_HEADER_LINES = 1024
+"""Elements and properties together; a splat with all its harmonics has 62 properties."""
+
 _TYPES = {
     "char": "i1",
     "int8": "i1",
@@ -43,27 +46,22 @@ class PlyElement:
     Attributes:
         name: for example ``vertex``.
         count: number of records.
-        properties: (name, NumPy type string) in file order.
+        properties: NumPy type strings by name, in file order.
     """
 
     name: str
     count: int
-    properties: list[tuple[str, str]] = field(default_factory=list)
+    properties: dict[str, str] = field(default_factory=dict)
 
     @property
     def dtype(self) -> np.dtype[np.void]:
         """Record type of one entry, packed."""
-        return np.dtype(self.properties)
+        return np.dtype(list(self.properties.items()))
 
     @property
     def nbytes(self) -> int:
         """Bytes of all records."""
         return self.count * self.dtype.itemsize if self.properties else 0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Property names in file order."""
-        return tuple(name for name, _ in self.properties)
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,8 @@ def read_ply_header(path: Path) -> PlyHeader:
     """Parse the header of a binary PLY file.
 
     Raises:
-        BundleError: no PLY, ascii, an unknown type, list properties, doubled names, no end.
+        BundleError: no PLY, ascii, an unknown type, list properties, doubled names, more than
+            ``MAX_HEADER_LINES``, no end.
     """
     with _open(path) as file:
         lines, nbytes = _header_lines(file.read(MAX_HEADER_BYTES), path)
@@ -97,12 +96,12 @@ def read_ply_header(path: Path) -> PlyHeader:
             case ["element", name, count]:
                 current = _element(name, count, path)
                 if name in elements:
-                    raise BundleError(f"{path}: ply header has element {name!r} twice")
+                    raise BundleError(f"{path}: ply header has element {name[:80]!r} twice")
                 elements[name] = current
             case ["property", *definition] if current is not None:
                 _add_property(current, definition, order, path)
             case _:
-                raise BundleError(f"{path}: ply header line {line!r} is not understood")
+                raise BundleError(f"{path}: ply header line {line[:80]!r} is not understood")
     return PlyHeader(elements, nbytes)
 
 
@@ -149,6 +148,11 @@ def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
             return lines, start
         if line.split()[:1] not in ([], ["ply"], ["comment"], ["obj_info"]):
             lines.append(line)
+            if len(lines) > MAX_HEADER_LINES:
+                raise BundleError(
+                    f"{path}: ply header declares more than {MAX_HEADER_LINES} elements and "
+                    "properties; a splat file has fewer than a hundred"
+                )
     if start == 0:
         raise BundleError(f"{path}: not a ply file (its first line must be 'ply')")
     raise BundleError(f"{path}: ply header has no end_header line; the file is cut short or no ply")
@@ -160,7 +164,7 @@ def _byte_order(line: str, path: Path) -> str:
         raise BundleError(f"{path}: ascii ply is not supported; write it as binary_little_endian")
     if words[0] != "format" or words[2:] != ["1.0"] or words[1] not in _BYTE_ORDERS:
         raise BundleError(
-            f"{path}: ply header starts with {line!r}; allowed is 'format' with one of "
+            f"{path}: ply header starts with {line[:80]!r}; allowed is 'format' with one of "
             f"{sorted(_BYTE_ORDERS)} and 1.0"
         )
     return _BYTE_ORDERS[words[1]]
@@ -183,12 +187,12 @@ def _add_property(element: PlyElement, definition: list[str], order: str, path: 
                     f"{path}: ply element {element.name!r} has list properties, a splat file none"
                 )
         case [kind, name] if kind in _TYPES:
-            if name in element.names:
-                raise BundleError(f"{path}: ply element {element.name!r} has {name!r} twice")
-            element.properties.append((name, order + _TYPES[kind]))
+            if name in element.properties:
+                raise BundleError(f"{path}: ply element {element.name!r} has {name[:80]!r} twice")
+            element.properties[name] = order + _TYPES[kind]
         case _:
             raise BundleError(
-                f"{path}: ply property {' '.join(definition)!r} is not understood; "
+                f"{path}: ply property {' '.join(definition)[:80]!r} is not understood; "
                 f"types are {sorted(_TYPES)}"
             )
 
