@@ -236,6 +236,7 @@ _BY_CODE: dict[str, type[StatusError]] = {
     "OVER_CAPACITY": CapacityError,
     "QUEUE_FULL": CapacityError,
     "OUT_OF_MEMORY": CapacityError,
+    "QUOTA_EXCEEDED": CapacityError,
     "DRAINING": CapacityError,
     "SESSION_CLOSED": SessionClosedError,
 }

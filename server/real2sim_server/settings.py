@@ -33,12 +33,20 @@ class Settings(BaseSettings):
         store_url: SQLAlchemy URL of scenarios and sessions.
         backend: what draws: ``auto`` chooses by the hardware at hand.
         threads: of numba and torch; 0 for one per core.
-        scene_memory_bytes: budget of resident scenes.
+        scene_memory_bytes: budget of resident scenes and assets together.
         max_sessions: open sessions; more are refused at creation.
         session_idle_seconds: unused sessions without connections leave the memory after this time;
             they are rebuilt from their logs on demand.
         queue_length: jobs that may wait for the engine; more are refused.
         max_request_bytes, max_upload_bytes: body of a request, and of an uploaded splat file.
+        max_scene_bytes, max_asset_bytes: what an imported scene or asset may take in memory,
+            however small its file is.
+        import_memory_bytes, import_seconds: of the process that reads an import.
+        assets_quota, assets_quota_bytes: assets of the library, and their disk.
+        scenes_quota, scenes_quota_bytes: scenes of the scene folder, and their disk; more cannot be
+            imported.
+        jobs_quota, jobs_quota_bytes: jobs on record, and the disk of their files; no job begins
+            beyond.
         max_pixels_per_step: pixels over all cameras of one observation or render.
         stall_seconds: `/livez` fails when one job takes longer than this.
         graceful_seconds: time that open requests get at shutdown.
@@ -66,6 +74,16 @@ class Settings(BaseSettings):
     queue_length: int = Field(default=64, ge=1)
     max_request_bytes: int = Field(default=4 * MIB, ge=1024)
     max_upload_bytes: int = Field(default=2 * GIB, ge=1024)
+    max_scene_bytes: int = Field(default=4 * GIB, ge=1024)
+    max_asset_bytes: int = Field(default=256 * MIB, ge=1024)
+    import_memory_bytes: int = Field(default=16 * GIB, ge=256 * MIB)
+    import_seconds: float = Field(default=600.0, gt=0)
+    assets_quota: int = Field(default=1000, ge=0)
+    assets_quota_bytes: int = Field(default=20 * GIB, ge=0)
+    scenes_quota: int = Field(default=1000, ge=0)
+    scenes_quota_bytes: int = Field(default=500 * GIB, ge=0)
+    jobs_quota: int = Field(default=10_000, ge=0)
+    jobs_quota_bytes: int = Field(default=100 * GIB, ge=0)
     max_pixels_per_step: int = Field(default=64_000_000, ge=1)
     stall_seconds: float = Field(default=120.0, gt=0)
     graceful_seconds: float = Field(default=10.0, ge=0)

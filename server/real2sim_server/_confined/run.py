@@ -31,7 +31,15 @@ log = structlog.get_logger(__name__)
 
 
 class ConfinedError(Exception):
-    """A confined call that came to no end of its own; the message says why."""
+    """A confined call that came to no end of its own; the message says why.
+
+    Attributes:
+        out_of_memory: whether it needed more memory than it might take.
+    """
+
+    def __init__(self, reason: str, *, out_of_memory: bool = False) -> None:
+        super().__init__(reason)
+        self.out_of_memory = out_of_memory
 
 
 def run_confined(
@@ -72,7 +80,8 @@ def _value(told: Mapping[str, Any], limits: Limits, errors: tuple[type[Exception
     if kind is None:
         return told["value"]
     if kind == OUT_OF_MEMORY:
-        raise ConfinedError(f"needs more than {limits.memory_bytes // MIB} MiB of memory")
+        reason = f"needs more than {limits.memory_bytes // MIB} MiB of memory"
+        raise ConfinedError(reason, out_of_memory=True)
     for error in errors:
         if kind == error.__name__:
             raise error(told["message"])

@@ -23,6 +23,8 @@ from .limits import Limits, apply_limits
 
 REQUEST_BYTES = 1 << 16
 OUT_OF_MEMORY = "out of memory"
+_MEMORY = ("allocate memory", "failed to map segment", "bad_alloc")
+"""Parts of messages of libraries that have no type of error for a lack of memory."""
 
 
 @dataclass
@@ -95,15 +97,22 @@ def _serve(control: socket.socket, children: dict[int, _Child]) -> bool:
     if not message:
         return False
     request = json.loads(message)
-    # Loaded here, so that the next child has it already. It is code of this program.
-    with contextlib.suppress(ImportError):
-        importlib.import_module(request["target"].partition(":")[0])
+    _load(request["target"].partition(":")[0])
     (answer,) = descriptors
     pid = os.fork()
     if pid == 0:
         _become_child(answer, request)
     children[pid] = _Child(answer, time.monotonic() + request["limits"]["seconds"])
     return True
+
+
+def _load(name: str) -> None:
+    """Load a module of the program before the fork: then children have it, and need no memory for
+    it. What its functions import late stands in its ``LOADED_EARLY``."""
+    with contextlib.suppress(ImportError):
+        module = importlib.import_module(name)
+        for late in getattr(module, "LOADED_EARLY", ()):
+            importlib.import_module(late)
 
 
 def _become_child(answer: int, request: dict[str, Any]) -> None:
@@ -152,7 +161,7 @@ def _outcome(target: str, arguments: dict[str, Any]) -> dict[str, Any]:
 def _lacks_memory(error: BaseException | None) -> bool:
     """Whether an error, or what it came from, is a lack of memory. torch has no type for it."""
     while error is not None:
-        if isinstance(error, MemoryError) or "allocate memory" in str(error):
+        if isinstance(error, MemoryError) or any(sign in str(error) for sign in _MEMORY):
             return True
         if isinstance(error, OSError) and error.errno == errno.ENOMEM:
             return True

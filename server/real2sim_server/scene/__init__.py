@@ -7,7 +7,13 @@ from .asset import Asset
 from .camera import Camera, CameraRig
 from .cloud import GaussianCloud
 from .colour import TimeColour
-from .errors import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
+from .errors import (
+    BundleError,
+    BundleTooLargeError,
+    SceneError,
+    TimeOutOfRangeError,
+    UnknownObjectError,
+)
 from .ground import Ground
 from .scene import Scene, SceneObject
 from .sky import Sky
@@ -16,6 +22,7 @@ from .trajectory import Trajectory
 __all__ = [
     "Asset",
     "BundleError",
+    "BundleTooLargeError",
     "Camera",
     "CameraRig",
     "GaussianCloud",

@@ -18,6 +18,7 @@ from starlette.requests import HTTPConnection
 from real2sim_proto.scenes import DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
+from ..scene.io import StagingLimits
 from ..settings import Settings
 from .engine import Engine
 from .http.idempotency import Idempotency
@@ -25,6 +26,9 @@ from .http.metrics import Metrics
 from .jobs.jobs import Jobs
 from .jobs.simulations import Simulations
 from .library.assets import AssetLibrary
+from .library.import_queue import ImportQueue
+from .library.memory import MemoryBudget
+from .library.quotas import Quota
 from .library.scene_cache import SceneCache
 from .library.scene_catalog import SceneCatalog
 from .rendering.renderer import Renderer
@@ -65,6 +69,7 @@ class Worker:
     sessions: Sessions
     backend: Backend
     device: DeviceInfo
+    imports: ImportQueue = field(default_factory=ImportQueue)
     waiting_for: set[str] = field(default_factory=lambda: {"start"})
     draining: bool = False
 
@@ -82,17 +87,18 @@ class Worker:
             threads=settings.threads,
             on_job=metrics.observe_job,
         )
+        budget = MemoryBudget(settings.scene_memory_bytes)
         scene_cache = SceneCache(
             SceneCatalog(settings.scenes_path),
             engine,
-            budget_bytes=settings.scene_memory_bytes,
+            budget=budget,
             device=_device_of(backend),
             on_load=metrics.scene_loads.observe,
         )
         store = Store(settings.database_url)
-        assets = AssetLibrary(settings.assets_path)
+        assets = AssetLibrary(settings.assets_path, budget)
         scenarios = Scenarios(store, scene_cache, metrics, assets=assets.find)
-        jobs = Jobs(JobLog(store, settings.worker_id), settings.jobs_path)
+        jobs = Jobs(JobLog(store, settings.worker_id), _jobs_quota(settings))
         kernels = KernelWarmUp()
         renderer = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(
@@ -139,6 +145,7 @@ class Worker:
             at_exit.push_async_callback(asyncio.to_thread, self.engine.stop)
             at_exit.callback(self.renderer.close)
             at_exit.callback(self.scene_cache.close)
+            at_exit.callback(self.imports.close)
             at_exit.push_async_callback(self.store.close)
             await self.store.open()
             at_exit.push_async_callback(self.scenarios.flush)
@@ -163,6 +170,45 @@ class Worker:
         if self.engine.queue_depth >= self.settings.queue_length:
             reasons.append(f"{self.settings.queue_length} jobs wait for the engine")
         return Readiness(ready=not reasons, reasons=reasons)
+
+    @property
+    def scene_limits(self) -> StagingLimits:
+        """Of the process that reads an imported scene."""
+        largest = min(self.settings.max_scene_bytes, self.settings.scene_memory_bytes)
+        return self._limits(largest)
+
+    @property
+    def asset_limits(self) -> StagingLimits:
+        """Of the process that reads an uploaded asset."""
+        return self._limits(min(self.settings.max_asset_bytes, self.settings.scene_memory_bytes))
+
+    def _limits(self, max_bytes: int) -> StagingLimits:
+        settings = self.settings
+        return StagingLimits(max_bytes, settings.import_memory_bytes, settings.import_seconds)
+
+    @property
+    def scenes_quota(self) -> Quota:
+        """Of the scene folder."""
+        return Quota(
+            self.settings.scenes_path,
+            "scenes",
+            self.settings.scenes_quota,
+            self.settings.scenes_quota_bytes,
+            "SCENES_QUOTA",
+            "delete bundles on the worker's disk",
+        )
+
+    @property
+    def assets_quota(self) -> Quota:
+        """Of the asset library."""
+        return Quota(
+            self.settings.assets_path,
+            "assets",
+            self.settings.assets_quota,
+            self.settings.assets_quota_bytes,
+            "ASSETS_QUOTA",
+            "delete assets: DELETE /v1/assets/{id}",
+        )
 
     def replayed(self, answer: Response) -> Response:
         """Count an answer that was given before."""
@@ -202,6 +248,17 @@ class Worker:
         self.metrics.watch(self.metrics.scene_bytes, lambda: self.scene_cache.resident_bytes)
         for state, count in self.scene_cache.counters().items():
             self.metrics.watch(self.metrics.scenes.labels(state), count)
+
+
+def _jobs_quota(settings: Settings) -> Quota:
+    return Quota(
+        settings.jobs_path,
+        "jobs",
+        settings.jobs_quota,
+        settings.jobs_quota_bytes,
+        "JOBS_QUOTA",
+        "delete jobs that are over: DELETE /v1/jobs/{id}",
+    )
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:

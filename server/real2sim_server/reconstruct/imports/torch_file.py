@@ -53,7 +53,7 @@ def read_torch_file(path: Path) -> Any:
             return _built(tree, tensors)
         except TorchFileError:
             raise
-        # The other process was fed by an untrusted file: nothing that it says is sure to have a form.
+        # The other process was fed by an untrusted file: what it says may be of any form.
         except Exception as error:
             raise TorchFileError(f"cannot be read: {error}") from error
 

@@ -32,10 +32,15 @@ VIEW_DURATION_US = 10_000_000
 """How long the ego of an imported scene stands: long enough to drive through it."""
 
 
-def read_splats(path: str | PathLike[str]) -> GaussianCloud:
+def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> GaussianCloud:
     """Read a splat file of any known format, in its own frame and units.
 
+    Args:
+        path: the file.
+        max_bytes: what its Gaussians may take in memory; None for any amount.
+
     Raises:
+        BundleTooLargeError: they take more.
         BundleError: naming the file and the reason: not there, of no known format, cut short,
             wrong counts, values that are not finite, rotations of length zero.
     """
@@ -43,10 +48,10 @@ def read_splats(path: str | PathLike[str]) -> GaussianCloud:
     head = _head(file)
     for splat_format in FORMATS:
         if splat_format.recognises(head):
-            return splat_format.read(file)
+            return splat_format.read(file, max_bytes=max_bytes)
     for splat_format in FORMATS:
         if not splat_format.has_signature and file.name.lower().endswith(splat_format.suffix):
-            return splat_format.read(file)
+            return splat_format.read(file, max_bytes=max_bytes)
     known = ", ".join(f.name for f in FORMATS)
     raise BundleError(f"{file}: not a ply nor any other known splat format; known are: {known}")
 
@@ -100,6 +105,7 @@ def import_splats(
     up_axis: UpAxis = "z",
     yaw: float = 0.0,
     scale: float = 1.0,
+    max_bytes: int | None = None,
 ) -> Scene: ...
 
 
@@ -113,6 +119,7 @@ def import_splats(
     up_axis: UpAxis = "z",
     yaw: float = 0.0,
     scale: float = 1.0,
+    max_bytes: int | None = None,
 ) -> Asset: ...
 
 
@@ -125,6 +132,7 @@ def import_splats(
     up_axis: UpAxis = "z",
     yaw: float = 0.0,
     scale: float = 1.0,
+    max_bytes: int | None = None,
 ) -> Scene | Asset:
     """Read a splat file as a scene (background only) or as an asset (centred on its box).
 
@@ -136,13 +144,15 @@ def import_splats(
         up_axis: which axis of the file points up; trained splats mostly have ``-y``.
         yaw: turn about z after that [rad], to bring the front of a thing to x.
         scale: metres per unit of the file.
+        max_bytes: what its Gaussians may take in memory; None for any amount.
 
     Raises:
+        BundleTooLargeError: they take more.
         BundleError: like :func:`read_splats`, and for a file without splats.
         SceneError: for an unknown ``up_axis`` or a scale that is not positive.
     """
     file = Path(path)
-    cloud = read_splats(file)
+    cloud = read_splats(file, max_bytes=max_bytes)
     if not len(cloud):
         raise BundleError(f"{file}: holds no splats; nothing to import")
     placed = cloud.moved(upright(up_axis, yaw), scale=scale)

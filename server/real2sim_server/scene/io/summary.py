@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +19,8 @@ from ..ground import Ground
 from ..trajectory import Trajectory
 from .bundle import load_ground
 from .container import read_container
-from .document import Bounds, SceneDocument, Vector3
+from .document import AssetDocument, Bounds, SceneDocument, Vector3
+from .tensors import check_file, cloud_shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,48 @@ def read_scene_summary(path: str | PathLike[str]) -> SceneSummary:
         return _summary(folder, document)
     except (SceneError, OverflowError) as error:
         raise BundleError(f"{folder}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class AssetSummary:
+    """What is known of an asset bundle without its Gaussians.
+
+    Attributes:
+        asset_id, category, size, provenance, content_hash: as in Asset.
+        gaussians: their number.
+        nbytes: what they take in memory.
+    """
+
+    asset_id: str
+    category: str
+    size: Vector3
+    provenance: Mapping[str, Any]
+    content_hash: str
+    gaussians: int
+    nbytes: int
+
+
+def read_asset_summary(path: str | PathLike[str]) -> AssetSummary:
+    """Read the document of an asset bundle and the size of its file, and nothing else.
+
+    Raises:
+        BundleError: no asset bundle, a newer version, cut short, or not as the format asks.
+    """
+    folder = Path(path)
+    document = read_container(folder, AssetDocument, verify=False)
+    for name, nbytes in document.files.items():
+        check_file(folder / Path(name).name, nbytes)
+    cloud = document.content.cloud
+    shapes = cloud_shapes(cloud.gaussians, cloud.sh_degree)
+    return AssetSummary(
+        asset_id=document.name,
+        category=document.content.category,
+        size=document.content.size,
+        provenance=document.provenance,
+        content_hash=document.content_hash,
+        gaussians=cloud.gaussians,
+        nbytes=4 * sum(math.prod(shape) for shape in shapes.values()),
+    )
 
 
 def _summary(folder: Path, document: SceneDocument) -> SceneSummary:

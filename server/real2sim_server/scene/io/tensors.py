@@ -69,7 +69,7 @@ class TensorFile:
     def __init__(self, path: Path, *, nbytes: int, verify: bool) -> None:
         self.path = path
         self.verify = verify
-        _check_file(path, nbytes)
+        check_file(path, nbytes)
         try:
             with safe_open(path, framework="pt", device="cpu") as file:
                 keys = file.keys()
@@ -118,7 +118,8 @@ class TensorFile:
         return tensor
 
 
-def _check_file(path: Path, nbytes: int) -> None:
+def check_file(path: Path, nbytes: int) -> None:
+    """Raise BundleError unless ``path`` is a plain file of ``nbytes`` bytes."""
     if path.is_symlink() or not path.is_file():
         raise BundleError(f"{path}: missing or no plain file; the bundle is incomplete")
     actual = path.stat().st_size

@@ -21,6 +21,7 @@ from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, problem_of, service_error
+from ..library.quotas import Quota
 from ..scenarios.replies import iso_time
 from ..storage.job_log import JobLog
 from ..storage.store import now_us
@@ -119,12 +120,13 @@ class Jobs:
 
     Args:
         job_log: keeps them.
-        folder: below it each job has a folder for its files.
+        quota: of jobs and their files; below its folder each job has one for its files.
     """
 
-    def __init__(self, job_log: JobLog, folder: Path) -> None:
+    def __init__(self, job_log: JobLog, quota: Quota) -> None:
         self._log = job_log
-        self._folder = folder
+        self._quota = quota
+        self._folder = quota.folder
         self._jobs: OrderedDict[str, _Job] = OrderedDict()
         self._turn = asyncio.Lock()
         self._closing = False
@@ -161,7 +163,7 @@ class Jobs:
             idempotent: what the answer is stored under.
 
         Raises:
-            ServiceError: QUEUE_FULL, or DRAINING.
+            ServiceError: QUEUE_FULL, QUOTA_EXCEEDED, or DRAINING.
         """
         if self._closing:
             raise ServiceError(ErrorCode.DRAINING, "the worker is stopping")
@@ -172,6 +174,9 @@ class Jobs:
                 f"{waiting} jobs wait already",
                 hint="send it again after Retry-After seconds, or cancel one: DELETE /v1/jobs/{id}",
             )
+        if not new.light:
+            stored = await self._log.count()
+            await asyncio.to_thread(self._quota.check, entries=stored)
         info = JobInfo(
             job_id=f"job_{secrets.token_hex(8)}",
             kind=new.kind,

@@ -4,24 +4,35 @@ from __future__ import annotations
 
 import secrets
 import shutil
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
-import numpy as np
 import structlog
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetInfo, AssetUpload
 
 from ...edit.lighting import Colour, ambient_colour, relighting_gain, relit
-from ...scene import Asset, BundleError, GaussianCloud, Scene, SceneError
-from ...scene.io import import_splats, load_asset, save_asset
+from ...scene import Asset, BundleError, GaussianCloud, Scene
+from ...scene.io import (
+    AssetSummary,
+    StagingLimits,
+    load_asset,
+    read_asset_summary,
+    save_asset,
+    stage_asset,
+)
 from ..http.problems import ServiceError
+from .imports import import_errors
+from .memory import IdleItem, MemoryBudget
+from .quotas import Quota, folder_usage
 
 ASSET_SUFFIX = ".r2a"
 
@@ -44,6 +55,16 @@ class LibraryAsset:
     def __init__(self, asset: Asset) -> None:
         self.asset = asset
         self._lit: WeakKeyDictionary[Scene, GaussianCloud] = WeakKeyDictionary()
+        self._lock = threading.Lock()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of its Gaussians, in the light of every scene that shows it [bytes]."""
+        with self._lock:
+            clouds = [self.asset.cloud, *self._lit.values()]
+        # Clouds in another light share all tensors but their colours.
+        tensors = [t for cloud in clouds for t in vars(cloud).values()]
+        return sum({t.data_ptr(): t.nbytes for t in tensors}.values())
 
     @property
     def asset_id(self) -> str:
@@ -81,88 +102,116 @@ class LibraryAsset:
         found = self._lit.get(scene)
         if found is None:
             cloud = self.asset.cloud.to(scene.background.device)
-            found = self._lit[scene] = relit(cloud, relighting_gain(scene, cloud, self.ambient))
+            found = relit(cloud, relighting_gain(scene, cloud, self.ambient))
+            with self._lock:
+                self._lit[scene] = found
         return found
-
-    def info(self) -> AssetInfo:
-        """What the wire says about it."""
-        provenance = {k: v for k, v in self.asset.provenance.items() if k != "ambient"}
-        return AssetInfo(
-            asset_id=self.asset_id,
-            category=self.category,
-            size=self.size,
-            gaussians=self.gaussians,
-            bytes=self.asset.nbytes,
-            content_hash=self.content_hash,
-            ambient=self.ambient,
-            provenance=provenance,
-        )
 
 
 class AssetLibrary:
     """The assets below a folder. Safe to use on any thread; reading and writing take time.
 
+    Those that were used last stay in memory as long as the budget has room. One that a scenario
+    shows stays alive with the scenario, and counts.
+
     Args:
         folder: of asset bundles; it need not exist.
+        budget: of memory, shared with scenes; without it all assets stay in memory.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, budget: MemoryBudget | None = None) -> None:
         self.folder = folder
-        self._assets: dict[str, LibraryAsset] = {}
+        self._budget = budget or MemoryBudget(sys.maxsize)
+        self._budget.add(self)
+        self._kept: dict[str, float] = {}
+        self._strong: dict[str, LibraryAsset] = {}
+        self._alive: WeakValueDictionary[str, LibraryAsset] = WeakValueDictionary()
+        self._summaries: dict[str, AssetSummary] = {}
+        self._reserved = 0
         self._removing: set[str] = set()
         self._lock = threading.Lock()
+        self._loading = threading.Lock()
 
-    def list(self) -> list[LibraryAsset]:
+    def list(self) -> list[AssetInfo]:
         """All assets by id; broken bundles are passed over, with a line in the log."""
         names = sorted(
             p.name.removesuffix(ASSET_SUFFIX) for p in self.folder.glob(f"*{ASSET_SUFFIX}")
         )
-        found = (self.find(name) for name in names if not name.startswith("."))
-        return [asset for asset in found if asset is not None]
+        found = (self._summary(name) for name in names if not name.startswith("."))
+        return [_info(summary) for summary in found if summary is not None]
+
+    def info(self, asset_id: str) -> AssetInfo:
+        """What the wire says about one. Raises ServiceError: UNKNOWN_ASSET."""
+        summary = self._summary(asset_id)
+        if summary is None:
+            raise _unknown(asset_id)
+        return _info(summary)
 
     def find(self, asset_id: str) -> LibraryAsset | None:
-        """The asset of that id, read from disk the first time."""
-        with self._lock:
-            if asset_id in self._removing:
-                return None
-            known = self._assets.get(asset_id)
-            if known is None and self._bundle(asset_id).is_dir():
-                try:
-                    known = self._assets[asset_id] = LibraryAsset(
-                        load_asset(self._bundle(asset_id))
-                    )
-                except BundleError as error:
-                    log.warning("asset broken", asset_id=asset_id, reason=str(error))
+        """The asset of that id, read from disk when it is not in memory.
+
+        Raises:
+            ServiceError: OUT_OF_MEMORY.
+        """
+        if (known := self._in_memory(asset_id)) is not None:
             return known
+        # One at a time: a second reader of the same asset finds it in memory.
+        with self._loading:
+            if (known := self._in_memory(asset_id)) is not None:
+                return known
+            summary = self._summary(asset_id)
+            return self._load(asset_id, summary) if summary is not None else None
 
     def get(self, asset_id: str) -> LibraryAsset:
-        """The asset of that id. Raises ServiceError: UNKNOWN_ASSET."""
+        """The asset of that id. Raises ServiceError: UNKNOWN_ASSET, OUT_OF_MEMORY."""
         found = self.find(asset_id)
         if found is None:
-            raise ServiceError(
-                ErrorCode.UNKNOWN_ASSET,
-                f"no asset {asset_id!r} in the library",
-                hint="GET /v1/assets lists them; POST /v1/assets adds one",
-            )
+            raise _unknown(asset_id)
         return found
 
-    def add(self, asset: Asset) -> LibraryAsset:
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the assets that are kept or in use, and of the one that is being read."""
+        with self._lock:
+            return self._reserved + sum(asset.nbytes for asset in self._alive.values())
+
+    def idle(self) -> Sequence[IdleItem]:
+        """Assets that are kept. One that a scenario shows frees nothing when it is dropped."""
+        with self._lock:
+            return [
+                IdleItem(used_at, self._strong[asset_id].nbytes, partial(self._drop, asset_id))
+                for asset_id, used_at in self._kept.items()
+            ]
+
+    def add(self, asset: Asset) -> AssetInfo:
         """Keep an asset.
 
         Raises:
             ServiceError: ALREADY_EXISTS: assets never change, because scenarios rely on them.
         """
+        self.check_free(asset.asset_id)
+        save_asset(asset, self.bundle(asset.asset_id))
+        return self.info(asset.asset_id)
+
+    def adopt(self, folder: Path, asset_id: str) -> AssetInfo:
+        """Take in a whole bundle of that id, which lies on the disk of the library.
+
+        Raises:
+            ServiceError: ALREADY_EXISTS.
+        """
         with self._lock:
-            target = self._bundle(asset.asset_id)
-            if target.exists():
-                raise ServiceError(
-                    ErrorCode.ALREADY_EXISTS,
-                    f"there is an asset {asset.asset_id!r} already; assets never change",
-                    hint="give another asset_id",
-                )
-            self.folder.mkdir(parents=True, exist_ok=True)
-            added = self._assets[asset.asset_id] = LibraryAsset(save_asset(asset, target))
-            return added
+            self.check_free(asset_id)
+            folder.rename(self.bundle(asset_id))
+        return self.info(asset_id)
+
+    def check_free(self, asset_id: str) -> None:
+        """Raises ServiceError: ALREADY_EXISTS where the id is taken."""
+        if self.bundle(asset_id).exists():
+            raise ServiceError(
+                ErrorCode.ALREADY_EXISTS,
+                f"there is an asset {asset_id!r} already; assets never change",
+                hint="give another asset_id",
+            )
 
     @contextmanager
     def removing(self, asset_id: str) -> Iterator[None]:
@@ -171,7 +220,7 @@ class AssetLibrary:
         Raises:
             ServiceError: UNKNOWN_ASSET, also while it is being removed.
         """
-        self.get(asset_id)
+        self.info(asset_id)
         with self._lock:
             self._removing.add(asset_id)
         try:
@@ -185,12 +234,95 @@ class AssetLibrary:
         with self._lock:
             # Renamed first: a crash must not leave half a bundle under its name.
             trash = self.folder / f".removed-{secrets.token_hex(6)}"
-            self._bundle(asset_id).rename(trash)
-            self._assets.pop(asset_id, None)
+            self.bundle(asset_id).rename(trash)
+            for known in (self._kept, self._strong, self._alive, self._summaries):
+                known.pop(asset_id, None)
         shutil.rmtree(trash, ignore_errors=True)
 
-    def _bundle(self, asset_id: str) -> Path:
+    def bundle(self, asset_id: str) -> Path:
+        """Where the bundle of that id belongs."""
         return self.folder / f"{asset_id}{ASSET_SUFFIX}"
+
+    # --- inside -----------------------------------------------------------------------------
+
+    def _summary(self, asset_id: str) -> AssetSummary | None:
+        with self._lock:
+            if asset_id in self._removing:
+                return None
+            known = self._summaries.get(asset_id)
+        folder = self.bundle(asset_id)
+        if not folder.is_dir():
+            return None
+        if known is None:
+            try:
+                known = read_asset_summary(folder)
+            except BundleError as error:
+                log.warning("asset broken", asset_id=asset_id, reason=str(error))
+                return None
+            with self._lock:
+                self._summaries[asset_id] = known
+        return known
+
+    def _in_memory(self, asset_id: str) -> LibraryAsset | None:
+        with self._lock:
+            if asset_id in self._removing:
+                return None
+            known = self._alive.get(asset_id)
+            if known is not None:
+                self._keep(asset_id, known)
+            return known
+
+    def _keep(self, asset_id: str, asset: LibraryAsset) -> None:
+        self._strong[asset_id], self._kept[asset_id] = asset, time.monotonic()
+
+    def _load(self, asset_id: str, summary: AssetSummary) -> LibraryAsset | None:
+        def reserve() -> None:
+            self._reserved = summary.nbytes
+
+        self._budget.make_room(f"asset {asset_id!r}", summary.nbytes, reserve=reserve)
+        try:
+            loaded = LibraryAsset(load_asset(self.bundle(asset_id)))
+            with self._lock:
+                self._alive[asset_id] = loaded
+                self._keep(asset_id, loaded)
+        except BundleError as error:
+            log.warning("asset broken", asset_id=asset_id, reason=str(error))
+            return None
+        finally:
+            self._reserved = 0
+        return loaded
+
+    def _drop(self, asset_id: str) -> int:
+        """Stop keeping an asset; the bytes that come free, none while others use it."""
+        with self._lock:
+            asset = self._strong.pop(asset_id, None)
+            self._kept.pop(asset_id, None)
+            nbytes = asset.nbytes if asset is not None else 0
+            # The last reference of this function: who else has one keeps it alive.
+            asset = None
+            return 0 if asset_id in self._alive else nbytes
+
+
+def _unknown(asset_id: str) -> ServiceError:
+    return ServiceError(
+        ErrorCode.UNKNOWN_ASSET,
+        f"no asset {asset_id!r} in the library",
+        hint="GET /v1/assets lists them; POST /v1/assets adds one",
+    )
+
+
+def _info(summary: AssetSummary) -> AssetInfo:
+    provenance = dict(summary.provenance)
+    return AssetInfo(
+        asset_id=summary.asset_id,
+        category=summary.category,
+        size=summary.size,
+        gaussians=summary.gaussians,
+        bytes=summary.nbytes,
+        content_hash=summary.content_hash,
+        ambient=provenance.pop("ambient", None),
+        provenance=provenance,
+    )
 
 
 def extract_object(scene: Scene, object_id: str, *, asset_id: str, category: str | None) -> Asset:
@@ -217,31 +349,39 @@ def extract_object(scene: Scene, object_id: str, *, asset_id: str, category: str
     return Asset(asset_id, category or found.category, found.size, cloud, provenance)
 
 
-def import_asset(path: Path, upload: AssetUpload, *, asset_id: str) -> Asset:
-    """The asset in a splat file, upright, centred and at a real size.
+def import_asset(
+    library: AssetLibrary,
+    source: Path,
+    upload: AssetUpload,
+    *,
+    asset_id: str,
+    limits: StagingLimits,
+    quota: Quota,
+) -> AssetInfo:
+    """Add the asset in a splat file, upright, centred and at a real size.
+
+    Args:
+        library: gets it.
+        source: the file, in a folder of its own on the library's disk, where the bundle is made.
+        upload: what was asked for.
+        asset_id: of the asset.
+        limits: of the process that reads the file.
+        quota: of the library.
 
     Raises:
-        ServiceError: IMPORT_FAILED, with the reason.
+        ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for what comes out of the
+            file, ALREADY_EXISTS, QUOTA_EXCEEDED.
     """
-    try:
-        raw = import_splats(
-            path,
-            name=asset_id,
-            as_asset=True,
-            category=upload.category,
-            up_axis=upload.up_axis,
-            yaw=upload.yaw,
-        )
-    except (BundleError, SceneError) as error:
-        reason = str(error).replace(f"{path.parent}/", "")
-        raise ServiceError(
-            ErrorCode.IMPORT_FAILED,
-            reason,
-            hint="give a splat file: .ply, .compressed.ply, .spz or .splat",
-        ) from error
-    length = upload.length or USUAL_LENGTHS.get(upload.category, raw.size[0])
-    factor = length / raw.size[0]
-    x, y, z = (side * factor for side in raw.size)
-    cloud = raw.cloud.moved(np.eye(4), scale=factor)
-    provenance = dict(raw.provenance) | {"scale": factor}
-    return replace(raw, cloud=cloud, size=(x, y, z), provenance=provenance)
+    library.check_free(asset_id)
+    quota.check()
+    staged = source.parent / "bundle"
+    options = {
+        "category": upload.category,
+        "up_axis": upload.up_axis,
+        "yaw": upload.yaw,
+        "length": upload.length or USUAL_LENGTHS.get(upload.category),
+    }
+    with import_errors(source, setting="MAX_ASSET_BYTES"):
+        stage_asset(source, staged, asset_id=asset_id, options=options, limits=limits)
+    quota.check(added_bytes=folder_usage(staged)[1])
+    return library.adopt(staged, asset_id)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import ID_PATTERN
 
-from ...scene import BundleError, SceneError
-from ...scene.io import import_splats, load_scene, save_scene
+from ...scene import BundleTooLargeError, SceneError
+from ...scene.io import StagingError, StagingLimits, stage_scene
 from ..http.problems import ServiceError
+from .quotas import Quota, folder_usage
 from .scene_catalog import SCENE_DOCUMENT, bundle_folder
 
 
@@ -35,28 +40,88 @@ def resolve_import(root: Path, given: str) -> Path:
     return target
 
 
-def import_scene(source: Path, *, scenes: Path, name: str) -> None:
-    """Read ``source`` whole, check it, and write it as bundle ``name`` below ``scenes``.
+def import_scene(
+    source: Path, *, scenes: Path, name: str, limits: StagingLimits, quota: Quota
+) -> None:
+    """Read ``source`` whole, check it, and make it bundle ``name`` below ``scenes``.
+
+    Args:
+        source: bundle or splat file.
+        scenes: the scene folder.
+        name: of the new scene.
+        limits: of the process that reads.
+        quota: of the scene folder.
 
     Raises:
-        ServiceError: IMPORT_FAILED when it cannot be read, ALREADY_EXISTS when the name is taken.
+        ServiceError: IMPORT_FAILED when it cannot be read or written, PAYLOAD_TOO_LARGE for what
+            comes out of it, ALREADY_EXISTS when the name is taken, QUOTA_EXCEEDED.
     """
     folder = bundle_folder(scenes, name)
-    if folder.exists() or (scenes / name).exists():
+    _check_name(folder, name)
+    quota.check()
+    with import_errors(source, setting="MAX_SCENE_BYTES"), staging_folder(scenes) as staging:
+        staged = staging / folder.name
+        stage_scene(source, staged, name=name, limits=limits)
+        quota.check(added_bytes=folder_usage(staged)[1])
+        _check_name(folder, name)
+        staged.rename(folder)
+
+
+@contextmanager
+def staging_folder(beside: Path) -> Iterator[Path]:
+    """A hidden folder on the disk of ``beside``, gone with the block.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    beside.mkdir(parents=True, exist_ok=True)
+    staging = beside / f".upload-{secrets.token_hex(6)}"
+    staging.mkdir()
+    try:
+        yield staging
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+@contextmanager
+def import_errors(source: Path, *, setting: str) -> Iterator[None]:
+    """Errors of the block as clients get them.
+
+    Args:
+        source: what is imported; its place on this machine is left out of messages.
+        setting: that limits what comes out.
+
+    Raises:
+        ServiceError: IMPORT_FAILED or PAYLOAD_TOO_LARGE.
+    """
+    try:
+        yield
+    except BundleTooLargeError as error:
+        raise ServiceError(
+            ErrorCode.PAYLOAD_TOO_LARGE,
+            _public(error, source),
+            hint=f"thin it out, or let the operator raise REAL2SIM_{setting} and "
+            "REAL2SIM_IMPORT_MEMORY_BYTES",
+        ) from error
+    except StagingError as error:
+        raise _import_failed(f"it cannot be written: {error}") from error
+    except SceneError as error:
+        raise _import_failed(_public(error, source)) from error
+    except OSError as error:
+        raise _import_failed(f"it cannot be written: {error.strerror}") from error
+
+
+def _public(error: Exception, source: Path) -> str:
+    return str(error).replace(f"{source.parent.absolute()}/", "").replace(f"{source.parent}/", "")
+
+
+def _check_name(folder: Path, name: str) -> None:
+    if folder.exists() or (folder.parent / name).exists():
         raise ServiceError(
             ErrorCode.ALREADY_EXISTS,
             f"there is a scene {name!r} already",
             hint="give another name in 'scene', or delete the bundle on the worker's disk",
         )
-    try:
-        scene = load_scene(source) if source.is_dir() else import_splats(source, name=name)
-        save_scene(scene, folder)
-    except BundleError as error:
-        raise _import_failed(str(error).replace(f"{source.parent}/", "")) from error
-    except SceneError as error:
-        raise _import_failed(str(error)) from error
-    except OSError as error:
-        raise _import_failed(f"scene {name!r} cannot be written: {error.strerror}") from error
 
 
 def scene_name(source: Path, given: str | None) -> str:
@@ -81,5 +146,6 @@ def _import_failed(detail: str) -> ServiceError:
     return ServiceError(
         ErrorCode.IMPORT_FAILED,
         detail,
-        hint=f"give a bundle (a folder with {SCENE_DOCUMENT}) or a Gaussian splat ply",
+        hint=f"give a bundle (a folder with {SCENE_DOCUMENT}) or a splat file: "
+        ".ply, .compressed.ply, .spz or .splat",
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +22,7 @@ from ...scene.io import SceneSummary, load_scene
 from ..engine import Engine
 from ..http.problems import ServiceError
 from ..lanes import Lane
+from .memory import IdleItem, MemoryBudget
 from .scene_catalog import Listing, SceneCatalog
 
 T = TypeVar("T")
@@ -46,7 +48,7 @@ class SceneCache:
     Args:
         catalog: the scene folder.
         engine: puts loaded scenes onto the device.
-        budget_bytes: of all resident scenes together.
+        budget: of memory, shared with others that load things.
         device: where their tensors live.
         on_load: called with the seconds each load took.
     """
@@ -56,12 +58,12 @@ class SceneCache:
         catalog: SceneCatalog,
         engine: Engine,
         *,
-        budget_bytes: int,
+        budget: MemoryBudget,
         device: str = "cpu",
         on_load: Callable[[float], None] | None = None,
     ) -> None:
         self.catalog = catalog
-        self.budget_bytes = budget_bytes
+        self.budget = budget
         self.device = device
         self._engine = engine
         self._on_load = on_load
@@ -71,6 +73,9 @@ class SceneCache:
         self._reserved: dict[str, int] = {}
         # Reading and hashing bundles is disk work: on the engine it would hold up every session,
         # on the loop everything. One thread, because disks and memory serve one best.
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop_thread = 0
+        budget.add(self)
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="scenes")
 
     def close(self) -> None:
@@ -143,7 +148,20 @@ class SceneCache:
     @property
     def resident_bytes(self) -> int:
         """Memory of all resident scenes."""
-        return sum(r.scene.nbytes for r in self._resident.values())
+        return sum(r.scene.nbytes for r in list(self._resident.values()))
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of all scenes that are resident or on their way."""
+        return self.resident_bytes + sum(list(self._reserved.values()))
+
+    def idle(self) -> list[IdleItem]:
+        """Scenes that no session pins. May be called on any thread, as what it returns."""
+        return [
+            IdleItem(r.used_at, r.scene.nbytes, partial(self._drop, name, r.scene.nbytes))
+            for name, r in list(self._resident.items())
+            if not r.pins
+        ]
 
     # --- using ------------------------------------------------------------------------------
 
@@ -205,8 +223,13 @@ class SceneCache:
                 summary = await self.summary(name)
                 if name in self._resident or name in self._loading:
                     continue
-                self._evict_for(name, summary.nbytes)
-                self._reserved[name] = summary.nbytes
+                self._loop = asyncio.get_running_loop()
+                self._loop_thread = threading.get_ident()
+                self.budget.make_room(
+                    f"scene {name!r}",
+                    summary.nbytes,
+                    reserve=partial(self._reserved.__setitem__, name, summary.nbytes),
+                )
                 task = asyncio.create_task(self._load(name, summary), name=f"load {name}")
                 # Read the outcome even when all who waited have left.
                 task.add_done_callback(lambda t: t.cancelled() or t.exception())
@@ -238,37 +261,21 @@ class SceneCache:
         log.info("scene loaded", scene=name, bytes=scene.nbytes, seconds=round(seconds, 3))
         return scene
 
-    def _evict_for(self, name: str, needed: int) -> None:
-        """Evict unpinned scenes, longest unused first, until ``needed`` bytes fit.
+    def _drop(self, name: str, nbytes: int) -> int:
+        """Forget an idle scene to make room; other threads leave that to the loop."""
+        loop = self._loop
+        if loop is None or loop.is_closed():
+            return 0
+        if threading.get_ident() == self._loop_thread:
+            self._forget_idle(name)
+        else:
+            loop.call_soon_threadsafe(self._forget_idle, name)
+        return nbytes
 
-        Raises:
-            ServiceError: OUT_OF_MEMORY; then nothing was evicted.
-        """
-        if needed > self.budget_bytes:
-            raise _out_of_memory(
-                f"scene {name!r} needs {needed} bytes, the budget is {self.budget_bytes}",
-                hint="raise REAL2SIM_SCENE_MEMORY_BYTES, or thin the scene out",
-                needed=needed,
-                free=self.budget_bytes,
-            )
-        idle = sorted(
-            (n for n, r in self._resident.items() if not r.pins),
-            key=lambda n: self._resident[n].used_at,
-        )
-        free = self.budget_bytes - self.resident_bytes - sum(self._reserved.values())
-        if needed > free + sum(self._resident[n].scene.nbytes for n in idle):
-            raise _out_of_memory(
-                f"scene {name!r} needs {needed} bytes; of the budget of {self.budget_bytes} all "
-                f"but {free} are taken by scenes that sessions use",
-                hint="close sessions on other scenes, or raise REAL2SIM_SCENE_MEMORY_BYTES",
-                needed=needed,
-                free=free,
-            )
-        for candidate in idle:
-            if needed <= free:
-                return
-            free += self._resident[candidate].scene.nbytes
-            self._forget(candidate)
+    def _forget_idle(self, name: str) -> None:
+        resident = self._resident.get(name)
+        if resident is not None and not resident.pins:
+            self._forget(name)
 
     def _forget(self, name: str) -> None:
         del self._resident[name]
@@ -281,8 +288,3 @@ def _broken(name: str, reason: str | None) -> ServiceError:
         f"scene {name!r} cannot be read: {reason}",
         hint="copy or import the bundle again; the worker notices by itself",
     )
-
-
-def _out_of_memory(detail: str, *, hint: str, needed: int, free: int) -> ServiceError:
-    extra = {"needed_bytes": needed, "free_bytes": free}
-    return ServiceError(ErrorCode.OUT_OF_MEMORY, detail, hint=hint, extra=extra)

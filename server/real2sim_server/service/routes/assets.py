@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import secrets
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -19,13 +17,13 @@ from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.base import Identifier
 
 from ...render import encode_image
-from ...scene.io.formats import suffixes
 from ..http.problems import ServiceError
 from ..http.responses import info_response
-from ..library.assets import LibraryAsset, extract_object, import_asset
-from ..library.imports import scene_name
+from ..library.assets import extract_object, import_asset
+from ..library.imports import import_errors, scene_name, staging_folder
 from ..library.thumbnails import draw_thumbnail
 from ..worker import Worker, WorkerOf
+from .scene_imports import stored_upload
 
 UPLOAD_PATH = "/v1/assets"
 
@@ -69,11 +67,11 @@ async def add(worker: WorkerOf, request: Request) -> Response:
     stays taken.
     """
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
-    if kind == "multipart/form-data":
-        asset = await _upload(worker, request)
-    else:
-        asset = await _extract(worker, _parsed(AssetCut, await request.body()))
-    info = asset.info()
+    with worker.imports.place():
+        if kind == "multipart/form-data":
+            info = await _upload(worker, request)
+        else:
+            info = await _extract(worker, _parsed(AssetCut, await request.body()))
     headers = {"Location": f"/v1/assets/{info.asset_id}"}
     return info_response(info, status=201, headers=headers)
 
@@ -81,14 +79,13 @@ async def add(worker: WorkerOf, request: Request) -> Response:
 @router.get("")
 async def list_assets(worker: WorkerOf) -> AssetList:
     """The whole library."""
-    assets = await asyncio.to_thread(worker.assets.list)
-    return AssetList(assets=[asset.info() for asset in assets])
+    return AssetList(assets=await asyncio.to_thread(worker.assets.list))
 
 
 @router.get("/{asset_id}")
 async def describe(worker: WorkerOf, asset_id: Identifier) -> AssetInfo:
     """One asset."""
-    return (await asyncio.to_thread(worker.assets.get, asset_id)).info()
+    return await asyncio.to_thread(worker.assets.info, asset_id)
 
 
 @router.delete("/{asset_id}", status_code=204, response_class=Response)
@@ -97,8 +94,8 @@ async def delete(worker: WorkerOf, asset_id: Identifier) -> Response:
 
     Sessions that show it go on.
     """
-    asset = await asyncio.to_thread(worker.assets.get, asset_id)
-    await _check_unused(worker, asset.asset_id)
+    await asyncio.to_thread(worker.assets.info, asset_id)
+    await _check_unused(worker, asset_id)
     with worker.assets.removing(asset_id):
         # Once more: an edit that was under way may have found it before.
         await _check_unused(worker, asset_id)
@@ -141,18 +138,20 @@ async def _check_unused(worker: Worker, asset_id: str) -> None:
         )
 
 
-async def _extract(worker: Worker, cut: AssetCut) -> LibraryAsset:
+async def _extract(worker: Worker, cut: AssetCut) -> AssetInfo:
     scene = await worker.scene_cache.get(cut.scene)
     asset_id = cut.asset_id or cut.object_id
 
-    def work() -> LibraryAsset:
+    def work() -> AssetInfo:
         asset = extract_object(scene, cut.object_id, asset_id=asset_id, category=cut.category)
+        worker.assets.check_free(asset_id)
+        worker.assets_quota.check(added_bytes=asset.nbytes)
         return worker.assets.add(asset)
 
-    return await worker.scene_cache.on_disk_thread(work)
+    return await worker.imports.run(work)
 
 
-async def _upload(worker: Worker, request: Request) -> LibraryAsset:
+async def _upload(worker: Worker, request: Request) -> AssetInfo:
     async with request.form(max_files=1, max_fields=len(AssetUpload.model_fields)) as form:
         file = form.get("file")
         if not isinstance(file, UploadFile):
@@ -164,26 +163,22 @@ async def _upload(worker: Worker, request: Request) -> LibraryAsset:
         fields = {name: value for name, value in form.items() if name != "file"}
         upload = _parsed(AssetUpload, fields)
 
-        def work() -> LibraryAsset:
+        def work() -> AssetInfo:
             asset_id = upload.asset_id or scene_name(Path(file.filename or "asset"), None)
-            stored = _stored(file, worker.assets.folder)
-            try:
-                return worker.assets.add(import_asset(stored, upload, asset_id=asset_id))
-            finally:
-                stored.unlink()
+            with (
+                import_errors(Path("upload"), setting="MAX_ASSET_BYTES"),
+                staging_folder(worker.assets.folder) as staging,
+            ):
+                return import_asset(
+                    worker.assets,
+                    stored_upload(file, staging),
+                    upload,
+                    asset_id=asset_id,
+                    limits=worker.asset_limits,
+                    quota=worker.assets_quota,
+                )
 
-        return await worker.scene_cache.on_disk_thread(work)
-
-
-def _stored(file: UploadFile, folder: Path) -> Path:
-    """The upload as a hidden file: readers map files into memory, and tell formats by suffix."""
-    folder.mkdir(parents=True, exist_ok=True)
-    given = Path(file.filename or "upload.ply").name.lower()
-    ending = next((suffix for suffix in suffixes() if given.endswith(suffix)), ".ply")
-    stored = folder / f".upload-{secrets.token_hex(6)}{ending}"
-    with stored.open("xb") as target:
-        shutil.copyfileobj(file.file, target, 1 << 20)
-    return stored
+        return await worker.imports.run(work)
 
 
 def _parsed(model: type[M], given: bytes | Mapping[str, Any]) -> M:

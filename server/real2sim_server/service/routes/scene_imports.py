@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,15 @@ from starlette.datastructures import UploadFile
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import SceneImport, SceneInfo
 
+from ...scene.io.formats import suffixes
 from ..http.problems import ServiceError
-from ..library.imports import import_scene, resolve_import, scene_name
+from ..library.imports import (
+    import_errors,
+    import_scene,
+    resolve_import,
+    scene_name,
+    staging_folder,
+)
 from ..worker import Worker, WorkerOf
 from .scenes import scene_response
 
@@ -53,10 +59,11 @@ router = APIRouter(prefix="/v1", tags=["scenes"])
 async def import_(worker: WorkerOf, request: Request) -> Response:
     """Add a scene: a bundle or ply below the import folder (JSON), or an uploaded ply."""
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
-    if kind == "multipart/form-data":
-        name = await _import_upload(worker, request)
-    else:
-        name = await _import_path(worker, await request.body())
+    with worker.imports.place():
+        if kind == "multipart/form-data":
+            name = await _import_upload(worker, request)
+        else:
+            name = await _import_path(worker, await request.body())
     await worker.scene_cache.refresh()
     headers = {"Location": f"/v1/scenes/{name}"}
     return await scene_response(worker, name, status=201, headers=headers)
@@ -69,10 +76,10 @@ async def _import_path(worker: Worker, body: bytes) -> str:
     def work() -> str:
         source = resolve_import(settings.import_path, request.path)
         name = scene_name(source, request.scene)
-        import_scene(source, scenes=settings.scenes_path, name=name)
+        _import(worker, source, name)
         return name
 
-    return await worker.scene_cache.on_disk_thread(work)
+    return await worker.imports.run(work)
 
 
 async def _import_upload(worker: Worker, request: Request) -> str:
@@ -83,24 +90,34 @@ async def _import_upload(worker: Worker, request: Request) -> str:
                 ErrorCode.INVALID_REQUEST,
                 "the form needs a part 'file' with the splat file, and may have a field 'scene'",
             )
-        scenes = worker.settings.scenes_path
 
         def work() -> str:
             name = scene_name(Path(file.filename or "upload"), given)
-            stored = _store_upload(file, scenes)
-            try:
-                import_scene(stored, scenes=scenes, name=name)
-            finally:
-                stored.unlink()
+            with (
+                import_errors(Path("upload"), setting="MAX_SCENE_BYTES"),
+                staging_folder(worker.settings.scenes_path) as staging,
+            ):
+                _import(worker, stored_upload(file, staging), name)
             return name
 
-        return await worker.scene_cache.on_disk_thread(work)
+        return await worker.imports.run(work)
 
 
-def _store_upload(file: UploadFile, scenes: Path) -> Path:
-    """The upload as a hidden file beside the scenes: readers of splats map files into memory."""
-    scenes.mkdir(parents=True, exist_ok=True)
-    stored = scenes / f".upload-{secrets.token_hex(6)}.ply"
+def _import(worker: Worker, source: Path, name: str) -> None:
+    import_scene(
+        source,
+        scenes=worker.settings.scenes_path,
+        name=name,
+        limits=worker.scene_limits,
+        quota=worker.scenes_quota,
+    )
+
+
+def stored_upload(file: UploadFile, staging: Path) -> Path:
+    """The upload as a file in ``staging``: readers map files, and tell some formats by suffix."""
+    given = Path(file.filename or "upload.ply").name.lower()
+    ending = next((suffix for suffix in suffixes() if given.endswith(suffix)), ".ply")
+    stored = staging / f"upload{ending}"
     with stored.open("xb") as target:
         shutil.copyfileobj(file.file, target, 1 << 20)
     return stored

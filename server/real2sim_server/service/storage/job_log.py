@@ -50,6 +50,11 @@ class JobLog:
         everything = sa.true() if subject is None else t.jobs.c.subject == subject
         return await self._select(everything, limit=limit)
 
+    async def count(self) -> int:
+        """Jobs on record."""
+        rows = await self._store.read(sa.select(sa.func.count().label("jobs")).select_from(t.jobs))
+        return int(rows[0]["jobs"])
+
     async def unfinished(self) -> list[JobInfo]:
         """Jobs that this worker has not ended."""
         own = t.jobs.c.worker_id == self._worker_id

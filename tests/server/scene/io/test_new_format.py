@@ -32,10 +32,11 @@ class SplatCsv:
     def recognises(self, head: bytes) -> bool:
         return head.startswith(",".join(COLUMNS).encode())
 
-    def read(self, path: Path) -> GaussianCloud:
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         lines = path.read_text(encoding="ascii").split("\n")
         if lines[-1]:
             raise BundleError(f"{path}: its last line is cut off")
+        types.check_memory(path, len(lines) - 2, 1, max_bytes)
         rows = np.array([line.split(",") for line in lines[1:-1]], dtype=np.float64)
         means, logits, scales, quats, colours = np.split(rows, [3, 4, 7, 11], axis=1)
         return types.build_cloud(

@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from real2sim_server.scene import BundleError
-from real2sim_server.scene.io.ply import MAX_HEADER_BYTES, read_ply_elements, read_ply_header
+from real2sim_server.scene.io.ply import (
+    MAX_HEADER_BYTES,
+    MAX_HEADER_LINES,
+    read_ply_elements,
+    read_ply_header,
+)
 
 HEADER = (
     "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
@@ -116,6 +121,30 @@ def test_a_file_longer_than_its_header_says_is_refused(ply):
 def test_an_absurd_count_is_refused_before_anything_is_allocated(ply):
     with pytest.raises(BundleError, match="truncated"):
         read_ply_elements(ply(HEADER.replace("vertex 3", "vertex 999999999999999")))
+
+
+@pytest.mark.parametrize("kind", ["property float p{}", "element e{} 0"])
+def test_a_header_that_declares_thousands_is_refused_at_once(ply, kind):
+    lines = "\n".join(kind.format(i) for i in range(20_000))
+    start = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    with pytest.raises(BundleError, match=f"more than {MAX_HEADER_LINES} elements and properties"):
+        read_ply_header(ply(f"{start}{lines}\nend_header\n", b""))
+
+
+def test_as_many_properties_as_are_allowed_are_read(ply):
+    names = [f"p{i}" for i in range(MAX_HEADER_LINES - 2)]
+    lines = "\n".join(f"property uchar {name}" for name in names)
+    start = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    found = read_ply_header(ply(f"{start}{lines}\nend_header\n", b""))
+    assert list(found.elements["vertex"].properties) == names
+
+
+def test_a_message_does_not_repeat_a_long_line(ply):
+    with pytest.raises(BundleError) as caught:
+        read_ply_header(
+            ply("ply\nformat binary_little_endian 1.0\n" + "x" * 100_000 + "\nend_header\n")
+        )
+    assert len(str(caught.value)) < 1000
 
 
 def test_a_missing_file_is_named(tmp_path):

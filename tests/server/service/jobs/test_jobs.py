@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import time
+from pathlib import Path
 
 import cv2
 import pytest
@@ -12,6 +13,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.http.problems import ServiceError
 from real2sim_server.service.jobs.jobs import JobResult, Jobs, NewJob
+from real2sim_server.service.library.quotas import Quota
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.store import Store
 
@@ -27,7 +29,7 @@ def with_jobs(tmp_path):
             store = Store(f"sqlite:///{tmp_path / 'store.db'}")
             await store.open()
             try:
-                jobs = Jobs(JobLog(store, "w0"), tmp_path / "jobs")
+                jobs = Jobs(JobLog(store, "w0"), _quota(tmp_path / "jobs"))
                 async with jobs.running():
                     return await work(jobs)
             finally:
@@ -36,6 +38,10 @@ def with_jobs(tmp_path):
         return asyncio.run(inside())
 
     return run
+
+
+def _quota(folder: Path) -> Quota:
+    return Quota(folder, "jobs", 1000, 1 << 30, "JOBS_QUOTA", "delete jobs")
 
 
 async def until_over(jobs: Jobs, job: JobInfo) -> JobInfo:

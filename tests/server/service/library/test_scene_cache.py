@@ -13,6 +13,7 @@ from real2sim_server.scene.io import read_scene_summary, save_scene
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.problems import ServiceError
 from real2sim_server.service.library import scene_cache as scene_cache_module
+from real2sim_server.service.library.memory import MemoryBudget
 from real2sim_server.service.library.scene_cache import SceneCache
 from real2sim_server.service.library.scene_catalog import SceneCatalog
 
@@ -38,7 +39,7 @@ def run(folder, work, *, budget_bytes: int = 10**9):
     async def running():
         engine = Engine()
         engine.start()
-        scene_cache = SceneCache(SceneCatalog(folder), engine, budget_bytes=budget_bytes)
+        scene_cache = SceneCache(SceneCatalog(folder), engine, budget=MemoryBudget(budget_bytes))
         try:
             yield scene_cache
         finally:

@@ -28,8 +28,8 @@ _NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 def read_pickled_arrays(path: Path, name: str) -> dict[Any, NDArray[Any]]:
     """The dictionary of arrays that ``numpy.savez`` put under ``name`` as a pickled object.
 
-    A pickle is a program, and what interprets it was not made for files of unknown origin. It is read
-    in a process of its own; here come plain ``.npy`` files of numbers only.
+    A pickle is a program, and what interprets it was not made for untrusted files. It is read in a
+    process of its own; only plain ``.npy`` files of numbers come back.
 
     Raises:
         LogError: the file is missing or broken, has no such entry, or its pickle holds anything

@@ -13,7 +13,7 @@ from ...._files import atomic_file
 from ...cloud import GaussianCloud
 from ...errors import BundleError
 from ...spherical_harmonics import SH_C0
-from .types import UpAxis, build_cloud, host_array
+from .types import UpAxis, build_cloud, check_memory, host_array
 
 RECORD = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
@@ -40,7 +40,7 @@ class AntimatterSplat:
         """Never: there is no header."""
         return False
 
-    def read(self, path: Path) -> GaussianCloud:
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
         nbytes = path.stat().st_size
         if nbytes % RECORD.itemsize:
@@ -48,6 +48,7 @@ class AntimatterSplat:
                 f"{path}: truncated or no .splat file: {nbytes} bytes are no multiple of "
                 f"{RECORD.itemsize}"
             )
+        check_memory(path, nbytes // RECORD.itemsize, 1, max_bytes)
         records = np.fromfile(path, dtype=RECORD)
         for name, bad in {
             "position": ~np.isfinite(records["position"]),
@@ -64,11 +65,11 @@ class AntimatterSplat:
         rgba = records["rgba"] / 255.0
         return build_cloud(
             path,
-            means=records["position"].astype(np.float64),
+            means=records["position"],
             quats=(records["rotation"].astype(np.float64) - 128) / 128,
             log_scales=log_scales,
             opacities=rgba[:, 3],
-            sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None, :],
+            sh=((rgba[:, :3] - 0.5) / SH_C0).astype(np.float32)[:, None, :],
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:

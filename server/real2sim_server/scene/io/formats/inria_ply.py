@@ -11,7 +11,7 @@ from ...._files import atomic_file
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
 from ..ply import read_ply_elements
-from .types import UpAxis, build_cloud, column, columns, require_properties
+from .types import UpAxis, build_cloud, check_memory, column, columns, require_properties
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -38,23 +38,25 @@ class InriaPly:
         """Whether ``head`` is that of a PLY file; the compressed kind is asked before."""
         return head.startswith((b"ply\n", b"ply\r\n"))
 
-    def read(self, path: Path) -> GaussianCloud:
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
         elements = read_ply_elements(path)
         vertex = elements.get("vertex")
         names = vertex.dtype.names or () if vertex is not None else None
         require_properties(path, "vertex", names, POSITION + DC + ("opacity",) + SCALE + ROTATION)
         assert vertex is not None
+        rest = _rest_properties(path, vertex)
+        check_memory(path, len(vertex), 1 + len(rest) // 3, max_bytes)
         logits = column(path, vertex, "opacity", infinite=True)
         with np.errstate(over="ignore"):
             opacities = 1 / (1 + np.exp(-logits))
         return build_cloud(
             path,
-            means=columns(path, vertex, POSITION),
+            means=columns(path, vertex, POSITION, np.float32),
             quats=columns(path, vertex, ROTATION),
             log_scales=columns(path, vertex, SCALE),
             opacities=opacities,
-            sh=_spherical_harmonics(path, vertex),
+            sh=_spherical_harmonics(path, vertex, rest),
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
@@ -100,8 +102,8 @@ def _rest_names(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def _spherical_harmonics(path: Path, vertex: NDArray[np.void]) -> NDArray[np.float64]:
-    """Coefficients [N, K, 3]; the file holds those past the first channel by channel."""
+def _rest_properties(path: Path, vertex: NDArray[np.void]) -> tuple[str, ...]:
+    """Names of the harmonics past the first, once they are of a whole degree."""
     given = [name for name in vertex.dtype.names or () if name.startswith("f_rest_")]
     names = _rest_names(len(given))
     if set(given) != set(names) or len(names) // 3 + 1 not in SH_DEGREES or len(names) % 3:
@@ -109,6 +111,17 @@ def _spherical_harmonics(path: Path, vertex: NDArray[np.void]) -> NDArray[np.flo
             f"{path}: {len(given)} f_rest properties; allowed are f_rest_0 to f_rest_8, _23, _44 "
             "without gaps, or none"
         )
-    first = columns(path, vertex, DC)[:, None, :]
-    rest = columns(path, vertex, names).reshape(len(vertex), 3, len(names) // 3)
-    return np.concatenate([first, rest.transpose(0, 2, 1)], axis=1)
+    return names
+
+
+def _spherical_harmonics(
+    path: Path, vertex: NDArray[np.void], rest: tuple[str, ...]
+) -> NDArray[np.float32]:
+    """Coefficients [N, K, 3]; the file holds those past the first channel by channel."""
+    per_channel = len(rest) // 3
+    sh = np.empty((len(vertex), 1 + per_channel, 3), dtype=np.float32)
+    sh[:, 0] = columns(path, vertex, DC, np.float32)
+    for channel in range(3):
+        names = rest[channel * per_channel : (channel + 1) * per_channel]
+        sh[:, 1:, channel] = columns(path, vertex, names, np.float32)
+    return sh

@@ -20,7 +20,15 @@ from ...errors import BundleError
 from ...spherical_harmonics import SH_C0
 from ..ply import read_ply_elements
 from .morton import morton_order
-from .types import UpAxis, build_cloud, columns, host_array, require_properties
+from .types import (
+    UpAxis,
+    build_cloud,
+    check_memory,
+    column,
+    columns,
+    host_array,
+    require_properties,
+)
 
 CHUNK_SIZE = 256
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -59,10 +67,13 @@ class PlayCanvasPly:
         header = head.split(b"end_header", 1)[0]
         return header.startswith((b"ply\n", b"ply\r\n")) and b" packed_position" in header
 
-    def read(self, path: Path) -> GaussianCloud:
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
         elements = read_ply_elements(path)
         vertex, chunks = self._checked(path, elements)
+        sh = elements.get("sh")
+        rest = 0 if sh is None else len(sh.dtype.names or ()) // 3
+        check_memory(path, len(vertex), 1 + rest, max_bytes)
         chunk_of = np.arange(len(vertex)) // CHUNK_SIZE
 
         def between(low: tuple[str, ...], high: tuple[str, ...], fraction: Float) -> Float:
@@ -72,14 +83,14 @@ class PlayCanvasPly:
         rgba = _unpack_8888(vertex["packed_color"])
         has_colours = LOW_COLOUR[0] in (chunks.dtype.names or ())
         rgb = between(LOW_COLOUR, HIGH_COLOUR, rgba[:, :3]) if has_colours else rgba[:, :3]
-        first = ((rgb - 0.5) / SH_C0)[:, None, :]
+        first = ((rgb - 0.5) / SH_C0).astype(np.float32)[:, None, :]
         return build_cloud(
             path,
             means=between(LOW_POSITION, HIGH_POSITION, _unpack_11_10_11(vertex["packed_position"])),
             quats=_unpack_rotation(vertex["packed_rotation"]),
             log_scales=between(LOW_SCALE, HIGH_SCALE, _unpack_11_10_11(vertex["packed_scale"])),
             opacities=rgba[:, 3],
-            sh=np.concatenate([first, _rest(path, elements.get("sh"), len(vertex))], axis=1),
+            sh=np.concatenate([first, _rest(path, sh, len(vertex))], axis=1),
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
@@ -157,10 +168,10 @@ def _unpack_rotation(words: Words) -> Float:
     return quats
 
 
-def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> Float:
+def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> NDArray[np.float32]:
     """Harmonics past the first [N, K - 1, 3]: bytes over [-4, 4], channel by channel."""
     if sh is None:
-        return np.empty((count, 0, 3))
+        return np.empty((count, 0, 3), dtype=np.float32)
     names = tuple(f"f_rest_{i}" for i in range(len(sh.dtype.names or ())))
     if len(names) % 3 or len(names) // 3 + 1 not in SH_DEGREES or len(sh) != count:
         raise BundleError(
@@ -168,10 +179,14 @@ def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> Float:
             f"allowed are {count} of 9, 24 or 45"
         )
     require_properties(path, "sh", sh.dtype.names, names)
-    codes = columns(path, sh, names)
-    # The writer cuts 256 equal bins; their middles come back, and the ends where it clamped.
-    fraction = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
-    return ((fraction - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+    per_channel = len(names) // 3
+    rest = np.empty((count, per_channel, 3), dtype=np.float32)
+    for index, name in enumerate(names):
+        codes = column(path, sh, name)
+        # The writer cuts 256 equal bins; their middles come back, and the ends where it clamped.
+        fraction = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
+        rest[:, index % per_channel, index // per_channel] = (fraction - 0.5) * 8
+    return rest
 
 
 def _packed(cloud: GaussianCloud) -> tuple[Float, Words]:
@@ -210,8 +225,8 @@ def _fractions(values: Float) -> tuple[Float, Float, Float]:
 def _pack(fractions: Float, bits: tuple[int, ...]) -> Words:
     """One word of each row of fractions; the first component goes to the highest bits."""
     words = np.zeros(len(fractions), dtype=np.uint32)
-    for column, width in enumerate(bits):
-        codes = np.rint(fractions[:, column] * (2**width - 1)).astype(np.uint32)
+    for axis, width in enumerate(bits):
+        codes = np.rint(fractions[:, axis] * (2**width - 1)).astype(np.uint32)
         words = words << np.uint32(width) | codes
     return words
 

@@ -14,7 +14,7 @@ from ...._files import atomic_file
 from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError, SceneError
-from .spz_container import Header, Streams, is_spz, read_streams, write_streams
+from .spz_container import MAX_REST, Header, Streams, is_spz, read_streams, write_streams
 from .types import UpAxis, build_cloud, host_array
 
 COLOUR_SCALE = 0.15
@@ -25,9 +25,6 @@ FRACTIONAL_BITS = 12
 
 SH_BITS = (5, 4, 4)
 """Bits kept of harmonics of degree 1, 2, 3; the other bits are zero and compress away."""
-
-MAX_REST = 15
-"""Harmonics past the first that a cloud can hold."""
 
 Bytes = NDArray[np.uint8]
 
@@ -63,9 +60,9 @@ class Spz:
         """Whether ``head`` is that of a plain or gzipped spz file."""
         return is_spz(head)
 
-    def read(self, path: Path) -> GaussianCloud:
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
-        header, streams = read_streams(path)
+        header, streams = read_streams(path, max_bytes=max_bytes)
         return build_cloud(
             path,
             means=_positions(path, header, streams),
@@ -97,9 +94,9 @@ class Spz:
             file.write(write_streams(header, streams))
 
 
-def _positions(path: Path, header: Header, streams: Streams) -> Float:
+def _positions(path: Path, header: Header, streams: Streams) -> NDArray[np.float32]:
     if header.version == 1:
-        means = streams.positions.view("<f2").astype(np.float64).reshape(-1, 3)
+        means = streams.positions.view("<f2").astype(np.float32).reshape(-1, 3)
         bad = int((~np.isfinite(means)).any(axis=1).sum())
         if bad:
             raise BundleError(
@@ -109,7 +106,10 @@ def _positions(path: Path, header: Header, streams: Streams) -> Float:
     triples = streams.positions.reshape(-1, 3).astype(np.int32)
     whole = triples[:, 0] | triples[:, 1] << 8 | triples[:, 2] << 16
     signed = np.where(whole >= 1 << 23, whole - (1 << 24), whole)
-    return signed.reshape(-1, 3) / float(1 << header.fractional_bits)
+    # 24 bits and a power of two: exact in float32.
+    means = signed.astype(np.float32).reshape(-1, 3)
+    means /= np.float32(1 << header.fractional_bits)
+    return means
 
 
 def _rotations(header: Header, streams: Streams) -> Float:
@@ -134,10 +134,14 @@ def _other_places(place: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array([[k for k in range(4) if k != p] for p in range(4)])[place]
 
 
-def _spherical_harmonics(header: Header, streams: Streams) -> Float:
-    first = (streams.colours.reshape(-1, 1, 3) / 255.0 - 0.5) / COLOUR_SCALE
+def _spherical_harmonics(header: Header, streams: Streams) -> NDArray[np.float32]:
+    """Coefficients [N, K, 3]. Bytes by powers of two are exact in float32."""
+    sh = np.empty((header.count, header.harmonics, 3), dtype=np.float32)
+    sh[:, 0] = (streams.colours.reshape(-1, 3) / 255.0 - 0.5) / COLOUR_SCALE
     rest = streams.sh.reshape(header.count, (header.sh_degree + 1) ** 2 - 1, 3)
-    return np.concatenate([first, (rest[:, :MAX_REST] - 128.0) / 128], axis=1)
+    np.subtract(rest[:, :MAX_REST], np.float32(128), out=sh[:, 1:])
+    sh[:, 1:] /= 128
+    return sh
 
 
 def _fractional_bits(means: Float) -> int:

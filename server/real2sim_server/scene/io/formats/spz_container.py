@@ -14,6 +14,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from ...errors import BundleError
+from .types import check_memory
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -23,6 +24,9 @@ TOC_ENTRY = struct.Struct("<QQ")
 
 HAS_EXTENSIONS = 2
 MAX_EXTENSION_BYTES = 1 << 20
+
+MAX_REST = 15
+"""Harmonics past the first that a cloud can hold; those of degree 4 are cut."""
 
 MAX_SPLATS = 20_000_000
 """More are refused; the largest street scenes have a few million."""
@@ -43,6 +47,11 @@ class Header:
     sh_degree: int
     fractional_bits: int
     flags: int
+
+    @property
+    def harmonics(self) -> int:
+        """Spherical harmonics of each splat once read."""
+        return 1 + min(MAX_REST, (self.sh_degree + 1) ** 2 - 1)
 
     @property
     def stream_sizes(self) -> dict[str, int]:
@@ -80,12 +89,17 @@ def is_spz(head: bytes) -> bool:
     return head.startswith(MAGIC)
 
 
-def read_streams(path: Path) -> tuple[Header, Streams]:
+def read_streams(path: Path, *, max_bytes: int | None = None) -> tuple[Header, Streams]:
     """Header and decompressed streams of a file of any version.
 
     No more is inflated than the header asks for, and the header is checked before.
 
+    Args:
+        path: the file.
+        max_bytes: what its Gaussians may take in memory.
+
     Raises:
+        BundleTooLargeError: they take more.
         BundleError: naming the file and the reason: not there, an unknown version, counts out of
             range or not fitting, cut short, broken compression.
     """
@@ -96,11 +110,13 @@ def read_streams(path: Path) -> tuple[Header, Streams]:
     if data.startswith(GZIP_MAGIC):
         inflated = _inflate_gzip(path, data, HEADER.size)
         header = _header(path, inflated, versions=(1, 2, 3))
+        check_memory(path, header.count, header.harmonics, max_bytes)
         wanted = HEADER.size + sum(header.stream_sizes.values())
         # One byte more than may be there tells a file that is too long.
         data = _inflate_gzip(path, data, wanted + _extension_room(header) + 1)
         return header, _cut(path, header, data)
     header = _header(path, data, versions=(1, 2, 3, 4))
+    check_memory(path, header.count, header.harmonics, max_bytes)
     return header, _cut(path, header, data) if header.version < 4 else _unpack(path, header, data)
 
 

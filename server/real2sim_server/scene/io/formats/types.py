@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
-from ...errors import BundleError
+from ...errors import BundleError, BundleTooLargeError
 
 UpAxis = Literal["z", "y", "-y"]
 """Axis of a file that points up: ``y`` as in glTF (z forward), ``-y`` as in OpenCV and COLMAP."""
@@ -45,10 +45,16 @@ class SplatFormat(Protocol):
         Always false where there is no signature.
         """
 
-    def read(self, path: Path) -> GaussianCloud:
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         """The Gaussians of a file, in the file's own frame and units.
 
+        Args:
+            path: the file.
+            max_bytes: what they may take in memory; compared before anything is unpacked. None for
+                any amount.
+
         Raises:
+            BundleTooLargeError: they take more.
             BundleError: naming the file and the reason.
         """
 
@@ -59,6 +65,25 @@ class SplatFormat(Protocol):
             SceneError: for values the format cannot hold.
             OSError: the file cannot be written.
         """
+
+
+def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) -> None:
+    """Refuse a file by what comes out of it, which says nothing of how small it is packed.
+
+    Args:
+        path: for the message.
+        count, harmonics: of Gaussians, and of each one's spherical harmonics.
+        max_bytes: what they may take in memory; None for any amount.
+
+    Raises:
+        BundleTooLargeError: they take more.
+    """
+    needed = 4 * count * (11 + 3 * harmonics)
+    if max_bytes is not None and needed > max_bytes:
+        raise BundleTooLargeError(
+            f"{path}: {count} splats with {harmonics} harmonics take {needed} bytes of memory; "
+            f"allowed are {max_bytes}"
+        )
 
 
 def require_properties(
@@ -91,11 +116,20 @@ def column(path: Path, records: NDArray[np.void], name: str, *, infinite: bool =
     return values
 
 
-def columns(path: Path, records: NDArray[np.void], names: tuple[str, ...]) -> Float:
-    """Properties [N, len(names)] of records as finite float64. Raises like :func:`column`."""
-    values = np.empty((len(records), len(names)))
+def columns(
+    path: Path,
+    records: NDArray[np.void],
+    names: tuple[str, ...],
+    dtype: type[np.floating[Any]] = np.float64,
+) -> NDArray[Any]:
+    """Properties [N, len(names)] of records, finite; float64 where ``dtype`` names no other type.
+
+    Raises like :func:`column`.
+    """
+    values = np.empty((len(records), len(names)), dtype=dtype)
     for index, name in enumerate(names):
-        values[:, index] = column(path, records, name)
+        with np.errstate(over="ignore"):
+            values[:, index] = column(path, records, name)
     return values
 
 
@@ -107,13 +141,15 @@ def host_array(tensor: torch.Tensor) -> Float:
 def build_cloud(
     path: Path,
     *,
-    means: Float,
-    quats: Float,
-    log_scales: Float,
-    opacities: Float,
-    sh: Float,
+    means: NDArray[np.floating[Any]],
+    quats: NDArray[np.floating[Any]],
+    log_scales: NDArray[np.floating[Any]],
+    opacities: NDArray[np.floating[Any]],
+    sh: NDArray[np.floating[Any]],
 ) -> GaussianCloud:
     """A cloud of parameters as files hold them: quats [N, 4] wxyz of any length, log scales.
+
+    Arrays of float32 are not copied; whoever has many values hands them over so.
 
     Raises:
         BundleError: for quaternions of length zero and values beyond the range of float32.
