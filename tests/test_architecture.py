@@ -25,6 +25,7 @@ LAYERS = (
     "_numba",
     "_files",
     "_confined",
+    "_npy",
     "console",
     "settings",
     "geometry",

@@ -14,6 +14,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 END_BYTES = 1024
+MAX_PIXELS = 1 << 27
+"""Of one image; a header may promise more than any memory holds."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -38,13 +40,18 @@ def encoded_size(data: bytes, where: str) -> tuple[int, int]:
     Raises:
         LogError: ``data`` is neither PNG nor JPEG, or its header is cut off; ``where`` names it.
     """
+    size: tuple[int, int] | None = None
     try:
         if len(data) >= 24 and data.startswith(PNG_START):
-            return struct.unpack(">II", data[16:24])
+            size = struct.unpack(">II", data[16:24])
         if data.startswith(JPEG_START):
-            return _jpeg_size(data)
+            size = _jpeg_size(data)
     except (struct.error, IndexError) as error:
         raise LogError(f"{where}: cannot be read as an image ({error})") from error
+    if size is not None:
+        if size[0] * size[1] > MAX_PIXELS:
+            raise LogError(f"{where}: {size[0]}x{size[1]} pixels; {MAX_PIXELS} are allowed")
+        return size
     raise LogError(f"{where}: expected a PNG or JPEG image, found {data[:8]!r}")
 
 

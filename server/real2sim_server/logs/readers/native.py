@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._npy import read_entries, read_npy
 from ...scene import Camera, CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image
@@ -19,6 +21,8 @@ from .formats.tables import check_ego_covers, check_frame_times, check_images
 FORMAT = "real2sim-log"
 VERSION = 1
 MANIFEST = "log.json"
+MAX_SWEEP_BYTES = 1 << 30
+"""Of a sweep when unpacked: thirty million points."""
 LIDAR_SHAPES = {"points": (3,), "intensity": (), "offset_us": ()}
 
 
@@ -248,14 +252,14 @@ class _NativeSource:
 
 
 def _read_sweep(path: Path) -> LidarSweep:
-    import zipfile
-
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            points, intensity, offset_us, origin = (
-                arrays[key] for key in ("points", "intensity", "offset_us", "origin")
-            )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        with zipfile.ZipFile(path) as archive:
+            parts = read_entries(archive, max_bytes=MAX_SWEEP_BYTES)
+        points, intensity, offset_us, origin = (
+            read_npy(parts[f"{key}.npy"]) for key in ("points", "intensity", "offset_us", "origin")
+        )
+    # Damage shows as almost any error, depending on where it is.
+    except Exception as error:
         raise LogError(
             f"{path}: expected an .npz with points, intensity, offset_us and origin ({error})"
         ) from error

@@ -26,10 +26,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from ..._files import atomic_file
+from ..._npy import read_entries, read_npy
 from ..camera import CameraRig
 from ..cloud import GaussianCloud
 from ..colour import TimeColour
-from ..errors import BundleError, SceneError
+from ..errors import BundleError
 from ..ground import Ground
 from ..scene import Scene, SceneObject
 from ..sky import Sky
@@ -38,7 +39,7 @@ from .document import CameraPart, TrajectoryPart
 FORMAT, VERSION = "real2sim-packed", 2
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
-"""Of one array when unpacked; a small file cannot ask for more memory than this."""
+"""Of all arrays when unpacked; a small file cannot ask for more memory than this."""
 MEAN_STEPS, QUAT_STEPS, OPACITY_STEPS, SH_STEPS = 65535, 127, 255, 127
 HEIGHT_STEP = 0.001
 """Of the ground [m]."""
@@ -137,15 +138,18 @@ def read_packed(path: str | PathLike[str]) -> Scene:
     file = Path(path)
     try:
         with zipfile.ZipFile(file) as archive:
-            document = _document(archive.read(DOCUMENT), file)
-            arrays = {name[:-4]: _array(archive, name) for name in _array_names(archive)}
+            parts = read_entries(archive, max_bytes=MAX_BYTES)
+        document = _document(parts[DOCUMENT], file)
+        arrays = {n[:-4]: read_npy(data) for n, data in parts.items() if n.endswith(".npy")}
         return _scene(document, arrays)
     except BundleError:
         raise
     except FileNotFoundError as error:
         raise BundleError(f"{file}: there is no such file") from error
-    except (zipfile.BadZipFile, OSError, KeyError, ValueError, SceneError) as error:
-        raise BundleError(f"{file}: not a packed scene, or a damaged one ({error})") from error
+    # Damage shows as almost any error, depending on where it is.
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise BundleError(f"{file}: not a packed scene, or a damaged one ({reason})") from error
 
 
 def _put(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
@@ -168,18 +172,6 @@ def _document(data: bytes, file: Path) -> _PackedDocument:
         return _PackedDocument.model_validate(values)
     except ValidationError as error:
         raise BundleError(f"{file}: {DOCUMENT} is damaged: {error.errors()[0]['msg']}") from error
-
-
-def _array_names(archive: zipfile.ZipFile) -> list[str]:
-    return [name for name in archive.namelist() if name.endswith(".npy")]
-
-
-def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    size = archive.getinfo(name).file_size
-    if size > MAX_BYTES:
-        raise ValueError(f"{name} has {size} bytes, more than {MAX_BYTES}")
-    array: NDArray[Any] = np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
-    return array
 
 
 def _pack_ground(ground: Ground, arrays: Arrays) -> _PackedGround:

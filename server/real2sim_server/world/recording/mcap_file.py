@@ -21,7 +21,7 @@ from typing import Any
 
 from .. import scoring
 from ..scoring import Instant
-from .recording import Recording, RecordingError, load_recording, to_bytes
+from .recording import Recording, RecordingError, recording_of_bytes, to_bytes
 
 MEDIA_TYPE = "application/vnd.real2sim.episode"
 ATTACHMENT = "episode.r2e"
@@ -84,22 +84,23 @@ def recording_in(path: Path) -> Recording:
         RecordingError: there is none in it, or the ``mcap`` extra is not installed.
         OSError: the file cannot be read.
     """
-    reader_module, exceptions = _mcap("reader"), _mcap("exceptions")
+    reader_module = _mcap("reader")
     with path.open("rb") as file:
         try:
-            found = [
-                a.data
-                for a in reader_module.make_reader(file).iter_attachments()
-                if a.name == ATTACHMENT and a.media_type == MEDIA_TYPE
-            ]
-        except exceptions.McapError as error:
+            found = next(
+                (
+                    bytes(a.data)
+                    for a in reader_module.make_reader(file).iter_attachments()
+                    if a.name == ATTACHMENT and a.media_type == MEDIA_TYPE
+                ),
+                None,
+            )
+        # Damage shows as almost any error, depending on where it is.
+        except Exception as error:
             raise RecordingError(f"{path} is no MCAP file, or is broken: {error}") from error
-    if not found:
+    if found is None:
         raise RecordingError(f"{path} holds no episode of this program")
-    with tempfile.TemporaryDirectory() as folder:
-        extracted = Path(folder) / ATTACHMENT
-        extracted.write_bytes(found[0])
-        return load_recording(extracted)
+    return recording_of_bytes(found, f"{path} ({ATTACHMENT})")
 
 
 def _mcap(module: str) -> Any:

@@ -19,37 +19,36 @@ import hashlib
 import io
 import json
 import os
+import re
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-import numpy as np
+from real2sim_proto import decode, encode
 
-from real2sim_proto import CodecError, decode, encode
-
+from ..._npy import read_entries
 from ...edit import AssetLookup, ScenarioState, pack_state, unpack_state
 from ...scene import Scene
 from .. import scoring
-from ..ego.reference import PlannedTrajectory
 from ..scoring import (
-    ContactRecord,
-    EgoSample,
     Instant,
     MetricAccumulator,
-    ObjectSamples,
     Score,
     ScoringContext,
     metrics_version,
 )
 from ..world import World
-from .replay import Entry, Replayer
+from .replay import KINDS, Entry, Replayer
+from .rows import instant_row, read_context, read_instant
 
 FORMAT = "real2sim-episode"
 VERSION = 1
-MAX_PART_BYTES = 1 << 30
+MAX_BYTES = 2 << 30
+"""Of all parts when unpacked; hours of driving have a tenth of it."""
+_FRAME = re.compile(r"frames/[^/]+/[^/]+/[0-9]{1,9}\.[a-z0-9]{1,8}")
 
 
 class RecordingError(ValueError):
@@ -203,7 +202,7 @@ def to_bytes(recording: Recording) -> bytes:
         "steps": len(recording.instants) - 1,
     }
     entries = [[e.kind, e.step, e.payload] for e in recording.entries]
-    rows = [_row(i, d) for i, d in zip(recording.instants, recording.digests, strict=True)]
+    rows = [instant_row(i, d) for i, d in zip(recording.instants, recording.digests, strict=True)]
     parts = {
         "episode.json": json.dumps(about, indent=2, allow_nan=False).encode(),
         "log.msgpack": encode({"entries": entries}),
@@ -241,97 +240,80 @@ def load_recording(path: Path) -> Recording:
     """The recording in a file.
 
     Raises:
-        RecordingError: no recording, broken, or of a newer version.
+        RecordingError: no recording, broken, too large, or of a newer version.
         OSError: the file cannot be read.
     """
+    with path.open("rb") as file:
+        return _read_recording(file, str(path))
+
+
+def recording_of_bytes(data: bytes, where: str) -> Recording:
+    """The recording in the content of a file; ``where`` names it in messages.
+
+    Raises:
+        RecordingError: as :func:`load_recording`.
+    """
+    return _read_recording(io.BytesIO(data), where)
+
+
+def _read_recording(file: IO[bytes], where: str) -> Recording:
     try:
-        with zipfile.ZipFile(path) as archive:
-            about = json.loads(_part(archive, "episode.json"))
-            if about.get("format") != FORMAT or about.get("version") != VERSION:
-                raise RecordingError(
-                    f"{path} has format {about.get('format')!r} version {about.get('version')!r}; "
-                    f"this program reads {FORMAT!r} version {VERSION}"
-                )
-            log, instants, context = (
-                decode(_part(archive, f"{name}.msgpack"), max_bytes=MAX_PART_BYTES)
-                for name in ("log", "instants", "context")
-            )
-            there = "state.msgpack" in archive.namelist()
-            state = _part(archive, "state.msgpack") if there else None
-            frames = {n: _part(archive, n) for n in archive.namelist() if n.startswith("frames/")}
-        rows = [_instant(row) for row in instants["instants"]]
-        return Recording(
-            scene=about["scene"],
-            scene_hash=about["scene_hash"],
-            scenario_id=about["scenario_id"],
-            scenario_revision=about["scenario_revision"],
-            entries=tuple(Entry(kind, step, payload) for kind, step, payload in log["entries"]),
-            context=ScoringContext.from_fields(context),
-            instants=tuple(instant for instant, _ in rows),
-            digests=tuple(found for _, found in rows),
-            scores=tuple(about["scores"]),
-            metrics=about["metrics"],
-            state=state,
-            frames=frames,
+        with zipfile.ZipFile(file) as archive:
+            return _of_parts(read_entries(archive, max_bytes=MAX_BYTES))
+    except RecordingError as error:
+        raise RecordingError(f"{where}: {error}") from error
+    # Damage shows as almost any error, depending on where it is.
+    except Exception as error:
+        raise RecordingError(
+            f"{where} is no episode recording, or is broken: {error or type(error).__name__}"
+        ) from error
+
+
+def _of_parts(parts: Mapping[str, bytes]) -> Recording:
+    about = json.loads(parts["episode.json"])
+    if about.get("format") != FORMAT or about.get("version") != VERSION:
+        raise RecordingError(
+            f"format {about.get('format')!r} version {about.get('version')!r}; "
+            f"this program reads {FORMAT!r} version {VERSION}"
         )
-    except (zipfile.BadZipFile, CodecError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise RecordingError(f"{path} is no episode recording, or is broken: {error}") from error
-
-
-def _part(archive: zipfile.ZipFile, name: str) -> bytes:
-    info = archive.getinfo(name)
-    if info.file_size > MAX_PART_BYTES:
-        raise RecordingError(f"{name!r} has {info.file_size} bytes; {MAX_PART_BYTES} are allowed")
-    return archive.read(info)
-
-
-def _row(instant: Instant, found: str) -> dict[str, Any]:
-    others = instant.others
-    row: dict[str, Any] = {
-        "step": instant.step,
-        "t_us": instant.t_us,
-        "ego": list(instant.ego),
-        "ids": list(others.ids),
-        "categories": list(others.categories),
-        "centres": others.centres,
-        "yaws": others.yaws,
-        "sizes": others.sizes,
-        "velocities": others.velocities,
-        "contacts": [asdict(c) | {"impulse": list(c.impulse)} for c in instant.contacts],
-        "secondary": instant.secondary,
-        "digest": found,
-    }
-    if instant.plan is not None:
-        row["plan"] = [instant.plan.times_us.tolist(), instant.plan.poses.tolist()]
-    return row
-
-
-def _instant(row: dict[str, Any]) -> tuple[Instant, str]:
-    plan = None
-    if "plan" in row:
-        times, poses = row["plan"]
-        plan = PlannedTrajectory(np.array(times, np.int64), np.array(poses, np.float64))
-    instant = Instant(
-        step=row["step"],
-        t_us=row["t_us"],
-        ego=EgoSample(*row["ego"]),
-        others=ObjectSamples(
-            ids=tuple(row["ids"]),
-            categories=tuple(row["categories"]),
-            # Copies, since kernels are compiled anew for arrays that must not be written to.
-            centres=np.array(row["centres"]),
-            yaws=np.array(row["yaws"]),
-            sizes=np.array(row["sizes"]),
-            velocities=np.array(row["velocities"]),
-        ),
-        contacts=tuple(
-            ContactRecord(**c | {"impulse": (c["impulse"][0], c["impulse"][1])})
-            for c in row["contacts"]
-        ),
-        secondary=row["secondary"],
-        plan=plan,
+    log, instants, context = (
+        decode(parts[f"{name}.msgpack"], max_bytes=MAX_BYTES)
+        for name in ("log", "instants", "context")
     )
-    return instant, row["digest"]
+    rows = [read_instant(row) for row in instants["instants"]]
+    if not rows:
+        raise RecordingError("it holds no instant")
+    frames = {name: data for name, data in parts.items() if name.startswith("frames/")}
+    for name in frames:
+        if not _FRAME.fullmatch(name):
+            raise RecordingError(f"an image is called {name!r}")
+    return Recording(
+        scene=_text(about, "scene"),
+        scene_hash=_text(about, "scene_hash"),
+        scenario_id=_text(about, "scenario_id") if about["scenario_id"] is not None else None,
+        scenario_revision=about["scenario_revision"],
+        entries=tuple(_entry(*entry) for entry in log["entries"]),
+        context=read_context(context),
+        instants=tuple(instant for instant, _ in rows),
+        digests=tuple(found for _, found in rows),
+        scores=tuple(dict(score) for score in about["scores"]),
+        metrics=_text(about, "metrics"),
+        state=parts.get("state.msgpack"),
+        frames=frames,
+    )
+
+
+def _entry(kind: Any, step: Any, payload: Any) -> Entry:
+    if kind not in KINDS or type(step) is not int or not isinstance(payload, bytes):
+        raise RecordingError(f"an entry of kind {str(kind)[:40]!r} is not understood")
+    return Entry(kind, step, payload)
+
+
+def _text(about: Mapping[str, Any], key: str) -> str:
+    value = about[key]
+    if not isinstance(value, str):
+        raise RecordingError(f"{key!r} is a {type(value).__name__}, no text")
+    return value
 
 
 def first_difference(recording: Recording, replayer: Replayer) -> int | None:

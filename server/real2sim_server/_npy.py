@@ -1,0 +1,64 @@
+"""Arrays of ``.npy`` files and entries of zip archives, whose headers may promise anything."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def read_npy(data: bytes) -> NDArray[Any]:
+    """The array of a ``.npy`` file of plain values.
+
+    Shape and type are compared with the bytes there are before anything is allocated.
+
+    Raises:
+        ValueError: no such file, values that are objects, or another number of bytes than it says.
+    """
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"version {version} of .npy is not read")
+    try:
+        shape, fortran, dtype = _HEADERS[version](stream)
+    # The header is an expression of Python, read by its parser.
+    except Exception as error:
+        raise ValueError(f"its header is damaged: {error}") from error
+    if dtype.hasobject:
+        raise ValueError("arrays of objects are not read")
+    if any(n < 0 for n in shape):
+        raise ValueError(f"shape {shape} holds no lengths")
+    start = stream.tell()
+    expected = math.prod(shape) * dtype.itemsize
+    if len(data) - start != expected:
+        raise ValueError(
+            f"{dtype} of shape {shape} needs {expected} bytes, not {len(data) - start}"
+        )
+    values = np.frombuffer(data, dtype, offset=start) if expected else np.zeros(0, dtype)
+    array: NDArray[Any] = values.reshape(shape, order="F" if fortran else "C")
+    return array.copy()
+
+
+def read_entries(archive: zipfile.ZipFile, *, max_bytes: int) -> dict[str, bytes]:
+    """All entries of an archive by name, unpacked.
+
+    Raises:
+        ValueError: they are more than ``max_bytes`` together, or a name is there twice.
+        Exception: damage shows as almost any error of the libraries that unpack.
+    """
+    infos = archive.infolist()
+    total = sum(info.file_size for info in infos)
+    if total > max_bytes:
+        raise ValueError(f"it unpacks to {total} bytes; allowed are {max_bytes}")
+    if len({info.filename for info in infos}) != len(infos):
+        raise ValueError("a name is in it twice")
+    return {info.filename: archive.read(info) for info in infos}
