@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
-import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import httpx2
 import numpy as np
 
 from .drive_probe import DriveProbe
+from .large_renders import large_renders
 
 HEAVY_WIDTH = 1920
 PING_EVERY_S = 0.005
@@ -31,7 +29,7 @@ def loop_lag(
     """
     idle = _pings(probe, IDLE_SECONDS)
     before = _buckets(url)
-    with _heavy_rendering(url, scene, camera) as pictures:
+    with large_renders(url, scene, camera, width=HEAVY_WIDTH) as pictures:
         loaded = _pings(probe, seconds)
     own = {le: count - before[le] for le, count in _buckets(url).items()}
     samples = own.get("+Inf", 0.0)
@@ -45,30 +43,6 @@ def loop_lag(
         "own_share_within_5_ms": within,
         "own_p99_below_ms": _quantile_bound(own, 0.99),
     }
-
-
-@contextlib.contextmanager
-def _heavy_rendering(url: str, scene: str, camera: str) -> Iterator[list[float]]:
-    """Pictures of HEAVY_WIDTH one after the other; yields the milliseconds each took."""
-    taken: list[float] = []
-    stop = threading.Event()
-
-    def work() -> None:
-        query = {"camera": camera, "width": str(HEAVY_WIDTH)}
-        with httpx2.Client(base_url=url, timeout=60) as client:
-            while not stop.is_set():
-                started = time.perf_counter()
-                answer = client.get(f"/v1/scenes/{scene}/render", params=query)
-                answer.raise_for_status()
-                taken.append((time.perf_counter() - started) * 1e3)
-
-    thread = threading.Thread(target=work, name="heavy", daemon=True)
-    thread.start()
-    try:
-        yield taken
-    finally:
-        stop.set()
-        thread.join(60)
 
 
 def _pings(probe: DriveProbe, seconds: float) -> list[float]:

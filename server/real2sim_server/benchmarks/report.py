@@ -13,6 +13,7 @@ TITLES = {
     "no_sensors_sdk": "the same, in the SDK",
     "one_raw_camera": "drive step, one raw camera",
     "real_time": "drive step, demo's street, three raw cameras",
+    "crowded": "drive step, one raw camera, beside large renders",
 }
 BY_STAGE = ("no_sensors", "one_raw_camera", "real_time")
 
@@ -27,6 +28,12 @@ def print_report(console: Console, figures: Mapping[str, Any]) -> None:
     console.print(
         f"event loop under load: {share:.1%} of {lag['own_samples']} samples within 5 ms, "
         f"p99 below {bound:g} ms; one heavy picture takes {lag['heavy_picture_ms']:.0f} ms"
+    )
+    crowded = figures["crowded"]
+    console.print(
+        f"beside {crowded['pictures']} large renders p99 of a step is "
+        f"{crowded['p99_more_ms']:.1f} ms more than alone just before "
+        f"({crowded['alone']['p99']:.1f} ms)"
     )
     if memory:
         console.print(

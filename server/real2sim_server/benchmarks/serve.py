@@ -23,6 +23,7 @@ from ..demo.street import unpack_street
 from ..demo.worker import worker_process
 from ..scene.io import save_scene
 from .drive_probe import DriveProbe, straight_on
+from .large_renders import large_renders
 from .loop_lag import loop_lag
 from .pauses import pauses
 from .report import print_report
@@ -39,6 +40,8 @@ DEVICE_STAGES = ("render", "physics")
 """What a step is for; all else is overhead."""
 WARM_UP_STEPS = 20
 SESSIONS = 10
+CROWD, CROWD_WIDTH = 3, 4096
+"""Clients that render beside a drive, and the width of their pictures [px]."""
 
 Figures = dict[str, Any]
 
@@ -108,6 +111,8 @@ def _measure(console: Console, options: ServeBenchOptions, *, url: str, pid: int
             figures["one_raw_camera"], _ = _drive(client, raw, options.camera_steps, CAMERA_STEP_US)
         with console.status("drive steps with three raw cameras on the demo's street"):
             figures["real_time"] = _real_time(client, options.real_time_steps)
+        with console.status(f"drive steps beside {CROWD} clients that render {CROWD_WIDTH} px"):
+            figures["crowded"] = _crowded(client, url, raw, options.camera_steps)
         with console.status("the event loop while large pictures are drawn"):
             figures["event_loop"] = _event_loop(client, url, options.heavy_seconds)
     return figures
@@ -121,6 +126,23 @@ def _real_time(client: real2sim.Client, steps: int) -> Figures:
     within = float(np.mean(np.array(latencies) <= REAL_TIME_STEP_US / 1e3))
     sizes = [[camera.width, camera.height] for camera in info.cameras]
     return figures | {"cameras": sizes, "share_within_100_ms": within}
+
+
+def _crowded(
+    client: real2sim.Client, url: str, sensors: Sequence[Mapping[str, Any]], steps: int
+) -> Figures:
+    """Steps with one raw camera alone, and at once afterwards beside clients that render."""
+    alone, _ = _drive(client, sensors, steps, CAMERA_STEP_US)
+    with large_renders(url, SCENE, CAMERA, width=CROWD_WIDTH, clients=CROWD) as pictures:
+        beside, _ = _drive(client, sensors, steps, CAMERA_STEP_US)
+    return (
+        beside
+        | {"alone": alone, "p99_more_ms": beside["p99"] - alone["p99"]}
+        | {
+            "picture_ms": float(np.mean(pictures)) if pictures else None,
+            "pictures": len(pictures),
+        }
+    )
 
 
 def _drive(

@@ -55,6 +55,8 @@ def test_a_short_run_gives_all_figures_as_json(capsys):
     assert figures["real_time"]["cameras"] == [[480, 320]] * 3
     overhead = figures["real_time"]["overhead_ms"]
     assert 0 < overhead["p50"] < figures["real_time"]["p50"]
+    crowded = figures["crowded"]
+    assert crowded["count"] == crowded["alone"]["count"] == 5
     assert figures["memory"]["per_session_mb"] < 5
     assert figures["machine"]["cores"] >= 1
     assert "drive step, no sensors" in capsys.readouterr().out
