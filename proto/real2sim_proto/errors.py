@@ -39,6 +39,9 @@ class ErrorCode(StrEnum):
     NOTHING_TO_REDO = "NOTHING_TO_REDO"
     IDEMPOTENCY_CONFLICT = "IDEMPOTENCY_CONFLICT"
     PAYLOAD_TOO_LARGE = "PAYLOAD_TOO_LARGE"
+    REQUEST_TIMEOUT = "REQUEST_TIMEOUT"
+    TOO_MANY_CONNECTIONS = "TOO_MANY_CONNECTIONS"
+    FOREIGN_PAGE = "FOREIGN_PAGE"
     OVER_CAPACITY = "OVER_CAPACITY"
     QUEUE_FULL = "QUEUE_FULL"
     OUT_OF_MEMORY = "OUT_OF_MEMORY"
@@ -87,6 +90,9 @@ HTTP_STATUS: dict[ErrorCode, int] = {
     ErrorCode.NOTHING_TO_REDO: 409,
     ErrorCode.IDEMPOTENCY_CONFLICT: 422,
     ErrorCode.PAYLOAD_TOO_LARGE: 413,
+    ErrorCode.REQUEST_TIMEOUT: 408,
+    ErrorCode.TOO_MANY_CONNECTIONS: 503,
+    ErrorCode.FOREIGN_PAGE: 403,
     ErrorCode.OVER_CAPACITY: 429,
     ErrorCode.QUEUE_FULL: 503,
     ErrorCode.OUT_OF_MEMORY: 507,
@@ -108,7 +114,14 @@ HTTP_STATUS: dict[ErrorCode, int] = {
 }
 
 RETRYABLE = frozenset(
-    {ErrorCode.OVER_CAPACITY, ErrorCode.QUEUE_FULL, ErrorCode.DRAINING, ErrorCode.TIMEOUT}
+    {
+        ErrorCode.OVER_CAPACITY,
+        ErrorCode.QUEUE_FULL,
+        ErrorCode.DRAINING,
+        ErrorCode.TIMEOUT,
+        ErrorCode.REQUEST_TIMEOUT,
+        ErrorCode.TOO_MANY_CONNECTIONS,
+    }
 )
 """Codes after which the same request may succeed later, unchanged."""
 

@@ -49,7 +49,15 @@ class Settings(BaseSettings):
             beyond.
         max_pixels_per_step: pixels over all cameras of one observation or render.
         stall_seconds: `/livez` fails when one job takes longer than this.
+        drain_seconds: how long a worker that is to stop goes on serving, not ready, so that proxies
+            send new work elsewhere; SIGINT, or a second signal, ends it at once.
         graceful_seconds: time that open requests get at shutdown.
+        max_connections: open connections; fewer where the limit of descriptors is lower. Where all
+            are taken, those make room that are silent for longest while it is their turn to send.
+        head_seconds: time for the headers of a request.
+        body_seconds: time for its body, beside the time that it takes at 10 kB/s.
+        write_seconds: time for a client to read what it was sent, beside the time at that rate.
+        keep_alive_seconds: how long a connection stays open between requests.
         metrics: whether `/metrics` is served.
         log_level, log_format: ``auto`` is text on a terminal and JSON elsewhere.
     """
@@ -86,7 +94,13 @@ class Settings(BaseSettings):
     jobs_quota_bytes: int = Field(default=100 * GIB, ge=0)
     max_pixels_per_step: int = Field(default=64_000_000, ge=1)
     stall_seconds: float = Field(default=120.0, gt=0)
+    drain_seconds: float = Field(default=5.0, ge=0)
     graceful_seconds: float = Field(default=10.0, ge=0)
+    max_connections: int = Field(default=4096, ge=1)
+    head_seconds: float = Field(default=10.0, gt=0)
+    body_seconds: float = Field(default=30.0, gt=0)
+    write_seconds: float = Field(default=30.0, gt=0)
+    keep_alive_seconds: int = Field(default=60, gt=0)
     metrics: bool = True
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["auto", "json", "text"] = "auto"

@@ -7,7 +7,8 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``storage``: tables and rows of scenarios, sessions, jobs and stored answers.
 - ``warm_up``: kernels compiled or loaded before they are needed.
 - ``lanes``, ``engine``: the thread that owns the device, and whose turn it is.
-- ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics, sockets.
+- ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics,
+  connections, sockets.
 - ``library``: scenes and assets, on disk and in memory.
 - ``rendering``: render requests, and images as frames of the wire.
 - ``scenarios``: edited under a lock each, cached, on record before they take effect.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
+from starlette.types import Message
 
 from real2sim_proto import Problem
 
@@ -16,10 +17,12 @@ from ..settings import Settings
 from .http.auth import require_token
 from .http.hosts import LoopbackOnly
 from .http.openapi import published
+from .http.origins import OwnPagesOnly
 from .http.problems import install_problem_handlers
 from .http.requests import BodyLimit, RequestContext
 from .routes import (
     assets,
+    docs,
     drive,
     exports,
     health,
@@ -51,6 +54,7 @@ OPEN: tuple[APIRouter, ...] = (
     drive.router,
     view.router,
     ui.router,
+    docs.router,
 )
 """Routers that ask for a token themselves, where they want one."""
 
@@ -65,8 +69,11 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        # Before anything else runs: FastAPI builds its routes at the first request, by way of
+        # warnings.catch_warnings(), which other threads must not use at the same time.
+        await _build_routes(app)
+        app.openapi_schema = published(app)
         async with worker.running():
-            app.openapi_schema = await asyncio.to_thread(published, app)
             yield
 
     app = FastAPI(
@@ -75,6 +82,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
         generate_unique_id_function=operation_id,
         responses={"default": {"model": Problem, "description": "problem+json (RFC 9457)"}},
+        docs_url=None,
         redoc_url=None,
     )
     app.state.worker = worker
@@ -84,12 +92,27 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
     if settings.token is None:
         app.add_middleware(LoopbackOnly)
+    app.add_middleware(OwnPagesOnly)
     app.add_middleware(RequestContext, metrics=worker.metrics)
     for router in OPEN:
         app.include_router(router)
     for router in PROTECTED:
         app.include_router(router, dependencies=[Depends(require_token)])
     return app
+
+
+async def _build_routes(app: FastAPI) -> None:
+    """Let a request that no route matches pass all of them."""
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def send(_message: Message) -> None:
+        """Nobody listens."""
+
+    unmatched = {"type": "http", "method": "GET", "path": "/unmatched", "headers": [], "app": app}
+    with suppress(HTTPException):
+        await app.router(unmatched | {"query_string": b"", "root_path": ""}, receive, send)
 
 
 def operation_id(route: APIRoute) -> str:

@@ -11,6 +11,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
@@ -20,6 +22,7 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from ..settings import Settings
 from .app import create_app
 from .http.auth import check_bind
+from .http.protocol import LimitedHttpProtocol
 from .http.websocket import ScatterGatherProtocol
 from .logging_setup import configure_logging
 from .preflight import bind, check_scenes, listen, url_of
@@ -62,7 +65,7 @@ def run(settings: Settings) -> int:
     listen(listener)
     worker: Worker = app.state.worker
     print(_announcement(worker, url_of(settings.host, listener)), file=sys.stderr, flush=True)
-    server = uvicorn.Server(server_config(app, settings))
+    server = DrainingServer(server_config(app, settings), worker)
     # A lost device poisons the process: it ends, so that its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
     # The server stops gracefully at a signal and then raises it once more for us.
@@ -105,20 +108,52 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
         listener.close()
 
 
+class DrainingServer(uvicorn.Server):
+    """uvicorn's server; after SIGTERM it serves on for a while, not ready, before it stops.
+
+    Args:
+        config: of the server.
+        worker: drains; its settings say for how long.
+    """
+
+    def __init__(self, config: uvicorn.Config, worker: Worker) -> None:
+        super().__init__(config)
+        self._worker = worker
+        self._stops_at: float | None = None
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """A signal: the first SIGTERM begins to drain, any other one stops."""
+        if sig == signal.SIGTERM and self._stops_at is None and self.started:
+            self._worker.drain()
+            self._stops_at = time.monotonic() + self._worker.settings.drain_seconds
+            self._captured_signals.append(sig)
+        else:
+            super().handle_exit(sig, frame)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Ten times a second: whether it is time to stop."""
+        if self._stops_at is not None and time.monotonic() >= self._stops_at:
+            self.should_exit = True
+        return await super().on_tick(counter)
+
+
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     """How uvicorn serves a worker."""
+    connections = app.state.worker.connections
     return uvicorn.Config(
         app,
+        http=partial(LimitedHttpProtocol, connections),  # type: ignore[arg-type]
         log_config=None,
         access_log=False,
         server_header=False,
         lifespan="on",
-        ws=ScatterGatherProtocol,
+        ws=partial(ScatterGatherProtocol, connections),  # type: ignore[arg-type]
         # Deflating a frame takes 20 ms and gains nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
         ws_ping_interval=PING_INTERVAL_S,
         ws_ping_timeout=PING_TIMEOUT_S,
+        timeout_keep_alive=settings.keep_alive_seconds,
         timeout_graceful_shutdown=max(1, round(settings.graceful_seconds)),
     )
 

@@ -21,6 +21,7 @@ from ..render import Backend, describe_backends, select_backend
 from ..scene.io import StagingLimits
 from ..settings import Settings
 from .engine import Engine
+from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
 from .jobs.jobs import Jobs
@@ -57,6 +58,7 @@ class Worker:
     settings: Settings
     engine: Engine
     metrics: Metrics
+    connections: Connections
     store: Store
     scene_cache: SceneCache
     scenarios: Scenarios
@@ -105,6 +107,7 @@ class Worker:
             settings=settings,
             engine=engine,
             metrics=metrics,
+            connections=Connections(_connection_limits(settings), metrics),
             store=store,
             scene_cache=scene_cache,
             scenarios=scenarios,
@@ -153,22 +156,22 @@ class Worker:
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
+            at_exit.push_async_callback(_cancel, asyncio.create_task(self.connections.watch()))
             await at_exit.enter_async_context(self.sessions.running())
             await at_exit.enter_async_context(self.jobs.running())
-            at_exit.callback(self._drain)
+            at_exit.callback(self.drain)
             yield self
 
     def readiness(self) -> Readiness:
-        """Whether new work is welcome, and if not, why."""
+        """Whether the worker can work, and if not, why.
+
+        A busy worker is ready: it refuses what is too much by request, and metrics tell.
+        """
         reasons = sorted(self.waiting_for)
         if self.draining:
             reasons.append("draining: the worker is stopping")
         if not self.engine.alive:
             reasons.append(f"engine stopped: {self.engine.failure or 'its thread has ended'}")
-        if self.sessions.full:
-            reasons.append(f"all {self.settings.max_sessions} sessions are taken")
-        if self.engine.queue_depth >= self.settings.queue_length:
-            reasons.append(f"{self.settings.queue_length} jobs wait for the engine")
         return Readiness(ready=not reasons, reasons=reasons)
 
     @property
@@ -215,8 +218,9 @@ class Worker:
         self.metrics.replays.inc()
         return answer
 
-    def _drain(self) -> None:
-        self.draining = True
+    def drain(self) -> None:
+        """Show that the worker is on its way out, and begin no sessions; open ones go on."""
+        self.draining = self.sessions.draining = True
 
     async def _warm_up(self) -> None:
         started = time.perf_counter()
@@ -244,6 +248,7 @@ class Worker:
         self.metrics.build.info(
             {"version": version("real2sim"), "backend": self.backend.name},
         )
+        self.metrics.session_limit.set(self.settings.max_sessions)
         self.metrics.watch(self.metrics.queue_depth, lambda: self.engine.queue_depth)
         self.metrics.watch(self.metrics.scene_bytes, lambda: self.scene_cache.resident_bytes)
         for state, count in self.scene_cache.counters().items():
@@ -258,6 +263,15 @@ def _jobs_quota(settings: Settings) -> Quota:
         settings.jobs_quota_bytes,
         "JOBS_QUOTA",
         "delete jobs that are over: DELETE /v1/jobs/{id}",
+    )
+
+
+def _connection_limits(settings: Settings) -> ConnectionLimits:
+    return ConnectionLimits(
+        most=connection_limit(settings.max_connections),
+        head_s=settings.head_seconds,
+        body_s=settings.body_seconds,
+        write_s=settings.write_seconds,
     )
 
 

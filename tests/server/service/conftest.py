@@ -31,6 +31,7 @@ def make_settings(tmp_path: Path, scenes_dir: Path) -> Callable[..., Settings]:
             "port": 0,
             "backend": "cpu",
             "log_level": "error",
+            "drain_seconds": 0,
         }
         return Settings(**(defaults | overrides))
 

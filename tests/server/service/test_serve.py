@@ -15,10 +15,18 @@ import httpx2
 import pytest
 
 import real2sim
+from real2sim_server.service.app import create_app
 from real2sim_server.service.http.auth import OpenBindError
 from real2sim_server.service.http.websocket import ScatterGatherProtocol
-from real2sim_server.service.preflight import AddressError, SceneFolderError, check_start
-from real2sim_server.service.serve import run, running_worker, server_config
+from real2sim_server.service.preflight import (
+    AddressError,
+    SceneFolderError,
+    bind,
+    check_start,
+    listen,
+    url_of,
+)
+from real2sim_server.service.serve import DrainingServer, run, running_worker, server_config
 
 pytestmark = pytest.mark.network
 
@@ -153,10 +161,9 @@ def test_the_default_scene_folder_may_be_missing(make_settings):
 
 def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
     from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
-    from real2sim_server.service.app import create_app
 
     config = server_config(create_app(make_settings()), make_settings())
-    assert config.ws is ScatterGatherProtocol
+    assert config.ws.func is ScatterGatherProtocol
     assert config.ws_per_message_deflate is False
     assert config.ws_max_size == MAX_CLIENT_MESSAGE_BYTES
 
@@ -207,6 +214,30 @@ def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(ma
     requests = [entry for line in lines if (entry := json.loads(line))["event"] == "request"]
     assert [(r["path"], r["status"]) for r in requests] == [("/v1/server", 200)]
     assert requests[0]["request_id"] == answer.headers["X-Request-Id"]
+
+
+def test_at_sigterm_a_worker_serves_on_not_ready_until_a_second_signal(make_settings):
+    settings = make_settings(drain_seconds=60)
+    app = create_app(settings)
+    listener = bind("127.0.0.1", 0)
+    listen(listener)
+    server = DrainingServer(server_config(app, settings), app.state.worker)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    url = url_of("127.0.0.1", listener)
+    while httpx2.get(f"{url}/readyz").status_code != 200:
+        time.sleep(0.02)
+    server.handle_exit(signal.SIGTERM, None)
+    draining, living = httpx2.get(f"{url}/readyz"), httpx2.get(f"{url}/livez")
+    refused = httpx2.post(f"{url}/v1/sessions?scene=tiny")
+    assert thread.is_alive()
+    server.handle_exit(signal.SIGTERM, None)
+    thread.join(30)
+    assert draining.status_code == 503
+    assert draining.json()["reasons"] == ["draining: the worker is stopping"]
+    assert living.status_code == 200
+    assert (refused.status_code, refused.json()["code"]) == (503, "DRAINING")
+    assert not thread.is_alive()
 
 
 def test_answers_do_not_wait_for_acknowledgements(make_settings):

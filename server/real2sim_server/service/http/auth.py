@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
-from typing import Annotated
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any
 
-from fastapi import Depends
+from fastapi import Depends, Request, Response
+from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.requests import HTTPConnection
 
@@ -59,21 +61,53 @@ def matches_any_secret(given: str | None, *secrets: str | None) -> bool:
 
 
 async def require_token(
+    _credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
     connection: HTTPConnection,
-    credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> None:
     """Dependency of every route that is not open.
 
     Raises:
         ServiceError: UNAUTHORIZED.
     """
-    secret = connection.app.state.worker.settings.token
+    check_token(connection)
+
+
+def check_token(connection: HTTPConnection) -> None:
+    """Raises ServiceError: UNAUTHORIZED, unless a request carries the worker's token."""
+    worker = connection.app.state.worker
+    secret = worker.settings.token
     if secret is None:
         return
-    if credentials is None:
-        raise unauthorized("this worker wants a bearer token")
-    if not secrets_equal(credentials.credentials, secret.get_secret_value()):
+    given = bearer_token(connection)
+    if not secrets_equal(given, secret.get_secret_value()):
+        worker.metrics.auth_failures.labels("http").inc()
+        if given is None:
+            raise unauthorized("this worker wants a bearer token")
         raise unauthorized("the bearer token is not this worker's")
+
+
+def bearer_token(connection: HTTPConnection) -> str | None:
+    """What stands behind ``Authorization: Bearer``; None where nothing does."""
+    scheme, _, given = connection.headers.get("Authorization", "").partition(" ")
+    return given.strip() or None if scheme.lower() == "bearer" else None
+
+
+class TokenRoute(APIRoute):
+    """A route that checks the worker's token before anything of the request is read."""
+
+    async def check(self, request: Request) -> None:
+        """Raises ServiceError: UNAUTHORIZED."""
+        check_token(request)
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """FastAPI's handler, behind the check."""
+        handle = super().get_route_handler()
+
+        async def checked(request: Request) -> Response:
+            await self.check(request)
+            return await handle(request)
+
+        return checked
 
 
 def unauthorized(detail: str) -> ServiceError:

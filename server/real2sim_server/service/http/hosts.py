@@ -10,17 +10,14 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from real2sim_proto import ErrorCode
 
 from .auth import is_loopback
+from .origins import FOREIGN_PAGE
 from .problems import ServiceError
-
-FOREIGN_HOST = 4403
-"""Code with which sockets of other sites' pages are closed."""
 
 
 class LoopbackOnly:
-    """ASGI middleware that refuses requests which name another host, or come from its pages.
+    """ASGI middleware that refuses requests which name another host.
 
-    Any site may point a name of its own at 127.0.0.1 (DNS rebinding), or open a WebSocket to it
-    from its pages; ``Host`` and ``Origin`` tell.
+    Any site may point a name of its own at 127.0.0.1 (DNS rebinding); ``Host`` tells.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -32,7 +29,7 @@ class LoopbackOnly:
             _check(Headers(scope=scope))
         elif scope["type"] == "websocket" and not _is_from_here(Headers(scope=scope)):
             await receive()
-            await send({"type": "websocket.close", "code": FOREIGN_HOST, "reason": "foreign host"})
+            await send({"type": "websocket.close", "code": FOREIGN_PAGE, "reason": "foreign host"})
             return
         await self._app(scope, receive, send)
 
@@ -42,17 +39,14 @@ def _check(headers: Headers) -> None:
         return
     raise ServiceError(
         ErrorCode.UNAUTHORIZED,
-        f"Host {headers.get('host')!r}, Origin {headers.get('origin')!r}: a worker without a token "
-        "answers requests to localhost or a loopback address, from its own pages or from programs",
+        f"Host {headers.get('host')!r}: a worker without a token answers requests to localhost or "
+        "a loopback address",
         hint="set REAL2SIM_TOKEN on the worker to let others in",
     )
 
 
 def _is_from_here(headers: Headers) -> bool:
-    origin = headers.get("origin")
-    return _names_loopback(f"//{headers.get('host', 'localhost')}") and (
-        origin is None or _names_loopback(origin)
-    )
+    return _names_loopback(f"//{headers.get('host', 'localhost')}")
 
 
 def _names_loopback(address: str) -> bool:

@@ -11,6 +11,7 @@ from typing import Annotated
 
 from fastapi import Header, Response
 from pydantic import BaseModel
+from starlette.datastructures import FormData
 from starlette.requests import Request
 
 from real2sim_proto import ErrorCode
@@ -50,7 +51,14 @@ class IdempotentRequest:
         """What to store together with the effect; None without a key."""
         if self.key is None:
             return None
-        content = body.model_dump_json().encode()
+        return self.reply_bytes(body.model_dump_json().encode(), status=status, headers=headers)
+
+    def reply_bytes(
+        self, content: bytes, *, status: int, headers: Mapping[str, str] | None = None
+    ) -> StoredReply | None:
+        """The same for JSON that is written already."""
+        if self.key is None:
+            return None
         return StoredReply(self.key, self.fingerprint, status, dict(headers or {}), content)
 
 
@@ -67,8 +75,16 @@ class Idempotency:
         self._locks: dict[str, tuple[asyncio.Lock, int]] = {}
 
     @asynccontextmanager
-    async def guard(self, request: Request, key: str | None) -> AsyncIterator[IdempotentRequest]:
+    async def guard(
+        self, request: Request, key: str | None, *, content: bytes | None = None
+    ) -> AsyncIterator[IdempotentRequest]:
         """The request's :class:`IdempotentRequest`, held until the block ends.
+
+        Args:
+            request: what is asked for.
+            key: of the client; None guards nothing.
+            content: what stands for the body; None for the body itself. A form, whose boundary
+                differs each time, is told by its parts: :func:`form_digest`.
 
         Raises:
             ServiceError: IDEMPOTENCY_CONFLICT when the key was used for another request.
@@ -78,7 +94,8 @@ class Idempotency:
             return
         scoped = f"{request.method} {request.url.path} {key}"
         full_key = hashlib.sha256(scoped.encode()).hexdigest()
-        fingerprint = _fingerprint(request, await request.body())
+        content = await request.body() if content is None else content
+        fingerprint = _fingerprint(request, content)
         async with self._exclusive(full_key):
             stored = await self._store.reply(full_key)
             if stored is not None and stored.fingerprint != fingerprint:
@@ -88,6 +105,15 @@ class Idempotency:
                     hint="make a new key for every new request",
                 )
             yield IdempotentRequest(full_key, fingerprint, _response(stored) if stored else None)
+
+    async def store(self, reply: StoredReply | None) -> None:
+        """Store an answer whose effect is not in the store, once it is there.
+
+        A crash in between leaves the effect alone; the same request is then refused, because what
+        it names exists.
+        """
+        if reply is not None:
+            await self._store.write(reply=reply)
 
     @asynccontextmanager
     async def _exclusive(self, key: str) -> AsyncIterator[None]:
@@ -104,6 +130,26 @@ class Idempotency:
                 self._locks[key] = (lock, users - 1)
 
 
+async def form_digest(form: FormData) -> bytes:
+    """What a form says, whatever its boundary; reads uploaded files from their beginning."""
+    digest = hashlib.sha256()
+    for name, value in form.multi_items():
+        _update(digest, name.encode("utf-8", "surrogateescape"))
+        if isinstance(value, str):
+            _update(digest, value.encode("utf-8", "surrogateescape"))
+        else:
+            _update(digest, (value.filename or "").encode("utf-8", "surrogateescape"))
+            file = value.file
+            content = await asyncio.to_thread(hashlib.file_digest, file, "sha256")  # type: ignore[arg-type]
+            await value.seek(0)
+            _update(digest, content.digest())
+    return digest.digest()
+
+
+def _update(digest: hashlib._Hash, part: bytes) -> None:
+    digest.update(len(part).to_bytes(8, "little") + part)
+
+
 def _fingerprint(request: Request, body: bytes) -> str:
     digest = hashlib.sha256()
     for part in (
@@ -111,7 +157,7 @@ def _fingerprint(request: Request, body: bytes) -> str:
         request.headers.get("If-Match", "").encode(),
         body,
     ):
-        digest.update(len(part).to_bytes(8, "little") + part)
+        _update(digest, part)
     return digest.hexdigest()
 
 

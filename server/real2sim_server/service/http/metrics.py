@@ -1,8 +1,14 @@
-"""Prometheus metrics of one worker. No session id is ever a label."""
+"""Prometheus metrics of one worker.
+
+Labels come from closed sets: what a client sends is never one as it is, nor is an id.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
@@ -11,12 +17,17 @@ FAST_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5,
 LOAD_BUCKETS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120)
 
 
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+OTHER = "other"
+
+
 class Metrics:
     """All metrics, on a registry of their own, so that one process may hold several workers."""
 
     def __init__(self) -> None:
         registry = self.registry = CollectorRegistry()
         self.build = Info("real2sim_build", "version and backend", registry=registry)
+        self._exposing = threading.Lock()
         self.requests = Histogram(
             "real2sim_http_request_duration_seconds",
             "time to answer a request",
@@ -70,6 +81,50 @@ class Metrics:
             "real2sim_idempotent_replays", "requests answered from memory", registry=registry
         )
         self.sessions = Gauge("real2sim_sessions", "open sessions", registry=registry)
+        self.session_limit = Gauge(
+            "real2sim_session_limit", "sessions that may be open", registry=registry
+        )
+        self.connections = Gauge(
+            "real2sim_connections", "open connections of clients", registry=registry
+        )
+        self.connection_limit = Gauge(
+            "real2sim_connection_limit", "connections that may be open", registry=registry
+        )
+        self.dropped_connections = Counter(
+            "real2sim_dropped_connections",
+            "connections closed by the worker, by reason",
+            ("reason",),
+            registry=registry,
+        )
+        self.auth_failures = Counter(
+            "real2sim_auth_failures",
+            "wrong or missing tokens, by where they were wanted",
+            ("where",),
+            registry=registry,
+        )
+        self.sockets = Gauge("real2sim_sockets", "open sockets", ("kind",), registry=registry)
+        self.steps = Histogram(
+            "real2sim_step_duration_seconds",
+            "time from an action to its observation, as the worker sees it",
+            buckets=FAST_BUCKETS,
+            registry=registry,
+        )
+        self.missed_deadlines = Counter(
+            "real2sim_missed_deadlines", "actions that came too late", registry=registry
+        )
+        self.store_calls = Histogram(
+            "real2sim_store_duration_seconds",
+            "time of a call of the store, its queue included",
+            ("call",),
+            buckets=FAST_BUCKETS,
+            registry=registry,
+        )
+        self.ended_jobs = Counter(
+            "real2sim_ended_jobs",
+            "jobs by kind and how they ended",
+            ("kind", "state"),
+            registry=registry,
+        )
         self.loop_lag = Histogram(
             "real2sim_event_loop_lag_seconds",
             "how late the event loop runs",
@@ -82,10 +137,25 @@ class Metrics:
         self.queue_wait.observe(waited_s)
         self.jobs.labels(label).observe(ran_s)
 
+    def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
+        """Note one answer; ``route`` is the path of a route, or what stands for none."""
+        known = method if method in METHODS else OTHER
+        self.requests.labels(known, route, str(status)).observe(seconds)
+
+    @contextmanager
+    def open_socket(self, kind: str) -> Iterator[None]:
+        """Count a socket for the length of the block; ``kind``: ``drive`` or ``view``."""
+        with self.sockets.labels(kind).track_inprogress():
+            yield
+
     def watch(self, gauge: Gauge, read: Callable[[], float]) -> None:
         """Let ``gauge`` call ``read`` whenever metrics are collected."""
         gauge.set_function(read)
 
-    def exposition(self) -> tuple[bytes, str]:
-        """Body and media type of ``/metrics``."""
-        return generate_latest(self.registry), CONTENT_TYPE_LATEST
+    async def exposition(self) -> tuple[bytes, str]:
+        """Body and media type of ``/metrics``, made on another thread, one at a time."""
+        return await asyncio.to_thread(self._expose), CONTENT_TYPE_LATEST
+
+    def _expose(self) -> bytes:
+        with self._exposing:
+            return generate_latest(self.registry)

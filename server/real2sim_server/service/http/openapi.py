@@ -13,7 +13,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from real2sim_proto import PROBLEM_MEDIA_TYPE
+from .documented_errors import document_errors
 
 METHODS = ("get", "put", "post", "delete", "patch")
 
@@ -82,7 +82,7 @@ def document(app: FastAPI) -> dict[str, Any]:
     """The OpenAPI document of ``app``."""
     made = app.openapi()
     for path, method, operation in operations(made):
-        _describe_errors(operation)
+        document_errors(operation)
         _add_examples(operation)
         operation["x-codeSamples"] = [{"lang": "Shell", "source": curl(path, method, operation)}]
     schemas = made["components"]["schemas"]
@@ -115,15 +115,6 @@ def curl(path: str, method: str, operation: dict[str, Any]) -> str:
     if example is not None:
         words += ["-H", "'Content-Type: application/json'", "-d", shlex.quote(json.dumps(example))]
     return " ".join(words)
-
-
-def _describe_errors(operation: dict[str, Any]) -> None:
-    """Errors are problem documents, also those of validation."""
-    responses = operation["responses"]
-    responses.pop("422", None)
-    problem = responses.get("default", {}).get("content", {})
-    if "application/json" in problem:
-        problem[PROBLEM_MEDIA_TYPE] = problem.pop("application/json")
 
 
 def _add_examples(operation: dict[str, Any]) -> None:

@@ -16,6 +16,8 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem
 from real2sim_proto.errors import ProblemDetail, title_of
@@ -85,8 +87,15 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
 """Errors of other packages whose messages are sent as they are; the first that fits counts."""
 
 
-def service_error(error: Exception) -> ServiceError:
+def service_error(error: Exception, *, log_unexpected: bool = False) -> ServiceError:
     """The error as clients get it. Unexpected ones become INTERNAL and reveal nothing."""
+    failure = _translated(error)
+    if log_unexpected and failure.code is ErrorCode.INTERNAL:
+        log.error("unexpected error", exc_info=error)
+    return failure
+
+
+def _translated(error: Exception) -> ServiceError:
     if isinstance(error, ServiceError):
         return error
     if isinstance(error, EditError):
@@ -151,7 +160,8 @@ def install_problem_handlers(app: FastAPI) -> None:
         # Never sent; the number is what proxies log for it.
         return Response(status_code=499)
 
-    app.add_exception_handler(ClientDisconnectedError, closed)
+    for gone in (ClientDisconnectedError, ClientDisconnect):
+        app.add_exception_handler(gone, closed)
 
     async def respond(request: Request, error: Exception) -> Response:
         return problem_response(
@@ -216,6 +226,17 @@ def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
             yield part
 
 
+def _allowed_methods(request: Request) -> list[str]:
+    """Methods that some route takes at the path of a request."""
+    allowed = []
+    for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"):
+        as_routed = "GET" if method == "HEAD" else method
+        scope = dict(request.scope) | {"method": as_routed}
+        if any(route.matches(scope)[0] is Match.FULL for route in request.app.routes):
+            allowed.append(method)
+    return allowed
+
+
 _CODES = {
     HTTPStatus.UNAUTHORIZED: ErrorCode.UNAUTHORIZED,
     HTTPStatus.FORBIDDEN: ErrorCode.UNAUTHORIZED,
@@ -233,7 +254,9 @@ def _of_http(request: Request, error: HTTPException) -> ServiceError:
             detail = f"there is nothing at {request.url.path!r}; see /docs for the calls"
             return ServiceError(ErrorCode.NOT_FOUND, detail, headers=headers)
         case HTTPStatus.METHOD_NOT_ALLOWED:
-            allowed = headers.get("Allow", headers.get("allow", "other methods"))
+            allowed = ", ".join(_allowed_methods(request))
+            headers = {name: v for name, v in headers.items() if name.lower() != "allow"}
+            headers["Allow"] = allowed
             detail = f"{request.method} is not allowed at {request.url.path!r}; allowed: {allowed}"
             return ServiceError(ErrorCode.METHOD_NOT_ALLOWED, detail, headers=headers)
     code = _CODES.get(HTTPStatus(error.status_code))

@@ -1,4 +1,4 @@
-"""What surrounds every request: its id, its log line, its duration, uncaught errors."""
+"""What surrounds every request: its id, its log line, its duration, uncaught errors, HEAD."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from real2sim_proto import ErrorCode
 
+from .clients import CLIENT_HEADER
 from .problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
+from .security import secure
 
 if TYPE_CHECKING:
     from .metrics import Metrics
 
 REQUEST_ID_HEADER = "X-Request-Id"
 _REQUEST_ID = re.compile(r"[A-Za-z0-9_.\-]{1,80}")
+_CLIENT_NAME = re.compile(r"[ -~]{1,80}")
 _QUIET = ("/livez", "/readyz", "/metrics")
 
 log = structlog.get_logger(__name__)
@@ -30,8 +33,9 @@ log = structlog.get_logger(__name__)
 class RequestContext:
     """ASGI middleware, outermost of ours.
 
-    Takes the request id from ``X-Request-Id`` or makes one, sends it back, binds it for logs,
-    measures the request, and answers INTERNAL for uncaught errors.
+    Takes the request id from ``X-Request-Id`` or makes one, sends it back, binds it and the client
+    for logs, measures the request, answers HEAD as GET without its body, and INTERNAL for uncaught
+    errors.
     """
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
@@ -43,43 +47,54 @@ class RequestContext:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        request_id = _request_id(Headers(scope=scope))
+        headers = Headers(scope=scope)
+        request_id = _request_id(headers)
         scope[REQUEST_ID_KEY] = request_id
-        with structlog.contextvars.bound_contextvars(request_id=request_id):
+        with structlog.contextvars.bound_contextvars(
+            request_id=request_id, **_client(scope, headers)
+        ):
             if scope["type"] == "http":
                 await self._serve(scope, receive, send, request_id)
             else:
                 await self._app(scope, receive, send)
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
-        started = time.perf_counter()
-        status = 0
+        started, method = time.perf_counter(), scope["method"]
+        status, ended = 0, False
+        if method == "HEAD":
+            scope["method"] = "GET"
 
         async def send_with_id(message: Message) -> None:
-            nonlocal status
+            nonlocal status, ended
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
+                headers = MutableHeaders(scope=message)
+                headers[REQUEST_ID_HEADER] = request_id
+                secure(headers)
+            elif method == "HEAD":
+                if ended:
+                    return
+                ended, message = True, {"type": "http.response.body"}
             await send(message)
 
         try:
             await self._app(scope, receive, send_with_id)
         except Exception as error:
-            failure = _as_service_error(error)
+            failure = service_error(error, log_unexpected=True)
             if status:  # the answer is under way; the server must cut it short
                 raise
             response = problem_response(failure, path=scope["path"], request_id=request_id)
             await response(scope, receive, send_with_id)
         finally:
-            self._note(scope, status, time.perf_counter() - started)
+            self._note(scope, method, status, time.perf_counter() - started)
 
-    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+    def _note(self, scope: Scope, method: str, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", None) or "unmatched"
-        self._metrics.requests.labels(scope["method"], route, str(status)).observe(seconds)
+        self._metrics.observe_request(method, route, status, seconds)
         write = log.debug if scope["path"] in _QUIET else log.info
         write(
             "request",
-            method=scope["method"],
+            method=method,
             path=scope["path"],
             status=status,
             ms=round(seconds * 1e3, 2),
@@ -136,8 +151,11 @@ def _request_id(headers: Headers) -> str:
     return given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
 
 
-def _as_service_error(error: Exception) -> ServiceError:
-    failure = service_error(error)
-    if failure.status == 500:
-        log.error("unexpected error", exc_info=error)
-    return failure
+def _client(scope: Scope, headers: Headers) -> dict[str, str]:
+    """Where a request comes from, and the name that the client gives itself, for logs."""
+    address = scope.get("client")
+    found = {"client": address[0]} if address else {}
+    name = headers.get(CLIENT_HEADER, "")
+    if _CLIENT_NAME.fullmatch(name):
+        found["client_name"] = name
+    return found

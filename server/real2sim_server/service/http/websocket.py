@@ -18,13 +18,18 @@ from websockets.frames import Opcode
 from websockets.http11 import Request
 from websockets.protocol import State
 
+from real2sim_proto import ErrorCode
+
 from .auth import is_loopback
+from .connections import Backlog, Connections, DropReason
+from .problems import ServiceError
 
 Part = bytes | memoryview
 
 EXTENSION = "websocket.send_parts"
 """Holds a function that writes the parts of a binary message, or returns False."""
 
+MAX_REASON_BYTES = 123
 FIN = 0x80
 SHORT, LONG = 126, 127
 """Stand for a length of 2 and of 8 bytes behind the first two of a frame (RFC 6455, 5.2)."""
@@ -47,14 +52,57 @@ def try_send_parts(websocket: WebSocket, parts: Sequence[Part]) -> bool:
     return send is not None and bool(send(parts))
 
 
+async def receive_text(websocket: WebSocket) -> str:
+    """The next message, where messages are text.
+
+    Raises:
+        WebSocketDisconnect: the client has disconnected.
+        ServiceError: BAD_MESSAGE, the message is binary.
+    """
+    event = await websocket.receive()
+    if event["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(event.get("code", 1005))
+    text = event.get("text")
+    if text is None:
+        raise ServiceError(ErrorCode.BAD_MESSAGE, "bytes were sent where messages are JSON text")
+    return str(text)
+
+
+def close_reason(text: str) -> str:
+    """As much of ``text`` as a close frame holds: 123 bytes (RFC 6455, 5.5)."""
+    return text.encode("utf-8", "replace")[:MAX_REASON_BYTES].decode("utf-8", "ignore")
+
+
 class ScatterGatherProtocol(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket protocol with that extension, for connections without compression."""
+    """uvicorn's WebSocket protocol with that extension, for connections without compression.
+
+    Args:
+        connections: of the worker; they watch this one.
+        options: of uvicorn's protocol.
+    """
+
+    def __init__(self, connections: Connections, **options: Any) -> None:
+        super().__init__(**options)
+        self._watch = connections
+        self._backlog = Backlog(connections.limits.write_s)
+        self._has_spoken = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection on which a handshake has begun."""
         super().connection_made(transport)
+        self._watch.admit(self)
         if self.client is not None and is_loopback(self.client[0]):
             _send_unpaced(transport.get_extra_info("socket"))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection has ended."""
+        self._watch.forget(self)
+        super().connection_lost(exc)
+
+    def resume_writing(self) -> None:
+        """The client has read most of what it was sent."""
+        self._backlog.cleared()
+        super().resume_writing()
 
     def handle_connect(self, event: Request) -> None:
         """Offer the extension in the scope of an accepted connection."""
@@ -62,6 +110,21 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         if not self.close_sent and not self.config.ws_per_message_deflate:
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[EXTENSION] = self._send_parts
+
+    def send_receive_event_to_app(self) -> None:
+        """A message is whole; from the first on, the connection gives way to no other."""
+        if not self._has_spoken:
+            self._has_spoken = True
+            self._watch.heard(self, more=False)
+        super().send_receive_event_to_app()
+
+    def overdue(self, now: float) -> DropReason | None:
+        """Why this connection has to go, if it has to: pings and the handshake end other waits."""
+        return DropReason.WRITE_TIMEOUT if self._backlog.overdue(self.transport, now) else None
+
+    def drop(self, reason: DropReason) -> None:
+        """End the connection."""
+        self.transport.abort()
 
     def _send_parts(self, parts: Sequence[Part]) -> bool:
         """Write one binary message, if nothing has to be waited for."""

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.base import Identifier
 
 from ...render import encode_image
+from ..http.auth import TokenRoute
+from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError
 from ..http.responses import info_response
 from ..library.assets import extract_object, import_asset
@@ -56,11 +59,13 @@ _BODY: dict[str, Any] = {
 
 M = TypeVar("M", bound=BaseModel)
 
-router = APIRouter(prefix="/v1/assets", tags=["assets"])
+router = APIRouter(prefix="/v1/assets", tags=["assets"], route_class=TokenRoute)
 
 
 @router.post("", status_code=201, response_model=AssetInfo, openapi_extra=_BODY)
-async def add(worker: WorkerOf, request: Request) -> Response:
+async def add(
+    worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
+) -> Response:
     """Add an asset: an object cut out of a scene (JSON), or an uploaded splat file (form).
 
     Assets stand upright with x forward, at a real size, and never change: an id that is taken
@@ -68,12 +73,30 @@ async def add(worker: WorkerOf, request: Request) -> Response:
     """
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
-        if kind == "multipart/form-data":
-            info = await _upload(worker, request)
-        else:
-            info = await _extract(worker, _parsed(AssetCut, await request.body()))
-    headers = {"Location": f"/v1/assets/{info.asset_id}"}
-    return info_response(info, status=201, headers=headers)
+        if kind != "multipart/form-data":
+            add_asset = partial(_extract, worker, await request.body())
+            return await _added(worker, request, idempotency_key, add_asset)
+        async with request.form(max_files=1, max_fields=len(AssetUpload.model_fields)) as form:
+            content = await form_digest(form) if idempotency_key is not None else None
+            add_asset = partial(_upload, worker, form)
+            return await _added(worker, request, idempotency_key, add_asset, content=content)
+
+
+async def _added(
+    worker: Worker,
+    request: Request,
+    key: str | None,
+    add_asset: Callable[[], Awaitable[AssetInfo]],
+    *,
+    content: bytes | None = None,
+) -> Response:
+    async with worker.idempotency.guard(request, key, content=content) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await add_asset()
+        headers = {"Location": f"/v1/assets/{info.asset_id}"}
+        await worker.idempotency.store(idempotent.reply(info, status=201, headers=headers))
+        return info_response(info, status=201, headers=headers)
 
 
 @router.get("")
@@ -138,7 +161,8 @@ async def _check_unused(worker: Worker, asset_id: str) -> None:
         )
 
 
-async def _extract(worker: Worker, cut: AssetCut) -> AssetInfo:
+async def _extract(worker: Worker, body: bytes) -> AssetInfo:
+    cut = _parsed(AssetCut, body)
     scene = await worker.scene_cache.get(cut.scene)
     asset_id = cut.asset_id or cut.object_id
 
@@ -151,34 +175,33 @@ async def _extract(worker: Worker, cut: AssetCut) -> AssetInfo:
     return await worker.imports.run(work)
 
 
-async def _upload(worker: Worker, request: Request) -> AssetInfo:
-    async with request.form(max_files=1, max_fields=len(AssetUpload.model_fields)) as form:
-        file = form.get("file")
-        if not isinstance(file, UploadFile):
-            raise ServiceError(
-                ErrorCode.INVALID_REQUEST,
-                "the form needs a part 'file' with the splat file",
-                hint="curl -F file=@car.ply -F category=car",
+async def _upload(worker: Worker, form: FormData) -> AssetInfo:
+    file = form.get("file")
+    if not isinstance(file, UploadFile):
+        raise ServiceError(
+            ErrorCode.INVALID_REQUEST,
+            "the form needs a part 'file' with the splat file",
+            hint="curl -F file=@car.ply -F category=car",
+        )
+    fields = {name: value for name, value in form.items() if name != "file"}
+    upload = _parsed(AssetUpload, fields)
+
+    def work() -> AssetInfo:
+        asset_id = upload.asset_id or scene_name(Path(file.filename or "asset"), None)
+        with (
+            import_errors(Path("upload"), setting="MAX_ASSET_BYTES"),
+            staging_folder(worker.assets.folder) as staging,
+        ):
+            return import_asset(
+                worker.assets,
+                stored_upload(file, staging),
+                upload,
+                asset_id=asset_id,
+                limits=worker.asset_limits,
+                quota=worker.assets_quota,
             )
-        fields = {name: value for name, value in form.items() if name != "file"}
-        upload = _parsed(AssetUpload, fields)
 
-        def work() -> AssetInfo:
-            asset_id = upload.asset_id or scene_name(Path(file.filename or "asset"), None)
-            with (
-                import_errors(Path("upload"), setting="MAX_ASSET_BYTES"),
-                staging_folder(worker.assets.folder) as staging,
-            ):
-                return import_asset(
-                    worker.assets,
-                    stored_upload(file, staging),
-                    upload,
-                    asset_id=asset_id,
-                    limits=worker.asset_limits,
-                    quota=worker.assets_quota,
-                )
-
-        return await worker.imports.run(work)
+    return await worker.imports.run(work)
 
 
 def _parsed(model: type[M], given: bytes | Mapping[str, Any]) -> M:

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Request, Response
 from real2sim_proto.jobs import ExportRequest, JobInfo
 
 from ...edit import ScenarioState, instances_at
+from ..http.auth import TokenRoute
 from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey
 from ..http.responses import info_response
@@ -16,7 +17,7 @@ from ..jobs.exports import VideoSource, check_camera, export_video, frame_times
 from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
 from ..worker import Worker, WorkerOf
 
-router = APIRouter(prefix="/v1/exports", tags=["exports"])
+router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=TokenRoute)
 
 
 @router.post("", status_code=202, response_model=JobInfo)

@@ -14,7 +14,10 @@ from ..worker import WorkerOf
 router = APIRouter(tags=["health"])
 
 
-@router.get("/livez")
+@router.get(
+    "/livez",
+    responses={503: {"model": dict[str, str], "description": "dead or stalled, and why"}},
+)
 async def live(worker: WorkerOf, response: Response) -> dict[str, str]:
     """200 while the engine thread shows signs of life; at 503 only a restart helps."""
     engine = worker.engine
@@ -43,5 +46,5 @@ async def metrics(worker: WorkerOf) -> Response:
     """Prometheus metrics."""
     if not worker.settings.metrics:
         raise ServiceError(ErrorCode.NOT_FOUND, "metrics are turned off by REAL2SIM_METRICS")
-    body, media_type = worker.metrics.exposition()
+    body, media_type = await worker.metrics.exposition()
     return Response(body, media_type=media_type)

@@ -12,6 +12,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo, JobList
 
+from ..http.auth import TokenRoute
 from ..http.disconnects import cancel_on_disconnect
 from ..http.events import event_stream
 from ..http.responses import info_response
@@ -21,7 +22,7 @@ from ..rendering.responses import FRAME_RESPONSES, frame_response
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=TokenRoute)
 
 
 @router.get("")

@@ -24,6 +24,7 @@ from real2sim_proto.scenarios import (
     ScenarioList,
 )
 
+from ..http.auth import TokenRoute
 from ..http.clients import ClientName
 from ..http.disconnects import cancel_on_disconnect
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
@@ -35,7 +36,7 @@ from ..scenarios.scenarios import created_headers, tag
 from ..worker import Worker, WorkerOf
 from .frame_query import FrameQueryOf
 
-router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
+router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"], route_class=TokenRoute)
 
 IfMatch = Annotated[
     str | None,

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import SceneImport, SceneInfo
 
 from ...scene.io.formats import suffixes
+from ..http.auth import TokenRoute
+from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError
 from ..library.imports import (
     import_errors,
@@ -52,21 +56,43 @@ _BODY = {
 }
 
 
-router = APIRouter(prefix="/v1", tags=["scenes"])
+router = APIRouter(prefix="/v1", tags=["scenes"], route_class=TokenRoute)
 
 
 @router.post("/scenes", status_code=201, response_model=SceneInfo, openapi_extra=_BODY)
-async def import_(worker: WorkerOf, request: Request) -> Response:
+async def import_(
+    worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
+) -> Response:
     """Add a scene: a bundle or ply below the import folder (JSON), or an uploaded ply."""
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
-        if kind == "multipart/form-data":
-            name = await _import_upload(worker, request)
-        else:
-            name = await _import_path(worker, await request.body())
-    await worker.scene_cache.refresh()
-    headers = {"Location": f"/v1/scenes/{name}"}
-    return await scene_response(worker, name, status=201, headers=headers)
+        if kind != "multipart/form-data":
+            add_scene = partial(_import_path, worker, await request.body())
+            return await _imported(worker, request, idempotency_key, add_scene)
+        async with request.form(max_files=1, max_fields=1) as form:
+            content = await form_digest(form) if idempotency_key is not None else None
+            add_scene = partial(_import_upload, worker, form)
+            return await _imported(worker, request, idempotency_key, add_scene, content=content)
+
+
+async def _imported(
+    worker: Worker,
+    request: Request,
+    key: str | None,
+    add_scene: Callable[[], Awaitable[str]],
+    *,
+    content: bytes | None = None,
+) -> Response:
+    async with worker.idempotency.guard(request, key, content=content) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        name = await add_scene()
+        await worker.scene_cache.refresh()
+        headers = {"Location": f"/v1/scenes/{name}"}
+        response = await scene_response(worker, name, status=201, headers=headers)
+        reply = idempotent.reply_bytes(bytes(response.body), status=201, headers=headers)
+        await worker.idempotency.store(reply)
+        return response
 
 
 async def _import_path(worker: Worker, body: bytes) -> str:
@@ -82,25 +108,24 @@ async def _import_path(worker: Worker, body: bytes) -> str:
     return await worker.imports.run(work)
 
 
-async def _import_upload(worker: Worker, request: Request) -> str:
-    async with request.form(max_files=1, max_fields=1) as form:
-        file, given = form.get("file"), form.get("scene")
-        if not isinstance(file, UploadFile) or not isinstance(given, str | None):
-            raise ServiceError(
-                ErrorCode.INVALID_REQUEST,
-                "the form needs a part 'file' with the splat file, and may have a field 'scene'",
-            )
+async def _import_upload(worker: Worker, form: FormData) -> str:
+    file, given = form.get("file"), form.get("scene")
+    if not isinstance(file, UploadFile) or not isinstance(given, str | None):
+        raise ServiceError(
+            ErrorCode.INVALID_REQUEST,
+            "the form needs a part 'file' with the splat file, and may have a field 'scene'",
+        )
 
-        def work() -> str:
-            name = scene_name(Path(file.filename or "upload"), given)
-            with (
-                import_errors(Path("upload"), setting="MAX_SCENE_BYTES"),
-                staging_folder(worker.settings.scenes_path) as staging,
-            ):
-                _import(worker, stored_upload(file, staging), name)
-            return name
+    def work() -> str:
+        name = scene_name(Path(file.filename or "upload"), given)
+        with (
+            import_errors(Path("upload"), setting="MAX_SCENE_BYTES"),
+            staging_folder(worker.settings.scenes_path) as staging,
+        ):
+            _import(worker, stored_upload(file, staging), name)
+        return name
 
-        return await worker.imports.run(work)
+    return await worker.imports.run(work)
 
 
 def _import(worker: Worker, source: Path, name: str) -> None:

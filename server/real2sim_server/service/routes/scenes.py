@@ -13,6 +13,7 @@ from real2sim_proto.jobs import JobInfo
 from real2sim_proto.scenes import SceneInfo, SceneList, SceneState
 
 from ...edit import ScenarioState
+from ..http.auth import TokenRoute
 from ..http.clients import ClientName
 from ..http.disconnects import cancel_on_disconnect
 from ..http.problems import ServiceError
@@ -26,7 +27,7 @@ from .frame_query import FrameQueryOf
 WAIT_S = 2.0
 MAX_WAIT_S = 600.0
 
-router = APIRouter(prefix="/v1", tags=["scenes"])
+router = APIRouter(prefix="/v1", tags=["scenes"], route_class=TokenRoute)
 
 
 @router.get("/scenes", response_model=SceneList)

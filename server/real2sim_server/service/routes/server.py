@@ -17,9 +17,10 @@ from real2sim_proto.sessions import MAX_STEPS_PER_REQUEST
 from real2sim_proto.version import SUPPORTED_SUBPROTOCOLS
 
 from ...settings import Settings
+from ..http.auth import TokenRoute
 from ..worker import WorkerOf
 
-router = APIRouter(prefix="/v1", tags=["server"])
+router = APIRouter(prefix="/v1", tags=["server"], route_class=TokenRoute)
 
 
 @router.get("/server")

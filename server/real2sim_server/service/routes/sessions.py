@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
@@ -19,41 +20,72 @@ from real2sim_proto.sessions import (
     StepRequest,
 )
 
-from ..http.auth import matches_any_secret, require_token, unauthorized
-from ..http.idempotency import IdempotencyKey
+from ...world import Event, World
+from ..http.auth import (
+    TokenRoute,
+    bearer_token,
+    check_token,
+    require_token,
+    secrets_equal,
+    unauthorized,
+)
+from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
 from ..sessions.describe import session_info, session_state
 from ..sessions.recording import RECORDING, recording_of
-from ..sessions.registry import created_headers
+from ..sessions.registry import check_not_closed, created_headers
 from ..sessions.session import Session
+from ..sessions.step import MakeReply
 from ..sessions.views import view_response
-from ..worker import WorkerOf
-
-router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+from ..storage.store import StoredReply
+from ..worker import Worker, WorkerOf
 
 _bearer = HTTPBearer(auto_error=False, description="the session's token, or the worker's")
+
+
+class SessionRoute(TokenRoute):
+    """A route of a session, for whoever has its token or the worker's."""
+
+    async def check(self, request: Request) -> None:
+        """Raises ServiceError: UNAUTHORIZED, UNKNOWN_SESSION or SESSION_CLOSED."""
+        session_id = request.path_params.get("session_id")
+        if session_id is None:
+            check_token(request)
+        else:
+            await _check_session_token(request, session_id)
+
+
+async def _check_session_token(request: Request, session_id: str) -> None:
+    worker: Worker = request.app.state.worker
+    given, secret = bearer_token(request), worker.settings.token
+    if secret is not None and secrets_equal(given, secret.get_secret_value()):
+        return
+    row = None
+    if given is not None or secret is None:
+        # The row is enough: no session is rebuilt for those who may not use it.
+        row = check_not_closed(await worker.sessions.row(session_id))
+    if row is None or not secrets_equal(given, row.token):
+        worker.metrics.auth_failures.labels("http").inc()
+        error = unauthorized("this call wants the session's token or the worker's")
+        error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
+        raise error
+
+
+router = APIRouter(prefix="/v1/sessions", tags=["sessions"], route_class=SessionRoute)
 
 
 async def _session_of(
     worker: WorkerOf,
     session_id: str,
-    credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
+    _credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Session:
-    """The session, for whoever has its token or the worker's.
+    """The session, whose token was checked by its route.
 
     Raises:
-        ServiceError: UNKNOWN_SESSION, SESSION_CLOSED or UNAUTHORIZED.
+        ServiceError: UNKNOWN_SESSION or SESSION_CLOSED.
     """
     session = await worker.sessions.find(session_id)
-    given = credentials.credentials if credentials else None
-    secret = worker.settings.token
-    if not matches_any_secret(
-        given, session.row.token, secret.get_secret_value() if secret else None
-    ):
-        error = unauthorized("this call wants the session's token or the worker's")
-        error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
-        raise error
     session.touch()
     return session
 
@@ -105,30 +137,50 @@ async def delete(worker: WorkerOf, session: SessionOf) -> Response:
 
 
 @router.post("/{session_id}/reset", response_model=SessionState)
-async def reset(worker: WorkerOf, session: SessionOf, body: ResetSpec | None = None) -> Response:
+async def reset(
+    worker: WorkerOf,
+    session: SessionOf,
+    request: Request,
+    body: ResetSpec | None = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
     """Begin an episode anew, from what the session was made of; refused beside a controller."""
-    async with session.lock:
-        session.check_open()
-        session.check_no_controller()
-        await worker.sessions.stepper.restart(session, body or ResetSpec())
-        world = session.running_world()
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        async with session.lock:
+            session.check_open()
+            session.check_no_controller()
+            reply = _state_reply(session, idempotent)
+            await worker.sessions.stepper.restart(session, body or ResetSpec(), reply=reply)
+            world = session.running_world()
     return await large_response(lambda: session_state(session.session_id, world, ()))
 
 
 @router.post("/{session_id}/step", response_model=SessionState)
-async def step(worker: WorkerOf, session: SessionOf, body: StepRequest) -> Response:
+async def step(
+    worker: WorkerOf,
+    session: SessionOf,
+    request: Request,
+    body: StepRequest,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
     """Move the clock; ends early with the episode. Refused beside a controller."""
-    async with session.lock:
-        session.check_open()
-        session.check_no_controller()
-        if body.dt_us not in {None, session.running_world().spec.dt_us}:
-            raise ServiceError(
-                ErrorCode.INVALID_REQUEST,
-                f"dt_us {body.dt_us} is not that of the episode, {session.spec.dt_us}",
-                hint="leave dt_us out, or reset the session with another one",
-            )
-        await worker.sessions.stepper.step(session, body.n, body.plan)
-        world, events = session.running_world(), session.take_events()
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        async with session.lock:
+            session.check_open()
+            session.check_no_controller()
+            if body.dt_us not in {None, session.running_world().spec.dt_us}:
+                raise ServiceError(
+                    ErrorCode.INVALID_REQUEST,
+                    f"dt_us {body.dt_us} is not that of the episode, {session.spec.dt_us}",
+                    hint="leave dt_us out, or reset the session with another one",
+                )
+            reply = _state_reply(session, idempotent)
+            await worker.sessions.stepper.step(session, body.n, body.plan, reply=reply)
+            world, events = session.running_world(), session.take_events()
     return await large_response(lambda: session_state(session.session_id, world, events))
 
 
@@ -139,12 +191,22 @@ async def state(session: SessionOf) -> Response:
     return await large_response(lambda: session_state(session.session_id, world, events))
 
 
-@router.post("/{session_id}/fork", status_code=201)
-async def fork(worker: WorkerOf, session: SessionOf, request: Request) -> SessionInfo:
+@router.post("/{session_id}/fork", status_code=201, response_model=SessionInfo)
+async def fork(
+    worker: WorkerOf,
+    session: SessionOf,
+    request: Request,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
     """A new session that goes on from the present instant of this one."""
-    async with session.lock:
-        session.check_open()
-        return await worker.sessions.fork(session, ws_base=_ws_base(request))
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        async with session.lock:
+            session.check_open()
+            ws_base = _ws_base(request)
+            info = await worker.sessions.fork(session, ws_base=ws_base, idempotent=idempotent)
+        return info_response(info, status=201, headers=created_headers(info))
 
 
 @router.get(
@@ -186,6 +248,17 @@ async def render(
     """Images of the current instant; never moves time."""
     pipeline, world = worker.sessions.pipeline, session.running_world()
     return await view_response(pipeline, world, body.sensors, accept)
+
+
+def _state_reply(session: Session, idempotent: IdempotentRequest) -> MakeReply:
+    """What is stored under a request's key once the world has moved."""
+
+    def reply(world: World, events: Sequence[Event]) -> StoredReply | None:
+        if idempotent.key is None:
+            return None
+        return idempotent.reply(session_state(session.session_id, world, events), status=200)
+
+    return reply
 
 
 def _ws_base(request: Request) -> str:

@@ -47,8 +47,6 @@ async def file(name: str) -> Response:
     headers = {
         "Cache-Control": "no-cache",
         "Content-Security-Policy": POLICY,
-        "X-Content-Type-Options": "nosniff",
-        "Referrer-Policy": "no-referrer",
     }
     return Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix], headers=headers)
 

@@ -2,56 +2,78 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from urllib.parse import urlsplit
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from pydantic import TypeAdapter, ValidationError
+
+from real2sim_proto import ErrorCode
 
 from ..http.auth import secrets_equal
-from ..http.hosts import FOREIGN_HOST
-from ..http.problems import ServiceError
+from ..http.problems import ServiceError, service_error
+from ..http.websocket import close_reason, receive_text
 from ..worker import Worker, WorkerOf
 from .view_connection import ViewConnection
 
-CLOSED_UNAUTHORIZED, CLOSED_NOT_FOUND = 4401, 4404
+HANDSHAKE_TIMEOUT_S = 10.0
+CLOSED_BAD_MESSAGE, CLOSED_UNAUTHORIZED, CLOSED_NOT_FOUND = 4400, 4401, 4404
+CLOSED_TIMEOUT, CLOSED_FAILED = 4408, 4500
 """Codes with which the socket is closed."""
 
+# Not json.loads(): it follows nesting until the stack ends, and lets lone surrogates pass.
+_HELLO: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
+
 router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
+
+
+class NoHelloError(Exception):
+    """A first message that lets nobody in.
+
+    Args:
+        code: with which the socket is closed.
+        reason: sent with it.
+    """
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
 
 
 @router.websocket("/{scenario_id}/view")
 async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
     """Frames and picks of a scenario for one browser; the latest question wins."""
-    if not same_origin(socket.headers.get("Origin"), socket.headers.get("Host")):
-        await socket.close(code=FOREIGN_HOST, reason="pages of other sites may not look")
-        return
     await socket.accept()
     try:
-        if not await _authenticate(socket, worker):
-            await socket.close(CLOSED_UNAUTHORIZED, "the token is not this worker's")
-            return
-        await worker.scenarios.view(scenario_id)
-        await socket.send_text(json.dumps({"type": "welcome"}))
-        await ViewConnection(socket, worker, scenario_id).serve()
-    except ServiceError as error:
-        await socket.close(CLOSED_NOT_FOUND, error.detail[:100])
+        with worker.metrics.open_socket("view"):
+            await _check_hello(socket, worker)
+            await worker.scenarios.view(scenario_id)
+            await socket.send_text(json.dumps({"type": "welcome"}))
+            await ViewConnection(socket, worker, scenario_id).serve()
+    except NoHelloError as error:
+        await socket.close(error.code, str(error))
     except WebSocketDisconnect:
         return
+    except Exception as error:
+        failure = service_error(error, log_unexpected=True)
+        missing = failure.code is ErrorCode.UNKNOWN_SCENARIO
+        code = CLOSED_NOT_FOUND if missing else CLOSED_FAILED
+        await socket.close(code, close_reason(failure.detail))
 
 
-def same_origin(origin: str | None, host: str | None) -> bool:
-    """Whether a page of this worker asks, or no page at all."""
-    return origin is None or urlsplit(origin).netloc == host
-
-
-async def _authenticate(socket: WebSocket, worker: Worker) -> bool:
-    """Read `{"type": "hello", "token": ...}`; whether the token is right, or none is needed."""
+async def _check_hello(socket: WebSocket, worker: Worker) -> None:
+    """Read `{"type": "hello", "token": ...}`. Raises NoHelloError where the token is not right."""
     try:
-        hello = json.loads(await socket.receive_text())
-    except ValueError:
-        return False
-    secret = worker.settings.token
+        async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
+            hello = _HELLO.validate_json(await receive_text(socket))
+    except TimeoutError as error:
+        reason = f"no hello within {HANDSHAKE_TIMEOUT_S:g} s"
+        raise NoHelloError(CLOSED_TIMEOUT, reason) from error
+    except (ValidationError, ServiceError) as error:
+        raise NoHelloError(CLOSED_BAD_MESSAGE, "the first message must be a hello") from error
+    secret, given = worker.settings.token, hello.get("token")
     if secret is None:
-        return isinstance(hello, dict)
-    given = hello.get("token") if isinstance(hello, dict) else None
-    return isinstance(given, str) and secrets_equal(given, secret.get_secret_value())
+        return
+    if not isinstance(given, str) or not secrets_equal(given, secret.get_secret_value()):
+        worker.metrics.auth_failures.labels("view").inc()
+        raise NoHelloError(CLOSED_UNAUTHORIZED, "the token is not this worker's")

@@ -21,7 +21,8 @@ from ...edit import EditError, instances_at, replay_operations
 from ...render import Instance, RenderError
 from ...scene import Scene, SceneError
 from ..engine import QueueFullError
-from ..http.problems import ServiceError
+from ..http.problems import ServiceError, service_error
+from ..http.websocket import receive_text
 from ..rendering.renderer import RenderRequest
 from ..worker import Worker
 
@@ -91,9 +92,11 @@ class ViewConnection:
 
     async def _read(self) -> None:
         while True:
-            text = await self._socket.receive_text()
             try:
-                request = VIEW_REQUEST.validate_json(text)
+                request = VIEW_REQUEST.validate_json(await receive_text(self._socket))
+            except ServiceError as error:
+                await self._send_event("error", code=error.code, detail=error.detail)
+                continue
             except ValidationError as error:
                 first = error.errors()[0]
                 where = ".".join(str(part) for part in first["loc"])
@@ -120,11 +123,14 @@ class ViewConnection:
     async def _answer_one(self, request: ViewRequest) -> None:
         try:
             await self._answer_view(request)
-        except ServiceError as error:
-            detail = {"code": error.code, "detail": error.detail, "hint": error.hint}
-            await self._send_event("error", seq=request.seq, **detail)
+        except WebSocketDisconnect:
+            raise
         except (EditError, SceneError, RenderError, QueueFullError) as error:
             await self._send_event("error", seq=request.seq, code="REFUSED", detail=str(error))
+        except Exception as error:
+            failure = service_error(error, log_unexpected=True)
+            detail = {"code": failure.code, "detail": failure.detail, "hint": failure.hint}
+            await self._send_event("error", seq=request.seq, **detail)
 
     async def _check_revision(self) -> None:
         view = await self._worker.scenarios.view(self._scenario_id)

@@ -1,4 +1,4 @@
-"""One drive socket: its handshake, then messages in lock step or as an observer.
+"""One drive socket once its client is known: messages in lock step or as an observer.
 
 The first two phases of a step are here, ``_receive`` and ``_check``; see `pipeline` for the others.
 """
@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator
 from functools import partial
-from typing import Any, assert_never
+from typing import assert_never
 
 import structlog
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
+from real2sim_proto import ErrorCode
 from real2sim_proto.drive import (
     Action,
     Agent,
@@ -29,28 +30,26 @@ from real2sim_proto.drive import (
     Snapshot,
 )
 
-from ..http.auth import matches_any_secret, secrets_equal, unauthorized
+from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import send_parts, try_send_parts
 from .deadline_timer import DeadlineTimer
 from .describe import welcome_fields
-from .messages import (
-    BadMessageError,
-    ReceivedMessage,
-    bad_message,
-    read_message,
-    unsupported_protocol,
+from .handshake import (
+    FatalError,
+    close_with_error,
+    error_message,
+    is_resuming,
+    receive,
+    with_progress,
 )
+from .messages import BadMessageError, ReceivedMessage, bad_message
 from .observers import ObserverQueue
 from .registry import Sessions
 from .session import Session, controller_taken
 from .wire import EncodedMessage, pack_message
 
-HANDSHAKE_TIMEOUT_S = 10.0
-PROGRESS_S = 1.0
 CLOSE_TIMEOUT_S = 2.0
-SMALL_BYTES = 16_384
-"""Messages up to this size are read on the event loop: that takes less than handing them over."""
 
 ALLOWED_MESSAGES: dict[str, tuple[type, ...]] = {
     "controller": (Hello, Reset, Action, Edit, Render, Agent, Snapshot, Restore, Fork, Bye),
@@ -58,57 +57,37 @@ ALLOWED_MESSAGES: dict[str, tuple[type, ...]] = {
     "agent": (Hello, Agent, Render, Bye),
 }
 
-POLICY_VIOLATION = 1008
 NORMAL_CLOSURE = 1000
 
 log = structlog.get_logger(__name__)
-
-
-class FatalError(Exception):
-    """Ends the connection with an error message."""
-
-    def __init__(self, error: ServiceError, *, message_id: int = 0) -> None:
-        super().__init__(error.detail)
-        self.error = error
-        self.message_id = message_id
 
 
 class Connection:
     """An accepted drive socket of a session.
 
     Args:
-        socket: accepted with our subprotocol.
+        socket: whose hello was right.
         session: that it belongs to.
         sessions: the session's registry.
-        authorised: whether the handshake carried the worker's token.
-        worker_token: opens every session; None where the worker has none.
         ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
     """
 
     def __init__(
-        self,
-        socket: WebSocket,
-        session: Session,
-        sessions: Sessions,
-        *,
-        authorised: bool,
-        worker_token: str | None,
-        ws_base: str,
+        self, socket: WebSocket, session: Session, sessions: Sessions, *, ws_base: str
     ) -> None:
         self._socket = socket
         self._session = session
         self._sessions = sessions
-        self._authorised = authorised
-        self._worker_token = worker_token
         self._ws_base = ws_base
         self._sending = asyncio.Lock()
-        self._deadline_timer = DeadlineTimer(session, sessions.stepper, self._send)
+        self._deadline_timer = DeadlineTimer(
+            session, sessions.stepper, self._send, missed=sessions.metrics.missed_deadlines
+        )
 
-    async def serve(self) -> None:
+    async def serve(self, hello: Hello) -> None:
         """Serve until one of both leaves. A client that vanishes is no error."""
         session = self._session
         try:
-            hello = await self._handshake()
             session.check_open()
             session.close_callbacks.add(self._close_with_error)
             if hello.role == "controller":
@@ -122,58 +101,28 @@ class Connection:
                     await self._serve_messages(hello.role)
         except WebSocketDisconnect:
             pass
-        except (FatalError, ServiceError) as error:
-            if isinstance(error, FatalError):
-                await self._close_with_error(error.error, message_id=error.message_id)
-            else:
-                await self._close_with_error(error)
+        except FatalError as error:
+            await self._close_with_error(error.error, message_id=error.message_id)
+        except ServiceError as error:
+            await self._close_with_error(error)
         finally:
             session.close_callbacks.discard(self._close_with_error)
             session.touch()
 
-    # --- handshake --------------------------------------------------------------------------
-
-    async def _handshake(self) -> Hello:
-        """The client's hello. Raises FatalError for anything else, or none in time."""
-        try:
-            async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
-                message = (await self._receive()).message
-        except TimeoutError as error:
-            detail = f"no hello within {HANDSHAKE_TIMEOUT_S:g} s"
-            raise FatalError(ServiceError(ErrorCode.TIMEOUT, detail)) from error
-        except BadMessageError as error:
-            raise FatalError(error.error, message_id=error.message_id) from error
-        if not isinstance(message, Hello):
-            wrong_type = bad_message(f"the first message must be hello, not {message.type}")
-            raise FatalError(wrong_type, message_id=message.id)
-        if not set(message.protocols) & set(SUPPORTED_SUBPROTOCOLS):
-            raise FatalError(unsupported_protocol(message.protocols), message_id=message.id)
-        if not (self._authorised or self._is_resuming(message) or self._has_token(message)):
-            no_token = unauthorized("hello carries neither the session's token nor the worker's")
-            no_token.hint = "the answer to POST /v1/sessions has the session's token"
-            raise FatalError(no_token, message_id=message.id)
-        return message
-
-    def _has_token(self, hello: Hello) -> bool:
-        return matches_any_secret(hello.token, self._session.row.token, self._worker_token)
-
-    def _is_resuming(self, hello: Hello) -> bool:
-        """Whether this is the session's controller who comes back."""
-        resume = hello.resume
-        return resume is not None and secrets_equal(resume.token, self._session.resume_token)
+    # --- welcome ----------------------------------------------------------------------------
 
     async def _welcome(self, hello: Hello) -> None:
         """Warm up, with progress messages meanwhile, and send what there is."""
-        warming = asyncio.create_task(self._sessions.warm_up(self._session))
-        # Read the outcome even when the client has left meanwhile.
-        warming.add_done_callback(lambda task: task.cancelled() or task.exception())
-        while not (await asyncio.wait({warming}, timeout=PROGRESS_S))[0]:
-            fields = {"phase": "warming up: kernels and first render", "eta_s": None}
-            await self._send(pack_message("progress", fields), hello.id)
+        warming = self._sessions.warm_up(self._session)
         try:
-            await warming
+            await with_progress(
+                self._socket, warming, hello, phase="warming up: kernels and first render"
+            )
+        except WebSocketDisconnect:
+            raise
         except Exception as error:
-            raise FatalError(_as_service_error(error), message_id=hello.id) from error
+            failure = service_error(error, log_unexpected=True)
+            raise FatalError(failure, message_id=hello.id) from error
         fields = await asyncio.to_thread(welcome_fields, self._session, hello.role)
         await self._send(pack_message("welcome", fields), hello.id)
 
@@ -181,7 +130,7 @@ class Connection:
     async def _as_controller(self, hello: Hello) -> AsyncIterator[None]:
         session = self._session
         old = session.controller
-        if old is not None and not self._is_resuming(hello):
+        if old is not None and not is_resuming(hello, session.row):
             raise FatalError(controller_taken(session.session_id), message_id=hello.id)
         session.controller = self
         if isinstance(old, Connection):
@@ -255,7 +204,7 @@ class Connection:
             _check_role(received.message, role)
             return await self._dispatch(received, role)
         except Exception as error:
-            return self._error_message(_as_service_error(error))
+            return self._error_message(service_error(error, log_unexpected=True))
 
     async def _dispatch(self, received: ReceivedMessage, role: str) -> EncodedMessage | None:
         message, session = received.message, self._session
@@ -287,19 +236,22 @@ class Connection:
     async def _act(self, action: Action, content: bytes) -> EncodedMessage | None:
         """Check an action, and let it pass the rest of the step pipeline."""
         session, waited_us = self._session, self._deadline_timer.waited_us
+        arrived = time.perf_counter()
         if action.step == session.lockstep.step:
             self._deadline_timer.cancel()
         async with session.lock:
             given_before = self._check(action, content)
             if given_before is not None:
                 return given_before
-            return await self._sessions.stepper.act(
+            answer = await self._sessions.stepper.act(
                 session,
                 action.plan,
                 content,
                 latency_us=waited_us,
                 write=partial(self._write_at_once, action.id),
             )
+            self._sessions.metrics.steps.observe(time.perf_counter() - arrived)
+            return answer
 
     def _check(self, action: Action, content: bytes) -> EncodedMessage | None:
         """Whether this action is due; the answer to it where it was given before.
@@ -326,7 +278,9 @@ class Connection:
                 self._deadline_timer.cancel()
                 return await stepper.restore(session, message.name)
             case Fork():
-                info = await self._sessions.fork(session, ws_base=self._ws_base)
+                info = await self._sessions.fork(
+                    session, ws_base=self._ws_base, idempotent=IdempotentRequest()
+                )
                 fields = info.model_dump(include={"session_id", "token", "ws_url"})
                 fields["step"] = session.running_world().steps
                 return pack_message("forked", fields)
@@ -366,16 +320,9 @@ class Connection:
     # --- bytes ------------------------------------------------------------------------------
 
     async def _receive(self) -> ReceivedMessage:
-        event = await self._socket.receive()
-        if event["type"] == "websocket.disconnect":
-            raise WebSocketDisconnect(event.get("code", 1005))
+        received = await receive(self._socket)
         self._session.touch()
-        data = event.get("bytes")
-        if data is None:
-            raise BadMessageError(bad_message("text was sent where messages are binary"))
-        if len(data) <= SMALL_BYTES:
-            return read_message(data)
-        return await asyncio.to_thread(read_message, data)
+        return received
 
     def _write_at_once(self, message_id: int, message: EncodedMessage) -> bool:
         """Write a message if nothing has to be waited for; whether it is written."""
@@ -390,21 +337,13 @@ class Connection:
 
     async def _close_with_error(self, error: ServiceError, *, message_id: int = 0) -> None:
         """Send the error and close; a client that does not read is left alone."""
-        with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
-            async with asyncio.timeout(CLOSE_TIMEOUT_S):
-                await self._send(self._error_message(error, fatal=True), message_id)
-                await self._socket.close(POLICY_VIOLATION, error.code.value)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CLOSE_TIMEOUT_S), self._sending:
+                step = self._session.lockstep.step
+                await close_with_error(self._socket, error, message_id=message_id, step=step)
 
-    def _error_message(self, error: ServiceError, *, fatal: bool = False) -> EncodedMessage:
-        fields: dict[str, Any] = {
-            "code": error.code.value,
-            "detail": error.detail,
-            "hint": error.hint,
-            "retryable": error.code in RETRYABLE,
-            "fatal": fatal,
-            "step": self._session.lockstep.step,
-        }
-        return pack_message("error", fields)
+    def _error_message(self, error: ServiceError) -> EncodedMessage:
+        return error_message(error, step=self._session.lockstep.step)
 
 
 def _check_role(message: ClientMessage, role: str) -> None:
@@ -418,10 +357,3 @@ def _check_role(message: ClientMessage, role: str) -> None:
         f"send {', '.join(kind.__name__.lower() for kind in allowed)}",
         hint="connect with role 'controller' to drive",
     )
-
-
-def _as_service_error(error: Exception) -> ServiceError:
-    error = service_error(error)
-    if error.code is ErrorCode.INTERNAL:
-        log.error("unexpected error", exc_info=error)
-    return error

@@ -8,6 +8,7 @@ import time
 from collections.abc import Awaitable, Callable
 
 import structlog
+from prometheus_client import Counter
 
 from .session import Session
 from .step import Stepper
@@ -29,12 +30,14 @@ class DeadlineTimer:
         session: whose controller is connected.
         stepper: makes the fallback's step.
         send: sends an observation that no action has led to.
+        missed: counts deadlines that have passed.
     """
 
-    def __init__(self, session: Session, stepper: Stepper, send: Send) -> None:
+    def __init__(self, session: Session, stepper: Stepper, send: Send, *, missed: Counter) -> None:
         self._session = session
         self._stepper = stepper
         self._send = send
+        self._missed = missed
         self._waiting: asyncio.Task[None] | None = None
         self._sent_at = time.monotonic()
 
@@ -92,6 +95,8 @@ class DeadlineTimer:
                 return
             if session.world is None or session.world.over:
                 return
+            if not session.expired:
+                self._missed.inc()
             if session.expired:
                 message = await self._stepper.stop(session, "wall_clock")
             elif session.spec.on_timeout == "pause":

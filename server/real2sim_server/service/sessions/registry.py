@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -38,6 +39,8 @@ from .step import Stepper
 
 RETRY_AFTER_S = 5
 IDLE_CHECK_S = 5.0
+
+_ID = re.compile(r"[A-Za-z0-9_.\-]{1,80}")
 
 log = structlog.get_logger(__name__)
 
@@ -84,6 +87,7 @@ class Sessions:
     ) -> None:
         self.pipeline = pipeline
         self.stepper = Stepper(pipeline, kernels, store)
+        self.metrics = metrics
         self.draining = False
         self._limits = limits
         self._store = store
@@ -179,18 +183,34 @@ class Sessions:
         """
         if (session := self._open.get(session_id)) is not None:
             return session
-        row = await self._store.session(session_id)
-        if row is not None and row.closed_us is not None:
-            raise _closed(session_id, row.reason or "closed")
-        if row is not None and row.worker_id == self._limits.worker_id:
-            return await self._rebuilt(row)
-        hint = "GET /v1/sessions lists them"
-        raise ServiceError(ErrorCode.UNKNOWN_SESSION, f"no session {session_id!r}", hint=hint)
+        return await self._rebuilt(check_not_closed(await self.row(session_id)))
 
-    async def fork(self, session: Session, *, ws_base: str) -> SessionInfo:
+    async def row(self, session_id: str) -> SessionRow:
+        """The row of a session, open or closed, without rebuilding it.
+
+        Raises:
+            ServiceError: UNKNOWN_SESSION.
+        """
+        if (session := self._open.get(session_id)) is not None:
+            return session.row
+        # What no id of ours looks like need not be asked of a database, which may choke on it.
+        row = await self._store.session(session_id) if _ID.fullmatch(session_id) else None
+        if row is None or row.worker_id != self._limits.worker_id:
+            hint = "GET /v1/sessions lists them"
+            raise ServiceError(ErrorCode.UNKNOWN_SESSION, f"no session {session_id!r}", hint=hint)
+        return row
+
+    async def fork(
+        self, session: Session, *, ws_base: str, idempotent: IdempotentRequest
+    ) -> SessionInfo:
         """A new session that goes on from the present instant of another, held by its lock.
 
         Its log begins with a copy of the other's, so that it can be rebuilt on its own.
+
+        Args:
+            session: the other one.
+            ws_base: how clients reach this worker.
+            idempotent: what the answer is stored under.
 
         Raises:
             ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET.
@@ -205,19 +225,21 @@ class Sessions:
             )
             await self._scene_cache.pin(row.scene)
             try:
-                await self._store.create_session(row)
                 entries = await self._store.session_entries(session.session_id)
-                await self._store.append_session_entries(row.session_id, entries)
+                forked = Session(row, session.start)
+                forked.begin(world, session.cameras)
+                forked.lockstep.reset(world.steps, over=world.over)
+                forked.next_seq, forked.snapshots = len(entries), dict(session.snapshots)
+                info = session_info(forked, ws_base=ws_base, token=row.token)
+                reply = idempotent.reply(info, status=201, headers=created_headers(info))
+                await self._store.create_session(row)
+                await self._store.append_session_entries(row.session_id, entries, reply=reply)
             except BaseException:
                 self._scene_cache.unpin(row.scene)
                 raise
-            forked = Session(row, session.start)
-            forked.begin(world, session.cameras)
-            forked.lockstep.reset(world.steps, over=world.over)
-            forked.next_seq, forked.snapshots = len(entries), dict(session.snapshots)
             self._open[row.session_id] = forked
         log.info("session forked", session_id=row.session_id, parent=session.session_id)
-        return session_info(forked, ws_base=ws_base, token=row.token)
+        return info
 
     async def entries(self, session: Session) -> list[Entry]:
         """Everything that has happened to a session, oldest first."""
@@ -376,6 +398,13 @@ class Sessions:
 def created_headers(info: SessionInfo) -> dict[str, str]:
     """Headers of the answer to a creation."""
     return {"Location": f"/v1/sessions/{info.session_id}"}
+
+
+def check_not_closed(row: SessionRow) -> SessionRow:
+    """The row. Raises ServiceError: SESSION_CLOSED when its session is over."""
+    if row.closed_us is not None:
+        raise _closed(row.session_id, row.reason or "closed")
+    return row
 
 
 def _closed(session_id: str, reason: str) -> ServiceError:

@@ -117,7 +117,7 @@ class Session:
     @property
     def resume_token(self) -> str:
         """Lets a controller come back; the same in every run of the worker."""
-        return hashlib.sha256(b"resume:" + self.row.token.encode()).hexdigest()
+        return resume_token_of(self.row)
 
     @property
     def expired(self) -> bool:
@@ -144,6 +144,11 @@ class Session:
         self.newest = message
         for queue in self.observers:
             queue.put(message)
+
+
+def resume_token_of(row: SessionRow) -> str:
+    """See :attr:`Session.resume_token`; told without the session."""
+    return hashlib.sha256(b"resume:" + row.token.encode()).hexdigest()
 
 
 def controller_taken(session_id: str) -> ServiceError:

@@ -7,6 +7,7 @@ goes wrong before leaves the session as it was, and what is in its log already i
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -28,7 +29,7 @@ from ...world.recording.replay import (
     stop_payload,
 )
 from ..http.problems import ServiceError
-from ..storage.store import SessionEntry, Store, now_us
+from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
@@ -36,6 +37,9 @@ from .wire import EncodedMessage
 
 LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
+
+MakeReply = Callable[[World, Sequence[Event]], StoredReply | None]
+"""Makes what is stored under a request's key of the world it led to and the events on the way."""
 
 MAX_SNAPSHOTS = 32
 
@@ -71,12 +75,16 @@ class Stepper:
         session.publish(observation.message)
         return observation.message
 
-    async def restart(self, session: Session, spec: ResetSpec) -> None:
-        """Begin an episode without rendering its first observation. Raises like reset()."""
+    async def restart(self, session: Session, spec: ResetSpec, *, reply: MakeReply) -> None:
+        """Begin an episode without rendering its first observation. Raises like reset().
+
+        ``reply`` makes the answer that is stored with it.
+        """
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
         await self._kernels.ready(spec.ego)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
-        await self._record(session, [("reset", 0, reset_payload(spec))])
+        stored = await asyncio.to_thread(reply, world, ())
+        await self._record(session, [("reset", 0, reset_payload(spec))], reply=stored)
         session.begin(world, cameras)
 
     async def begin(self, session: Session, spec: ResetSpec) -> None:
@@ -163,25 +171,28 @@ class Stepper:
         session.publish(observation.message)
         return observation, written
 
-    async def step(self, session: Session, n: int, plan: Plan | None) -> None:
+    async def step(self, session: Session, n: int, plan: Plan | None, *, reply: MakeReply) -> None:
         """Move the clock ``n`` times under one plan, or to the end; nothing is drawn.
+
+        All of it takes effect, or nothing; ``reply`` makes the answer that is stored with it.
 
         Raises:
             WorldError: the plan is refused, or the episode is over already.
         """
-        given, left = plan, n
-        while left and (left == n or not session.running_world().over):
-            now = session.running_world()
-            count = min(STEPS_AT_ONCE, left)
-            world, events = await self._pipeline.on_world_thread(_moved_on, now, count, given)
-            done = world.steps - now.steps
+        now = session.running_world()
+        given, world, events = plan, now, list(session.events)
+        entries: list[LogRecord] = []
+        while not entries or (world.steps < now.steps + n and not world.over):
+            count, before = min(STEPS_AT_ONCE, now.steps + n - world.steps), world.steps
+            world, happened = await self._pipeline.on_world_thread(_moved_on, world, count, given)
+            done = world.steps - before
             payloads = [action_payload(given), *[KEPT_PLAN] * (done - 1)]
-            entries = [("action", now.steps + k, p) for k, p in enumerate(payloads)]
-            await self._record(session, entries)
-            session.world = world
-            session.events += events
-            session.lockstep.skip(done, over=world.over)
-            given, left = None, left - done
+            entries += [("action", before + k, p) for k, p in enumerate(payloads)]
+            events, given = events + happened, None
+        stored = await asyncio.to_thread(reply, world, events)
+        await self._record(session, entries, reply=stored)
+        session.world, session.events = world, events
+        session.lockstep.skip(world.steps - now.steps, over=world.over)
 
     async def edit(
         self, session: Session, operations: Sequence[Operation], *, base_rev: int | None
@@ -269,9 +280,15 @@ class Stepper:
         session.next_seq += len(entries)
         return observation, transition.sent
 
-    async def _record(self, session: Session, records: Sequence[LogRecord]) -> None:
+    async def _record(
+        self,
+        session: Session,
+        records: Sequence[LogRecord],
+        *,
+        reply: StoredReply | None = None,
+    ) -> None:
         entries = _entries(session, records)
-        await self._store.append_session_entries(session.session_id, entries)
+        await self._store.append_session_entries(session.session_id, entries, reply=reply)
         session.next_seq += len(entries)
 
 

@@ -211,20 +211,30 @@ class Store:
         await self._write(Write(sa.update(t.sessions).where(still_open).values(values)))
 
     async def append_session_entries(
-        self, session_id: str, entries: Sequence[SessionEntry]
+        self,
+        session_id: str,
+        entries: Sequence[SessionEntry],
+        *,
+        reply: StoredReply | None = None,
     ) -> None:
-        """Append to a session's log, all or nothing.
+        """Append to a session's log, and the answer to the request for it, all or nothing.
 
         Raises:
             ConflictError: a ``seq`` is taken, or the session does not exist.
         """
-        await self._run(self.record, session_id, entries)
+        await self._run(self.record, session_id, entries, reply=reply)
 
-    def record(self, session_id: str, entries: Sequence[SessionEntry]) -> None:
+    def record(
+        self,
+        session_id: str,
+        entries: Sequence[SessionEntry],
+        *,
+        reply: StoredReply | None = None,
+    ) -> None:
         """Like :meth:`append_session_entries`, on the calling thread; never on the event loop."""
         rows = [{"session_id": session_id} | vars(entry) for entry in entries]
         if rows:
-            self._execute([_insert_rows(t.session_log, *rows)])
+            self._execute([_insert_rows(t.session_log, *rows), *_reply_writes(reply)])
 
     async def withdraw(self, session_id: str, *, from_seq: int) -> None:
         """Remove the end of a session's log: what was recorded ahead and never took effect."""

@@ -17,6 +17,7 @@ from real2sim_proto.scenarios import (
     ScenarioFork,
 )
 from real2sim_server.service.app import create_app
+from real2sim_server.service.http.documented_errors import OF_OPERATION
 from real2sim_server.service.http.openapi import BODIES, document, operations, text_of
 from real2sim_server.service.serve import running_worker
 
@@ -55,8 +56,31 @@ def test_operation_ids_are_unique_and_errors_are_problem_documents(made):
     ids = [operation["operationId"] for _, _, operation in found]
     assert len(set(ids)) == len(ids)
     for path, method, operation in found:
-        content = operation["responses"]["default"]["content"]
-        assert list(content) == ["application/problem+json"], f"{method} {path}"
+        for status, response in operation["responses"].items():
+            if int(status) >= 400:
+                content = response["content"]
+                assert "application/problem+json" in content, f"{method} {path} {status}"
+
+
+def test_every_status_is_documented_by_number_with_its_codes(made):
+    for path, method, operation in operations(made):
+        assert "default" not in operation["responses"], f"{method} {path}"
+        assert {"401", "403", "500", "503"} <= set(operation["responses"]), f"{method} {path}"
+    edit = made["paths"]["/v1/scenarios/{scenario_id}/operations"]["post"]["responses"]
+    assert "STALE_REVISION" in edit["412"]["description"]
+    assert "UNKNOWN_SCENARIO" in edit["404"]["description"]
+
+
+def test_errors_are_documented_for_operations_that_exist(made):
+    ids = {operation["operationId"] for _, _, operation in operations(made)}
+    assert set(OF_OPERATION) <= ids
+
+
+def test_every_post_that_changes_something_takes_an_idempotency_key(made):
+    for path, method, operation in operations(made):
+        if method == "post" and not path.endswith("/render"):
+            names = [parameter["name"] for parameter in operation.get("parameters", ())]
+            assert "Idempotency-Key" in names, path
 
 
 @pytest.mark.parametrize(

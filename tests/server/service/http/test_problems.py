@@ -46,7 +46,7 @@ def test_a_path_that_does_not_exist_is_a_problem(client):
 def test_a_method_that_is_not_allowed_names_those_that_are(client):
     response = client.put("/v1/server")
     assert problem_of(response).code is ErrorCode.METHOD_NOT_ALLOWED
-    assert response.headers["Allow"] == "GET"
+    assert response.headers["Allow"] == "GET, HEAD"
 
 
 def test_bad_json_is_a_problem_that_points_to_the_body(client):

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.sync.client import connect
 
+from real2sim_server.service.http.connections import ConnectionLimits, Connections
+from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.http.websocket import EXTENSION, ScatterGatherProtocol, send_parts
 
 pytestmark = pytest.mark.network
@@ -35,8 +38,10 @@ def app(talk: Talk) -> Starlette:
 @contextlib.contextmanager
 def served(talk: Talk, *, deflate: bool = False) -> Iterator[str]:
     listener = socket.create_server(("127.0.0.1", 0))
+    limits = ConnectionLimits(most=100, head_s=60, body_s=60, write_s=60)
+    protocol = partial(ScatterGatherProtocol, Connections(limits, Metrics()))
     config = uvicorn.Config(
-        app(talk), ws=ScatterGatherProtocol, ws_per_message_deflate=deflate, log_level="error"
+        app(talk), ws=protocol, ws_per_message_deflate=deflate, log_level="error"
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([listener],))

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from real2sim_server.service.logging_setup import configure_logging
 from real2sim_server.service.serve import running_worker
 from real2sim_server.settings import Settings
 
@@ -24,6 +25,7 @@ def beside(name: str) -> ModuleType:
 
 
 def main(scenes: Path) -> None:
+    configure_logging(level="error")
     shared, determinism = beside("conftest"), beside("test_determinism")
     with tempfile.TemporaryDirectory() as folder:
         options: dict[str, Any] = {"backend": "cpu", "threads": 1, "log_level": "error"}

@@ -26,11 +26,17 @@ def test_beyond_the_limit_creation_is_refused_with_a_time_to_come_back(own_site)
     answer = site.http.post("/v1/sessions", params={"scene": "tiny"})
     assert (answer.status_code, answer.json()["code"]) == (429, "OVER_CAPACITY")
     assert int(answer.headers["Retry-After"]) > 0
-    ready = site.http.get("/readyz")
-    assert (ready.status_code, ready.json()["reasons"]) == (503, ["all 2 sessions are taken"])
     site.call("DELETE", made[0])
-    assert site.http.get("/readyz").status_code == 200
     site.create()
+
+
+def test_a_worker_whose_sessions_are_all_taken_stays_ready_and_metrics_tell(own_site):
+    site = own_site(max_sessions=1)
+    site.create()
+    assert site.http.get("/readyz").status_code == 200
+    metrics = site.http.get("/metrics").text
+    assert "real2sim_sessions 1.0" in metrics
+    assert "real2sim_session_limit 1.0" in metrics
 
 
 def test_sessions_that_nobody_uses_leave_the_memory_and_come_back_as_they_were(own_site, join):

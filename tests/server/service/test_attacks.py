@@ -1,0 +1,565 @@
+"""What was tried on a worker's sockets from outside, each with the answer that it gets now.
+
+Attacks on readers, imports and the store are tested beside those.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from starlette.websockets import WebSocketDisconnect
+from websockets.sync.client import connect
+
+from real2sim_proto import DRIVE_SUBPROTOCOL, encode
+from real2sim_server.scene.io import save_scene
+from real2sim_server.service.http.metrics import Metrics
+from real2sim_server.service.routes import view as view_route
+from real2sim_server.service.serve import RunningWorker, running_worker
+from real2sim_server.service.sessions import handshake
+from real2sim_server.settings import Settings
+
+TOKEN = "a long enough secret"
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+WAIT_S = 30
+"""For what takes a second or two."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory, tiny_scene) -> Iterator[RunningWorker]:
+    """A worker with a token on a real socket; connections may wait a second."""
+    root = tmp_path_factory.mktemp("attacked")
+    save_scene(tiny_scene, root / "scenes" / "tiny.r2s")
+    settings = Settings(
+        data_dir=root,
+        port=0,
+        backend="cpu",
+        token=TOKEN,
+        head_seconds=1,
+        body_seconds=1,
+        write_seconds=1,
+        max_connections=12,
+    )
+    with running_worker(settings) as running:
+        yield running
+
+
+def opened(url: str) -> socket.socket:
+    host, port = re.fullmatch(r"http://([^:]+):(\d+)", url).groups()
+    return socket.create_connection((host, int(port)), timeout=WAIT_S)
+
+
+def read_to_end(connection: socket.socket) -> bytes:
+    """Everything until the worker closes; fails when it does not."""
+    received = b""
+    with contextlib.suppress(ConnectionResetError):
+        while data := connection.recv(65536):
+            received += data
+    return received
+
+
+def status_of(answer: bytes) -> int:
+    return int(answer.split(b" ", 2)[1])
+
+
+# --- metrics ----------------------------------------------------------------------------------
+
+
+def test_methods_that_nobody_knows_are_one_label(client):
+    for k in range(20):
+        client.request(f"METHOD{k}", "/v1/server")
+    text = client.get("/metrics").text
+    assert 'method="other"' in text
+    assert "METHOD" not in text
+
+
+def test_paths_that_nobody_knows_are_one_label(client):
+    client.get("/v1/secret-of-somebody")
+    assert "secret-of-somebody" not in client.get("/metrics").text
+
+
+def test_metrics_are_written_on_another_thread(client, monkeypatch):
+    threads = []
+
+    def expose(self) -> bytes:
+        threads.append(threading.current_thread())
+        return b""
+
+    monkeypatch.setattr(Metrics, "_expose", expose)
+    asking = client.portal.call(threading.current_thread)
+    client.get("/metrics")
+    assert threads != [asking]
+
+
+# --- connections that wait --------------------------------------------------------------------
+
+
+@pytest.mark.network
+def test_a_silent_connection_is_closed(site):
+    with opened(site.url) as connection:
+        assert read_to_end(connection) == b""
+
+
+@pytest.mark.network
+def test_headers_that_never_end_are_answered_and_closed(site):
+    with opened(site.url) as connection:
+        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ")
+        answer = read_to_end(connection)
+    assert status_of(answer) == 408
+    assert b"REQUEST_TIMEOUT" in answer
+
+
+@pytest.mark.network
+def test_headers_that_trickle_are_closed_too(site):
+    with opened(site.url) as connection:
+        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ")
+        connection.settimeout(0.2)
+        ended, answer = time.monotonic() + WAIT_S, b""
+        while not answer and time.monotonic() < ended:
+            connection.sendall(b"a")
+            with contextlib.suppress(TimeoutError):
+                answer = connection.recv(65536)
+    assert status_of(answer) == 408
+
+
+@pytest.mark.network
+def test_a_body_that_never_comes_is_answered_and_closed(site):
+    head = (
+        f"POST /v1/scenarios HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+        "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
+    )
+    with opened(site.url) as connection:
+        connection.sendall(head.encode())
+        answer = read_to_end(connection)
+    assert status_of(answer) == 408
+    assert b"Content-Security-Policy" in answer
+
+
+@pytest.mark.network
+def test_a_second_request_that_stays_half_sent_is_closed(site):
+    with opened(site.url) as connection:
+        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /li")
+        connection.sendall(b"v")
+        answers = read_to_end(connection)
+    assert answers.startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.network
+def test_a_client_that_never_reads_is_given_up(site):
+    request = b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    with opened(site.url) as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        for _ in range(100):
+            connection.sendall(request)
+        ended = time.monotonic() + WAIT_S
+        while dropped(site, "write_timeout") == 0:
+            assert time.monotonic() < ended
+            time.sleep(0.05)
+
+
+@pytest.mark.network
+def test_bytes_that_are_no_http_get_a_problem_document(site):
+    with opened(site.url) as connection:
+        connection.sendall(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n")
+        answer = read_to_end(connection)
+    assert status_of(answer) == 400
+    assert b"application/problem+json" in answer
+
+
+def dropped(site: RunningWorker, reason: str) -> float:
+    counter = site.worker.metrics.dropped_connections.labels(reason)
+    return next(s.value for s in counter.collect()[0].samples if s.name.endswith("_total"))
+
+
+@pytest.mark.network
+def test_silent_connections_make_room_for_those_who_ask(site):
+    before = dropped(site, "crowded_out")
+    with contextlib.ExitStack() as stack:
+        for _ in range(30):
+            stack.enter_context(opened(site.url))
+        assert httpx2.get(f"{site.url}/livez", timeout=WAIT_S).status_code == 200
+    assert dropped(site, "crowded_out") > before
+
+
+@pytest.mark.network
+def test_sockets_stay_when_silent_connections_crowd(site):
+    info = create_session(site)
+    with joined(info) as drive, contextlib.ExitStack() as stack:
+        for _ in range(30):
+            stack.enter_context(opened(site.url))
+        drive.send(encode({"v": 1, "type": "reset", "id": 2, "spec": {}}))
+        assert drive.recv(timeout=WAIT_S)
+
+
+@pytest.mark.network
+def test_where_all_connections_work_another_is_refused_with_503(make_settings, kernels):
+    with running_worker(make_settings(max_connections=2)) as running:
+        url = f"{running.url}/v1/sessions?scene=tiny"
+        info = httpx2.post(url, headers={"Connection": "close"}, timeout=WAIT_S).json()
+        with joined(info), joined(info, role="observer"), opened(running.url) as third:
+            answer = read_to_end(third)
+    assert status_of(answer) == 503
+    assert b"TOO_MANY_CONNECTIONS" in answer
+
+
+@pytest.mark.network
+def test_a_thousand_silent_and_half_open_connections_lock_nobody_out(tmp_path, tiny_scene):
+    wanted = 1000
+    allow_descriptors(wanted + 200)
+    save_scene(tiny_scene, tmp_path / "scenes" / "tiny.r2s")
+    with worker_process(tmp_path, descriptors=1024) as (url, errors):
+        answer = httpx2.post(f"{url}/v1/sessions?scene=tiny", timeout=WAIT_S)
+        with joined(answer.json()) as drive, contextlib.ExitStack() as stack:
+            for k in range(wanted):
+                connection = stack.enter_context(opened(url))
+                if k % 3 == 1:
+                    connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127")
+                elif k % 3 == 2:
+                    connection.sendall(
+                        b"POST /v1/scenarios HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+                        b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+                    )
+            drive.send(encode({"v": 1, "type": "reset", "id": 2, "spec": {}}))
+            assert drive.recv(timeout=WAIT_S)
+            for _ in range(5):
+                assert httpx2.get(f"{url}/livez", timeout=WAIT_S).status_code == 200
+            time.sleep(1.5)  # the log is told once a second
+    entries = [json.loads(line) for line in errors if line.startswith("{")]
+    assert any(e["event"] == "connections near their limit" for e in entries)
+    told = [e["reasons"] for e in entries if e["event"] == "connections dropped"]
+    assert sum(reasons.get("crowded_out", 0) for reasons in told) > 100
+
+
+def allow_descriptors(count: int) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < count:
+        pytest.skip(f"{count} descriptors are needed, {hard} are allowed")
+    if soft != resource.RLIM_INFINITY and soft < count:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (count, hard))
+
+
+@contextlib.contextmanager
+def worker_process(
+    folder: Path, *, descriptors: int, **settings: str
+) -> Iterator[tuple[str, list[str]]]:
+    """A worker of its own; its address, and after the block the lines of its log."""
+    code = (
+        "import sys; from real2sim_server.settings import Settings; "
+        "from real2sim_server.service.serve import run; sys.exit(run(Settings()))"
+    )
+    limit = f'ulimit -n {descriptors}; exec "$0" -c "$1"'
+    environment = {
+        "REAL2SIM_PORT": "0",
+        "REAL2SIM_DATA_DIR": str(folder),
+        "REAL2SIM_BACKEND": "cpu",
+        "REAL2SIM_LOG_FORMAT": "json",
+        "REAL2SIM_DRAIN_SECONDS": "0",
+    }
+    process = subprocess.Popen(
+        ["sh", "-c", limit, sys.executable, code],
+        env=os.environ | environment | settings,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    lines: list[str] = []
+    with process:
+        first = process.stderr.readline()
+        url = re.search(r"http://127\.0\.0\.1:\d+", first).group()
+        reading = threading.Thread(target=lambda: lines.extend(process.stderr))
+        reading.start()
+        ended = time.monotonic() + 120
+        while httpx2.get(f"{url}/readyz", timeout=120).status_code != 200:
+            assert time.monotonic() < ended
+            time.sleep(0.1)
+        try:
+            yield url, lines
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(60)
+            reading.join()
+
+
+def create_session(site: RunningWorker) -> dict[str, Any]:
+    url = f"{site.url}/v1/sessions?scene=tiny"
+    return httpx2.post(url, headers=BEARER, timeout=WAIT_S).json()
+
+
+@contextlib.contextmanager
+def joined(info: dict[str, Any], *, role: str = "controller") -> Iterator[Any]:
+    """A drive socket behind its welcome."""
+    with connect(
+        info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
+    ) as drive:
+        hello = {"protocols": [DRIVE_SUBPROTOCOL], "token": info["token"], "role": role}
+        drive.send(encode({"v": 1, "type": "hello", "id": 1, **hello}))
+        while b"welcome" not in drive.recv(timeout=WAIT_S):
+            pass
+        yield drive
+
+
+# --- the view socket --------------------------------------------------------------------------
+
+
+def view(client: Any, scenario_id: str = "any") -> Any:
+    return client.websocket_connect(
+        f"/v1/scenarios/{scenario_id}/view", headers={"Host": "127.0.0.1"}
+    )
+
+
+def close_code(socket: Any) -> int:
+    with pytest.raises(WebSocketDisconnect) as closed:
+        socket.receive_text()
+    return closed.value.code
+
+
+NESTED = "[" * 100_000 + "]" * 100_000
+FIRST_MESSAGES: dict[str, Callable[[Any], None]] = {
+    "bytes": lambda socket: socket.send_bytes(b"\x00\x01"),
+    "nested": lambda socket: socket.send_text(NESTED),
+    "nested token": lambda socket: socket.send_text('{"token": ' + NESTED + "}"),
+    "lone surrogate": lambda socket: socket.send_text('{"token": "\\ud800"}'),
+    "no object": lambda socket: socket.send_text("7"),
+    "no json": lambda socket: socket.send_text("{"),
+}
+
+
+@pytest.mark.parametrize("first", FIRST_MESSAGES)
+def test_a_first_message_that_is_no_hello_closes_the_view(start_worker, logged, first):
+    client = start_worker(token=TOKEN)
+    with view(client) as socket:
+        FIRST_MESSAGES[first](socket)
+        assert close_code(socket) in (4400, 4401)
+    assert not any("exc_info" in entry for entry in logged)
+
+
+def test_a_view_without_a_hello_is_closed_in_time(start_worker, monkeypatch):
+    monkeypatch.setattr(view_route, "HANDSHAKE_TIMEOUT_S", 0.1)
+    with view(start_worker(token=TOKEN)) as socket:
+        assert close_code(socket) == 4408
+
+
+@pytest.mark.parametrize(
+    "message", [b"\x00", NESTED, '{"camera": "\\ud800", "t_us": 0}', '{"camera": "x", "t_us": NaN}']
+)
+def test_a_bad_question_is_refused_and_the_view_goes_on(client, message):
+    made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()
+    with view(client, made["scenario_id"]) as socket:
+        socket.send_json({"type": "hello"})
+        assert socket.receive_json() == {"type": "welcome"}
+        for _ in range(2):
+            if isinstance(message, bytes):
+                socket.send_bytes(message)
+            else:
+                socket.send_text(message)
+            assert socket.receive_json()["type"] == "error"
+
+
+def test_the_reason_of_a_close_fits_its_frame(client):
+    name = "%C3%A9" * 90
+    with view(client, name) as socket:
+        socket.send_json({"type": "hello"})
+        with pytest.raises(WebSocketDisconnect) as closed:
+            socket.receive_text()
+    assert closed.value.code == 4404
+    assert len(closed.value.reason.encode()) <= 123
+
+
+# --- the drive socket -------------------------------------------------------------------------
+
+
+@pytest.mark.network
+@pytest.mark.parametrize(
+    "data", [b"\x91" * 100_000 + b"\x90", b"\x81\xa5token\xa3\xed\xa0\x80", b"\xc1", b"", "text"]
+)
+def test_a_first_message_that_is_no_hello_closes_the_drive_socket(site, data):
+    info = create_session(site)
+    with connect(
+        info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
+    ) as drive:
+        drive.send(data)
+        assert b"BAD_MESSAGE" in drive.recv(timeout=WAIT_S, decode=False)
+        with contextlib.suppress(Exception):
+            drive.recv(timeout=WAIT_S)
+        assert drive.close_code == 1008
+
+
+@pytest.mark.network
+def test_a_drive_socket_without_a_hello_is_closed_in_time(site, monkeypatch):
+    monkeypatch.setattr(handshake, "HANDSHAKE_TIMEOUT_S", 0.1)
+    info = create_session(site)
+    with connect(
+        info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
+    ) as drive:
+        assert b"TIMEOUT" in drive.recv(timeout=WAIT_S, decode=False)
+
+
+# --- pages of other sites ---------------------------------------------------------------------
+
+FOREIGN = [
+    {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"},
+    {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "cors"},
+    {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
+    {"Origin": "http://127.0.0.1:3000"},
+    {"Origin": "https://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "http://["},
+]
+
+
+@pytest.mark.parametrize("headers", FOREIGN)
+@pytest.mark.parametrize("token", [None, TOKEN])
+def test_pages_of_other_sites_and_ports_are_refused(start_worker, headers, token):
+    client = start_worker(token=token)
+    auth = BEARER if token else {}
+    for method, path in (("GET", "/v1/scenes/tiny/render"), ("POST", "/v1/scenarios")):
+        answer = client.request(method, path, headers=headers | auth)
+        assert (answer.status_code, answer.json()["code"]) == (403, "FOREIGN_PAGE")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1"},
+        {"Sec-Fetch-Site": "none"},
+    ],
+)
+def test_our_own_pages_and_programs_may_call(client, headers):
+    assert client.get("/v1/server", headers=headers).status_code == 200
+
+
+def test_a_link_from_elsewhere_leads_to_the_studio_and_no_frame_does(client):
+    link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    assert client.get("/ui/", headers=link | {"Sec-Fetch-Dest": "document"}).status_code == 200
+    assert client.get("/ui/", headers=link | {"Sec-Fetch-Dest": "iframe"}).status_code == 403
+
+
+# --- headers of answers -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "path", ["/livez", "/v1/server", "/v1/nothing", "/ui/", "/docs", "/v1/scenes/tiny/render", "/"]
+)
+def test_every_answer_tells_browsers_not_to_guess_embed_or_run(client, path):
+    headers = client.get(path, follow_redirects=False).headers
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert "unsafe" not in headers["Content-Security-Policy"]
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+
+def test_the_reference_of_calls_runs_no_script_and_needs_nobody_else(client):
+    answer = client.get("/docs")
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "<script" not in answer.text
+    assert re.findall(r'(?:src|href)="(?:https?:)?//[^"]*"', answer.text) == []
+    for path in re.findall(r'href="(/[^"#]*)"', answer.text):
+        assert client.get(path).status_code == 200
+    assert "/v1/scenarios/{scenario_id}/operations" in answer.text
+
+
+# --- tokens -----------------------------------------------------------------------------------
+
+
+def test_no_call_reads_a_body_before_its_token(start_worker):
+    client = start_worker(token=TOKEN)
+    asked = []
+    for path, item in client.get("/openapi.json").json()["paths"].items():
+        for method in set(item) & {"get", "post", "put", "delete"}:
+            if path in ("/livez", "/readyz"):
+                continue
+            asked.append(path)
+            found = re.sub(r"\{\w+\}", "w0.0123456789abcdef", path)
+            answer = client.request(
+                method, found, content=b"{" * 99, headers={"Content-Type": "application/json"}
+            )
+            assert answer.status_code == 401, f"{method} {path}"
+    assert len(asked) > 30
+
+
+def test_a_session_out_of_memory_is_not_rebuilt_for_strangers(start_worker, monkeypatch):
+    client = start_worker(token=TOKEN)
+    info = client.post("/v1/sessions?scene=tiny", headers=BEARER).json()
+    sessions = client.app.state.worker.sessions
+    for session in sessions:
+        client.portal.call(sessions.evict, session)
+    path = f"/v1/sessions/{info['session_id']}/state"
+    for headers in ({}, {"Authorization": "Bearer guess"}):
+        assert client.get(path, headers=headers).status_code == 401
+    url = f"/v1/sessions/{info['session_id']}/drive"
+    with client.websocket_connect(url, subprotocols=[DRIVE_SUBPROTOCOL]) as drive:
+        hello = {"v": 1, "type": "hello", "id": 1, "protocols": [DRIVE_SUBPROTOCOL]}
+        drive.send_bytes(encode(hello | {"token": "guess"}))
+        assert b"UNAUTHORIZED" in drive.receive_bytes()
+    assert len(sessions) == 0
+
+
+def test_failed_tokens_are_counted(start_worker):
+    client = start_worker(token=TOKEN)
+    client.get("/v1/server")
+    text = client.get("/metrics", headers=BEARER).text
+    assert 'real2sim_auth_failures_total{where="http"} 1.0' in text
+
+
+# --- methods and paths ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("/v1/scenarios", "GET, HEAD, POST"),
+        ("/v1/scenarios/any", "GET, HEAD, DELETE"),
+        ("/v1/scenes/tiny/residency", "PUT, DELETE"),
+        ("/v1/sessions", "GET, HEAD, POST"),
+    ],
+)
+def test_allow_names_all_methods(client, path, allowed):
+    answer = client.request("PATCH", path)
+    assert (answer.status_code, answer.headers["Allow"]) == (405, allowed)
+
+
+@pytest.mark.parametrize("path", ["/livez", "/readyz", "/v1/server", "/v1/scenes/tiny/render"])
+def test_head_is_answered_like_get_without_its_body(client, path):
+    client.get("/v1/scenes/tiny/render")
+    get, head = client.get(path), client.head(path)
+    assert head.status_code == get.status_code
+    assert head.headers["Content-Type"] == get.headers["Content-Type"]
+    assert head.content == b""
+
+
+def test_routes_are_built_before_anything_else_runs(make_settings, monkeypatch):
+    from fastapi.routing import _IncludedRouter
+
+    from real2sim_server.service.app import create_app
+    from real2sim_server.service.worker import Worker
+
+    app, built = create_app(make_settings()), []
+    running = Worker.running
+
+    def noted(self: Worker) -> Any:
+        built.extend(r._effective_candidates_version for r in routers)
+        return running(self)
+
+    routers = [route for route in app.routes if isinstance(route, _IncludedRouter)]
+    monkeypatch.setattr(Worker, "running", noted)
+    from fastapi.testclient import TestClient
+
+    with TestClient(app, base_url="http://127.0.0.1"):
+        pass
+    assert len(built) > 5
+    assert None not in built
