@@ -62,6 +62,8 @@ class LimitedHttpProtocol(H11Protocol):
     def on_response_complete(self) -> None:
         """The answer is written whole."""
         super().on_response_complete()
+        if self.conn.their_state is h11.IDLE and (begun := self.conn.trailing_data[0]):
+            self._head_since, self._received = time.monotonic(), len(begun)
         self._note_turn()
 
     def resume_writing(self) -> None:
