@@ -11,7 +11,12 @@ PYTEST := $(BIN)/python -m pytest -q
 FAST := tests/test_architecture.py tests/test_vocabulary.py tests/test_docs.py tests/proto \
 	tests/client tests/server/geometry tests/server/scene tests/server/edit tests/server/cli
 
-.PHONY: demo check test test-slow lint lint-studio format schema coverage bench docs clean
+WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cublas \
+	nvidia-cuda-cupti nvidia-cuda-nvrtc nvidia-cuda-runtime nvidia-cudnn-cu13 nvidia-cufft \
+	nvidia-cufile nvidia-curand nvidia-cusolver nvidia-cusparse nvidia-cusparselt-cu13 \
+	nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
+
+.PHONY: demo check test test-slow lint lint-studio format schema coverage bench pins docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
@@ -48,6 +53,15 @@ schema: $(STAMP)
 
 coverage: $(STAMP)
 	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile --cov --cov-report=html:out/coverage --cov-report=term
+
+# What an image installs, with hashes, from constraints.txt; and the notices that go with it. torch
+# and what comes with it are apart: builds for CPU and CUDA differ.
+pins: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip compile pyproject.toml --quiet --extra server --extra postgres -c constraints.txt \
+	  --generate-hashes --universal --python-version 3.11 --no-annotate --no-header \
+	  $(patsubst %,--no-emit-package %,$(WITH_TORCH)) -o docker/requirements.txt
+	$(BIN)/python scripts/third_party.py
 
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -62,6 +62,8 @@ ROOT_PAGES = {
     "site/architecture": "ARCHITECTURE.md",
     "site/contributing": "CONTRIBUTING.md",
     "site/changelog": "CHANGELOG.md",
+    "site/security": "SECURITY.md",
+    "site/third_party": "THIRD_PARTY.md",
 }
 """Pages of the site that show a file at the root of the repository, before their own text."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -56,3 +57,37 @@ def test_an_image_is_built_only_if_no_kernel_is_left_to_compile(name):
 @pytest.mark.parametrize("name", IMAGES)
 def test_an_image_can_share_a_database_server(name):
     assert re.search(r"'\.\[server,.*postgres.*\]'", (DOCKER / name).read_text())
+
+
+def pins(path: Path) -> dict[str, str]:
+    found = re.findall(r"(?m)^([A-Za-z0-9._-]+)==([^ ;\n\\]+)", path.read_text())
+    return {name.lower().replace("_", "-").replace(".", "-"): version for name, version in found}
+
+
+IMAGE_PINS = DOCKER / "requirements.txt"
+
+
+def test_an_image_installs_only_what_is_pinned_with_a_hash():
+    requirements = re.split(r"(?m)^(?=[A-Za-z])", IMAGE_PINS.read_text())[1:]
+    assert len(requirements) > 40
+    assert [r.split()[0] for r in requirements if "--hash=sha256:" not in r] == []
+
+
+def test_an_image_has_the_versions_that_are_tested():
+    tested = pins(DOCKER.parent / "constraints.txt")
+    image = pins(IMAGE_PINS)
+    assert {name: v for name, v in image.items() if tested.get(name, v) != v} == {}
+
+
+def test_whatever_a_worker_needs_is_pinned_for_images():
+    project = tomllib.loads((DOCKER.parent / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    needed = [*project["dependencies"], *extras["server"], *extras["postgres"]]
+    names = {re.split(r"[><=~\[; ]", need)[0].lower().replace("_", "-") for need in needed}
+    assert names - pins(IMAGE_PINS).keys() == {"torch"}
+
+
+def test_everything_in_an_image_is_among_the_notices():
+    rows = (DOCKER.parent / "THIRD_PARTY.md").read_text()
+    missing = [n for n, v in pins(IMAGE_PINS).items() if f"| {n} | {v} |" not in rows]
+    assert missing == []
