@@ -10,7 +10,7 @@ import httpx2
 
 from ._call import Request
 from ._replies import Reply, error_from_reply
-from ._retry import RETRYABLE_STATUS, RetryPolicy
+from ._retry import RETRYABLE_CODES, RETRYABLE_STATUS, RetryPolicy
 from ._target import Target
 from .errors import Real2SimError, ReplyTimeoutError, StatusError, UnreachableError
 
@@ -104,5 +104,5 @@ class Attempts:
 
 def _is_transient(error: Real2SimError) -> bool:
     if isinstance(error, StatusError):
-        return error.status in RETRYABLE_STATUS
+        return error.status in RETRYABLE_STATUS or error.code in RETRYABLE_CODES
     return isinstance(error, UnreachableError | ReplyTimeoutError)

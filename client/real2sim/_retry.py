@@ -9,7 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 
+from real2sim_proto import RETRYABLE
+
 RETRYABLE_STATUS = frozenset({408, 429, 502, 503, 504})
+
+RETRYABLE_CODES = frozenset(code.value for code in RETRYABLE)
+"""Codes of this package's protocol that pass, whatever their status."""
 
 
 @dataclass(frozen=True)

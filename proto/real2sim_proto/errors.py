@@ -46,6 +46,8 @@ class ErrorCode(StrEnum):
     QUEUE_FULL = "QUEUE_FULL"
     OUT_OF_MEMORY = "OUT_OF_MEMORY"
     QUOTA_EXCEEDED = "QUOTA_EXCEEDED"
+    STORAGE_FULL = "STORAGE_FULL"
+    STORAGE_UNAVAILABLE = "STORAGE_UNAVAILABLE"
     DRAINING = "DRAINING"
     UNSUPPORTED_PROTOCOL = "UNSUPPORTED_PROTOCOL"
     BAD_MESSAGE = "BAD_MESSAGE"
@@ -97,6 +99,8 @@ HTTP_STATUS: dict[ErrorCode, int] = {
     ErrorCode.QUEUE_FULL: 503,
     ErrorCode.OUT_OF_MEMORY: 507,
     ErrorCode.QUOTA_EXCEEDED: 507,
+    ErrorCode.STORAGE_FULL: 507,
+    ErrorCode.STORAGE_UNAVAILABLE: 503,
     ErrorCode.DRAINING: 503,
     ErrorCode.UNSUPPORTED_PROTOCOL: 426,
     ErrorCode.BAD_MESSAGE: 400,
@@ -121,6 +125,8 @@ RETRYABLE = frozenset(
         ErrorCode.TIMEOUT,
         ErrorCode.REQUEST_TIMEOUT,
         ErrorCode.TOO_MANY_CONNECTIONS,
+        ErrorCode.STORAGE_FULL,
+        ErrorCode.STORAGE_UNAVAILABLE,
     }
 )
 """Codes after which the same request may succeed later, unchanged."""

@@ -31,6 +31,10 @@ class Settings(BaseSettings):
         assets_dir: folder of asset bundles.
         jobs_dir: folder of the files that jobs leave.
         store_url: SQLAlchemy URL of scenarios and sessions.
+        store_timeout_seconds: after which a database that does not answer is in trouble.
+        durability: what is on the disk before it is acknowledged: ``all``; ``edits``, which is all
+            but the steps of sessions; or ``process``, nothing. The rest is safe when the process
+            is killed, and its last seconds are lost when the machine loses power. SQLite only.
         backend: what draws: ``auto`` chooses by the hardware at hand.
         threads: of numba and torch; 0 for one per core.
         scene_memory_bytes: budget of resident scenes and assets together.
@@ -74,6 +78,8 @@ class Settings(BaseSettings):
     assets_dir: Path | None = None
     jobs_dir: Path | None = None
     store_url: str | None = None
+    store_timeout_seconds: float = Field(default=5.0, ge=0.1, le=600)
+    durability: Literal["all", "edits", "process"] = "edits"
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
     threads: int = Field(default=0, ge=0, le=1024)
     scene_memory_bytes: int = Field(default=8 * GIB, gt=0)

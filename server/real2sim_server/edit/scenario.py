@@ -102,6 +102,23 @@ class Scenario:
         scenario.state = scenario._state_after(len(scenario._done))
         return scenario
 
+    def extended(self, entries: Iterable[LogEntry]) -> Scenario:
+        """A scenario of its own that goes on from this one by entries that others have stored.
+
+        Args:
+            entries: of the log, those behind this scenario's revision, oldest first.
+
+        Raises:
+            EditError: they do not go on from here.
+        """
+        longer = Scenario(self._states[0], scene=self.scene, scene_hash=self.scene_hash)
+        longer.entries, longer._states = list(self.entries), self._states.copy()
+        longer._done, longer._undone = list(self._done), list(self._undone)
+        for entry in entries:
+            longer._append(entry)
+        longer.state = longer._state_after(len(longer._done))
+        return longer
+
     @property
     def revision(self) -> int:
         """Number of entries so far."""

@@ -2,9 +2,9 @@
 
 Its parts, lowest first; each imports only those before it, and no file is part of a circle:
 
+- ``storage``: tables and rows of scenarios, sessions, jobs and stored answers; who owns them.
 - ``preflight``: what is refused before anything heavy is loaded.
 - ``first_run``: a second process that compiles, begun before anything heavy is loaded.
-- ``storage``: tables and rows of scenarios, sessions, jobs and stored answers.
 - ``warm_up``: kernels compiled or loaded before they are needed.
 - ``lanes``, ``engine``: the thread that owns the device, and whose turn it is.
 - ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics,

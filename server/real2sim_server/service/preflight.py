@@ -7,6 +7,7 @@ import ipaddress
 import socket
 
 from ..settings import Settings
+from .storage.ownership import check_state_folder
 
 
 class SceneFolderError(ValueError):
@@ -22,9 +23,11 @@ def check_start(settings: Settings) -> None:
 
     Raises:
         SceneFolderError: the folder of scenes is missing.
+        StateFolderError: another worker is on the state folder, or it cannot be written to.
         AddressError: the address is taken, or none of this machine.
     """
     check_scenes(settings)
+    check_state_folder(settings.data_dir)
     bind(settings.host, settings.port).close()
 
 

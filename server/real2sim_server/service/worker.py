@@ -37,7 +37,9 @@ from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .storage.job_log import JobLog
+from .storage.ownership import owned_folder
 from .storage.store import Store
+from .storage.tokens import worker_key
 from .warm_up import KernelWarmUp
 
 LAG_PERIOD_S = 0.1
@@ -97,7 +99,12 @@ class Worker:
             device=_device_of(backend),
             on_load=metrics.scene_loads.observe,
         )
-        store = Store(settings.database_url)
+        store = Store(
+            settings.database_url,
+            worker_id=settings.worker_id,
+            timeout_s=settings.store_timeout_seconds,
+            durability=settings.durability,
+        )
         assets = AssetLibrary(settings.assets_path, budget)
         scenarios = Scenarios(store, scene_cache, metrics, assets=assets.find)
         jobs = Jobs(JobLog(store, settings.worker_id), _jobs_quota(settings))
@@ -141,9 +148,12 @@ class Worker:
         """The worker at work: from the start of its engine to the end of its last job.
 
         Raises:
+            StateFolderError: another worker is on the state folder, or it cannot be written to.
             StoreError: the store cannot be opened.
         """
         async with AsyncExitStack() as at_exit:
+            at_exit.enter_context(owned_folder(self.settings.data_dir))
+            self.sessions.resume_key = worker_key(self.settings.data_dir)
             self.engine.start()
             at_exit.push_async_callback(asyncio.to_thread, self.engine.stop)
             at_exit.callback(self.renderer.close)
@@ -151,6 +161,7 @@ class Worker:
             at_exit.callback(self.imports.close)
             at_exit.push_async_callback(self.store.close)
             await self.store.open()
+            at_exit.push_async_callback(_cancel, asyncio.create_task(self.store.watch()))
             at_exit.push_async_callback(self.scenarios.flush)
             await self.scene_cache.refresh()
             self.waiting_for = {"warming up kernels"}
@@ -172,6 +183,8 @@ class Worker:
             reasons.append("draining: the worker is stopping")
         if not self.engine.alive:
             reasons.append(f"engine stopped: {self.engine.failure or 'its thread has ended'}")
+        if self.store.trouble is not None:
+            reasons.append(str(self.store.trouble))
         return Readiness(ready=not reasons, reasons=reasons)
 
     @property

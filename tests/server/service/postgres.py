@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import getpass
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,6 +26,32 @@ class Postgres:
     """A running server."""
 
     port: int
+    data: Path
+    control: Callable[..., None]
+
+    def start(self) -> None:
+        """Start it, or start it again."""
+        options = f"-p {self.port} -h 127.0.0.1 -k {self.data.parent} -F"
+        self.control("-l", self.data.parent / "log", "-w", "-o", options, "start")
+
+    def stop(self) -> None:
+        """Stop it at once; its connections break."""
+        self.control("-m", "immediate", "stop")
+
+    @contextmanager
+    def frozen(self) -> Iterator[None]:
+        """Connections stay open, and nothing is answered, for the length of the block."""
+        server = int((self.data / "postmaster.pid").read_text().split()[0])
+        listed = Path(f"/proc/{server}/task/{server}/children").read_text()
+        processes = [server, *map(int, listed.split())]
+        for process in processes:
+            os.kill(process, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            for process in processes:
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGCONT)
 
     def url(self, database: str) -> str:
         return f"postgresql+pg8000://{USER}@127.0.0.1:{self.port}/{database}"
@@ -60,12 +89,12 @@ def running_postgres(folder: Path) -> Iterator[Postgres]:
     call(programs / "initdb", "-D", data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    options = f"-p {port} -h 127.0.0.1 -k {folder} -F"
-    call(programs / "pg_ctl", "-D", data, "-l", folder / "log", "-w", "-o", options, "start")
+    server = Postgres(port, data, partial(call, programs / "pg_ctl", "-D", data))
+    server.start()
     try:
-        yield Postgres(port)
+        yield server
     finally:
-        call(programs / "pg_ctl", "-D", data, "-m", "immediate", "stop")
+        server.stop()
 
 
 def _programs() -> Path:

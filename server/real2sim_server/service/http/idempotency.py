@@ -17,6 +17,7 @@ from starlette.requests import Request
 from real2sim_proto import ErrorCode
 
 from ..storage.store import Store, StoredReply
+from ..storage.tokens import sealed, unsealed
 from .problems import ServiceError
 
 REPLAY_HEADER = "Idempotent-Replayed"
@@ -38,11 +39,13 @@ class IdempotentRequest:
 
     Attributes:
         key: None where the client sent none; then nothing is remembered.
+        secret: the key as the client sent it; the store has only its hash, and answers sealed.
         replay: the answer given before; send it and do nothing.
     """
 
     key: str | None = None
     fingerprint: str = ""
+    secret: str = ""
     replay: Response | None = None
 
     def reply(
@@ -59,7 +62,8 @@ class IdempotentRequest:
         """The same for JSON that is written already."""
         if self.key is None:
             return None
-        return StoredReply(self.key, self.fingerprint, status, dict(headers or {}), content)
+        body = sealed(content, self.secret)
+        return StoredReply(self.key, self.fingerprint, status, dict(headers or {}), body)
 
 
 class Idempotency:
@@ -104,7 +108,8 @@ class Idempotency:
                     f"Idempotency-Key {key!r} was used for another request to this call",
                     hint="make a new key for every new request",
                 )
-            yield IdempotentRequest(full_key, fingerprint, _response(stored) if stored else None)
+            replay = _response(stored, scoped) if stored else None
+            yield IdempotentRequest(full_key, fingerprint, scoped, replay)
 
     async def store(self, reply: StoredReply | None) -> None:
         """Store an answer whose effect is not in the store, once it is there.
@@ -161,9 +166,9 @@ def _fingerprint(request: Request, body: bytes) -> str:
     return digest.hexdigest()
 
 
-def _response(stored: StoredReply) -> Response:
+def _response(stored: StoredReply, secret: str) -> Response:
     return Response(
-        stored.body,
+        unsealed(stored.body, secret),
         status_code=stored.status,
         media_type="application/json",
         headers=dict(stored.headers) | {REPLAY_HEADER: "true"},

@@ -28,9 +28,11 @@ from ...render import RenderError
 from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from ...world import WorldError
 from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
+from ..storage.errors import StoreFullError, StoreUnavailableError, is_full
 from .disconnects import ClientDisconnectedError
 
 MAX_DETAILS = 50
+RETRY_AFTER_S = {ErrorCode.STORAGE_UNAVAILABLE: "2", ErrorCode.STORAGE_FULL: "5"}
 REQUEST_ID_KEY = "real2sim.request_id"
 
 log = structlog.get_logger(__name__)
@@ -66,7 +68,7 @@ class ServiceError(Exception):
         self.extra = dict(extra or {})
         self.headers = dict(headers or {})
         if code in RETRYABLE:
-            self.headers.setdefault("Retry-After", "1")
+            self.headers.setdefault("Retry-After", RETRY_AFTER_S.get(code, "1"))
 
     @property
     def status(self) -> int:
@@ -74,8 +76,12 @@ class ServiceError(Exception):
         return HTTP_STATUS[self.code]
 
 
+_AGAIN = "send it again after Retry-After seconds; under an Idempotency-Key it takes effect once"
+
 _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (QueueFullError, ErrorCode.QUEUE_FULL, "send it again after Retry-After seconds"),
+    (StoreFullError, ErrorCode.STORAGE_FULL, "free space on the worker, and send it again"),
+    (StoreUnavailableError, ErrorCode.STORAGE_UNAVAILABLE, _AGAIN),
     (EngineStoppedError, ErrorCode.DRAINING, None),
     (TimeOutOfRangeError, ErrorCode.TIME_OUT_OF_RANGE, None),
     (UnknownObjectError, ErrorCode.UNKNOWN_OBJECT, None),
@@ -105,6 +111,19 @@ def _translated(error: Exception) -> ServiceError:
     for kind, code, hint in _KINDS:
         if isinstance(error, kind):
             return ServiceError(code, str(error), hint=hint)
+    if (shortage := _of_shortage(error)) is not None:
+        return shortage
+    detail = "an unexpected error; it is in the worker's log under this request_id"
+    if isinstance(error, DeviceLostError):
+        detail = "the device was lost; the worker restarts"
+    return ServiceError(ErrorCode.INTERNAL, detail)
+
+
+def _of_shortage(error: Exception) -> ServiceError | None:
+    """Of a want of space or memory."""
+    if isinstance(error, OSError) and is_full(error):
+        detail = "the worker has no space left for this"
+        return ServiceError(ErrorCode.STORAGE_FULL, detail, hint="free space on the worker")
     # torch's class is known by its name, so that this module needs no torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return ServiceError(
@@ -112,10 +131,7 @@ def _translated(error: Exception) -> ServiceError:
             "the device has no memory left for this",
             hint="ask for smaller or fewer images, or unload a scene",
         )
-    detail = "an unexpected error; it is in the worker's log under this request_id"
-    if isinstance(error, DeviceLostError):
-        detail = "the device was lost; the worker restarts"
-    return ServiceError(ErrorCode.INTERNAL, detail)
+    return None
 
 
 def _of_edit(error: EditError) -> ServiceError:

@@ -24,7 +24,7 @@ from ..http.problems import ServiceError, problem_of, service_error
 from ..library.quotas import Quota
 from ..scenarios.replies import iso_time
 from ..storage.job_log import JobLog
-from ..storage.store import now_us
+from ..storage.store import StoreTroubleError, now_us
 
 MAX_QUEUED_JOBS = 32
 """Jobs that may wait for their turn; more are refused."""
@@ -34,6 +34,9 @@ MAX_EVENTS = 256
 
 UNKNOWN_EVENTS = 1_000_000
 """More events than a job has: its end is newer than any progress that was sent but not stored."""
+
+STORE_RETRY_S = 1.0
+"""Between tries to put on record what has become of a job, while the store is in trouble."""
 
 MAX_FINISHED_JOBS = 64
 """Ended jobs in memory; others are read from the store."""
@@ -331,7 +334,16 @@ class Jobs:
     async def _become(self, job: _Job, info: JobInfo) -> None:
         info = info.model_copy(update={"event": job.info.event + 1})
         # Stored first: what a client was sent is true after a crash as well.
-        await self._log.update(info)
+        while True:
+            try:
+                await self._log.update(info)
+                break
+            except StoreTroubleError as error:
+                if self._closing:
+                    # The next run finds it unfinished, and says so.
+                    log.error("job not on record", job_id=info.job_id, reason=error.reason)
+                    break
+                await asyncio.sleep(STORE_RETRY_S)
         job.info = info
         job.events.append(info)
         async with job.changed:

@@ -59,6 +59,7 @@ async def _serve(socket: WebSocket, worker: Worker, row: SessionRow, *, authoris
         row,
         authorised=authorised,
         worker_token=secret.get_secret_value() if secret else None,
+        resume_token=worker.sessions.resume_token(row),
     )
     try:
         session = await with_progress(

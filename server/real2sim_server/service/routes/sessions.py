@@ -65,7 +65,7 @@ async def _check_session_token(request: Request, session_id: str) -> None:
     if given is not None or secret is None:
         # The row is enough: no session is rebuilt for those who may not use it.
         row = check_not_closed(await worker.sessions.row(session_id))
-    if row is None or not secrets_equal(given, row.token):
+    if row is None or not opens_session(given, row):
         worker.metrics.auth_failures.labels("http").inc()
         error = unauthorized("this call wants the session's token or the worker's")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"

@@ -15,6 +15,7 @@ from ...scene.io import SceneSummary
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..storage.store import ScenarioRow, Store
+from .replies import stored_entry
 from .snapshots import Snapshots
 
 MAX_CACHED_SCENARIOS = 256
@@ -26,6 +27,7 @@ class CachedScenario:
     """A scenario in memory.
 
     Attributes:
+        scenario: replaced, under the lock, by a longer one when others have added to its log.
         lock: one edit at a time; readers need none, for states are immutable.
     """
 
@@ -74,32 +76,59 @@ class ScenarioCache:
                     return
 
     async def get(self, scenario_id: str) -> CachedScenario:
-        """The scenario, from the store where it is not in memory.
+        """The scenario with all that is in its log, by whichever worker.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN where its scene has changed.
         """
-        cached = self._cached.get(scenario_id)
-        if cached is None:
-            lock = self._opening.setdefault(scenario_id, asyncio.Lock())
-            try:
-                async with lock:
-                    cached = self._cached.get(scenario_id) or await self._rebuild(scenario_id)
-                    self.put(cached)
-            finally:
-                if not lock.locked():
-                    self._opening.pop(scenario_id, None)
-        self._cached.move_to_end(scenario_id)
+        while (cached := self._cached.get(scenario_id)) is not None:
+            if await self._is_current(scenario_id, cached):
+                return cached
+        lock = self._opening.setdefault(scenario_id, asyncio.Lock())
+        try:
+            async with lock:
+                cached = self._cached.get(scenario_id) or await self._rebuild(scenario_id)
+                self.put(cached)
+        finally:
+            if not lock.locked():
+                self._opening.pop(scenario_id, None)
         return cached
+
+    async def _is_current(self, scenario_id: str, cached: CachedScenario) -> bool:
+        """Whether a scenario in memory is, by now, what the log says; evicts it where it is not.
+
+        The log is asked each time, because other workers on the same store may have written to it.
+        """
+        known = cached.scenario.revision
+        stored = await self._store.revision(scenario_id)
+        if stored is None:
+            self.evict(scenario_id)
+            raise _unknown(scenario_id)
+        if stored < known:
+            # The store has been put back to an earlier day.
+            self.evict(scenario_id)
+            return False
+        if stored > cached.scenario.revision:
+            # What a change of our own has written takes effect before its lock is free.
+            async with cached.lock:
+                await self._catch_up(scenario_id, cached)
+        if self._cached.get(scenario_id) is not cached:
+            return False
+        self._cached.move_to_end(scenario_id)
+        return True
+
+    async def _catch_up(self, scenario_id: str, cached: CachedScenario) -> None:
+        """Apply what others have added to the log; the scenario's lock is held."""
+        scenario = cached.scenario
+        missed = await self._store.scenario_entries(scenario_id, after=scenario.revision)
+        if missed:
+            entries = [stored_entry(entry) for entry in missed]
+            cached.scenario = await asyncio.to_thread(scenario.extended, entries)
 
     async def _rebuild(self, scenario_id: str) -> CachedScenario:
         row = await self._store.scenario(scenario_id)
         if row is None:
-            raise ServiceError(
-                ErrorCode.UNKNOWN_SCENARIO,
-                f"no scenario {scenario_id!r}",
-                hint="GET /v1/scenarios lists them",
-            )
+            raise _unknown(scenario_id)
         summary = await self._scene_cache.summary(row.scene)
         if summary.content_hash != row.scene_hash:
             raise ServiceError(
@@ -119,3 +148,11 @@ class ScenarioCache:
                 :-MAX_CACHED_SCENARIOS
             ]:
                 del self._cached[key]
+
+
+def _unknown(scenario_id: str) -> ServiceError:
+    return ServiceError(
+        ErrorCode.UNKNOWN_SCENARIO,
+        f"no scenario {scenario_id!r}",
+        hint="GET /v1/scenarios lists them",
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import secrets
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -45,6 +46,9 @@ from .scenario_cache import CachedScenario, ScenarioCache
 from .snapshots import Snapshots
 
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
+
+MAX_RACES = 8
+"""Tries of one change against changes of other workers to the same scenario."""
 
 
 class Scenarios:
@@ -301,6 +305,24 @@ class Scenarios:
         dry_run: bool = False,
         idempotent: IdempotentRequest,
     ) -> OperationResult:
+        for _ in range(MAX_RACES):
+            # Another worker may be faster; then the change is planned anew behind its entry.
+            with contextlib.suppress(ConflictError):
+                return await self._change_once(
+                    scenario_id, plan, expected, dry_run=dry_run, idempotent=idempotent
+                )
+        raise changed_elsewhere(scenario_id)
+
+    async def _change_once(
+        self,
+        scenario_id: str,
+        plan: Callable[[Scenario], PlannedEntry],
+        expected: int | None,
+        *,
+        dry_run: bool,
+        idempotent: IdempotentRequest,
+    ) -> OperationResult:
+        """A change on top of the newest revision. Raises ConflictError: there is a newer one."""
         async with self._scenarios_cache.locked(scenario_id) as cached:
             scenario = cached.scenario
             if expected is not None and expected != scenario.revision:
@@ -319,13 +341,11 @@ class Scenarios:
 
             try:
                 planned, result = await asyncio.to_thread(change)
-            except EditError:
+            except (EditError, ConflictError):
                 raise
-            except Exception as error:
+            except Exception:
                 # Only the store knows whether the entry is in the log.
                 self._scenarios_cache.evict(scenario_id)
-                if isinstance(error, ConflictError):
-                    raise changed_elsewhere(scenario_id) from error
                 raise
             if not dry_run:
                 scenario.commit(planned)

@@ -130,7 +130,7 @@ class Connection:
     async def _as_controller(self, hello: Hello) -> AsyncIterator[None]:
         session = self._session
         old = session.controller
-        if old is not None and not is_resuming(hello, session.row):
+        if old is not None and not is_resuming(hello, session.resume_token):
             raise FatalError(controller_taken(session.session_id), message_id=hello.id)
         session.controller = self
         if isinstance(old, Connection):

@@ -27,7 +27,7 @@ from .messages import (
     read_message,
     unsupported_protocol,
 )
-from .session import resume_token_of
+from .session import opens_session
 from .wire import EncodedMessage, pack_message
 
 T = TypeVar("T")
@@ -50,7 +50,12 @@ class FatalError(Exception):
 
 
 async def receive_hello(
-    socket: WebSocket, row: SessionRow, *, authorised: bool, worker_token: str | None
+    socket: WebSocket,
+    row: SessionRow,
+    *,
+    authorised: bool,
+    worker_token: str | None,
+    resume_token: str,
 ) -> Hello:
     """The hello of a client that may use the session of a row.
 
@@ -59,6 +64,7 @@ async def receive_hello(
         row: of the session.
         authorised: whether the handshake carried the worker's token.
         worker_token: opens every session; None where the worker has none.
+        resume_token: of the session's controller.
 
     Raises:
         FatalError: anything else came, or nothing in time, or without a token.
@@ -77,18 +83,19 @@ async def receive_hello(
         raise FatalError(wrong_type, message_id=message.id)
     if not set(message.protocols) & set(SUPPORTED_SUBPROTOCOLS):
         raise FatalError(unsupported_protocol(message.protocols), message_id=message.id)
-    has_token = matches_any_secret(message.token, row.token, worker_token)
-    if not (authorised or has_token or is_resuming(message, row)):
+    is_worker_token = matches_any_secret(message.token, worker_token)
+    has_token = opens_session(message.token, row) or is_worker_token
+    if not (authorised or has_token or is_resuming(message, resume_token)):
         no_token = unauthorized("hello carries neither the session's token nor the worker's")
         no_token.hint = "the answer to POST /v1/sessions has the session's token"
         raise FatalError(no_token, message_id=message.id)
     return message
 
 
-def is_resuming(hello: Hello, row: SessionRow) -> bool:
+def is_resuming(hello: Hello, resume_token: str) -> bool:
     """Whether this is the session's controller who comes back."""
     resume = hello.resume
-    return resume is not None and secrets_equal(resume.token, resume_token_of(row))
+    return resume is not None and secrets_equal(resume.token, resume_token)
 
 
 async def receive(socket: WebSocket) -> ReceivedMessage:

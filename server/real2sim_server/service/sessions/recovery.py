@@ -15,29 +15,26 @@ from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store
 from .log import entries_of
 from .pipeline import StepPipeline, Transition
-from .session import EpisodeStart, Session
+from .session import Session
 
 
-async def rebuild(
-    row: SessionRow, start: EpisodeStart, *, store: Store, pipeline: StepPipeline
-) -> Session:
-    """The session as it was when its last entry took effect.
+async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> None:
+    """Make a new session what it was when its last entry took effect.
 
     Everything is replayed without rendering but the last step, whose answer its client may never
     have got: it is rendered, so that the same action sent again gets it.
 
     Args:
-        row: of the session.
-        start: its scene, pinned, and the objects it began from.
+        session: at its beginning, its scene pinned.
         store: has its log.
         pipeline: moves worlds and draws.
     """
-    session = Session(row, start)
-    rows = await store.session_entries(row.session_id)
+    start = session.start
+    rows = await store.session_entries(session.session_id)
     session.next_seq = rows[-1].seq + 1 if rows else 0
     entries = entries_of(rows)
     if not entries:
-        return session
+        return
     replayer = Replayer.on(start.scene, start.state)
     *before, last = entries
     await pipeline.on_world_thread(_apply_all, replayer, before)
@@ -50,11 +47,10 @@ async def rebuild(
         if not decode(last.payload).get("missed"):
             session.lockstep.restore_answer(_content(last), observation.message)
         session.newest = observation.message
-        return session
+        return
     world = await pipeline.on_world_thread(replayer.apply, last)
     session.begin(world, pipeline.cameras(start.scene, world.spec.sensors))
     session.lockstep.reset(world.steps, over=world.over)
-    return session
 
 
 async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> ScenarioState:

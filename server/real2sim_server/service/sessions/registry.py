@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hmac
 import re
 import secrets
 import time
@@ -29,6 +30,7 @@ from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store, now_us
+from ..storage.tokens import token_hash
 from ..warm_up import KernelWarmUp
 from .describe import session_info
 from .log import entries_of
@@ -38,6 +40,7 @@ from .session import EpisodeStart, Session
 from .step import Stepper
 
 RETRY_AFTER_S = 5
+TOKEN_BYTES = 24
 IDLE_CHECK_S = 5.0
 
 _ID = re.compile(r"[A-Za-z0-9_.\-]{1,80}")
@@ -72,6 +75,9 @@ class Sessions:
         scene_cache: keeps their scenes in memory.
         scenarios: what they may begin from.
         metrics: gets their number.
+
+    Attributes:
+        resume_key: what tokens of controllers that come back are made with.
     """
 
     def __init__(
@@ -89,6 +95,7 @@ class Sessions:
         self.stepper = Stepper(pipeline, kernels, store)
         self.metrics = metrics
         self.draining = False
+        self.resume_key = secrets.token_bytes()
         self._limits = limits
         self._store = store
         self._scene_cache = scene_cache
@@ -158,15 +165,17 @@ class Sessions:
                 hint="name exactly one: POST /v1/sessions?scene=... or ?scenario=...",
             )
         with self._reserved_slot():
-            row, start = await self._start(scene, scenario)
+            token = secrets.token_urlsafe(TOKEN_BYTES)
+            row, start = await self._start(scene, scenario, token)
             try:
-                session = Session(row, start)
+                session = self._session(row, start)
                 if spec is not None:
                     await self.stepper.begin(session, spec)
-                info = session_info(session, ws_base=ws_base, token=row.token)
+                info = session_info(session, ws_base=ws_base, token=token)
                 reply = idempotent.reply(info, status=201, headers=created_headers(info))
-                await self._store.create_session(row, reply=reply)
-                await self.stepper.record_beginning(session)
+                entries = self.stepper.beginning_entries(session)
+                await self._store.create_session(row, entries=entries, reply=reply)
+                session.next_seq = len(entries)
             except BaseException:
                 self._scene_cache.unpin(row.scene)
                 raise
@@ -217,23 +226,24 @@ class Sessions:
         """
         world = session.running_world()
         with self._reserved_slot():
+            token = secrets.token_urlsafe(TOKEN_BYTES)
             row = replace(
                 session.row,
                 session_id=f"{self._limits.worker_id}.{secrets.token_hex(8)}",
-                token=secrets.token_urlsafe(24),
+                token_hash=token_hash(token),
                 created_us=now_us(),
             )
             await self._scene_cache.pin(row.scene)
             try:
-                entries = await self._store.session_entries(session.session_id)
-                forked = Session(row, session.start)
+                rows = await self._store.session_entries(session.session_id)
+                entries = [entry for entry in rows if entry.seq < session.next_seq]
+                forked = self._session(row, session.start)
                 forked.begin(world, session.cameras)
                 forked.lockstep.reset(world.steps, over=world.over)
                 forked.next_seq, forked.snapshots = len(entries), dict(session.snapshots)
-                info = session_info(forked, ws_base=ws_base, token=row.token)
+                info = session_info(forked, ws_base=ws_base, token=token)
                 reply = idempotent.reply(info, status=201, headers=created_headers(info))
-                await self._store.create_session(row)
-                await self._store.append_session_entries(row.session_id, entries, reply=reply)
+                await self._store.create_session(row, entries=entries, reply=reply)
             except BaseException:
                 self._scene_cache.unpin(row.scene)
                 raise
@@ -274,8 +284,14 @@ class Sessions:
             return
         session.closed = _closed(session.session_id, reason)
         async with session.lock:
+            try:
+                await self._store.close_session(session.session_id, reason=reason)
+            except BaseException:
+                # It is not over as long as the store does not say so.
+                session.closed = None
+                self._open[session.session_id] = session
+                raise
             self._scene_cache.unpin(session.row.scene)
-            await self._store.close_session(session.session_id, reason=reason)
         for close in session.close_callbacks:
             # Not awaited: clients may be slow to read.
             closing = asyncio.ensure_future(close(session.closed))
@@ -302,6 +318,10 @@ class Sessions:
         if scene not in self._warm:
             await self.pipeline.first_render(scene, session.start.state)
             self._warm.add(scene)
+
+    def resume_token(self, row: SessionRow) -> str:
+        """Lets a controller come back; the same in every run, and not in the store."""
+        return hmac.new(self.resume_key, row.session_id.encode(), "sha256").hexdigest()
 
     # --- inside -----------------------------------------------------------------------------
 
@@ -344,7 +364,8 @@ class Sessions:
                 else:
                     state = await self._bare_state(pinned)
                 start = EpisodeStart(pinned, summary, state)
-                session = await rebuild(row, start, store=self._store, pipeline=self.pipeline)
+                session = self._session(row, start)
+                await rebuild(session, store=self._store, pipeline=self.pipeline)
             except BaseException:
                 self._scene_cache.unpin(row.scene)
                 raise
@@ -352,8 +373,11 @@ class Sessions:
         log.info("session rebuilt", session_id=row.session_id, entries=session.next_seq)
         return session
 
+    def _session(self, row: SessionRow, start: EpisodeStart) -> Session:
+        return Session(row, start, resume_token=self.resume_token(row))
+
     async def _start(
-        self, scene: str | None, scenario: str | None
+        self, scene: str | None, scenario: str | None, token: str
     ) -> tuple[SessionRow, EpisodeStart]:
         """What the new session is and begins from; its scene is pinned."""
         view = await self._scenarios.view(scenario) if scenario is not None else None
@@ -372,7 +396,7 @@ class Sessions:
             scene_hash=summary.content_hash,
             scenario_id=scenario,
             scenario_revision=view.revision if view is not None else None,
-            token=secrets.token_urlsafe(24),
+            token_hash=token_hash(token),
             created_us=now_us(),
         )
         return row, EpisodeStart(pinned, summary, state)

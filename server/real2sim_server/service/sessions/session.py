@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -15,8 +14,10 @@ from ...edit import ScenarioState
 from ...scene import Camera, Scene
 from ...scene.io import SceneSummary
 from ...world import Event, World
+from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
 from ..storage.store import SessionRow
+from ..storage.tokens import token_hash
 from .lockstep import LockStep, not_reset
 from .observers import ObserverQueue
 from .wire import EncodedMessage
@@ -45,14 +46,17 @@ class Session:
     """A light view onto a scene. Belongs to the event loop; its worlds are computed elsewhere.
 
     Attributes:
-        row: as it is in the store; holds id and token.
+        row: as it is in the store.
         start: scene and objects at step 0.
+        resume_token: lets a controller come back; the same in every run of the worker.
         lock: held during any change of the session.
         world: the committed instant; never changed in place, so readers need no lock.
         cameras: of the episode's sensors at the sizes they name, by name.
         lockstep: which action is due.
         events: since the last answer to a REST step.
         next_seq: of the session's log.
+        log_unsure: whether there may be something in the log from ``next_seq`` on that never took
+            effect: the store did not say how it ended.
         snapshots: instants to return to, by name.
         newest: observation of the present instant, where it has been shown.
         late: whether the planner has missed the deadline of the due action, and the clock waits.
@@ -65,12 +69,14 @@ class Session:
 
     row: SessionRow
     start: EpisodeStart
+    resume_token: str
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     world: World | None = None
     cameras: dict[str, Camera] = field(default_factory=dict)
     lockstep: LockStep[EncodedMessage] = field(default_factory=LockStep)
     events: list[Event] = field(default_factory=list)
     next_seq: int = 0
+    log_unsure: bool = False
     snapshots: dict[str, World] = field(default_factory=dict)
     newest: EncodedMessage | None = None
     late: bool = False
@@ -115,11 +121,6 @@ class Session:
         self.expires_at = None if cap is None else time.monotonic() + cap
 
     @property
-    def resume_token(self) -> str:
-        """Lets a controller come back; the same in every run of the worker."""
-        return resume_token_of(self.row)
-
-    @property
     def expired(self) -> bool:
         """Whether the episode has used up its wall-clock time."""
         return self.expires_at is not None and time.monotonic() >= self.expires_at
@@ -146,9 +147,9 @@ class Session:
             queue.put(message)
 
 
-def resume_token_of(row: SessionRow) -> str:
-    """See :attr:`Session.resume_token`; told without the session."""
-    return hashlib.sha256(b"resume:" + row.token.encode()).hexdigest()
+def opens_session(token: str | None, row: SessionRow) -> bool:
+    """Whether a token is that of the session of a row."""
+    return token is not None and secrets_equal(token_hash(token), row.token_hash)
 
 
 def controller_taken(session_id: str) -> ServiceError:

@@ -29,7 +29,7 @@ from ...world.recording.replay import (
     stop_payload,
 )
 from ..http.problems import ServiceError
-from ..storage.store import SessionEntry, Store, StoredReply, now_us
+from ..storage.store import SessionEntry, Store, StoredReply, StoreTroubleError, now_us
 from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
@@ -88,16 +88,17 @@ class Stepper:
         session.begin(world, cameras)
 
     async def begin(self, session: Session, spec: ResetSpec) -> None:
-        """Like restart(), for a session that is not in the store yet: record it once it is."""
+        """Like restart(), for a session that is not in the store yet; see beginning_entries()."""
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
         await self._kernels.ready(spec.ego)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
 
-    async def record_beginning(self, session: Session) -> None:
-        """Put the episode of a new session on record, if it has one."""
-        if session.world is not None:
-            await self._record(session, [("reset", 0, reset_payload(session.spec))])
+    def beginning_entries(self, session: Session) -> list[SessionEntry]:
+        """The log of a session that is not in the store yet: its first episode, if it has one."""
+        if session.world is None:
+            return []
+        return _entries(session, [("reset", 0, reset_payload(session.spec))])
 
     async def act(
         self,
@@ -269,16 +270,26 @@ class Stepper:
     ) -> tuple[EncodedObservation, bool]:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])
-        store = partial(self._store.record, session.session_id, entries)
+        store = partial(self._store.record, session.session_id, entries, instead=session.log_unsure)
         transition = Transition(change, cameras, record=store, write=write)
         try:
             observation = await self._pipeline.run(transition)
+        except StoreTroubleError:
+            session.log_unsure = True
+            raise
         except Exception:
             if transition.recorded:
-                await self._store.withdraw(session.session_id, from_seq=session.next_seq)
+                await self._withdraw(session)
             raise
-        session.next_seq += len(entries)
+        session.next_seq, session.log_unsure = session.next_seq + len(entries), False
         return observation, transition.sent
+
+    async def _withdraw(self, session: Session) -> None:
+        """Take back what has been recorded ahead; by the next entry where the store is not well."""
+        try:
+            await self._store.withdraw(session.session_id, from_seq=session.next_seq)
+        except StoreTroubleError:
+            session.log_unsure = True
 
     async def _record(
         self,
@@ -288,8 +299,14 @@ class Stepper:
         reply: StoredReply | None = None,
     ) -> None:
         entries = _entries(session, records)
-        await self._store.append_session_entries(session.session_id, entries, reply=reply)
-        session.next_seq += len(entries)
+        try:
+            await self._store.append_session_entries(
+                session.session_id, entries, instead=session.log_unsure, reply=reply
+            )
+        except StoreTroubleError:
+            session.log_unsure = True
+            raise
+        session.next_seq, session.log_unsure = session.next_seq + len(entries), False
 
 
 def _entries(session: Session, records: Sequence[LogRecord]) -> list[SessionEntry]:

@@ -1,63 +1,95 @@
-"""The database of a store: how it is reached, and the schema in it."""
+"""The database of a store: how it is reached, how long it may take, and what reaches the disk."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection, make_url
+from sqlalchemy.engine import make_url
 from sqlalchemy.pool import StaticPool
 
-from . import tables as t
+DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
+"""Argument of a PostgreSQL driver that limits its waiting [s]. Only pg8000 limits reading too, so
+that a server that is frozen is noticed."""
+
+SERVER_SHARE = 0.8
+"""Of the time that a statement may take, before the server itself gives it up."""
 
 
-class StoreError(RuntimeError):
-    """The store cannot be used; the message says why and what to do."""
+def connect(url: str, *, timeout_s: float) -> sa.Engine:
+    """An engine for ``url``; SQLite's folder is made, its journal is a write-ahead one.
 
-
-def connect(url: str) -> sa.Engine:
-    """An engine for ``url``; SQLite's folder is made, its journal is a write-ahead one."""
+    Args:
+        url: SQLAlchemy URL.
+        timeout_s: of one statement, of a lock, and of an answer of the server [s].
+    """
     parsed = make_url(url)
     if parsed.get_backend_name() != "sqlite":
-        return sa.create_engine(parsed, pool_pre_ping=True)
-    if not parsed.database or parsed.database == ":memory:":
+        return _server_engine(parsed, timeout_s)
+    file = file_of(url)
+    if file is None:
         # Such a database belongs to its connection, whichever thread uses it.
         other_threads = {"check_same_thread": False}
         engine = sa.create_engine(parsed, poolclass=StaticPool, connect_args=other_threads)
     else:
-        Path(parsed.database).absolute().parent.mkdir(parents=True, exist_ok=True)
-        engine = sa.create_engine(parsed)
-    sa.event.listen(engine, "connect", _set_up_sqlite)
+        file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        make_private(file)
+        engine = sa.create_engine(parsed, connect_args={"timeout": timeout_s})
+
+    @sa.event.listens_for(engine, "connect")
+    def set_up(connection: Any, _record: object) -> None:
+        cursor = connection.cursor()
+        if not cursor.execute("PRAGMA page_count").fetchone()[0]:
+            # Freed pages can be given back in pieces, if this is said before there is any.
+            cursor.execute("PRAGMA auto_vacuum=INCREMENTAL")
+        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
+            cursor.execute(f"PRAGMA {pragma}")
+        cursor.execute(f"PRAGMA busy_timeout={round(timeout_s * 1000)}")
+        cursor.close()
+
     return engine
 
 
-def is_local(engine: sa.Engine) -> bool:
-    """Whether the database is a file of this machine: a connection to it is never lost."""
-    return engine.dialect.name == "sqlite" and not isinstance(engine.pool, StaticPool)
+def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
+    limit = DRIVER_TIMEOUTS.get(url.get_driver_name())
+    # The others take whole seconds.
+    seconds = timeout_s if limit == "timeout" else max(1, round(timeout_s))
+    arguments = {limit: seconds} if limit else {}
+    engine = sa.create_engine(
+        url, pool_pre_ping=True, pool_timeout=timeout_s, connect_args=arguments
+    )
+    if url.get_backend_name() == "postgresql":
+
+        @sa.event.listens_for(engine, "connect")
+        def set_up(connection: Any, _record: object) -> None:
+            cursor = connection.cursor()
+            for name in ("statement_timeout", "lock_timeout"):
+                cursor.execute(f"SET {name} = {round(timeout_s * SERVER_SHARE * 1000)}")
+            cursor.close()
+            connection.commit()
+
+    return engine
 
 
-def _set_up_sqlite(connection: Any, _record: object) -> None:
-    cursor = connection.cursor()
-    # NORMAL loses no committed transaction when the process dies, only when the machine does.
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.execute("PRAGMA busy_timeout=5000")
-    cursor.close()
+def file_of(url: str) -> Path | None:
+    """The file of an SQLite database; None for others and for those in memory."""
+    parsed = make_url(url)
+    if parsed.get_backend_name() != "sqlite" or not parsed.database:
+        return None
+    return None if parsed.database == ":memory:" else Path(parsed.database).absolute()
 
 
-def prepare_schema(connection: Connection) -> None:
-    """Create what is missing. Raises StoreError where the schema is of another version."""
-    t.schema_version.create(connection, checkfirst=True)
-    found = connection.execute(sa.select(sa.func.max(t.schema_version.c.version))).scalar()
-    if found is not None and found != t.SCHEMA_VERSION:
-        raise StoreError(
-            f"the store has schema version {found}, this worker reads {t.SCHEMA_VERSION}; "
-            "start a worker of that version, or give another REAL2SIM_STORE_URL"
-        )
-    t.metadata.create_all(connection)
-    if found is None:
-        connection.execute(sa.insert(t.schema_version), {"version": t.SCHEMA_VERSION})
+def make_private(file: Path) -> None:
+    """Make sure that nobody but its owner can read a database file; made where it is missing.
+
+    SQLite gives its journals the permissions of the file.
+    """
+    os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+    for path in (file, *(file.with_name(file.name + end) for end in ("-wal", "-shm"))):
+        if path.exists() and path.stat().st_mode & 0o077:
+            path.chmod(0o600)
 
 
 def shown_url(url: str) -> str:

@@ -39,6 +39,7 @@ class SessionRow:
 
     Attributes:
         scenario_id, scenario_revision: what it began from; None for the bare scene.
+        token_hash: of the token that opens it, as :func:`~.tokens.token_hash` makes it.
         closed_us, reason: None while it is open.
     """
 
@@ -48,7 +49,7 @@ class SessionRow:
     scene_hash: str
     scenario_id: str | None
     scenario_revision: int | None
-    token: str
+    token_hash: str
     created_us: int
     closed_us: int | None = None
     reason: str | None = None

@@ -15,7 +15,8 @@ from sqlalchemy import (
     Text,
 )
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Raised with every change of a table, together with an entry in `migrations`."""
 
 metadata = MetaData()
 
@@ -72,7 +73,7 @@ sessions = Table(
     Column("scene_hash", String(64), nullable=False),
     Column("scenario_id", String(80), nullable=True),
     Column("scenario_revision", Integer, nullable=True),
-    Column("token", String(200), nullable=False),
+    Column("token_hash", String(200), nullable=False),
     Column("created_us", BigInteger, nullable=False),
     Column("closed_us", BigInteger, nullable=True),
     Column("reason", Text, nullable=True),

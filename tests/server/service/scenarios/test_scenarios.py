@@ -305,16 +305,6 @@ def test_nothing_takes_effect_that_is_not_on_record(client, monkeypatch):
     assert edit(client, scenario, DELETE_RED).json()["revision"] == 1
 
 
-def test_two_workers_on_one_store_never_make_the_same_revision(start_worker):
-    first, second = start_worker(), start_worker()
-    scenario = create(first)
-    shown(second, scenario)
-    assert edit(first, scenario, DELETE_RED).json()["revision"] == 1
-    assert edit(second, scenario, MOVE_POST).json()["code"] == ErrorCode.STALE_REVISION
-    assert edit(second, scenario, MOVE_POST).json()["revision"] == 2
-    assert "car_red" not in shown(second, scenario)
-
-
 def test_edits_that_arrive_together_are_made_one_after_the_other(client):
     scenario = create(client)
     with ThreadPoolExecutor(8) as pool:

@@ -84,7 +84,8 @@ class Planner:
 class Site:
     """A worker and its REST interface."""
 
-    def __init__(self, running: RunningWorker) -> None:
+    def __init__(self, running: RunningWorker, *, stop: Callable[[], None]) -> None:
+        self.stop = stop
         self.worker = running.worker
         self.url = running.url
         self.http = httpx2.Client(base_url=running.url, timeout=60)
@@ -124,9 +125,10 @@ def own_site(tmp_path_factory, tiny_scene) -> Iterator[Callable[..., Site]]:
             root = tmp_path_factory.mktemp("worker")
             save_scene(tiny_scene, root / "scenes" / "tiny.r2s")
             defaults = {"data_dir": root, "port": 0, "backend": "cpu", "log_level": "error"}
-            running = stack.enter_context(running_worker(Settings(**defaults | overrides)))
-            site = Site(running)
-            stack.callback(site.http.close)
+            life = stack.enter_context(ExitStack())
+            running = life.enter_context(running_worker(Settings(**defaults | overrides)))
+            site = Site(running, stop=life.close)
+            life.callback(site.http.close)
             return site
 
         yield start

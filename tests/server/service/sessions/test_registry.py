@@ -61,6 +61,7 @@ def test_sessions_of_an_earlier_run_are_rebuilt_when_they_are_asked_for(own_site
     info = before.create({"action": "control"})
     plan = {"kind": "control", "acceleration": 1.0, "steering": 0.02}
     state = before.call("POST", info, "/step", json={"n": 5, "plan": plan}).json()
+    before.stop()
     after = own_site(store_url=url)
     again = after.call("GET", info, "/state").json()
     assert {k: again[k] for k in ("ego", "step")} == {k: state[k] for k in ("ego", "step")}

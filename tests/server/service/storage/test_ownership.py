@@ -1,0 +1,97 @@
+"""One worker on a state folder, and one of a name on a store."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from real2sim_server.service.preflight import check_start
+from real2sim_server.service.storage.ownership import (
+    StateFolderError,
+    check_state_folder,
+    owned_folder,
+)
+from real2sim_server.service.storage.store import StoreError
+
+HOLD = (
+    "import sys, time\n"
+    "from pathlib import Path\n"
+    "from real2sim_server.service.storage.ownership import owned_folder\n"
+    "with owned_folder(Path(sys.argv[1])):\n"
+    "    print('held', flush=True)\n"
+    "    time.sleep(60)\n"
+)
+
+
+def test_a_second_worker_on_a_state_folder_is_refused_with_the_process_that_has_it(tmp_path):
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as first:
+        try:
+            assert first.stdout.readline() == "held\n"
+            with pytest.raises(StateFolderError, match=f"process {first.pid} ") as refused:
+                check_state_folder(tmp_path)
+            assert "--data" in str(refused.value)
+        finally:
+            first.kill()
+    # However a process ends, its folder is free.
+    check_state_folder(tmp_path)
+
+
+def test_a_worker_on_a_taken_folder_is_refused_before_anything_is_loaded(make_settings, tmp_path):
+    with (
+        owned_folder(tmp_path / "data"),
+        pytest.raises(StateFolderError, match=f"process {os.getpid()}"),
+    ):
+        check_start(make_settings())
+
+
+def test_a_worker_on_a_taken_folder_marks_no_jobs(run_worker):
+    with run_worker() as client:
+        body = {"scene": "tiny", "camera": "front", "fps": 1}
+        job = client.post("/v1/exports", json=body).headers["Location"]
+        before = client.get(job).json()["state"]
+        with pytest.raises(StateFolderError), run_worker():
+            pass
+        assert "interrupted" not in {before, client.get(job).json()["state"]}
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_name_is_given_once_on_a_shared_store(kind, request, run_worker, tmp_path):
+    url = f"sqlite:///{tmp_path / 'shared.db'}"
+    if kind == "postgresql":
+        url = request.getfixturevalue("postgres").new_database()
+    first, second = tmp_path / "first", tmp_path / "second"
+    with run_worker(data_dir=first, store_url=url):
+        with (
+            pytest.raises((StoreError, StateFolderError), match=f"process {os.getpid()} .*WORKER"),
+            run_worker(data_dir=second, store_url=url),
+        ):
+            pass
+        with run_worker(data_dir=second, store_url=url, worker_id="w1") as other:
+            assert other.get("/v1/scenarios").status_code == 200
+    with run_worker(data_dir=second, store_url=url) as heir:
+        assert heir.get("/v1/scenarios").status_code == 200
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_with_the_remedy():
+    if os.getuid() != 0 or shutil.which("setpriv") is None:
+        pytest.skip("needs root, to become somebody else")
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from real2sim_server.service.storage.ownership import check_state_folder\n"
+        "try: check_state_folder(Path(sys.argv[1]))\n"
+        "except OSError as error: print(error)\n"
+    )
+    command = ["setpriv", "--reuid=65534", "--clear-groups", sys.executable, "-c", code]
+    # Not below pytest's own folder, which other users cannot enter.
+    with tempfile.TemporaryDirectory(prefix="real2sim-closed-") as folder:
+        Path(folder).chmod(0o755)
+        told = subprocess.run([*command, folder], capture_output=True, text=True, check=False)
+    assert "cannot be written to" in told.stdout, told.stderr
+    assert "--data" in told.stdout

@@ -1,0 +1,214 @@
+"""A full disk, a database that is gone or frozen, a clock set back: what clients are told
+meanwhile, and that nothing acknowledged is lost and all goes on by itself."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from real2sim_server.service.storage import store as store_module
+
+from .postgres import Postgres, running_postgres
+
+# The driver of PostgreSQL leaves sockets of connections that broke to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+MOVE = {"operations": [{"op": "translate", "object_id": "post", "x": 0.25}]}
+TIMEOUT_S = 0.5
+
+
+class Site:
+    """A worker with a scenario, and a session on it that has made a step."""
+
+    def __init__(self, client: TestClient) -> None:
+        self.client = client
+        self.scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
+        made = client.post("/v1/sessions?scene=tiny", json={"reset": {"action": "control"}}).json()
+        self.session = f"/v1/sessions/{made['session_id']}"
+        self.token = {"Authorization": f"Bearer {made['token']}"}
+        self.edits = 0
+        self.steps = 0
+
+    def edit(self, key: str | None = None):
+        headers = {"Idempotency-Key": key} if key else {}
+        answer = self.client.post(f"{self.scenario}/operations", json=MOVE, headers=headers)
+        self.edits += answer.status_code == 200
+        return answer
+
+    def step(self):
+        answer = self.client.post(f"{self.session}/step", json={}, headers=self.token)
+        self.steps += answer.status_code == 200
+        return answer
+
+    def state(self):
+        return self.client.get(f"{self.session}/state", headers=self.token)
+
+    def check_nothing_is_lost(self) -> None:
+        assert self.client.get(self.scenario).json()["revision"] == self.edits
+        assert self.state().json()["step"] == self.steps
+
+
+def wait_until(true: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline, "it has not come true in time"
+        time.sleep(0.05)
+
+
+def is_ready(client: TestClient) -> bool:
+    return client.get("/readyz").status_code == 200
+
+
+def assert_told(answer, code: str, status: int) -> None:
+    assert answer.status_code == status, answer.text
+    problem = answer.json()
+    assert (problem["code"], problem["retryable"]) == (code, True)
+    assert float(answer.headers["Retry-After"]) > 0
+
+
+@pytest.fixture
+def small_disk() -> Iterator[Path]:
+    """A file system of 4 MiB."""
+    if os.getuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("needs root, to mount a small file system")
+    with tempfile.TemporaryDirectory(prefix="real2sim-disk-") as folder:
+        mounted = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder]
+        done = subprocess.run(mounted, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+        try:
+            yield Path(folder)
+        finally:
+            subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@contextlib.contextmanager
+def filled(disk: Path) -> Iterator[None]:
+    """A disk without a free byte, for the length of the block."""
+    ballast = disk / "ballast"
+    with ballast.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    try:
+        yield
+    finally:
+        ballast.unlink()
+
+
+def test_a_full_disk_refuses_what_would_be_stored_and_nothing_else(small_disk, start_worker):
+    client = start_worker(data_dir=small_disk / "data")
+    site = Site(client)
+    assert site.edit().status_code == 200
+    assert site.step().status_code == 200
+    with filled(small_disk):
+        for _ in range(10):
+            step = site.step()
+            if step.status_code != 200:
+                assert_told(step, "STORAGE_FULL", 507)
+        # There may be some pages left in the journal.
+        edits = (site.edit() for _ in range(500))
+        refused = next(answer for answer in edits if answer.status_code != 200)
+        assert_told(refused, "STORAGE_FULL", 507)
+        assert client.get("/readyz").json()["reasons"] == [
+            "the worker has no space left to store anything"
+        ]
+        assert client.get("/livez").status_code == 200
+        site.check_nothing_is_lost()
+    wait_until(lambda: is_ready(client))
+    assert site.edit().status_code == 200
+    assert site.step().status_code == 200
+    site.check_nothing_is_lost()
+
+
+@pytest.fixture
+def own_postgres() -> Iterator[Postgres]:
+    with (
+        tempfile.TemporaryDirectory(prefix="real2sim-pg-") as folder,
+        running_postgres(Path(folder)) as server,
+    ):
+        yield server
+
+
+@pytest.fixture
+def site(own_postgres, start_worker) -> Site:
+    """A worker whose database can be taken away."""
+    url = own_postgres.new_database()
+    site = Site(start_worker(store_url=url, store_timeout_seconds=TIMEOUT_S))
+    assert site.edit().status_code == 200
+    assert site.step().status_code == 200
+    return site
+
+
+@contextlib.contextmanager
+def stopped(server: Postgres) -> Iterator[None]:
+    server.stop()
+    try:
+        yield
+    finally:
+        server.start()
+
+
+@pytest.mark.parametrize("trouble", [stopped, Postgres.frozen], ids=["stopped", "frozen"])
+def test_a_database_that_is_gone_is_told_and_comes_back_by_itself(trouble, site, own_postgres):
+    with trouble(own_postgres):
+        assert_told(site.edit("once"), "STORAGE_UNAVAILABLE", 503)
+        # From now on nobody waits for it.
+        began = time.monotonic()
+        for _ in range(5):
+            assert_told(site.edit("once"), "STORAGE_UNAVAILABLE", 503)
+            assert_told(site.step(), "STORAGE_UNAVAILABLE", 503)
+        assert time.monotonic() - began < 5 * 2 * TIMEOUT_S
+        readiness = site.client.get("/readyz")
+        assert readiness.status_code == 503
+        assert "store" in readiness.json()["reasons"][0]
+        assert site.client.get("/livez").status_code == 200
+    wait_until(lambda: is_ready(site.client))
+    assert site.step().status_code == 200
+    assert site.edit("once").status_code == 200
+    assert site.edit("once").headers["Idempotent-Replayed"] == "true"
+    site.edits -= 1
+    site.check_nothing_is_lost()
+
+
+def test_a_database_that_goes_in_a_step_leaves_the_session_where_it_was(site, own_postgres):
+    with own_postgres.frozen():
+        assert_told(site.step(), "STORAGE_UNAVAILABLE", 503)
+    # What the frozen database did in the end with what it was sent, nobody knows.
+    wait_until(lambda: is_ready(site.client))
+    for _ in range(3):
+        assert site.step().status_code == 200
+    site.check_nothing_is_lost()
+
+
+def test_a_job_that_ends_without_a_database_is_on_record_afterwards(site, own_postgres):
+    body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}
+    job = site.client.post("/v1/exports", json=body).headers["Location"]
+    with stopped(own_postgres):
+        time.sleep(2.0)
+    wait_until(lambda: is_ready(site.client))
+    wait_until(lambda: site.client.get(job).json()["state"] == "succeeded", 60)
+
+
+def test_a_clock_that_is_set_back_by_an_hour_changes_nothing(client, monkeypatch):
+    site = Site(client)
+    assert site.edit("before").status_code == 200
+    hour_ns, time_ns = 3600 * 10**9, time.time_ns
+    monkeypatch.setattr(store_module.time, "time_ns", lambda: time_ns() - hour_ns)
+    again = site.edit("before")
+    assert again.headers["Idempotent-Replayed"] == "true"
+    site.edits -= 1
+    later = client.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
+    listed = [s["scenario_id"] for s in client.get("/v1/scenarios").json()["scenarios"]]
+    assert [f"/v1/scenarios/{i}" for i in listed] == [site.scenario, later]
+    assert site.edit("after").status_code == 200
+    assert site.step().status_code == 200
+    site.check_nothing_is_lost()
