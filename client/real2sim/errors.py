@@ -237,6 +237,8 @@ _BY_CODE: dict[str, type[StatusError]] = {
     "QUEUE_FULL": CapacityError,
     "OUT_OF_MEMORY": CapacityError,
     "QUOTA_EXCEEDED": CapacityError,
+    "STORAGE_FULL": CapacityError,
+    "STORAGE_UNAVAILABLE": CapacityError,
     "DRAINING": CapacityError,
     "SESSION_CLOSED": SessionClosedError,
 }

@@ -73,6 +73,8 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         (429, "OVER_CAPACITY", real2sim.CapacityError),
         (500, "INTERNAL", real2sim.WorkerFailedError),
         (507, "OUT_OF_MEMORY", real2sim.CapacityError),
+        (507, "STORAGE_FULL", real2sim.CapacityError),
+        (503, "STORAGE_UNAVAILABLE", real2sim.CapacityError),
         (418, "CODE_OF_THE_FUTURE", real2sim.StatusError),
     ],
 )
@@ -144,6 +146,16 @@ def test_a_busy_worker_is_asked_again_after_the_time_it_names(slept):
     with client_of(script) as client:
         assert len(client.scenes.list()) == 1
     assert slept == [3.0]
+
+
+def test_a_full_disk_is_waited_for_and_a_full_device_is_not(slept):
+    script = Script(problem(507, "STORAGE_FULL"), httpx2.Response(200, json=SCENES))
+    with client_of(script) as client:
+        assert len(client.scenes.list()) == 1
+    assert len(slept) == 1
+    with client_of(Script(problem(507, "OUT_OF_MEMORY"))) as client, pytest.raises(CapacityError):
+        client.scenes.list()
+    assert len(slept) == 1
 
 
 def test_a_worker_that_stays_busy_is_given_up_with_its_wish(slept):

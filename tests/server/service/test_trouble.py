@@ -44,8 +44,9 @@ class Site:
         self.edits += answer.status_code == 200
         return answer
 
-    def step(self):
-        answer = self.client.post(f"{self.session}/step", json={}, headers=self.token)
+    def step(self, key: str | None = None):
+        headers = self.token | ({"Idempotency-Key": key} if key else {})
+        answer = self.client.post(f"{self.session}/step", json={}, headers=headers)
         self.steps += answer.status_code == 200
         return answer
 
@@ -181,11 +182,11 @@ def test_a_database_that_is_gone_is_told_and_comes_back_by_itself(trouble, site,
 
 def test_a_database_that_goes_in_a_step_leaves_the_session_where_it_was(site, own_postgres):
     with own_postgres.frozen():
-        assert_told(site.step(), "STORAGE_UNAVAILABLE", 503)
+        assert_told(site.step("once"), "STORAGE_UNAVAILABLE", 503)
     # What the frozen database did in the end with what it was sent, nobody knows.
     wait_until(lambda: is_ready(site.client))
-    for _ in range(3):
-        assert site.step().status_code == 200
+    for key in ("once", "twice", "thrice"):
+        assert site.step(key).status_code == 200
     site.check_nothing_is_lost()
 
 

@@ -35,7 +35,7 @@ from ..http.responses import info_response, large_response
 from ..sessions.describe import session_info, session_state
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import check_not_closed, created_headers
-from ..sessions.session import Session
+from ..sessions.session import Session, opens_session
 from ..sessions.step import MakeReply
 from ..sessions.views import view_response
 from ..storage.store import StoredReply

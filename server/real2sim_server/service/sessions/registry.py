@@ -191,6 +191,9 @@ class Sessions:
                 of rebuilding it.
         """
         if (session := self._open.get(session_id)) is not None:
+            if session.log_unsure:
+                async with session.lock:
+                    await self.stepper.settle(session)
             return session
         return await self._rebuilt(check_not_closed(await self.row(session_id)))
 

@@ -57,6 +57,7 @@ class Session:
         next_seq: of the session's log.
         log_unsure: whether there may be something in the log from ``next_seq`` on that never took
             effect: the store did not say how it ended.
+        unsure_replies: keys of answers that may be stored likewise.
         snapshots: instants to return to, by name.
         newest: observation of the present instant, where it has been shown.
         late: whether the planner has missed the deadline of the due action, and the clock waits.
@@ -77,6 +78,7 @@ class Session:
     events: list[Event] = field(default_factory=list)
     next_seq: int = 0
     log_unsure: bool = False
+    unsure_replies: tuple[str, ...] = ()
     snapshots: dict[str, World] = field(default_factory=dict)
     newest: EncodedMessage | None = None
     late: bool = False

@@ -29,7 +29,8 @@ from ...world.recording.replay import (
     stop_payload,
 )
 from ..http.problems import ServiceError
-from ..storage.store import SessionEntry, Store, StoredReply, StoreTroubleError, now_us
+from ..storage.errors import StoreTroubleError, StoreUnavailableError
+from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
@@ -274,7 +275,7 @@ class Stepper:
         transition = Transition(change, cameras, record=store, write=write)
         try:
             observation = await self._pipeline.run(transition)
-        except StoreTroubleError:
+        except StoreUnavailableError:
             session.log_unsure = True
             raise
         except Exception:
@@ -291,6 +292,13 @@ class Stepper:
         except StoreTroubleError:
             session.log_unsure = True
 
+    async def settle(self, session: Session) -> None:
+        """Take back what may be on record of changes that never took effect, answers included."""
+        if session.log_unsure:
+            keys, seq = session.unsure_replies, session.next_seq
+            await self._store.withdraw(session.session_id, from_seq=seq, replies=keys)
+            session.log_unsure, session.unsure_replies = False, ()
+
     async def _record(
         self,
         session: Session,
@@ -303,8 +311,10 @@ class Stepper:
             await self._store.append_session_entries(
                 session.session_id, entries, instead=session.log_unsure, reply=reply
             )
-        except StoreTroubleError:
+        except StoreUnavailableError:
             session.log_unsure = True
+            if reply is not None:
+                session.unsure_replies += (reply.key,)
             raise
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
 

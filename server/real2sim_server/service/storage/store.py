@@ -333,9 +333,14 @@ class Store:
         durable = reply is not None and self._durability != "process"
         self._execute(changes, durable=durable or self._durability == "all")
 
-    async def withdraw(self, session_id: str, *, from_seq: int) -> None:
-        """Remove the end of a session's log: what was recorded ahead and never took effect."""
-        await self._write(_log_end(session_id, from_seq))
+    async def withdraw(
+        self, session_id: str, *, from_seq: int, replies: Sequence[str] = ()
+    ) -> None:
+        """Remove the end of a session's log, and answers by their keys: what was recorded ahead and
+        never took effect."""
+        told = t.idempotent_replies.c.key.in_(replies)
+        forgotten = [Write(sa.delete(t.idempotent_replies).where(told))] if replies else []
+        await self._write(_log_end(session_id, from_seq), *forgotten)
 
     async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
         """The log of a session behind ``after``, oldest first."""
