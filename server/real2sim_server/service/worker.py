@@ -104,10 +104,12 @@ class Worker:
             worker_id=settings.worker_id,
             timeout_s=settings.store_timeout_seconds,
             durability=settings.durability,
+            on_call=metrics.observe_store,
         )
         assets = AssetLibrary(settings.assets_path, budget)
         scenarios = Scenarios(store, scene_cache, metrics, assets=assets.find)
-        jobs = Jobs(JobLog(store, settings.worker_id), _jobs_quota(settings))
+        job_log = JobLog(store, settings.worker_id)
+        jobs = Jobs(job_log, _jobs_quota(settings), on_end=metrics.observe_ended_job)
         kernels = KernelWarmUp()
         renderer = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
         worker = cls(

@@ -7,9 +7,13 @@ import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
+from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.scenes import Readiness
 from real2sim_server.service.app import create_app
 from real2sim_server.service.storage.store import StoreError
+
+
+HERE = {"Host": "127.0.0.1"}
 
 
 def wait_until_ready(client) -> None:
@@ -122,3 +126,48 @@ def test_a_store_that_cannot_be_opened_ends_the_start_and_leaves_no_thread(make_
     with pytest.raises(StoreError), TestClient(app):
         pass
     assert threading.active_count() <= before
+
+
+def test_metrics_tell_of_store_jobs_and_sockets(client):
+    client.put("/v1/scenes/tiny/residency")
+    info = client.post("/v1/sessions?scene=tiny", json={"reset": {"action": "control"}}).json()
+    url = f"/v1/sessions/{info['session_id']}/drive"
+    with client.websocket_connect(url, [DRIVE_SUBPROTOCOL], headers=HERE) as drive:
+        hello = {"protocols": [DRIVE_SUBPROTOCOL], "token": info["token"]}
+        plan = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
+        drive.send_bytes(encode({"v": 1, "type": "hello", "id": 1, **hello}))
+        drive.receive_bytes()
+        drive.send_bytes(encode({"v": 1, "type": "action", "id": 2, "step": 0, "plan": plan}))
+        assert decode(drive.receive_bytes())["type"] == "obs"
+        assert samples(client)["real2sim_socketsdrive"] == 1
+    found = samples(client)
+    assert found["real2sim_socketsdrive"] == 0
+    assert found["real2sim_step_duration_seconds_count"] == 1
+    assert found["real2sim_store_duration_seconds_countwrite"] > 0
+    assert found["real2sim_ended_jobs_totalload_scenesucceeded"] == 1
+
+
+def test_missed_deadlines_are_counted(client):
+    body = {"reset": {"action": "control", "deadline_ms": 1, "on_timeout": "fail"}}
+    info = client.post("/v1/sessions?scene=tiny", json=body).json()
+    url = f"/v1/sessions/{info['session_id']}/drive"
+    with client.websocket_connect(url, [DRIVE_SUBPROTOCOL], headers=HERE) as drive:
+        hello = {"protocols": [DRIVE_SUBPROTOCOL], "token": info["token"]}
+        resume = {"resume": {"token": "none", "last_step": 0}}
+        drive.send_bytes(encode({"v": 1, "type": "hello", "id": 1, **hello, **resume}))
+        assert decode(drive.receive_bytes())["type"] == "welcome"
+        assert decode(drive.receive_bytes())["type"] == "obs"
+    assert samples(client)["real2sim_missed_deadlines_total"] == 1
+
+
+def test_a_drive_socket_leaves_a_line_at_its_beginning_and_end(client, logged):
+    info = client.post("/v1/sessions?scene=tiny").json()
+    url = f"/v1/sessions/{info['session_id']}/drive"
+    name = HERE | {"X-Real2Sim-Client": "planner 7"}
+    with client.websocket_connect(url, [DRIVE_SUBPROTOCOL], headers=name) as drive:
+        hello = {"protocols": [DRIVE_SUBPROTOCOL], "token": info["token"]}
+        drive.send_bytes(encode({"v": 1, "type": "hello", "id": 1, **hello}))
+        drive.receive_bytes()
+    lines = {e["event"]: e for e in logged if e["event"].startswith("drive socket")}
+    assert lines["drive socket opened"]["role"] == "controller"
+    assert lines["drive socket closed"]["steps"] == 0

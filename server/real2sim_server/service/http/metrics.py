@@ -114,10 +114,13 @@ class Metrics:
         )
         self.store_calls = Histogram(
             "real2sim_store_duration_seconds",
-            "time of a call of the store, its queue included",
+            "time of a read or write of the store",
             ("call",),
             buckets=FAST_BUCKETS,
             registry=registry,
+        )
+        self.store_failures = Counter(
+            "real2sim_store_failures", "reads and writes that failed", ("call",), registry=registry
         )
         self.ended_jobs = Counter(
             "real2sim_ended_jobs",
@@ -136,6 +139,16 @@ class Metrics:
         """Note one engine job."""
         self.queue_wait.observe(waited_s)
         self.jobs.labels(label).observe(ran_s)
+
+    def observe_store(self, call: str, seconds: float, done: bool) -> None:
+        """Note a read or write of the store."""
+        self.store_calls.labels(call).observe(seconds)
+        if not done:
+            self.store_failures.labels(call).inc()
+
+    def observe_ended_job(self, kind: str, state: str) -> None:
+        """Note a job that is over."""
+        self.ended_jobs.labels(kind, state).inc()
 
     def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
         """Note one answer; ``route`` is the path of a route, or what stands for none."""

@@ -124,10 +124,14 @@ class Jobs:
     Args:
         job_log: keeps them.
         quota: of jobs and their files; below its folder each job has one for its files.
+        on_end: told the kind and the last state of each job.
     """
 
-    def __init__(self, job_log: JobLog, quota: Quota) -> None:
+    def __init__(
+        self, job_log: JobLog, quota: Quota, *, on_end: Callable[[str, str], None] | None = None
+    ) -> None:
         self._log = job_log
+        self._on_end = on_end
         self._quota = quota
         self._folder = quota.folder
         self._jobs: OrderedDict[str, _Job] = OrderedDict()
@@ -346,6 +350,8 @@ class Jobs:
                 await asyncio.sleep(STORE_RETRY_S)
         job.info = info
         job.events.append(info)
+        if info.over and self._on_end is not None:
+            self._on_end(info.kind, info.state.value)
         async with job.changed:
             job.changed.notify_all()
 

@@ -65,6 +65,9 @@ Durability = Literal["all", "edits", "process"]
 """What is on the disk before it is acknowledged: all, all but steps of sessions, or nothing; what
 is not is safe when the process dies, and the last of it lost when the machine does."""
 
+OnCall = Callable[[str, float, bool], None]
+"""Told of a call: ``read`` or ``write``, its seconds, and whether it went well."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -93,6 +96,7 @@ class Store:
         worker_id: name to hold as long as the store is open; None for a guest.
         timeout_s: of a statement, a lock, an answer [s].
         durability: what reaches the disk before it is acknowledged.
+        on_call: told of each read and write, on the thread that did it.
     """
 
     def __init__(
@@ -102,8 +106,10 @@ class Store:
         worker_id: str | None = None,
         timeout_s: float = TIMEOUT_S,
         durability: Durability = "edits",
+        on_call: OnCall | None = None,
     ) -> None:
         self.url = url
+        self._on_call = on_call
         self._worker_id = worker_id
         self._timeout_s = timeout_s
         self._durability = durability
@@ -398,7 +404,7 @@ class Store:
         def read() -> list[dict[str, Any]]:
             self._refuse_while_down()
             try:
-                with self._connected().connect() as connection:
+                with self._timed("read"), self._connected().connect() as connection:
                     return [dict(row) for row in connection.execute(query).mappings()]
             except Exception as error:
                 self._reraise(error)
@@ -418,7 +424,7 @@ class Store:
         if not self._write_lock.acquire(timeout=self._timeout_s):
             raise self._noted(StoreUnavailableError("the write before this one has not ended"))
         try:
-            with self._transaction(durable=durable) as connection:
+            with self._timed("write"), self._transaction(durable=durable) as connection:
                 counts = [connection.execute(c.statement, c.rows).rowcount for c in changes]
         except Exception as error:
             self._reraise(error)
@@ -427,6 +433,16 @@ class Store:
         if self._trouble is not None:
             self._recovered()
         return counts
+
+    @contextlib.contextmanager
+    def _timed(self, kind: str) -> Iterator[None]:
+        started, done = time.perf_counter(), False
+        try:
+            yield
+            done = True
+        finally:
+            if self._on_call is not None:
+                self._on_call(kind, time.perf_counter() - started, done)
 
     @contextlib.contextmanager
     def _transaction(self, *, durable: bool) -> Iterator[sa.Connection]:

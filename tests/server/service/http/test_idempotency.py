@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from real2sim_proto import ErrorCode
+from real2sim_server.scene.io import write_ply
 
 KEY = {"Idempotency-Key": "7f3c"}
 MOVE = {"operations": [{"op": "translate", "object_id": "post", "x": 1.0}]}
@@ -99,3 +100,91 @@ def test_a_key_that_is_too_long_is_refused(client, url):
     headers = {"Idempotency-Key": "k" * 201}
     problem = client.post(f"{url}/undo", headers=headers).json()
     assert problem["code"] == ErrorCode.INVALID_REQUEST
+
+
+# --- sessions, assets, scenes -------------------------------------------------------------------
+
+
+@pytest.fixture
+def session(client) -> dict:
+    """The path of a session whose episode has begun, and the headers that open it."""
+    body = {"reset": {"seed": 0, "dt_us": 50_000, "action": "control"}}
+    info = client.post("/v1/sessions?scene=tiny", json=body).json()
+    token = {"Authorization": f"Bearer {info['token']}"}
+    return {"path": f"/v1/sessions/{info['session_id']}", "token": token, "info": info}
+
+
+def test_a_step_sent_twice_moves_the_clock_once(client, session):
+    first, second = (
+        client.post(f"{session['path']}/step", json={"n": 3}, headers=session["token"] | KEY)
+        for _ in "ab"
+    )
+    assert first.json() == second.json()
+    assert second.headers["Idempotent-Replayed"] == "true"
+    state = client.get(f"{session['path']}/state", headers=session["token"])
+    assert state.json()["step"] == first.json()["step"] == 3
+
+
+def test_a_reset_sent_twice_begins_one_episode(client, session):
+    headers = session["token"] | KEY
+    client.post(f"{session['path']}/reset", json={"seed": 5}, headers=headers)
+    client.post(f"{session['path']}/step", json={"n": 2}, headers=session["token"])
+    client.post(f"{session['path']}/reset", json={"seed": 5}, headers=headers)
+    state = client.get(f"{session['path']}/state", headers=session["token"])
+    assert state.json()["step"] == 2
+
+
+def test_a_fork_sent_twice_makes_one_session(client, session):
+    headers = session["token"] | KEY
+    answers = [client.post(f"{session['path']}/fork", headers=headers) for _ in "ab"]
+    assert [a.status_code for a in answers] == [201, 201]
+    assert answers[0].json() == answers[1].json()
+    assert len(client.get("/v1/sessions").json()["sessions"]) == 2
+
+
+def test_an_answer_to_a_step_survives_a_restart_with_the_step(run_worker):
+    with run_worker() as client:
+        info = client.post("/v1/sessions?scene=tiny", json={"reset": {}}).json()
+        path = f"/v1/sessions/{info['session_id']}"
+        headers = {"Authorization": f"Bearer {info['token']}"} | KEY
+        first = client.post(f"{path}/step", json={"n": 25}, headers=headers).json()
+    with run_worker() as client:
+        again = client.post(f"{path}/step", json={"n": 25}, headers=headers)
+        assert again.json() == first
+        assert again.headers["Idempotent-Replayed"] == "true"
+
+
+def test_a_step_that_cannot_be_stored_moves_nothing(client, session, monkeypatch):
+    store = client.app.state.worker.store
+
+    async def fail(*_args, **_kwargs):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(store, "append_session_entries", fail)
+    request = {"json": {"n": 30}, "headers": session["token"] | KEY}
+    assert client.post(f"{session['path']}/step", **request).status_code >= 500
+    monkeypatch.undo()
+    assert client.post(f"{session['path']}/step", **request).json()["step"] == 30
+
+
+def test_an_asset_cut_out_twice_is_one_asset(client):
+    cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}
+    answers = [client.post("/v1/assets", json=cut, headers=KEY) for _ in "ab"]
+    assert [a.status_code for a in answers] == [201, 201]
+    assert answers[0].json() == answers[1].json()
+    assert client.post("/v1/assets", json=cut).json()["code"] == ErrorCode.ALREADY_EXISTS
+
+
+@pytest.mark.parametrize(("path", "name"), [("/v1/assets", "assets"), ("/v1/scenes", "scenes")])
+def test_an_upload_sent_twice_with_other_boundaries_takes_effect_once(
+    client, tmp_path, tiny_scene, path, name
+):
+    write_ply(tiny_scene.objects["car_red"].cloud, tmp_path / "car.ply")
+    content = (tmp_path / "car.ply").read_bytes()
+    before = len(client.get(path).json()[name])
+    answers = [client.post(path, files={"file": ("car.ply", content)}, headers=KEY) for _ in "ab"]
+    assert [a.status_code for a in answers] == [201, 201], answers[1].text
+    assert answers[0].json() == answers[1].json()
+    assert len(client.get(path).json()[name]) == before + 1
+    other = client.post(path, files={"file": ("car.ply", content + b"\0")}, headers=KEY)
+    assert other.json()["code"] == ErrorCode.IDEMPOTENCY_CONFLICT
