@@ -12,7 +12,6 @@ from real2sim_proto.scenes import Readiness
 from real2sim_server.service.app import create_app
 from real2sim_server.service.storage.store import StoreError
 
-
 HERE = {"Host": "127.0.0.1"}
 
 
