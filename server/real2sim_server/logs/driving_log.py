@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -64,6 +65,23 @@ class ObjectTrack:
         return path.transform(min(max(t_us, path.start_us), path.end_us))
 
 
+@contextmanager
+def damage_named(where: str) -> Iterator[None]:
+    """Any error of the block as one of a damaged log, as far as a reader did not say it better.
+
+    Raises:
+        LogError: with ``where`` and the error.
+    """
+    try:
+        yield
+    except LogError:
+        raise
+    except Exception as error:
+        raise LogError(
+            f"{where}: is damaged, or not as its layout asks ({type(error).__name__}: {error})"
+        ) from error
+
+
 class FrameSource(Protocol):
     """Reads the heavy parts of a log, one file at a time."""
 
@@ -120,7 +138,9 @@ class DrivingLog:
         if camera in self.provenance.get("cameras_without_images", ()):
             raise LogError(f"log {self.name!r}: camera {camera!r} has no images")
         expected = self.rig[camera]
-        image = self.source.image(camera, self._checked(frame))
+        checked = self._checked(frame)
+        with damage_named(f"log {self.name!r}: image of camera {camera!r} at frame {frame}"):
+            image = self.source.image(camera, checked)
         if image.shape != (expected.height, expected.width, 3):
             raise LogError(
                 f"log {self.name!r}: image of camera {camera!r} at frame {frame} is {image.shape}, "
@@ -143,7 +163,9 @@ class DrivingLog:
         Raises:
             LogError: the sweep is missing or broken.
         """
-        return self.source.lidar(self._checked(frame))
+        checked = self._checked(frame)
+        with damage_named(f"log {self.name!r}: sweep of frame {frame}"):
+            return self.source.lidar(checked)
 
     def _checked(self, frame: int) -> int:
         if not 0 <= frame < self.frame_count:

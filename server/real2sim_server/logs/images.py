@@ -98,11 +98,14 @@ def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
     import simplejpeg
 
     try:
-        return np.asarray(simplejpeg.decode_jpeg(data, "RGB"))
-    except ValueError as error:
-        # Some cameras put a few bytes between segments, which harms nothing.
-        if "extraneous bytes" in str(error):
+        try:
+            return np.asarray(simplejpeg.decode_jpeg(data, "RGB"))
+        except ValueError as error:
+            # Some cameras put a few bytes between segments, which harms nothing.
+            if "extraneous bytes" not in str(error):
+                raise
             return np.asarray(simplejpeg.decode_jpeg(data, "RGB", strict=False))
+    except ValueError as error:
         raise LogError(f"{where}: is a damaged JPEG image ({error})") from error
 
 

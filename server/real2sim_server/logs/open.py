@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .driving_log import DrivingLog, LogError
+from .driving_log import DrivingLog, LogError, damage_named
 from .readers import READERS, LogReader
 
 
@@ -24,7 +24,9 @@ def open_log(
     folder = Path(path)
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; a log is a folder\n{_known_formats()}")
-    return _reader_for(folder, format).read(folder, sequence=sequence)
+    reader = _reader_for(folder, format)
+    with damage_named(f"{folder} ({reader.name})"):
+        return reader.read(folder, sequence=sequence)
 
 
 def _reader_for(folder: Path, format_name: str | None) -> LogReader:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from real2sim_server.logs import LogError, open_log
+from real2sim_server.logs.readers.native import NativeReader
 
 
 def test_missing_folder_is_named(tmp_path: Path) -> None:
@@ -25,3 +26,12 @@ def test_unknown_format_lists_the_known_ones(tmp_path: Path) -> None:
 def test_named_format_is_not_guessed(written_native: Path) -> None:
     with pytest.raises(LogError, match="image_02"):
         open_log(written_native, format="kitti")
+
+
+def test_damage_that_a_reader_does_not_foresee_is_a_log_error(native_folder, monkeypatch):
+    def fail(self, path, *, sequence=None):
+        raise KeyError("a token")
+
+    monkeypatch.setattr(NativeReader, "read", fail)
+    with pytest.raises(LogError, match=r"native.*is damaged.*KeyError.*a token"):
+        open_log(native_folder)

@@ -191,3 +191,9 @@ def test_other_file_is_named(folder: Path) -> None:
 def test_message_that_is_none_is_named() -> None:
     with pytest.raises(LogError, match="here: is no protocol-buffer message"):
         ProtoMessage(b"\x0a\xff\x01", "here")
+
+
+def test_packed_numbers_that_are_cut_off_are_an_error():
+    message = ProtoMessage(b"\x1a\x02\x01\x80", "segment")
+    with pytest.raises(LogError, match="segment: field 3 is cut off"):
+        message.integers(3)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import zipfile
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from real2sim_proto import decode, encode
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Delete, Translate
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.edit.apply import replay_operations
+from real2sim_server.world.recording import recording as recording_module
 from real2sim_server.world.recording.recording import (
     RecordingError,
     first_difference,
@@ -149,6 +156,83 @@ def test_files_that_are_no_recording_are_refused(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"recording|version 99"):
         load_recording(path)
+
+
+def rewritten(path, recording, name, change):
+    """The recording as a file with one part changed by ``change``, in place."""
+    parts = {}
+    with zipfile.ZipFile(io.BytesIO(to_bytes(recording))) as archive:
+        parts = {n: archive.read(n) for n in archive.namelist()}
+    is_json = name.endswith(".json")
+    fields = json.loads(parts[name]) if is_json else decode(parts[name])
+    change(fields)
+    parts[name] = json.dumps(fields).encode() if is_json else encode(fields)
+    with zipfile.ZipFile(path, "w") as archive:
+        for entry, data in parts.items():
+            archive.writestr(entry, data)
+    return path
+
+
+def _put(key, value):
+    return lambda fields: fields.__setitem__(key, value)
+
+
+def _row(key, value):
+    return lambda fields: fields["instants"][0].__setitem__(key, value)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("episode.json", _put("scene", 5)),
+        ("episode.json", _put("scores", [1])),
+        ("log.msgpack", _put("entries", [["reset", 0]])),
+        ("log.msgpack", _put("entries", [["dance", 0, b""]])),
+        ("instants.msgpack", _put("instants", [])),
+        ("instants.msgpack", _row("ids", ["a"])),
+        ("instants.msgpack", _row("ego", [0.0] * 3)),
+        ("instants.msgpack", _row("yaws", np.full(3, np.nan))),
+        ("instants.msgpack", _row("centres", np.zeros((3, 2)))),
+        ("instants.msgpack", _row("step", 1.5)),
+        ("instants.msgpack", _row("plan", [[2, 1], [[0, 0, 0]] * 2])),
+        ("instants.msgpack", _row("contacts", [{"side": "above"}])),
+        ("context.msgpack", _put("route", np.zeros((1, 2)))),
+        ("context.msgpack", _put("route", np.array([[0.0, 0], [1e300, 0]]))),
+        ("context.msgpack", _put("route", np.array([[0.0, 0], [1e9, 0]]))),
+        ("context.msgpack", _put("horizon", 3)),
+        ("context.msgpack", _put("dt", "soon")),
+        ("context.msgpack", _put("lanes", [np.zeros((3, 1))])),
+    ],
+)
+def test_damage_inside_is_told_by_name(recording, tmp_path, part, change):
+    path = rewritten(tmp_path / "episode.r2e", recording, part, change)
+    with pytest.raises(RecordingError, match=r"episode\.r2e"):
+        load_recording(path)
+
+
+def test_damage_anywhere_in_the_file_is_told_by_name(recording, tmp_path):
+    whole = to_bytes(recording)
+    path = tmp_path / "episode.r2e"
+    generator = np.random.default_rng(3)
+    for place in generator.integers(0, len(whole), 150):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(generator.integers(8))
+        path.write_bytes(damaged)
+        with contextlib.suppress(RecordingError):
+            load_recording(path).rescore()
+
+
+def test_a_file_that_unpacks_to_more_than_is_allowed_is_refused(recording, tmp_path, monkeypatch):
+    path = save_recording(recording, tmp_path / "episode.r2e")
+    monkeypatch.setattr(recording_module, "MAX_BYTES", 1000)
+    with pytest.raises(RecordingError, match="allowed are 1000"):
+        load_recording(path)
+
+
+def test_an_entry_that_cannot_be_applied_is_named(recording, scene):
+    broken = replace(recording, entries=(*recording.entries[:2], Entry("edit", 1, b"\x80")))
+    with pytest.raises(RecordingError, match=r"entry 2 \(edit, step 1\) is damaged"):
+        first_difference(broken, Replayer.on(scene, ScenarioState.of(scene)))
 
 
 def test_the_last_episode_begins_at_the_last_reset():

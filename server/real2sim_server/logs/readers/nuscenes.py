@@ -148,7 +148,8 @@ def _recordings(tables: Tables, samples: set[str]) -> dict[str, _Recording]:
     rows: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for row in tables.rows("sample_data"):
         if row["sample_token"] in samples:
-            rows[channels[row["calibrated_sensor_token"]]].append(row)
+            sensor = tables.row("calibrated_sensor", row["calibrated_sensor_token"])
+            rows[channels[sensor["token"]]].append(row)
     return {
         channel: _Recording(sorted(found, key=lambda r: int(r["timestamp"])))
         for channel, found in sorted(rows.items())

@@ -37,6 +37,7 @@ from .waymo.segment import (
 )
 
 TYPES = {"vehicle": 1, "pedestrian": 2, "sign": 3, "cyclist": 4, "misc": 0}
+MAX_TIME_S = 1e12
 LASER = (1.43, 0.0, 2.184)
 """Where Waymo's TOP laser sits on the vehicle [m]; the folder does not say."""
 
@@ -111,7 +112,7 @@ class _Times:
         if by_frame is None:
             return None
         value = by_frame.get(f"{frame:06d}") if isinstance(by_frame, dict) else None
-        if not isinstance(value, int | float) or not np.isfinite(value):
+        if not isinstance(value, int | float) or not abs(value) < MAX_TIME_S:
             raise LogError(f"{self._path}: {sensor!r} has no time of frame {frame:06d}")
         return round(value * 1e6)
 

@@ -30,9 +30,10 @@ from typing import IO, Any
 from real2sim_proto import decode, encode
 
 from ..._npy import read_entries
-from ...edit import AssetLookup, ScenarioState, pack_state, unpack_state
+from ...edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_state
 from ...scene import Scene
 from .. import scoring
+from ..errors import WorldError
 from ..scoring import (
     Instant,
     MetricAccumulator,
@@ -322,10 +323,14 @@ def first_difference(recording: Recording, replayer: Replayer) -> int | None:
     Args:
         recording: of the episode.
         replayer: fresh, on the same scene.
+
+    Raises:
+        RecordingError: an entry that cannot be applied.
+        WorldError, EditError: one that never took effect.
     """
     digests: list[str] = []
-    for entry in recording.entries:
-        world = replayer.apply(entry)
+    for number, entry in enumerate(recording.entries):
+        world = _applied(replayer, entry, number)
         if entry.kind == "snapshot":
             continue
         del digests[world.steps :]
@@ -335,3 +340,15 @@ def first_difference(recording: Recording, replayer: Replayer) -> int | None:
     if not differing and len(digests) != len(recording.digests):
         return min(len(digests), len(recording.digests))
     return differing[0] if differing else None
+
+
+def _applied(replayer: Replayer, entry: Entry, number: int) -> World:
+    try:
+        return replayer.apply(entry)
+    except (WorldError, EditError):
+        raise
+    # What an entry holds is looked at where it is applied.
+    except Exception as error:
+        raise RecordingError(
+            f"entry {number} ({entry.kind}, step {entry.step}) is damaged: {error}"
+        ) from error

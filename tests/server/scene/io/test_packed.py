@@ -1,5 +1,7 @@
 """Packed scenes: how near they come back, and what is refused."""
 
+import contextlib
+import io
 import json
 import zipfile
 from dataclasses import replace
@@ -113,6 +115,34 @@ def test_a_missing_array_is_refused(packed, tmp_path):
             if name != "background.quats.npy":
                 target.writestr(name, source.read(name))
     with pytest.raises(BundleError, match="damaged"):
+        read_packed(other)
+
+
+def test_damage_anywhere_in_the_file_is_told_by_name(packed, tmp_path):
+    whole = packed.read_bytes()
+    path = tmp_path / "damaged.r2s.zip"
+    generator = np.random.default_rng(3)
+    places = [*generator.integers(0, len(whole), 100), *range(len(whole) - 100, len(whole))]
+    for place in places:
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(generator.integers(8))
+        path.write_bytes(damaged)
+        with contextlib.suppress(BundleError):
+            read_packed(path)
+
+
+def test_an_array_that_promises_more_than_there_is_is_refused(packed, tmp_path):
+    other = tmp_path / "other.r2s.zip"
+    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(other, "w") as target:
+        for name in source.namelist():
+            data = source.read(name)
+            if name == "background.means.npy":
+                head = io.BytesIO()
+                described = {"descr": "<u2", "fortran_order": False, "shape": (10**12, 3)}
+                np.lib.format.write_array_header_1_0(head, described)
+                data = head.getvalue()
+            target.writestr(name, data)
+    with pytest.raises(BundleError, match="needs 6000000000000 bytes"):
         read_packed(other)
 
 

@@ -20,7 +20,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise LogError(f"{path}: is no JSON file ({error})") from error
 
 
@@ -37,6 +37,8 @@ class Tables:
             if not isinstance(content, list) or not all(isinstance(r, dict) for r in content):
                 raise LogError(f"{self.path(name)}: expected a list of objects")
             rows = [_Row(r, self.path(name)) for r in content]
+            if not all(isinstance(r["token"], str) for r in rows):
+                raise LogError(f"{self.path(name)}: a token is no text")
             self._rows[name] = rows
             self._by_token[name] = {r["token"]: r for r in rows}
 
@@ -52,7 +54,7 @@ class Tables:
         """The row with a token. Raises LogError where there is none."""
         try:
             return self._by_token[name][token]
-        except KeyError:
+        except (KeyError, TypeError):
             raise LogError(f"{self.path(name)}: has no row with token {token!r}") from None
 
 

@@ -190,9 +190,12 @@ class ProtoMessage:
                 found.append(value)
                 continue
             position = 0
-            while position < len(value):
-                item, position = _varint(value, position)
-                found.append(item)
+            try:
+                while position < len(value):
+                    item, position = _varint(value, position)
+                    found.append(item)
+            except (IndexError, ValueError) as error:
+                raise LogError(f"{self.where}: field {number} is cut off ({error})") from error
         return found
 
 

@@ -1,0 +1,53 @@
+"""Damaged files of every kind: each reader refuses them by its own error, in time and in memory.
+
+``REAL2SIM_FUZZ_INPUTS`` (2000 for each reader) and ``REAL2SIM_FUZZ_SEED`` (0) say how many inputs
+and which; ``REAL2SIM_FUZZ_CORPUS`` is the folder in which inputs of interest are kept from run to
+run.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent
+
+
+def _module(name: str):
+    spec = importlib.util.spec_from_file_location(f"fuzz_{name}", FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+check = _module("check")
+NAMES = (
+    "ply", "playcanvas_ply", "spz", "spz_packed", "spz4", "splat", "bundle", "asset", "packed",
+    "packed_zip", "recording", "recording_zip", "mcap", "pickle", "checkpoint", "checkpoint_zip",
+    "old_checkpoint", "image", "sweep", "protobuf", "tfrecord", "parquet", "feather", "message",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_input_is_refused(name, pytestconfig):
+    if name == "mcap":
+        pytest.importorskip("mcap")
+    check.check_target(name, pytestconfig)
+
+
+@pytest.mark.timeout(120)
+def test_the_same_seed_gives_the_same_inputs():
+    sys.path.insert(0, str(FOLDER))
+    try:
+        import random
+
+        mutation = _module("mutation")
+        runs = [mutation.damaged_bytes(b"0123456789" * 50, [], random.Random(7)) for _ in range(2)]
+    finally:
+        sys.path.remove(str(FOLDER))
+    assert runs[0] == runs[1] != b"0123456789" * 50
