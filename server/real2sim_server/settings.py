@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field, SecretStr
+from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 GIB = 1024**3
@@ -24,6 +26,7 @@ class Settings(BaseSettings):
     Attributes:
         host, port: where to listen; an address beyond loopback needs ``token``.
         token: bearer token that every request but ``/livez`` and ``/readyz`` must carry.
+        token_file: file that holds the token, as an orchestrator mounts it.
         worker_id: first part of session ids, so that a proxy can find the worker again.
         data_dir: what the worker writes; the next five lie below it by default.
         scenes_dir: folder of scene bundles.
@@ -66,10 +69,13 @@ class Settings(BaseSettings):
         log_level, log_format: ``auto`` is text on a terminal and JSON elsewhere.
     """
 
-    model_config = SettingsConfigDict(env_prefix="REAL2SIM_", frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(
+        env_prefix="REAL2SIM_", frozen=True, extra="forbid", hide_input_in_errors=True
+    )
 
     host: str = "127.0.0.1"
     port: int = Field(default=8600, ge=0, le=65535)
+    token_file: Path | None = None
     token: SecretStr | None = Field(default=None, min_length=8)
     worker_id: str = Field(default="w0", pattern=r"^w[0-9]{1,6}$")
     data_dir: Path = Field(default_factory=_default_data_dir)
@@ -111,6 +117,16 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["auto", "json", "text"] = "auto"
 
+    @model_validator(mode="before")
+    @classmethod
+    def _token_of_file(cls, given: dict[str, Any]) -> dict[str, Any]:
+        file = given.get("token_file")
+        if not file:
+            return given
+        if given.get("token") is not None:
+            raise ValueError("token and token_file are both given; one of them is enough")
+        return given | {"token": read_token(Path(file))}
+
     @property
     def scenes_path(self) -> Path:
         """Folder of scene bundles."""
@@ -135,3 +151,40 @@ class Settings(BaseSettings):
     def database_url(self) -> str:
         """SQLAlchemy URL of the store."""
         return self.store_url or f"sqlite:///{self.data_dir / 'real2sim.db'}"
+
+
+OTHER_VARIABLES = frozenset(
+    {"REAL2SIM_DEBUG", "REAL2SIM_MEMORY", "REAL2SIM_SCENES", "REAL2SIM_TEST_DATA", "REAL2SIM_URL"}
+)
+"""Of the client, the compose file and the tests."""
+
+LIKENESS = 0.8
+"""Share of letters from which on a name is taken for a misspelt one."""
+
+
+def read_token(file: Path) -> str:
+    """The token in a file, without the end of its line.
+
+    Raises:
+        ValueError: the file cannot be read.
+    """
+    try:
+        return file.read_text("utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise ValueError(f"the token cannot be read from {str(file)!r}: {reason}") from error
+
+
+def unknown_variables(names: Iterable[str]) -> dict[str, str | None]:
+    """Variables of the environment that look like settings and are none.
+
+    Returns:
+        For each the setting that it is probably meant to be, or None.
+    """
+    known = {f"REAL2SIM_{name.upper()}" for name in Settings.model_fields} | OTHER_VARIABLES
+    found: dict[str, str | None] = {}
+    for name in sorted(names):
+        if name.upper().startswith("REAL2SIM_") and name.upper() not in known:
+            near = difflib.get_close_matches(name.upper(), known, n=1, cutoff=LIKENESS)
+            found[name] = near[0] if near else None
+    return found

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 
-from ..console import CommandError
+from ..console import CommandError, errors
 from .command import command
 
 
@@ -20,7 +23,12 @@ def serve(
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 picks a free one.")] = None,
     scenes: Annotated[Path | None, typer.Option(help="Folder of scene bundles.")] = None,
     data: Annotated[Path | None, typer.Option(help="Folder for scenarios and sessions.")] = None,
-    token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File with the token; or set REAL2SIM_TOKEN.")
+    ] = None,
+    token: Annotated[
+        str | None, typer.Option(help="Shows in the process list: better --token-file.")
+    ] = None,
     backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda or reference")] = None,
 ) -> None:
     """Start a worker. Settings not given here come from REAL2SIM_* variables."""
@@ -28,8 +36,16 @@ def serve(
 
     from ..service.first_run import begin_compiling
     from ..service.preflight import check_start
-    from ..settings import Settings
+    from ..settings import Settings, read_token
 
+    _check_variables()
+    if token is not None:
+        _warn("--token shows in the process list; give --token-file, or set REAL2SIM_TOKEN")
+    elif token_file is not None:
+        try:
+            token = read_token(token_file)
+        except ValueError as error:
+            raise CommandError(str(error)) from error
     options: dict[str, Any] = {
         "host": host,
         "port": port,
@@ -42,9 +58,7 @@ def serve(
     try:
         settings = Settings(**given)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise CommandError(f"setting {name}: {first['msg']} (given: {first['input']!r})") from error
+        raise CommandError(_said(error.errors()[0])) from None
     # Before the worker's libraries are loaded, which takes seconds.
     check_start(settings)
     begin_compiling()
@@ -52,3 +66,33 @@ def serve(
 
     if code := worker.run(settings):
         raise typer.Exit(code)
+
+
+def _check_variables() -> None:
+    """Refuse a misspelt setting, which would silently not count; warn of others that are unknown.
+
+    Raises:
+        CommandError: naming it, and the setting that is probably meant.
+    """
+    from ..settings import unknown_variables
+
+    for name, nearest in unknown_variables(os.environ).items():
+        if nearest is not None:
+            raise CommandError(
+                f"{name} is no setting; do you mean {nearest}? Correct it, or unset {name}"
+            )
+        _warn(f"{name} is no setting of a worker, and is ignored")
+
+
+def _said(error: Mapping[str, Any]) -> str:
+    """What is wrong with a setting; secrets are not shown."""
+    name = ".".join(str(part) for part in error["loc"])
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if not name:
+        return message
+    given = "" if name == "token" else f" (given: {error['input']!r})"
+    return f"setting {name}: {message}{given}"
+
+
+def _warn(message: str) -> None:
+    errors.print(f"[yellow]warning:[/] {escape(message)}", highlight=False, soft_wrap=True)

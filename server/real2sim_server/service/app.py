@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
@@ -73,7 +73,12 @@ def create_app(settings: Settings) -> FastAPI:
         # warnings.catch_warnings(), which other threads must not use at the same time.
         await _build_routes(app)
         app.openapi_schema = published(app)
-        async with worker.running():
+        async with AsyncExitStack() as at_exit:
+            try:
+                await at_exit.enter_async_context(worker.running())
+            except Exception as error:
+                worker.start_error = error
+                raise
             yield
 
     app = FastAPI(

@@ -306,11 +306,16 @@ class Engine:
         self._jobs.discard(lambda job: job.future.cancelled())
 
     def _work(self) -> None:
-        lower_priority(NICENESS)
-        while (job := self._next()) is not None:
-            self._start(job)
-            # The job holds arguments and result; an idle engine must not keep them alive.
-            del job
+        try:
+            lower_priority(NICENESS)
+            while (job := self._next()) is not None:
+                self._start(job)
+                # The job holds arguments and result; an idle engine must not keep them alive.
+                del job
+        except BaseException as error:
+            # Without its thread an engine answers nobody: who waits is told, and the worker ends.
+            log.exception("engine ended")
+            self._lose_device(error)
 
     def _next(self) -> _EngineJob | None:
         with self._changed:
@@ -391,7 +396,9 @@ def lower_priority(niceness: int) -> None:
     if sys.platform == "linux":
         thread = threading.get_native_id()
         if os.getpriority(os.PRIO_PROCESS, thread) < niceness:
-            os.setpriority(os.PRIO_PROCESS, thread, niceness)
+            # Where a sandbox forbids it, all goes on at one priority.
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
 
 def _fail(jobs: Iterable[_EngineJob], error: EngineError) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import logging
 import signal
 import sys
 import threading
@@ -19,6 +20,7 @@ from fastapi import FastAPI
 
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 
+from ..console import is_expected
 from ..settings import Settings
 from .app import create_app
 from .http.auth import check_bind
@@ -56,6 +58,8 @@ def run(settings: Settings) -> int:
         SceneFolderError: the folder of scenes is missing.
         AddressError: the address is taken, or none of this machine.
         RenderError: the backend of the settings cannot be used here.
+        StateFolderError: another worker is on the state folder, or it cannot be written to.
+        StoreError: the store cannot be opened.
     """
     check_bind(settings.host, _token(settings))
     check_scenes(settings)
@@ -70,8 +74,10 @@ def run(settings: Settings) -> int:
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
     # The server stops gracefully at a signal and then raises it once more for us.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt), _start_errors_told_once(worker):
         server.run(sockets=[listener])
+    if worker.start_error is not None:
+        raise worker.start_error
     return 0 if worker.engine.failure is None and server.started else 1
 
 
@@ -95,17 +101,40 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
     app = create_app(settings)
     listen(listener)
     server = uvicorn.Server(server_config(app, settings))
-    thread = threading.Thread(
-        target=server.run, kwargs={"sockets": [listener]}, name="worker", daemon=True
-    )
+    worker: Worker = app.state.worker
+
+    def serve() -> None:
+        with _start_errors_told_once(worker):
+            server.run(sockets=[listener])
+
+    thread = threading.Thread(target=serve, name="worker", daemon=True)
     thread.start()
     try:
-        _wait_until_ready(listener.getsockname(), thread, timeout_s)
-        yield RunningWorker(url_of(settings.host, listener), _token(settings), app.state.worker)
+        _wait_until_ready(listener.getsockname(), thread, timeout_s, worker)
+        yield RunningWorker(url_of(settings.host, listener), _token(settings), worker)
     finally:
         server.should_exit = True
         thread.join(settings.graceful_seconds + 30)
         listener.close()
+
+
+@contextmanager
+def _start_errors_told_once(worker: Worker) -> Iterator[None]:
+    """Whoever starts the worker is told what is in its way: no traceback in the log besides."""
+
+    def is_news(_record: logging.LogRecord) -> bool:
+        return worker.start_error is None or not is_expected(worker.start_error)
+
+    server_log = logging.getLogger("uvicorn.error")
+    server_log.addFilter(is_news)
+    try:
+        yield
+    except SystemExit:
+        # The server's way to say that it has not started.
+        if worker.start_error is None:
+            raise
+    finally:
+        server_log.removeFilter(is_news)
 
 
 class DrainingServer(uvicorn.Server):
@@ -171,12 +200,15 @@ def _token(settings: Settings) -> str | None:
     return settings.token.get_secret_value() if settings.token else None
 
 
-def _wait_until_ready(address: tuple[str, int], thread: threading.Thread, timeout_s: float) -> None:
+def _wait_until_ready(
+    address: tuple[str, int], thread: threading.Thread, timeout_s: float, worker: Worker
+) -> None:
     deadline = time.monotonic() + timeout_s
     answer = "no answer yet"
     while time.monotonic() < deadline:
         if not thread.is_alive():
-            raise RuntimeError("the worker ended while it started; see its log")
+            reason = worker.start_error or "see its log"
+            raise RuntimeError(f"the worker ended while it started: {reason}")
         # Short, because a worker that has died leaves the connection open and silent.
         ready, answer = _ask_readiness(address, timeout_s=0.5)
         if ready:

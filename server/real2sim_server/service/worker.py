@@ -55,6 +55,7 @@ class Worker:
         device: what draws, and why.
         waiting_for: what has to happen before the worker is ready.
         draining: whether the worker is on its way out.
+        start_error: why it did not start.
     """
 
     settings: Settings
@@ -76,6 +77,7 @@ class Worker:
     imports: ImportQueue = field(default_factory=ImportQueue)
     waiting_for: set[str] = field(default_factory=lambda: {"start"})
     draining: bool = False
+    start_error: Exception | None = None
 
     @classmethod
     def build(cls, settings: Settings) -> Worker:

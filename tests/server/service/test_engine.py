@@ -417,3 +417,40 @@ def test_a_process_of_low_priority_starts_its_engine_at_that_priority():
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert ran.stdout == "7\n", ran.stderr
+
+
+def test_an_engine_whose_thread_ends_tells_those_who_wait(monkeypatch):
+    def fail(_niceness: int) -> None:
+        raise PermissionError("may not lower its niceness")
+
+    monkeypatch.setattr("real2sim_server.service.engine.lower_priority", fail)
+    engine, ended = Engine(), threading.Event()
+    engine.on_failure = ended.set
+    with pytest.raises(DeviceLostError, match="niceness"):
+        engine.start()
+    assert ended.wait(5)
+    assert not engine.alive
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads are Linux's")
+def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
+    code = (
+        "import os\n"
+        "os.nice(10)\n"
+        "if os.getuid() == 0: os.setuid(65534)\n"
+        "from real2sim_server.service.engine import Engine\n"
+        "engine = Engine()\n"
+        "engine.start()\n"
+        "print(engine.call_sync(lambda: 'works', timeout_s=30))\n"
+        "engine.stop()\n"
+    )
+    # While everything can still be read.
+    import_first = "import numba, torch, real2sim_server.service.engine\nnumba.get_num_threads()\n"
+    done = subprocess.run(
+        [sys.executable, "-c", import_first + code],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.stdout == "works\n", done.stderr[-2000:]

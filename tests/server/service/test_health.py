@@ -119,7 +119,7 @@ def test_two_workers_in_one_process_count_apart(start_worker, tmp_path):
 
 
 def test_a_store_that_cannot_be_opened_ends_the_start_and_leaves_no_thread(make_settings, tmp_path):
-    (tmp_path / "data").write_text("a file where a folder should be")
+    (tmp_path / "data" / "real2sim.db").mkdir(parents=True)
     before = threading.active_count()
     app = create_app(make_settings())
     with pytest.raises(StoreError), TestClient(app):

@@ -76,11 +76,10 @@ def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
     warm.set()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_worker_that_cannot_start_says_so_at_once(make_settings, tmp_path):
+def test_a_worker_that_cannot_start_says_why_at_once(make_settings, tmp_path):
     (tmp_path / "data").write_text("in the way")
     with (
-        pytest.raises(RuntimeError, match="ended while it started"),
+        pytest.raises(RuntimeError, match="ended while it started: the state folder"),
         running_worker(make_settings()),
     ):
         pass
