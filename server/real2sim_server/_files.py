@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<purpose>tmp|old)-[0-9a-f]{12}")
+"""What :func:`_sibling` calls things."""
 
 
 @contextmanager
@@ -48,6 +53,42 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         _exchange(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def sweep_leftovers(folder: Path, *, unused_s: float, prefix: str | None = None) -> list[Path]:
+    """Remove what killed programs have left unfinished in a folder; what was removed.
+
+    A folder that was moved aside, and whose place is empty, goes back there.
+
+    Args:
+        folder: of which the entries are looked at; it need not exist.
+        unused_s: seconds for which nobody may have written to what is removed.
+        prefix: of the hidden names to remove instead of those that this module makes.
+    """
+    removed = []
+    for path in sorted(folder.glob(".*")):
+        made = None if prefix else _TEMPORARY.fullmatch(path.name)
+        if made is None and not (prefix and path.name.startswith(prefix)):
+            continue
+        try:
+            if time.time() - _last_written(path) < unused_s:
+                continue
+            if made and made["purpose"] == "old" and not (folder / made["name"]).exists():
+                path.rename(folder / made["name"])
+                continue
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            removed.append(path)
+        except OSError:
+            # Gone meanwhile, or not ours to remove.
+            continue
+    return removed
+
+
+def _last_written(path: Path) -> float:
+    """Of a file, or of anything in a folder [s since 1970]."""
+    below = path.rglob("*") if path.is_dir() else ()
+    times: list[float] = [entry.lstat().st_mtime for entry in (path, *below)]
+    return max(times)
 
 
 def _exchange(new: Path, path: Path) -> None:

@@ -38,6 +38,9 @@ class Settings(BaseSettings):
         durability: what is on the disk before it is acknowledged: ``all``; ``edits``, which is all
             but the steps of sessions; or ``process``, nothing. The rest is safe when the process
             is killed, and its last seconds are lost when the machine loses power. SQLite only.
+        store_max_bytes: size above which the oldest ended sessions are removed.
+        session_retention_days: after which ended sessions are removed, and unused ones ended.
+        job_retention_days: after which ended jobs are removed, with their files.
         backend: what draws: ``auto`` chooses by the hardware at hand.
         threads: of numba and torch; 0 for one per core.
         scene_memory_bytes: budget of resident scenes and assets together.
@@ -85,6 +88,9 @@ class Settings(BaseSettings):
     jobs_dir: Path | None = None
     store_url: str | None = None
     store_timeout_seconds: float = Field(default=5.0, ge=0.1, le=600)
+    store_max_bytes: int = Field(default=8 * GIB, ge=MIB)
+    session_retention_days: float = Field(default=30.0, gt=0, le=36_500)
+    job_retention_days: float = Field(default=30.0, gt=0, le=36_500)
     durability: Literal["all", "edits", "process"] = "edits"
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
     threads: int = Field(default=0, ge=0, le=1024)

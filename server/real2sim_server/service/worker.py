@@ -40,6 +40,7 @@ from .storage.job_log import JobLog
 from .storage.ownership import owned_folder
 from .storage.store import Store
 from .storage.tokens import worker_key
+from .upkeep import Upkeep
 from .warm_up import KernelWarmUp
 
 LAG_PERIOD_S = 0.1
@@ -167,6 +168,9 @@ class Worker:
             await self.store.open()
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.store.watch()))
             at_exit.push_async_callback(self.scenarios.flush)
+            upkeep = Upkeep(self.settings, self.store, self.jobs, self.sessions)
+            # Nobody uploads yet: what lies about now was left behind.
+            await asyncio.to_thread(upkeep.sweep)
             await self.scene_cache.refresh()
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
@@ -174,6 +178,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.connections.watch()))
             await at_exit.enter_async_context(self.sessions.running())
             await at_exit.enter_async_context(self.jobs.running())
+            at_exit.push_async_callback(_cancel, asyncio.create_task(upkeep.run()))
             at_exit.callback(self.drain)
             yield self
 

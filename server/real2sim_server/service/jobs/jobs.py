@@ -145,6 +145,8 @@ class Jobs:
             ended = _ended(info, JobState.INTERRUPTED, error=_interruption())
             newest = {"event": info.event + UNKNOWN_EVENTS}
             await self._log.update(ended.model_copy(update=newest))
+            folder = self._folder / info.job_id
+            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
             log.warning("job interrupted", job_id=info.job_id, kind=info.kind)
         try:
             yield self
@@ -284,6 +286,15 @@ class Jobs:
                 yield event
             if job.info.over and job.info.event <= after:
                 return
+
+    async def forget_before(self, created_us: int) -> int:
+        """Forget ended jobs that were begun before, with their files; how many."""
+        forgotten = 0
+        while found := await self._log.ended_before(created_us):
+            for job_id in found:
+                await self.cancel(job_id)
+            forgotten += len(found)
+        return forgotten
 
     # --- inside -----------------------------------------------------------------------------
 

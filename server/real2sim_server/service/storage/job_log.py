@@ -60,6 +60,12 @@ class JobLog:
         own = t.jobs.c.worker_id == self._worker_id
         return await self._select(own & t.jobs.c.state.in_(UNFINISHED), limit=100_000)
 
+    async def ended_before(self, created_us: int, *, limit: int = 100) -> list[str]:
+        """Ids of ended jobs of this worker that were begun before."""
+        mine = (t.jobs.c.worker_id == self._worker_id) & ~t.jobs.c.state.in_(UNFINISHED)
+        query = sa.select(t.jobs.c.job_id).where(mine & (t.jobs.c.created_us < created_us))
+        return [row["job_id"] for row in await self._store.read(query.limit(limit))]
+
     async def _select(self, condition: sa.ColumnElement[bool], *, limit: int) -> list[JobInfo]:
         query = sa.select(t.jobs.c.document).where(condition)
         query = query.order_by(t.jobs.c.created_us.desc(), t.jobs.c.job_id).limit(limit)

@@ -48,6 +48,9 @@ __all__ = [
 
 T = TypeVar("T")
 
+ROW_BYTES = 120
+"""About what a row of a log takes beside its payload, with its index."""
+
 REPLY_LIFETIME_US = 24 * 3600 * 1_000_000
 
 
@@ -367,6 +370,54 @@ class Store:
         row = rows[0]
         headers = json.loads(row["headers"])
         return StoredReply(key, row["fingerprint"], row["status"], headers, row["body"])
+
+    async def forget_old_replies(self) -> None:
+        """Remove the answers that are kept no longer."""
+        await self._write(Write(_delete_old_replies()))
+
+    # --- size -------------------------------------------------------------------------------
+
+    async def size_bytes(self) -> int:
+        """What the store takes, without what it could give back; of a server about its logs."""
+        if self._connected().dialect.name == "sqlite":
+            return await self._patiently(self._pages_bytes)
+        log = t.session_log
+        payload = sa.func.coalesce(sa.func.sum(sa.func.length(log.c.payload)), 0)
+        query = sa.select(payload.label("bytes"), sa.func.count().label("rows")).select_from(log)
+        (row,) = await self._read(query)
+        return int(row["bytes"]) + ROW_BYTES * int(row["rows"])
+
+    async def give_back(self, pages: int) -> bool:
+        """Give free pages of a database file back to the disk; whether there are more."""
+        if self._file is None:
+            return False
+        return await self._patiently(partial(self._shrink, pages))
+
+    def _pages_bytes(self) -> int:
+        with self._connected().connect() as connection:
+            count, free, size = (
+                connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
+                for name in ("page_count", "freelist_count", "page_size")
+            )
+        return int((count - free) * size)
+
+    def _shrink(self, pages: int) -> bool:
+        try:
+            with self._write_lock, self._connected().connect() as connection:
+                raw = connection.connection.dbapi_connection
+                assert raw is not None
+                cursor = raw.cursor()
+                (before,) = cursor.execute("PRAGMA freelist_count").fetchone()
+                # A row a page: it goes on as the rows are read.
+                cursor.execute(f"PRAGMA incremental_vacuum({pages})").fetchall()
+                (after,) = cursor.execute("PRAGMA freelist_count").fetchone()
+                more = 0 < after < before
+                if not more:
+                    cursor.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+                cursor.close()
+                return bool(more)
+        except Exception as error:
+            self._reraise(error)
 
     # --- other tables -------------------------------------------------------------------
 

@@ -1,0 +1,172 @@
+"""What a store lets go of by itself, and what it never does."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import replace
+
+import pytest
+import sqlalchemy as sa
+
+from real2sim_server.service.storage import retention as module
+from real2sim_server.service.storage import tables
+from real2sim_server.service.storage.retention import DAY_US, Retention, RetentionLimits
+from real2sim_server.service.storage.store import (
+    ScenarioRow,
+    SessionEntry,
+    SessionRow,
+    Store,
+    Write,
+    now_us,
+)
+
+from ..postgres import Postgres
+
+SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "hash", 1)
+GIB = 1024**3
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request, tmp_path) -> str:
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'store.db'}"
+    server: Postgres = request.getfixturevalue("postgres")
+    return server.new_database()
+
+
+def run(url: str, work):
+    async def inside():
+        store = Store(url)
+        await store.open()
+        try:
+            return await work(store)
+        finally:
+            await store.close()
+
+    return asyncio.run(inside())
+
+
+async def add(store, session_id, *, days_ago, ended=False, steps=3, payload=b"x") -> None:
+    """A session that was last used, and has ended or not, so many days ago."""
+    us = now_us() - round(days_ago * DAY_US)
+    entries = [SessionEntry(k, "action", k, payload, us) for k in range(steps)]
+    row = replace(SESSION, session_id=session_id, created_us=us - DAY_US)
+    await store.create_session(row, entries=entries)
+    if ended:
+        change = sa.update(tables.sessions).where(tables.sessions.c.session_id == session_id)
+        await store.write(Write(change.values(closed_us=us, reason="done")))
+
+
+async def kept(store) -> dict[str, bool]:
+    """Sessions that there are, and whether they are open."""
+    rows = await store.read(sa.select(tables.sessions))
+    return {row["session_id"]: row["closed_us"] is None for row in rows}
+
+
+def tidy(store, *, days=30.0, max_bytes=GIB, in_use=()):
+    limits = RetentionLimits(days, max_bytes)
+    return Retention(store, limits, worker_id="w0").tidy(in_use=in_use)
+
+
+def test_ended_sessions_go_with_their_logs_after_their_time(url, monkeypatch):
+    monkeypatch.setattr(module, "PIECE_ROWS", 10)
+
+    async def work(store):
+        await add(store, "w0.old", days_ago=31, ended=True, steps=35)
+        await add(store, "w0.new", days_ago=29, ended=True)
+        removed = await tidy(store)
+        return removed, await kept(store), len(await store.session_entries("w0.old"))
+
+    assert run(url, work) == (1, {"w0.new": False}, 0)
+
+
+def test_sessions_that_nobody_uses_are_ended_and_others_are_not(url):
+    async def work(store):
+        await add(store, "w0.forgotten", days_ago=31)
+        await add(store, "w0.held", days_ago=31)
+        await add(store, "w0.used", days_ago=1)
+        await tidy(store, in_use={"w0.held"})
+        return await kept(store)
+
+    expected = {"w0.forgotten": False, "w0.held": True, "w0.used": True}
+    assert run(url, work) == expected
+
+
+def test_above_its_size_a_store_lets_the_oldest_ended_sessions_go(url):
+    async def work(store):
+        for n in range(20):
+            payload = bytes(10_000)
+            await add(store, f"w0.{n:02}", days_ago=20 - n, ended=True, steps=20, payload=payload)
+        await add(store, "w0.open", days_ago=20)
+        before = await store.size_bytes()
+        await tidy(store, max_bytes=before // 2)
+        return await kept(store), await store.size_bytes(), before
+
+    left, after, before = run(url, work)
+    assert after <= before // 2
+    assert "w0.open" in left
+    assert "w0.19" in left
+    assert "w0.00" not in left
+
+
+def test_scenarios_stay_whatever_they_take(url):
+    async def work(store):
+        await store.create_scenario(ScenarioRow("sc_1", "n", "tiny", "0" * 64, 1))
+        store.record_revision("sc_1", 1, {"kind": "edit", "x": "y" * 100_000}, created_us=1)
+        await tidy(store, max_bytes=1)
+        return await store.scenario_entries("sc_1")
+
+    assert len(run(url, work)) == 1
+
+
+def test_what_went_is_given_back_to_the_disk(tmp_path):
+    file = tmp_path / "store.db"
+    url = f"sqlite:///{file}"
+    log = {"steps": 200, "payload": bytes(10_000)}
+    run(url, lambda store: add(store, "w0.old", days_ago=31, ended=True, **log))
+    before = file.stat().st_size
+    assert before > 2_000_000
+    run(url, tidy)
+    assert file.stat().st_size < before / 4
+
+
+@pytest.mark.slow
+def test_a_week_of_work_stays_within_the_limit_and_opens_at_once(tmp_path):
+    """A million steps, 100,000 edits, 1,000 sessions."""
+    url, limit = f"sqlite:///{tmp_path / 'store.db'}", 200 * 1024**2
+    entry = {"kind": "edit", "operations": [{"op": "translate", "object_id": "post", "x": 1.0}]}
+
+    async def week(store) -> list[int]:
+        for n in range(100):
+            row = ScenarioRow(f"sc_{n}", "n", "tiny", "0" * 64, n)
+            log = [entry | {"revision": k + 1} for k in range(1000)]
+            await store.create_scenario(row, entries=log)
+        resident = []
+        for n in range(1000):
+            days_ago = 7 * (1 - n / 1000)
+            await add(
+                store, f"w0.{n}", days_ago=days_ago, ended=True, steps=1000, payload=b"p" * 250
+            )
+            if n % 100 == 99:
+                await tidy(store, max_bytes=limit)
+                resident.append(_resident_bytes())
+        return resident
+
+    resident = run(url, week)
+    assert resident[-1] - resident[1] < 50 * 1024**2
+    assert sum(f.stat().st_size for f in tmp_path.glob("store.db*")) < 1.2 * limit
+
+    async def open_and_read(store):
+        return len(await store.scenario_entries("sc_99")), len(
+            await store.session_entries("w0.999")
+        )
+
+    began = time.perf_counter()
+    assert run(url, open_and_read) == (1000, 1000)
+    assert time.perf_counter() - began < 1.0
+
+
+def _resident_bytes() -> int:
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * 4096

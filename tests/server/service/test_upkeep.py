@@ -1,0 +1,59 @@
+"""What killed runs have left goes at the next start; what is old goes by itself."""
+
+from __future__ import annotations
+
+import os
+import time
+
+from real2sim_server._files import sweep_leftovers
+from real2sim_server.service.storage import store as store_module
+
+HOUR_S = 3600
+
+
+def test_the_upload_of_a_worker_that_was_killed_is_gone_after_the_next_start(run_worker, tmp_path):
+    assets = tmp_path / "data" / "assets"
+    (assets / ".upload-abcdef012345").mkdir(parents=True)
+    (assets / ".upload-abcdef012345" / "big.ply").write_bytes(bytes(1000))
+    (assets / ".upload-fedcba543210.ply").write_bytes(bytes(1000))
+    with run_worker():
+        assert list(assets.iterdir()) == []
+
+
+def test_what_another_worker_is_uploading_to_a_shared_folder_stays(run_worker, scenes_dir):
+    fresh, old = scenes_dir / ".upload-aaaaaaaaaaaa.ply", scenes_dir / ".upload-bbbbbbbbbbbb.ply"
+    for file in (fresh, old):
+        file.write_bytes(b"ply")
+    long_ago = time.time() - 2 * HOUR_S
+    os.utime(old, (long_ago, long_ago))
+    try:
+        with run_worker():
+            assert (fresh.exists(), old.exists()) == (True, False)
+    finally:
+        fresh.unlink(missing_ok=True)
+        old.unlink(missing_ok=True)
+
+
+def test_a_folder_that_was_moved_aside_goes_back_where_its_place_is_empty(tmp_path):
+    for name in (".kept.r2s.old-0123456789ab", ".gone.r2s.old-0123456789ab", "gone.r2s"):
+        (tmp_path / name).mkdir()
+    (tmp_path / ".half.r2s.tmp-0123456789ab").mkdir()
+    (tmp_path / ".hidden").touch()
+    sweep_leftovers(tmp_path, unused_s=0.0)
+    assert {p.name for p in tmp_path.iterdir()} == {"kept.r2s", "gone.r2s", ".hidden"}
+
+
+def test_old_jobs_go_with_their_files(client, tmp_path, monkeypatch):
+    body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}
+    job = client.post("/v1/exports", json=body).json()
+    assert client.get(f"/v1/jobs/{job['job_id']}?wait_s=30").status_code == 200
+    worker = client.app.state.worker
+    for _ in range(300):
+        if client.get(f"/v1/jobs/{job['job_id']}").json()["state"] == "succeeded":
+            break
+        time.sleep(0.1)
+    folder = worker.settings.jobs_path / job["job_id"]
+    assert folder.is_dir()
+    client.portal.call(worker.jobs.forget_before, store_module.now_us() + 1)
+    assert client.get(f"/v1/jobs/{job['job_id']}").status_code == 404
+    assert not folder.exists()
