@@ -23,6 +23,7 @@ from typing import Any
 import httpx2
 import pytest
 from starlette.websockets import WebSocketDisconnect
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, encode
@@ -173,6 +174,18 @@ def test_a_client_that_never_reads_is_given_up(site):
 
 
 @pytest.mark.network
+def test_a_driver_that_never_reads_is_given_up(site):
+    before = dropped(site, "write_timeout")
+    info = create_session(site)
+    render = {"v": 1, "type": "render", "sensors": [{"camera": "front", "codec": "raw"}]}
+    with contextlib.suppress(ConnectionClosed), joined(info, max_queue=1) as drive:
+        drive.send(encode({"v": 1, "type": "reset", "id": 2, "spec": {}}))
+        for k in range(5000):
+            drive.send(encode(render | {"id": 3 + k}))
+    assert dropped(site, "write_timeout") > before
+
+
+@pytest.mark.network
 def test_bytes_that_are_no_http_get_a_problem_document(site):
     with opened(site.url) as connection:
         connection.sendall(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n")
@@ -300,10 +313,10 @@ def create_session(site: RunningWorker) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def joined(info: dict[str, Any], *, role: str = "controller") -> Iterator[Any]:
+def joined(info: dict[str, Any], *, role: str = "controller", **options: Any) -> Iterator[Any]:
     """A drive socket behind its welcome."""
     with connect(
-        info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
+        info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None, **options
     ) as drive:
         hello = {"protocols": [DRIVE_SUBPROTOCOL], "token": info["token"], "role": role}
         drive.send(encode({"v": 1, "type": "hello", "id": 1, **hello}))

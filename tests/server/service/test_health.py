@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.scenes import Readiness
 from real2sim_server.service.app import create_app
-from real2sim_server.service.storage.store import StoreError
+from real2sim_server.service.storage.ownership import StateFolderError
 
 HERE = {"Host": "127.0.0.1"}
 
@@ -122,7 +122,7 @@ def test_a_store_that_cannot_be_opened_ends_the_start_and_leaves_no_thread(make_
     (tmp_path / "data" / "real2sim.db").mkdir(parents=True)
     before = threading.active_count()
     app = create_app(make_settings())
-    with pytest.raises(StoreError), TestClient(app):
+    with pytest.raises(StateFolderError), TestClient(app):
         pass
     assert threading.active_count() <= before
 
@@ -170,3 +170,14 @@ def test_a_drive_socket_leaves_a_line_at_its_beginning_and_end(client, logged):
     lines = {e["event"]: e for e in logged if e["event"].startswith("drive socket")}
     assert lines["drive socket opened"]["role"] == "controller"
     assert lines["drive socket closed"]["steps"] == 0
+
+
+def test_a_view_socket_leaves_a_line_at_its_beginning_and_end(client, logged):
+    made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()
+    with client.websocket_connect(
+        f"/v1/scenarios/{made['scenario_id']}/view", headers=HERE
+    ) as view:
+        view.send_json({"type": "hello"})
+        view.receive_json()
+    told = [e["event"] for e in logged if e["event"].startswith("view socket")]
+    assert told == ["view socket opened", "view socket closed"]

@@ -212,6 +212,7 @@ def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(ma
     assert second == f"Studio: {url}/ui/\n"
     requests = [entry for line in lines if (entry := json.loads(line))["event"] == "request"]
     assert [(r["path"], r["status"]) for r in requests] == [("/v1/server", 200)]
+    assert requests[0]["client"] == "127.0.0.1"
     assert requests[0]["request_id"] == answer.headers["X-Request-Id"]
 
 

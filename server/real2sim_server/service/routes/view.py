@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 
+import structlog
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import TypeAdapter, ValidationError
 
@@ -23,6 +25,8 @@ CLOSED_TIMEOUT, CLOSED_FAILED = 4408, 4500
 
 # Not json.loads(): it follows nesting until the stack ends, and lets lone surrogates pass.
 _HELLO: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
+
+log = structlog.get_logger(__name__)
 
 router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
 
@@ -49,8 +53,9 @@ async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
             await _check_hello(socket, worker)
             await worker.scenarios.view(scenario_id)
             await socket.send_text(json.dumps({"type": "welcome"}))
-            await ViewConnection(socket, worker, scenario_id).serve()
+            await _serve(socket, worker, scenario_id)
     except NoHelloError as error:
+        log.info("view socket refused", code=error.code, reason=str(error))
         await socket.close(error.code, str(error))
     except WebSocketDisconnect:
         return
@@ -59,6 +64,16 @@ async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
         missing = failure.code is ErrorCode.UNKNOWN_SCENARIO
         code = CLOSED_NOT_FOUND if missing else CLOSED_FAILED
         await socket.close(code, close_reason(failure.detail))
+
+
+async def _serve(socket: WebSocket, worker: Worker, scenario_id: str) -> None:
+    started = time.perf_counter()
+    log.info("view socket opened", scenario_id=scenario_id)
+    try:
+        await ViewConnection(socket, worker, scenario_id).serve()
+    finally:
+        seconds = round(time.perf_counter() - started, 1)
+        log.info("view socket closed", scenario_id=scenario_id, seconds=seconds)
 
 
 async def _check_hello(socket: WebSocket, worker: Worker) -> None:
