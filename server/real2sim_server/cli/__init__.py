@@ -20,6 +20,7 @@ from . import (  # noqa: I001 - the order of the help
     train_policy,
     replay,
     serve,
+    backup,
     demo,
     doctor,
     bench,
@@ -30,6 +31,7 @@ app.add_typer(bench.app, name="bench")
 
 __all__ = [
     "app",
+    "backup",
     "bench",
     "demo",
     "doctor",

@@ -11,6 +11,7 @@ from .._files import sweep_leftovers
 from ..settings import Settings
 from .jobs.jobs import Jobs
 from .sessions import Sessions
+from .storage.backup import RESTORING
 from .storage.errors import StoreError
 from .storage.retention import DAY_US, Retention, RetentionLimits
 from .storage.store import Store, now_us
@@ -70,6 +71,7 @@ class Upkeep:
             removed += sweep_leftovers(folder, unused_s=unused_s, prefix=UPLOADS)
             removed += sweep_leftovers(folder, unused_s=OTHERS_UNUSED_S)
         removed += sweep_leftovers(settings.data_dir, unused_s=0.0)
+        removed += sweep_leftovers(settings.data_dir, unused_s=0.0, prefix=RESTORING)
         if removed:
             names = [path.name for path in removed[:10]]
             log.warning("leftovers removed", count=len(removed), names=names)

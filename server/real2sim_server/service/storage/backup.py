@@ -1,0 +1,234 @@
+"""Copies of a worker's store: taken while it works, and put back where none works.
+
+A backup is one tar file: what it is (`backup.json`), the database, and the bundles of the assets
+that scenarios may name. Scenes and results of jobs are files like others, and not in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import shutil
+import sqlite3
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path, PurePosixPath
+
+from . import tables as t
+from .errors import StoreError
+from .migrations import check_version
+from .ownership import owned_folder
+
+MANIFEST = "backup.json"
+DATABASE = "store.db"
+ASSETS = "assets"
+FORMAT = 1
+RESTORING = ".restore-"
+"""First part of the name of what is unpacked for a while in a state folder."""
+
+
+class BackupError(StoreError):
+    """A backup cannot be made or put back; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class BackupInfo:
+    """What a backup is.
+
+    Attributes:
+        format: of the file.
+        created_at: UTC, ISO 8601.
+        made_by: version of this program.
+        schema: version of the database's.
+        sha256: of the database.
+        assets: bundles in it.
+    """
+
+    format: int
+    created_at: str
+    made_by: str
+    schema: int
+    sha256: str
+    assets: int
+
+
+def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
+    """Copy a store, also while a worker writes to it: the copy is what it was at one instant.
+
+    Args:
+        database: SQLite file.
+        assets: folder of asset bundles; it need not exist.
+        out: tar file to make; must not exist.
+
+    Raises:
+        BackupError: there is no such database, or the copy is damaged.
+        OSError: ``out`` cannot be written.
+    """
+    if not database.is_file():
+        raise BackupError(f"there is no store at {str(database)!r}; name its folder with --data")
+    with tempfile.TemporaryDirectory(prefix=".backup-", dir=out.parent) as folder:
+        copy = Path(folder) / DATABASE
+        _copy_database(database, copy)
+        # After the database: an asset that it names is there already, and never changes.
+        bundles = [path for path in sorted(assets.glob("[!.]*")) if path.is_dir()]
+        info = BackupInfo(
+            format=FORMAT,
+            created_at=datetime.now(UTC).isoformat(timespec="seconds"),
+            made_by=version("real2sim"),
+            schema=_checked_schema(copy),
+            sha256=_sha256(copy),
+            assets=len(bundles),
+        )
+        packed = Path(folder) / "backup.tar"
+        with tarfile.open(packed, "x", format=tarfile.PAX_FORMAT) as tar:
+            _add_bytes(tar, MANIFEST, (json.dumps(asdict(info), indent=2) + "\n").encode())
+            tar.add(copy, DATABASE)
+            for bundle in bundles:
+                tar.add(bundle, f"{ASSETS}/{bundle.name}")
+        packed.chmod(0o600)
+        with packed.open("rb") as file:
+            os.fsync(file.fileno())
+        # Never over a file that has come meanwhile.
+        os.link(packed, out)
+    return info
+
+
+def restore_backup(file: Path, data: Path, *, database: Path, assets: Path, replace: bool) -> Path:
+    """Put a backup back; the store that was there is moved aside.
+
+    Args:
+        file: made by :func:`make_backup`.
+        data: state folder, which no worker may own.
+        database: SQLite file to make.
+        assets: folder that gets the bundles it lacks.
+        replace: whether there may be a store already.
+
+    Returns:
+        The store that was there, where it lies now; ``database`` itself if there was none.
+
+    Raises:
+        BackupError: it is no backup, damaged, or too new; or there is a store already.
+        StateFolderError: a worker is on the state folder.
+        OSError: something cannot be written.
+    """
+    if not file.is_file():
+        raise BackupError(f"there is no file {str(file)!r}")
+    with owned_folder(data), _unpacked(file, data) as folder:
+        copy = folder / DATABASE
+        check_version(_checked_schema(copy))
+        aside = database
+        if database.exists():
+            if not replace:
+                raise BackupError(
+                    f"there is a store at {str(database)!r} already; give --overwrite to put it "
+                    "aside, or another folder with --data"
+                )
+            aside = _move_aside(database)
+        copy.chmod(0o600)
+        database.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(copy, database)
+        _add_missing(folder / ASSETS, assets)
+    return aside
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    with (
+        contextlib.closing(sqlite3.connect(f"{source.as_uri()}?mode=ro", uri=True)) as reading,
+        contextlib.closing(sqlite3.connect(target)) as writing,
+    ):
+        try:
+            # In one piece, so that it ends also while a worker writes; it keeps no writer waiting.
+            reading.backup(writing, pages=-1)
+            writing.execute("PRAGMA journal_mode=DELETE")
+        except sqlite3.Error as error:
+            raise BackupError(f"the store {str(source)!r} cannot be copied: {error}") from error
+
+
+def _checked_schema(database: Path) -> int:
+    """The schema version of a copy. Raises BackupError: it is damaged."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        try:
+            (state,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            (found,) = connection.execute(
+                f"SELECT max(version) FROM {t.schema_version.name}"
+            ).fetchone()
+        except sqlite3.Error as error:
+            raise BackupError(f"{database.name} is no store of a worker: {error}") from error
+    if state != "ok" or found is None:
+        raise BackupError(f"{database.name} is damaged: {state}")
+    return int(found)
+
+
+@contextlib.contextmanager
+def _unpacked(file: Path, beside: Path) -> Iterator[Path]:
+    """The contents of a backup, checked, in a folder that goes with the block."""
+    with tempfile.TemporaryDirectory(prefix=RESTORING, dir=beside) as name:
+        folder = Path(name)
+        try:
+            with tarfile.open(file, "r:") as tar:
+                members = [member for member in tar if _belongs(member)]
+                tar.extractall(folder, members=members, filter="data")
+            told = json.loads((folder / MANIFEST).read_text("utf-8"))
+            info = BackupInfo(**told)
+        except (tarfile.TarError, OSError, ValueError, TypeError) as error:
+            raise BackupError(f"{str(file)!r} is no backup of a worker: {error}") from error
+        if info.format != FORMAT:
+            raise BackupError(
+                f"{str(file)!r} has format {info.format}, this program reads {FORMAT}; use "
+                f"real2sim {info.made_by}"
+            )
+        if not (folder / DATABASE).is_file() or _sha256(folder / DATABASE) != info.sha256:
+            raise BackupError(f"{str(file)!r} is damaged: its store is not what it was")
+        yield folder
+
+
+def _belongs(member: tarfile.TarInfo) -> bool:
+    path = PurePosixPath(member.name)
+    if member.name in (MANIFEST, DATABASE):
+        return member.isfile()
+    return path.parts[:1] == (ASSETS,) and (member.isfile() or member.isdir())
+
+
+def _move_aside(database: Path) -> Path:
+    """Move a store out of the way, with what its journal holds."""
+    with (
+        contextlib.closing(sqlite3.connect(database)) as connection,
+        contextlib.suppress(sqlite3.Error),
+    ):
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    aside = database.with_name(f"{database.name}.before-{stamp}")
+    for end in ("-wal", "-shm"):
+        journal = database.with_name(database.name + end)
+        if journal.exists():
+            journal.replace(aside.with_name(aside.name + end))
+    return database.replace(aside)
+
+
+def _add_missing(bundles: Path, assets: Path) -> None:
+    """Assets never change, so that those of an id that is there are the same."""
+    if not bundles.is_dir():
+        return
+    assets.mkdir(parents=True, exist_ok=True)
+    for bundle in sorted(bundles.iterdir()):
+        if not (assets / bundle.name).exists():
+            shutil.move(bundle, assets / bundle.name)
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _add_bytes(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    member = tarfile.TarInfo(name)
+    member.size, member.mode = len(content), 0o600
+    tar.addfile(member, io.BytesIO(content))
