@@ -77,9 +77,8 @@ def damage_named(where: str) -> Iterator[None]:
     except LogError:
         raise
     except Exception as error:
-        raise LogError(
-            f"{where}: is damaged, or not as its layout asks ({type(error).__name__}: {error})"
-        ) from error
+        reason = f"{type(error).__name__}: {str(error)[:300]}"
+        raise LogError(f"{where}: is damaged, or not as its layout asks ({reason})") from error
 
 
 class FrameSource(Protocol):

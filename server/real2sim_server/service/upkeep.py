@@ -60,18 +60,24 @@ class Upkeep:
         if forgotten := await self._jobs.forget_before(now_us() - round(days * DAY_US)):
             log.info("ended jobs forgotten", jobs=forgotten)
 
-    def sweep(self) -> None:
-        """Remove what killed runs have left half done."""
+    def sweep(self, *, at_start: bool = False) -> None:
+        """Remove what killed runs have left half done.
+
+        Args:
+            at_start: nothing of this worker is under way, so what lies in its own folders was left
+                behind, however young it is.
+        """
         settings = self._settings
         removed: list[Path] = []
         for folder in (settings.assets_path, settings.scenes_path):
             # What lies in our state folder is ours alone.
             own = folder.resolve().is_relative_to(settings.data_dir.resolve())
-            unused_s = 0.0 if own else OTHERS_UNUSED_S
+            unused_s = 0.0 if own and at_start else OTHERS_UNUSED_S
             removed += sweep_leftovers(folder, unused_s=unused_s, prefix=UPLOADS)
             removed += sweep_leftovers(folder, unused_s=OTHERS_UNUSED_S)
-        removed += sweep_leftovers(settings.data_dir, unused_s=0.0)
-        removed += sweep_leftovers(settings.data_dir, unused_s=0.0, prefix=RESTORING)
+        unused_s = 0.0 if at_start else OTHERS_UNUSED_S
+        removed += sweep_leftovers(settings.data_dir, unused_s=unused_s)
+        removed += sweep_leftovers(settings.data_dir, unused_s=unused_s, prefix=RESTORING)
         if removed:
             names = [path.name for path in removed[:10]]
             log.warning("leftovers removed", count=len(removed), names=names)

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from typing import Annotated
 
@@ -170,7 +171,7 @@ class Worker:
             at_exit.push_async_callback(self.scenarios.flush)
             upkeep = Upkeep(self.settings, self.store, self.jobs, self.sessions)
             # Nobody uploads yet: what lies about now was left behind.
-            await asyncio.to_thread(upkeep.sweep)
+            await asyncio.to_thread(partial(upkeep.sweep, at_start=True))
             await self.scene_cache.refresh()
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))

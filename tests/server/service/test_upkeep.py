@@ -7,6 +7,7 @@ import time
 
 from real2sim_server._files import sweep_leftovers
 from real2sim_server.service.storage import store as store_module
+from real2sim_server.service.upkeep import Upkeep
 
 HOUR_S = 3600
 
@@ -18,6 +19,16 @@ def test_the_upload_of_a_worker_that_was_killed_is_gone_after_the_next_start(run
     (assets / ".upload-fedcba543210.ply").write_bytes(bytes(1000))
     with run_worker():
         assert list(assets.iterdir()) == []
+
+
+def test_an_upload_that_is_under_way_outlives_the_hourly_round(run_worker, tmp_path):
+    staging = tmp_path / "data" / "assets" / ".upload-abcdef012345"
+    with run_worker() as client:
+        staging.mkdir(parents=True)
+        (staging / "upload.ply").write_bytes(b"ply")
+        worker = client.app.state.worker
+        Upkeep(worker.settings, worker.store, worker.jobs, worker.sessions).sweep()
+        assert staging.exists()
 
 
 def test_what_another_worker_is_uploading_to_a_shared_folder_stays(run_worker, scenes_dir):

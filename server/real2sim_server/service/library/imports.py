@@ -18,6 +18,9 @@ from ..http.problems import ServiceError
 from .quotas import Quota, folder_usage
 from .scene_catalog import SCENE_DOCUMENT, bundle_folder
 
+STAGING_PREFIX = ".upload-"
+"""Of folders that are removed when a crash has left them, see :mod:`..upkeep`."""
+
 
 def resolve_import(root: Path, given: str) -> Path:
     """The file or bundle at ``given`` below ``root``.
@@ -75,7 +78,7 @@ def staging_folder(beside: Path) -> Iterator[Path]:
         OSError: it cannot be made.
     """
     beside.mkdir(parents=True, exist_ok=True)
-    staging = beside / f".upload-{secrets.token_hex(6)}"
+    staging = beside / f"{STAGING_PREFIX}{secrets.token_hex(6)}"
     staging.mkdir()
     try:
         yield staging

@@ -91,11 +91,15 @@ def test_scenes_and_assets_make_room_for_each_other(tiny_scene, tmp_path):
         budget = MemoryBudget(needed)
         cache = SceneCache(SceneCatalog(scenes), engine, budget=budget)
         library = AssetLibrary(assets, budget)
+
+        def find() -> None:
+            assert library.find("large") is not None
+
         try:
-            await asyncio.to_thread(library.find, "large")
+            await asyncio.to_thread(find)
             await cache.get("street")
             after_scene = (library.held_bytes, cache.held_bytes > 0)
-            await asyncio.to_thread(library.find, "large")
+            await asyncio.to_thread(find)
             await asyncio.sleep(0)
             await asyncio.sleep(0)
             return after_scene, (library.held_bytes, cache.held_bytes)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,8 @@ class ParquetFile:
         if column.null_count:
             raise LogError(f"{self.path}: column {name!r} has {column.null_count} empty cells")
         if not _is_list(column.type):
-            return np.asarray(column.to_numpy(zero_copy_only=False))
+            with _broken_named(f"{self.path}: column {name!r}"):
+                return np.asarray(column.to_numpy(zero_copy_only=False))
         flat = column.flatten()
         if len(column) == 0 or len(flat) % len(column) or flat.null_count:
             raise LogError(f"{self.path}: the lists of column {name!r} differ in length")
@@ -65,11 +67,13 @@ class ParquetFile:
 
     def texts(self, name: str) -> list[str]:
         """A whole column of text [N]."""
-        return [str(value) for value in self._whole(name).to_pylist()]
+        return [str(value) for value in self.lists(name)]
 
     def lists(self, name: str) -> list[Any]:
         """A whole column as Python values; for small columns whose lists differ in length."""
-        return list(self._whole(name).to_pylist())
+        column = self._whole(name)
+        with _broken_named(f"{self.path}: column {name!r}"):
+            return list(column.to_pylist())
 
     def cell(self, name: str, row: int) -> Any:
         """One pyarrow scalar of a heavy column."""
@@ -131,8 +135,20 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         column = table.column(name)
         if column.null_count:
             raise LogError(f"{path}: column {name!r} has {column.null_count} empty cells")
-        found[name] = np.asarray(column.to_numpy())
+        with _broken_named(f"{path}: column {name!r}"):
+            found[name] = np.asarray(column.to_numpy())
     return found
+
+
+@contextmanager
+def _broken_named(where: str) -> Iterator[None]:
+    """Values that pyarrow cannot convert, such as text that is none, as LogError."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (pa.ArrowException, ValueError, OverflowError) as error:
+        raise LogError(f"{where} is broken ({_line(error)})") from error
 
 
 def _is_list(kind: Any) -> bool:

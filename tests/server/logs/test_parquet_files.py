@@ -1,0 +1,21 @@
+"""Damage in tables that shows only where values are converted."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+import pytest
+from pyarrow import feather
+
+from real2sim_server.logs import LogError
+from real2sim_server.logs.readers.formats.parquet_files import read_feather
+
+
+def test_text_that_is_none_is_an_error_of_the_file(tmp_path):
+    good = "a text that can be found"
+    file = tmp_path / "a.feather"
+    feather.write_feather(pa.table({"t": [good]}), file, compression="uncompressed")
+    whole = file.read_bytes()
+    assert whole.count(good.encode()) == 1
+    file.write_bytes(whole.replace(good.encode(), b"\xff" * len(good)))
+    with pytest.raises(LogError, match=r"a\.feather: column 't' is broken"):
+        read_feather(file, ["t"])
