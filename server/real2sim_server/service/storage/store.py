@@ -408,8 +408,8 @@ class Store:
                 assert raw is not None
                 cursor = raw.cursor()
                 (before,) = cursor.execute("PRAGMA freelist_count").fetchone()
-                # A row a page: it goes on as the rows are read.
-                cursor.execute(f"PRAGMA incremental_vacuum({pages})").fetchall()
+                # A step a page; the driver makes but one of what has no columns, save in scripts.
+                cursor.executescript(f"PRAGMA incremental_vacuum({pages})")
                 (after,) = cursor.execute("PRAGMA freelist_count").fetchone()
                 more = 0 < after < before
                 if not more:

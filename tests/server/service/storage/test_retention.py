@@ -131,7 +131,29 @@ def test_what_went_is_given_back_to_the_disk(tmp_path):
     assert file.stat().st_size < before / 4
 
 
+def test_as_many_pages_are_given_back_at_once_as_asked_for(tmp_path):
+    async def work(store):
+        await add(store, "w0.old", days_ago=31, ended=True, steps=200, payload=bytes(10_000))
+        everything = sa.delete(tables.session_log)
+        await store.write(Write(everything))
+        more = await store.give_back(300)
+        return more, await _free_pages(store), await store.give_back(10_000)
+
+    more, left, even_more = run(f"sqlite:///{tmp_path / 'store.db'}", work)
+    assert (more, even_more) == (True, False)
+    assert 200 <= left <= 500
+
+
+async def _free_pages(store) -> int:
+    def ask() -> int:
+        with store._connected().connect() as connection:
+            return connection.exec_driver_sql("PRAGMA freelist_count").scalar_one()
+
+    return await store._run(ask)
+
+
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_week_of_work_stays_within_the_limit_and_opens_at_once(tmp_path):
     """A million steps, 100,000 edits, 1,000 sessions."""
     url, limit = f"sqlite:///{tmp_path / 'store.db'}", 200 * 1024**2
