@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.scenes import Readiness
 from real2sim_server.service.app import create_app
-from real2sim_server.service.storage.ownership import StateFolderError
+from real2sim_server.service.storage.store import StoreError
 
 HERE = {"Host": "127.0.0.1"}
 
@@ -122,7 +122,7 @@ def test_a_store_that_cannot_be_opened_ends_the_start_and_leaves_no_thread(make_
     (tmp_path / "data" / "real2sim.db").mkdir(parents=True)
     before = threading.active_count()
     app = create_app(make_settings())
-    with pytest.raises(StateFolderError), TestClient(app):
+    with pytest.raises(StoreError), TestClient(app):
         pass
     assert threading.active_count() <= before
 
