@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import pyarrow as pa
 import pytest
 from pyarrow import feather
@@ -18,4 +20,16 @@ def test_text_that_is_none_is_an_error_of_the_file(tmp_path):
     assert whole.count(good.encode()) == 1
     file.write_bytes(whole.replace(good.encode(), b"\xff" * len(good)))
     with pytest.raises(LogError, match=r"a\.feather: column 't' is broken"):
+        read_feather(file, ["t"])
+
+
+def test_offsets_that_lead_out_of_the_file_are_not_followed(tmp_path):
+    good = "a text that can be found"
+    file = tmp_path / "a.feather"
+    feather.write_feather(pa.table({"t": [good]}), file, compression="uncompressed")
+    whole = file.read_bytes()
+    offsets = struct.pack("<ii", 0, len(good))
+    assert whole.count(offsets) == 1
+    file.write_bytes(whole.replace(offsets, struct.pack("<ii", 0, 1 << 30)))
+    with pytest.raises(LogError, match=r"a\.feather: cannot be read as a Feather file"):
         read_feather(file, ["t"])

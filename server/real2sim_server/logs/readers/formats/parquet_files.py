@@ -36,7 +36,8 @@ class ParquetFile:
             self._file = pq.ParquetFile(path)
         except (OSError, pa.ArrowException) as error:
             raise LogError(f"{path}: cannot be read as Parquet ({_line(error)})") from error
-        self.names = frozenset(self._file.schema_arrow.names)
+        with _broken_named(f"{path}: the list of columns"):
+            self.names = frozenset(self._file.schema_arrow.names)
         metadata = self._file.metadata
         sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
         self._starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
@@ -126,12 +127,16 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         with path.open("rb") as file:
             table = ipc.open_file(file).read_all()
+        # The file's offsets are followed as they are, unless they are looked at before.
+        table.validate(full=True)
     except (OSError, pa.ArrowException) as error:
         raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
+    with _broken_named(f"{path}: the list of columns"):
+        there = list(table.column_names)
     found = {}
     for name in columns:
-        if name not in table.column_names:
-            raise LogError(f"{path}: has no column {name!r}; it has {table.column_names}")
+        if name not in there:
+            raise LogError(f"{path}: has no column {name!r}; it has {there[:12]}")
         column = table.column(name)
         if column.null_count:
             raise LogError(f"{path}: column {name!r} has {column.null_count} empty cells")
