@@ -19,7 +19,7 @@ def test_text_that_is_none_is_an_error_of_the_file(tmp_path):
     whole = file.read_bytes()
     assert whole.count(good.encode()) == 1
     file.write_bytes(whole.replace(good.encode(), b"\xff" * len(good)))
-    with pytest.raises(LogError, match=r"a\.feather: column 't' is broken"):
+    with pytest.raises(LogError, match=r"a\.feather: .*(broken|cannot be read)"):
         read_feather(file, ["t"])
 
 
@@ -29,7 +29,7 @@ def test_offsets_that_lead_out_of_the_file_are_not_followed(tmp_path):
     feather.write_feather(pa.table({"t": [good]}), file, compression="uncompressed")
     whole = file.read_bytes()
     offsets = struct.pack("<ii", 0, len(good))
-    assert whole.count(offsets) == 1
-    file.write_bytes(whole.replace(offsets, struct.pack("<ii", 0, 1 << 30)))
+    at = whole.rindex(offsets, 0, whole.index(good.encode()))
+    file.write_bytes(whole[:at] + struct.pack("<ii", 0, 1 << 30) + whole[at + 8 :])
     with pytest.raises(LogError, match=r"a\.feather: cannot be read as a Feather file"):
         read_feather(file, ["t"])
