@@ -66,11 +66,11 @@ def test_the_token_is_handed_on(make_settings):
 def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
     warm = threading.Event()
     monkeypatch.setattr(
-        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(1)
+        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(6)
     )
     with (
         pytest.raises(RuntimeError, match="warming up kernels"),
-        running_worker(make_settings(), timeout_s=0.5),
+        running_worker(make_settings(), timeout_s=3),
     ):
         pass
     warm.set()

@@ -31,7 +31,7 @@ def main(scenes: Path) -> None:
         options: dict[str, Any] = {"backend": "cpu", "threads": 1, "log_level": "error"}
         settings = Settings(data_dir=folder, scenes_dir=scenes, port=0, **options)
         with running_worker(settings) as running:
-            site = shared.Site(running)
+            site = shared.Site(running, stop=lambda: None)
             with shared.Planner(site.create()) as planner:
                 planner.hello()
                 print(json.dumps(determinism.fingerprint(planner)))
