@@ -72,7 +72,13 @@ class VideoFile:
             self._waiting.popleft().result()
 
     def close(self) -> None:
-        """Finish the file; without a frame there is none."""
+        """Finish the file; without a frame there is none. Raises what encoding a frame raised."""
+        try:
+            while self._waiting:
+                self._waiting.popleft().result()
+        except BaseException:
+            self.discard()
+            raise
         if not self._finish():
             return
         if self._path.suffix == ".webm":
@@ -97,9 +103,8 @@ class VideoFile:
         return writer
 
     def _finish(self) -> bool:
-        """Encode what waits and end the thread; whether there is a file."""
+        """End the thread and the encoder; whether there is a file."""
         self._encoder.shutdown(wait=True)
-        self._waiting.clear()
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.release()

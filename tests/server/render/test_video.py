@@ -72,3 +72,10 @@ def test_a_frame_may_be_changed_once_it_is_added(tmp_path):
     read = [film.read() for _ in range(41)]
     assert [more for more, _ in read] == [True] * 40 + [False]
     assert min(image.mean() for more, image in read if more) > 180
+
+
+def test_a_frame_that_cannot_be_encoded_is_an_error_and_leaves_no_file(tmp_path):
+    frames = [FRAMES[0], np.zeros((48, 64, 3), np.complex128)]
+    with pytest.raises(cv2.error):
+        write(tmp_path / "film.webm", frames)
+    assert list(tmp_path.iterdir()) == []
