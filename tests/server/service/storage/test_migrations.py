@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import sqlite3
 import threading
 
@@ -11,10 +10,10 @@ import sqlalchemy as sa
 
 from real2sim_server.service.storage import migrations, tables
 from real2sim_server.service.storage.database import connect
-from real2sim_server.service.storage.store import Store
 from real2sim_server.service.storage.tokens import token_hash
 
 from ..postgres import Postgres
+from .opened_store import run
 
 SECRET = "a-token-that-nobody-should-find"
 VERSION_1 = [
@@ -85,18 +84,6 @@ def write_version_1(url: str) -> None:
     engine.dispose()
 
 
-def opened(url: str, work):
-    async def inside():
-        store = Store(url)
-        await store.open()
-        try:
-            return await work(store)
-        finally:
-            await store.close()
-
-    return asyncio.run(inside())
-
-
 async def nothing(_store) -> None:
     pass
 
@@ -117,11 +104,11 @@ def schema_of(url: str) -> dict[str, object]:
 
 def test_an_older_store_gets_the_present_schema(url, tmp_path, request):
     write_version_1(url)
-    opened(url, nothing)
+    run(url, nothing)
     new = f"sqlite:///{tmp_path / 'new.db'}"
     if url.startswith("postgresql"):
         new = request.getfixturevalue("postgres").new_database()
-    opened(new, nothing)
+    run(new, nothing)
     assert schema_of(url) == schema_of(new)
 
 
@@ -136,7 +123,7 @@ def test_what_an_older_store_holds_is_kept(url):
             await store.reply("telling"),
         )
 
-    entries, session, harmless, telling = opened(url, read)
+    entries, session, harmless, telling = run(url, read)
     assert entries == [{"kind": "edit"}]
     assert session.token_hash == token_hash(SECRET)
     assert harmless.body == b'{"revision":1}'
@@ -146,7 +133,7 @@ def test_what_an_older_store_holds_is_kept(url):
 def test_no_token_is_left_in_the_files_of_a_store_that_was_migrated(tmp_path):
     url = f"sqlite:///{tmp_path / 'store.db'}"
     write_version_1(url)
-    opened(url, nothing)
+    run(url, nothing)
     for file in tmp_path.iterdir():
         assert SECRET.encode() not in file.read_bytes(), file.name
 
@@ -163,9 +150,9 @@ def test_a_migration_that_fails_leaves_the_store_as_it_was(url, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(migrations, "MIGRATIONS", (broken,))
         with pytest.raises(Exception, match="the plug was pulled"):
-            opened(url, nothing)
+            run(url, nothing)
     assert schema_of(url) == before
-    opened(url, nothing)
+    run(url, nothing)
     assert "token_hash" in str(schema_of(url)["sessions"])
 
 
@@ -207,6 +194,6 @@ def test_the_files_of_a_store_are_for_its_owner_alone(tmp_path):
     async def modes(_store):
         return {f.name: f.stat().st_mode & 0o777 for f in tmp_path.glob("store.db*")}
 
-    found = opened(f"sqlite:///{file}", modes)
+    found = run(f"sqlite:///{file}", modes)
     assert set(found) == {"store.db", "store.db-wal", "store.db-shm"}
     assert set(found.values()) == {0o600}

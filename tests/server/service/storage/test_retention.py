@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from dataclasses import replace
 
@@ -16,12 +15,12 @@ from real2sim_server.service.storage.store import (
     ScenarioRow,
     SessionEntry,
     SessionRow,
-    Store,
     Write,
     now_us,
 )
 
 from ..postgres import Postgres
+from .opened_store import run
 
 SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "hash", 1)
 GIB = 1024**3
@@ -33,18 +32,6 @@ def url(request, tmp_path) -> str:
         return f"sqlite:///{tmp_path / 'store.db'}"
     server: Postgres = request.getfixturevalue("postgres")
     return server.new_database()
-
-
-def run(url: str, work):
-    async def inside():
-        store = Store(url)
-        await store.open()
-        try:
-            return await work(store)
-        finally:
-            await store.close()
-
-    return asyncio.run(inside())
 
 
 async def add(store, session_id, *, days_ago, ended=False, steps=3, payload=b"x") -> None:

@@ -17,7 +17,6 @@ from real2sim_server.service.storage.store import (
     SessionEntry,
     SessionRow,
     SnapshotRow,
-    Store,
     StoredReply,
     StoreError,
     Write,
@@ -25,6 +24,7 @@ from real2sim_server.service.storage.store import (
 )
 
 from ..postgres import Postgres
+from .opened_store import run
 
 SCENARIO = ScenarioRow("sc_1", "first", "tiny", "0" * 64, 1)
 SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "secret", 1)
@@ -43,20 +43,6 @@ def url(request, sqlite_url) -> str:
         return sqlite_url
     server: Postgres = request.getfixturevalue("postgres")
     return server.new_database()
-
-
-def run(url: str, work):
-    """Run ``work(store)`` on a store opened for it."""
-
-    async def inside():
-        store = Store(url)
-        await store.open()
-        try:
-            return await work(store)
-        finally:
-            await store.close()
-
-    return asyncio.run(inside())
 
 
 def entry(text: str) -> dict:
