@@ -1,4 +1,7 @@
-"""The CUDA backend against the reference, in Numba's simulator: one process for all scenes."""
+"""The CUDA backend against the reference, in Numba's simulator: two processes for all scenes.
+
+The simulator takes seconds a scene, so every run sees one of each kind and the slow ones all.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from numba import cuda
@@ -27,16 +31,16 @@ SCENES = (
 )
 TOUCHES = dict.fromkeys(SCENES, 1) | {"two bodies": 2, "leaving": 0}
 CASES = ("free_fall", "affine_patch", "spin", "invariants")
+ALWAYS = ("Metal", "Sand", "height field", "two bodies", "leaving", "free_fall")
 TOLERANCES = {"Metal": 1e-7, "Foam": 1e-7}
 """Compiled laws hold the sqrt(2/3) of von Mises in single precision, the reference in double."""
 pytestmark = pytest.mark.timeout(300, func_only=True)
 
 
-@pytest.fixture(scope="module")
-def simulated():
+def simulate(*names: str) -> dict[str, Any]:
     program = [sys.executable, "-W", "error::RuntimeWarning", "-m"]
     done = subprocess.run(
-        [*program, "tests.server.physics.simulated_cuda"],
+        [*program, "tests.server.physics.simulated_cuda", *names],
         cwd=ROOT,
         env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
         capture_output=True,
@@ -47,33 +51,53 @@ def simulated():
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_the_device_follows_the_reference(simulated, scene):
-    off = dict(simulated["reference"][scene])
-    assert off.pop("contacts") == TOUCHES[scene]
-    bound = TOLERANCES.get(scene, 1e-9)
-    assert {name: value for name, value in off.items() if not value < bound} == {}
+@pytest.fixture(scope="module")
+def always() -> dict[str, Any]:
+    return simulate(*ALWAYS)
 
 
-@pytest.mark.parametrize("material", MATERIALS)
-def test_the_device_follows_the_compiled_cpu(simulated, material):
-    off = dict(simulated["cpu"][material])
-    assert off.pop("contacts") == TOUCHES[material]
-    assert {name: value for name, value in off.items() if not value < 1e-9} == {}
+@pytest.fixture(scope="module")
+def besides() -> dict[str, Any]:
+    return simulate(*{*SCENES, *CASES} - {*ALWAYS})
 
 
-def test_single_precision_stays_near_double(simulated):
-    assert 1e-12 < simulated["single"]["positions"] < 1e-6
-    assert simulated["single"]["F_elastic"] < 1e-4
+@pytest.fixture
+def simulated(request: pytest.FixtureRequest, name: str) -> dict[str, Any]:
+    return request.getfixturevalue("always" if name in ALWAYS else "besides")
 
 
-def test_a_run_that_is_taken_back_goes_on_as_before(simulated):
-    assert simulated["restored"] < 1e-12
+def every(*names: str) -> pytest.MarkDecorator:
+    marked = [n if n in ALWAYS else pytest.param(n, marks=pytest.mark.slow) for n in names]
+    return pytest.mark.parametrize("name", marked)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_the_cheap_cases_of_the_table_hold(simulated, case):
-    lines = [line for line in simulated["lines"] if line["case"] == case]
+@every(*SCENES)
+def test_the_device_follows_the_reference(simulated, name):
+    off = dict(simulated["reference"][name])
+    assert off.pop("contacts") == TOUCHES[name]
+    bound = TOLERANCES.get(name, 1e-9)
+    assert {field: value for field, value in off.items() if not value < bound} == {}
+
+
+@every(*MATERIALS)
+def test_the_device_follows_the_compiled_cpu(simulated, name):
+    off = dict(simulated["cpu"][name])
+    assert off.pop("contacts") == TOUCHES[name]
+    assert {field: value for field, value in off.items() if not value < 1e-9} == {}
+
+
+def test_single_precision_stays_near_double(always):
+    assert 1e-12 < always["single"]["positions"] < 1e-6
+    assert always["single"]["F_elastic"] < 1e-4
+
+
+def test_a_run_that_is_taken_back_goes_on_as_before(always):
+    assert always["restored"] < 1e-12
+
+
+@every(*CASES)
+def test_the_cheap_cases_of_the_table_hold(simulated, name):
+    lines = [line for line in simulated["lines"] if line["case"] == name]
     assert lines
     assert [line for line in lines if not line["passed"]] == []
 

@@ -18,6 +18,12 @@ from real2sim_server.settings import Settings
 
 from .postgres import Postgres, running_postgres
 
+PROCESSORS = [
+    structlog.contextvars.merge_contextvars,
+    structlog.processors.add_log_level,
+    structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback),
+]
+
 
 @pytest.fixture
 def make_settings(tmp_path: Path, scenes_dir: Path) -> Callable[..., Settings]:
@@ -93,4 +99,7 @@ def logged() -> Iterator[list[dict[str, Any]]]:
 
 
 def _log_from(level: int) -> None:
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(level))
+    # Tracebacks as a worker writes them: pretty ones print all local variables, which takes seconds.
+    structlog.configure(
+        processors=PROCESSORS, wrapper_class=structlog.make_filtering_bound_logger(level)
+    )
