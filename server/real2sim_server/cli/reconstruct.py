@@ -43,23 +43,22 @@ def reconstruct(
     json: JsonFile = None,
 ) -> None:
     """Turn a driving log into a scene of Gaussians."""
-    from ..reconstruct import reconstruct
+    from ..logs import open_log
+    from ..reconstruct import ReconstructOptions, reconstruct
     from ..reconstruct.training.schedule import preset as training_preset
 
     refuse_existing(out, overwrite=overwrite)
     training = training_preset(preset)
+    if iterations:
+        training = replace(training, iterations=iterations)
     if width is not None:
         training = replace(training, width=width, max_width=width)
     with staged_progress() as report:
         result = reconstruct(
-            log,
+            open_log(log, format=log_format, sequence=sequence),
             out,
-            iterations=iterations,
-            training=training if iterations else None,
+            ReconstructOptions(training=training if iterations else None, box_noise=box_noise),
             resume=resume,
-            box_noise=box_noise,
-            log_format=log_format,
-            sequence=sequence,
             overwrite=overwrite,
             on_progress=report,
             on_training=_training_bar(report),

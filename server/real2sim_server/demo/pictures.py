@@ -27,17 +27,6 @@ def mosaic(images: Sequence[Image], caption: str) -> Image:
     return np.concatenate([row, bar], axis=0)
 
 
-def write_png(path: Path, image: Image) -> None:
-    """Write an RGB image uint8 [H, W, 3].
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), np.ascontiguousarray(image[:, :, ::-1])):
-        raise OSError(f"{path}: cannot be written")
-
-
 def draw_map(
     path: Path,
     *,

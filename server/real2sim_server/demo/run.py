@@ -13,8 +13,9 @@ from real2sim import Client, ReplyTimeoutError, connect
 from real2sim.planners import FollowRoute
 
 from ..console import console, print_figures, write_json
+from ..render.picture_file import write_png
 from .edits import StreetEdits, edit_street
-from .pictures import draw_map, write_png
+from .pictures import draw_map
 from .worker import starting_worker
 
 if TYPE_CHECKING:

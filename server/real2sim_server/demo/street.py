@@ -38,28 +38,27 @@ def record_street(log: Path, *, duration_s: float, hz: float) -> None:
 
 def build_street(log: Path, scenes: Path, name: str) -> None:
     """Make the bundle ``name`` from the log without training."""
-    from ..reconstruct import InitialiseOptions, reconstruct
+    from ..reconstruct import InitialiseOptions, ReconstructOptions, reconstruct
 
     small = InitialiseOptions(max_background=MAX_BACKGROUND, max_object=MAX_OBJECT)
     with staged_progress() as report:
-        reconstruct(log, scenes / name, options=small, on_progress=report)
+        reconstruct(log, scenes / name, ReconstructOptions(initialise=small), on_progress=report)
 
 
 def train_street(out: Path) -> None:
     """Record and train the street, and pack it into the file ``out``."""
-    from ..reconstruct import reconstruct
+    from ..reconstruct import ReconstructOptions, reconstruct
     from ..reconstruct.training.schedule import preset
 
     folder = Path(tempfile.mkdtemp(prefix="real2sim-street-"))
     try:
         record_street(folder / "log", duration_s=DURATION_S, hz=TRAINING_HZ)
-        options = preset("cpu-small")
+        options = ReconstructOptions(training=preset("cpu-small"))
         with staged_progress() as report:
             reconstruct(
                 folder / "log",
                 folder / "demo_street",
-                iterations=options.iterations,
-                training=options,
+                options,
                 on_progress=report,
             )
         write_packed(load_scene(folder / "demo_street"), out)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .._files import atomic_file
 from ..logs import DrivingLog, open_log
+from ..render.picture_file import write_png
 from ..scene import Scene
 from ..scene.io import save_scene
 from .evaluation import evaluate_views, render_logged_view
@@ -17,7 +17,7 @@ from .initialise.stage0 import initialise_scene
 from .initialise.views import chosen_frames
 from .options import InitialiseOptions, ReconstructError
 from .stages import OnProgress, Stages
-from .training import OnTraining, TrainOptions, held_out_frames, preset, train, with_box_noise
+from .training import OnTraining, TrainOptions, held_out_frames, train, with_box_noise
 
 EVALUATED_FRAMES = 4
 
@@ -86,36 +86,42 @@ class ReconstructReport:
     training: TrainingFigures | None = None
 
 
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """How a scene is made from a log.
+
+    Attributes:
+        initialise: of stage 0; None takes those of ``training``.
+        training: None builds from LiDAR without training.
+        box_noise: scatter added to the boxes of the log, to see how much training mends; see
+            ``with_box_noise``.
+    """
+
+    initialise: InitialiseOptions | None = None
+    training: TrainOptions | None = None
+    box_noise: float = 0.0
+
+
 def reconstruct(
-    log_path: str | PathLike[str],
+    log: DrivingLog | str | PathLike[str],
     out: str | PathLike[str],
+    options: ReconstructOptions | None = None,
     *,
-    iterations: int = 0,
-    options: InitialiseOptions | None = None,
-    training: TrainOptions | None = None,
     resume: bool = False,
-    box_noise: float = 0.0,
-    log_format: str | None = None,
-    sequence: str | None = None,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
     on_training: OnTraining | None = None,
 ) -> ReconstructReport:
-    """Build a scene from the log in a folder and write it as a bundle.
+    """Build a scene from a log and write it as a bundle.
 
     Besides the bundle ``out`` a preview ``<out name>.preview.png`` is left next to it, and by
     training the folder ``<out name>.training`` with checkpoint, metrics and preview pictures.
 
     Args:
-        log_path: folder of the log.
+        log: opened, or its folder.
         out: folder of the bundle, by custom ``<name>.r2s``.
-        iterations: of training; 0 for stage 0 alone.
-        options: of stage 0; by default those of ``training``.
-        training: its options, the preset ``cpu-small`` by default; ``iterations`` counts.
+        options: what is made of it; by default stage 0 as it comes.
         resume: go on from the checkpoint of a run of the same arguments that was broken off.
-        box_noise: scatter added to the boxes of the log, to see how much training mends; see
-            ``with_box_noise``.
-        log_format, sequence: passed to ``open_log``.
         overwrite: replace an existing bundle.
         on_progress: called with the stage, steps done and steps in all.
         on_training: called with figures of training as it goes on.
@@ -125,23 +131,24 @@ def reconstruct(
         LogError: the log cannot be read.
         BundleError: ``out`` exists and may not be replaced.
     """
-    if iterations < 0 or (resume and iterations == 0):
-        raise ReconstructError(
-            f"iterations={iterations!r} must be 0 or more, and more than 0 to resume training"
-        )
+    options = options or ReconstructOptions()
+    if resume and options.training is None:
+        raise ReconstructError("there is nothing to resume without training: give its options")
     timing_s: dict[str, float] = {}
     stages = Stages(on_progress, timing_s)
     with stages("open"):
-        log = open_log(Path(log_path), format=log_format, sequence=sequence)
-        if box_noise > 0:
-            log = with_box_noise(log, box_noise)
+        log = log if isinstance(log, DrivingLog) else open_log(Path(log))
+        if options.box_noise > 0:
+            log = with_box_noise(log, options.box_noise)
     figures = None
-    if iterations == 0:
-        scene = initialise_scene(log, options=options, on_progress=on_progress, timing_s=timing_s)
+    if options.training is None:
+        scene = initialise_scene(
+            log, options=options.initialise, on_progress=on_progress, timing_s=timing_s
+        )
     else:
         scene, figures = _train(
             log,
-            _training_options(training, iterations, options),
+            _training_options(options.training, options.initialise),
             Path(out),
             resume=resume,
             stages=_Callbacks(on_progress, on_training, timing_s),
@@ -179,11 +186,8 @@ class _Callbacks:
     timing_s: dict[str, float]
 
 
-def _training_options(
-    training: TrainOptions | None, iterations: int, options: InitialiseOptions | None
-) -> TrainOptions:
-    chosen = replace(training or preset("cpu-small"), iterations=iterations)
-    return chosen if options is None else replace(chosen, initialise=options)
+def _training_options(training: TrainOptions, initialise: InitialiseOptions | None) -> TrainOptions:
+    return training if initialise is None else replace(training, initialise=initialise)
 
 
 def _train(
@@ -225,15 +229,8 @@ def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[
 
 def _write_preview(scene: Scene, log: DrivingLog, out: Path, frame: int) -> Path:
     """The logged image of the first camera above the rendered one."""
-    import cv2
-
     camera = log.rig.cameras[0]
     rendered = render_logged_view(scene, camera, int(log.frame_times_us[frame]))
-    pair = np.concatenate([log.image(camera.name, frame), rendered])
     path = out.parent / f"{out.name}.preview.png"
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pair[..., ::-1]))
-    if not done:
-        raise ReconstructError(f"{path}: the preview could not be encoded")
-    with atomic_file(path) as file:
-        file.write(data.tobytes())
+    write_png(path, np.concatenate([log.image(camera.name, frame), rendered]))
     return path

@@ -9,6 +9,7 @@ from real2sim_server.logs import open_log, write_native_log
 from real2sim_server.reconstruct import (
     InitialiseOptions,
     ReconstructError,
+    ReconstructOptions,
     evaluate_views,
     initialise_scene,
     reconstruct,
@@ -27,7 +28,9 @@ SMALL = InitialiseOptions(
 
 def test_a_log_on_disk_becomes_a_bundle_with_a_preview(tmp_path):
     write_native_log(painted_log(frames=3), tmp_path / "log")
-    report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", options=SMALL)
+    report = reconstruct(
+        tmp_path / "log", tmp_path / "out.r2s", ReconstructOptions(initialise=SMALL)
+    )
     scene = load_scene(tmp_path / "out.r2s")
     assert scene.gaussian_count == report.gaussians
     assert list(scene.objects) == ["other_1"]
@@ -39,9 +42,11 @@ def test_a_log_on_disk_becomes_a_bundle_with_a_preview(tmp_path):
 
 def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
     write_native_log(painted_log(frames=7), tmp_path / "log")
-    training = TrainOptions(sky_resolution=16, log_every=2, checkpoint_every=3, preview_every=4)
-    arguments = {"iterations": 6, "options": SMALL, "training": training}
-    report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", **arguments)
+    training = TrainOptions(
+        iterations=6, sky_resolution=16, log_every=2, checkpoint_every=3, preview_every=4
+    )
+    options = ReconstructOptions(initialise=SMALL, training=training)
+    report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", options)
     assert report.training.steps == 6
     assert report.training.held_out_frames == report.evaluated_frames == [2]
     assert report.training.psnr > 15
@@ -51,15 +56,15 @@ def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 3
     assert (folder / "previews" / "000004.png").stat().st_size > 1000
     again = reconstruct(
-        tmp_path / "log", tmp_path / "out.r2s", **arguments, resume=True, overwrite=True
+        tmp_path / "log", tmp_path / "out.r2s", options, resume=True, overwrite=True
     )
     assert again.training.steps == 0
     assert again.training.psnr == pytest.approx(report.training.psnr)
 
 
-def test_negative_iterations_are_refused(tmp_path):
-    with pytest.raises(ReconstructError, match=r"iterations=-1 must be 0 or more"):
-        reconstruct(tmp_path, tmp_path / "out.r2s", iterations=-1)
+def test_without_training_there_is_nothing_to_resume(tmp_path):
+    with pytest.raises(ReconstructError, match="nothing to resume without training"):
+        reconstruct(tmp_path, tmp_path / "out.r2s", resume=True)
 
 
 def test_psnr_of_a_constant_error_is_the_textbook_value():

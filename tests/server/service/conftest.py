@@ -99,7 +99,7 @@ def logged() -> Iterator[list[dict[str, Any]]]:
 
 
 def _log_from(level: int) -> None:
-    # Tracebacks as a worker writes them: pretty ones print all local variables, which takes seconds.
+    # Tracebacks as a worker writes them: pretty ones print all variables, which takes seconds.
     structlog.configure(
         processors=PROCESSORS, wrapper_class=structlog.make_filtering_bound_logger(level)
     )

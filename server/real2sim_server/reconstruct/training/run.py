@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..._files import atomic_file
 from ...logs import DrivingLog, check_log
 from ...render.backends import Backend
+from ...render.picture_file import write_png
 from ...scene import Scene
 from ...scene.io import load_scene, save_scene
 from ..initialise.stage0 import initialise_scene
@@ -154,7 +154,6 @@ def _previewer(
     views = TrainingViews(log, [frames[len(frames) // 2]], options)
 
     def write(model: SceneModel, iteration: int) -> None:
-        import cv2
         import torch
 
         columns = []
@@ -165,11 +164,7 @@ def _previewer(
             columns.append(np.concatenate([view.image.numpy(), image.numpy()]))
         height = max(column.shape[0] for column in columns)
         padded = [np.pad(c, ((0, height - c.shape[0]), (0, 0), (0, 0))) for c in columns]
-        picture = (np.concatenate(padded, axis=1)[..., ::-1] * 255).round().astype(np.uint8)
-        done, data = cv2.imencode(".png", picture)
-        if not done:
-            raise ReconstructError("the preview could not be encoded")
-        with atomic_file(folder / f"{iteration:06d}.png") as file:
-            file.write(data.tobytes())
+        picture = (np.concatenate(padded, axis=1) * 255).round().astype(np.uint8)
+        write_png(folder / f"{iteration:06d}.png", picture)
 
     return write

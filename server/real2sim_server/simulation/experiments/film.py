@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,9 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...physics.colliders import Plane
-from ...physics.errors import PhysicsError
 from ...render import Instance, RasterOptions, render_cameras
+from ...render.picture_file import write_png
+from ...render.video import video_file
 from ...scene import Camera, GaussianCloud
 from ..body import BodyMode
 from ..playback import Playback
@@ -158,51 +158,28 @@ def write_film(
         on_progress: called with (pictures done, pictures).
 
     Raises:
-        PhysicsError: when OpenCV cannot encode.
+        VideoError: when OpenCV cannot encode.
     """
-    import cv2
-
     result = playback.result
-    stride = max(round(float(result.figures["frame_rate"]) / FILM_RATE), 1)
+    frame_rate = float(result.figures["frame_rate"])
+    stride = max(round(frame_rate / FILM_RATE), 1)
     frames = list(range(0, result.frames, stride))
     stills = {frames[round(k * (len(frames) - 1) / (STILLS - 1))] for k in range(STILLS)}
-    temporary = folder / ".film.tmp.mp4"
-    writer, kept = None, []
-    for done, frame in enumerate(frames):
-        images = [
-            _outlined(image, view.camera, outlines)
-            for image, view in zip(draw(playback, shown, frame, backend), shown, strict=True)
-        ]
-        picture = _even(_captioned(np.concatenate(images, axis=1), float(result.times_s[frame])))
-        if writer is None:
-            size = (picture.shape[1], picture.shape[0])
-            rate = float(result.figures["frame_rate"]) / stride
-            writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-            if not writer.isOpened():
-                raise PhysicsError(f"{temporary}: OpenCV here cannot write MPEG-4 video")
-        writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
-        if frame in stills:
-            kept.append([_captioned(i, float(result.times_s[frame])) for i in images])
-        if on_progress is not None:
-            on_progress(done + 1, len(frames))
-    assert writer is not None
-    writer.release()
-    os.replace(temporary, folder / "film.mp4")
+    kept = []
+    with video_file(folder / "film.mp4", frames_per_second=frame_rate / stride) as video:
+        for done, frame in enumerate(frames):
+            images = [
+                _outlined(image, view.camera, outlines)
+                for image, view in zip(draw(playback, shown, frame, backend), shown, strict=True)
+            ]
+            time = float(result.times_s[frame])
+            video.add(_captioned(np.concatenate(images, axis=1), time))
+            if frame in stills:
+                kept.append([_captioned(image, time) for image in images])
+            if on_progress is not None:
+                on_progress(done + 1, len(frames))
     rows = [np.concatenate([still[c] for still in kept], axis=1) for c in range(len(shown))]
     write_png(folder / "strip.png", np.concatenate(rows, axis=0))
-
-
-def write_png(path: Path, image: Image) -> None:
-    """Write an RGB image, whole or not at all."""
-    import cv2
-
-    from ..._files import atomic_file
-
-    done, data = cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))
-    if not done:
-        raise PhysicsError(f"{path}: the image could not be encoded")
-    with atomic_file(path) as file:
-        file.write(data.tobytes())
 
 
 def draw_curves(result: SimulationResult, path: Path) -> None:
@@ -263,10 +240,6 @@ def _captioned(image: Image, time: float) -> Image:
     return picture
 
 
-def _even(image: Image) -> Image:
-    return np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
-
-
 __all__ = [
     "FilmView",
     "draw",
@@ -275,5 +248,4 @@ __all__ = [
     "views",
     "walls",
     "write_film",
-    "write_png",
 ]
