@@ -16,6 +16,7 @@ import simplejpeg
 import typer
 
 from real2sim import cli
+from real2sim._commands import drive as drive_command
 
 from .fake_episode import IMAGE
 from .fake_worker import FakeWorker
@@ -233,3 +234,16 @@ def fly() -> None:
 @extension.command()
 def swim() -> None:
     """Not a car either."""
+
+
+def test_the_width_holds_for_what_a_planner_is_shown():
+    needed = [
+        {"camera": "front", "modalities": ["rgb"], "width": None},
+        {"camera": "left", "modalities": ["depth"], "width": 64},
+    ]
+    shown = drive_command._sensors(["left"], 320, needed)
+    assert shown == [
+        {"camera": "front", "modalities": ["rgb"], "width": 320},
+        {"camera": "left", "modalities": ["depth", "rgb"], "width": 320},
+    ]
+    assert drive_command._sensors([], 320, needed)[1]["width"] == 64

@@ -37,10 +37,15 @@ def drive(
     ] = "follow_route",
     steps: Annotated[int, typer.Option(min=1, help="Clock steps; fewer when it ends.")] = 100,
     cameras: Annotated[str, typer.Option(help="Names, with commas between; 'all'.")] = "",
-    width: Annotated[int | None, typer.Option(min=16, help="Pixels; default: recorded.")] = None,
+    width: Annotated[
+        int | None, typer.Option(min=16, help="Pixels of its images; default: recorded.")
+    ] = None,
     codec: Annotated[str, typer.Option(help="auto, raw, jpeg or png.")] = "auto",
     seed: Annotated[int, typer.Option(min=0, help="Of the episode.")] = 0,
     dt_us: Annotated[int, typer.Option(help="Clock step.")] = 100_000,
+    warmup_us: Annotated[
+        int, typer.Option(min=0, help="The vehicle moves as recorded for so long; plans wait.")
+    ] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Save frames there: CAMERA/STEP.jpg, summary.json.")
     ] = None,
@@ -75,6 +80,7 @@ def drive(
                 on_observation=on_observation,
                 seed=seed,
                 dt_us=dt_us,
+                warmup_us=warmup_us,
                 action=needs.action,
                 # A planner that does not say what it needs is shown everything.
                 privileged=needs.privileged or not hasattr(driver, "needs"),
@@ -85,8 +91,12 @@ def drive(
 def _sensors(
     names: list[str], width: int | None, needed: list[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """What the planner needs, and rgb of the cameras asked for."""
-    sensors = {sensor["camera"]: sensor for sensor in needed}
+    """What the planner needs, and rgb of the cameras asked for.
+
+    ``width`` holds for all but cameras of which the planner needs a width of its own, and that
+    nobody else asks for.
+    """
+    sensors = {s["camera"]: s | {"width": s["width"] or width} for s in needed}
     for name in names:
         sensor = sensors.setdefault(name, {"camera": name, "modalities": [], "width": None})
         both = {*sensor["modalities"], "rgb"}

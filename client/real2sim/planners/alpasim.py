@@ -9,47 +9,95 @@ from __future__ import annotations
 import importlib
 import math
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl
 
 import numpy as np
 
 from real2sim_proto.plans import TrajectoryPlan
 
-from ._alpasim_messages import GLOBAL_SHUTTER, METHODS, SERVICE, messages
-from .peer import Matrix, PeerError, T_ego_camera, T_world_ego, checked_points, rgb_frames
+from .._alpasim_messages import (
+    DRIVER,
+    DRIVER_METHODS,
+    GLOBAL_SHUTTER,
+    MAX_MESSAGE_BYTES,
+    messages,
+)
+from .._poses import Matrix, quaternion_of
+from ._ftheta import Ftheta
+from .follow_route import Comfort, Path, delays_of_poses
+from .peer import (
+    Look,
+    PeerError,
+    T_ego_camera,
+    T_world_ego,
+    cameras_for,
+    checked_points,
+    looks_in,
+    looks_of,
+    quoted_cameras,
+    rgb_frames,
+)
 from .planner import Needs
 
 if TYPE_CHECKING:
+    from real2sim_proto.scenes import CameraInfo
+
     from ..images import Frame
     from ..observation import Observation
 
-MAX_MESSAGE_BYTES = 64 * 1024 * 1024
+PATIENCE = 50
+"""Answers without a plan at the start of a session, before it is given up."""
+WAYPOINTS, WAYPOINT_SPACING = 20, 80 / 19
+"""Of the route as AlpaSim sends it [m]; what is missing at its end is not a number."""
+ALPASIM_CAMERAS = {
+    "camera_front_wide_120fov": Look(0.0, math.radians(120)),
+    "camera_front_tele_30fov": Look(0.0, math.radians(30)),
+    "camera_cross_left_120fov": Look(math.radians(70), math.radians(120)),
+    "camera_cross_right_120fov": Look(math.radians(-70), math.radians(120)),
+    "camera_rear_left_70fov": Look(math.radians(150), math.radians(70)),
+    "camera_rear_right_70fov": Look(math.radians(-150), math.radians(70)),
+    "camera_rear_tele_30fov": Look(math.pi, math.radians(30)),
+}
+"""The cameras that AlpaSim's drivers know; directions to some ten degrees."""
 
 
 class AlpasimDriver:
-    """Asks a planner behind AlpaSim's interface."""
+    """Asks a planner behind AlpaSim's interface.
 
-    needs = Needs(modalities=("rgb",), all_cameras=True)
+    It is shown the cameras that it wants, under the names by which it knows them. NVIDIA's own
+    service says which these are when a session lacks them; other drivers are shown every camera
+    unless ``cameras`` says which. While a driver has no plan yet, for want of images or of a past,
+    the vehicle keeps to its route at its speed.
+    """
 
     def __init__(
         self,
         target: str = "127.0.0.1:6789",
         *,
         timeout: float = 60.0,
-        step_us: int = 100_000,
+        step_us: int | None = None,
         seed: int = 0,
+        cameras: Mapping[str, str] | Sequence[str] = (),
+        patience: int = PATIENCE,
     ) -> None:
         """Reach a driver; it may take ``timeout`` seconds to come up, and as long for an answer.
 
         Args:
-            target: host and port.
+            target: host and port; ``?cameras=NAME:CAMERA,NAME`` behind them says what ``cameras``
+                does.
             timeout: [s].
-            step_us: when it will be asked again [us].
+            step_us: when it will be asked again [us]; default: what lay between the last two
+                observations.
             seed: of the session; sent to the driver.
+            cameras: names by which the driver knows cameras; of a mapping, to the scene's.
+            patience: how many answers may lack a plan at the start of a session.
 
         Raises:
             PeerError: it does not come up, or the ``alpasim`` extra is not installed.
+            ValueError: an option behind the target that is unknown.
         """
         try:
             self._grpc, self._messages = importlib.import_module("grpc"), messages()
@@ -57,25 +105,35 @@ class AlpasimDriver:
             raise PeerError(
                 "AlpaSim drivers need the alpasim extra: pip install 'real2sim[alpasim]'"
             ) from error
-        self.target, self._timeout = target, timeout
+        self.target, options = _split(target)
+        self._timeout, self._patience = timeout, patience
         self._step_us, self._seed = step_us, seed
-        self._session, self._origin = "", np.zeros(3)
+        self._session, self._origin, self._last_us = "", np.zeros(3), -1
+        self._shown: dict[str, str] = {}
+        self._without_plan = 0
+        self._planned = self._in_ftheta = False
         sizes = ("grpc.max_send_message_length", "grpc.max_receive_message_length")
-        options = [(name, MAX_MESSAGE_BYTES) for name in sizes]
-        self._channel = self._grpc.insecure_channel(target, options=options)
-        self._calls = {name: self._call_of(name, *pair) for name, pair in METHODS.items()}
+        self._channel = self._grpc.insecure_channel(
+            self.target, options=[(name, MAX_MESSAGE_BYTES) for name in sizes]
+        )
+        self._calls = {name: self._call_of(name, *pair) for name, pair in DRIVER_METHODS.items()}
         self.version = self._call("get_version", self._messages.Empty(), wait=True).version_id
+        given = dict(cameras) if isinstance(cameras, Mapping) else dict.fromkeys(cameras, "")
+        given |= options
+        names = tuple(given) or self._asked_for()
+        self._given = {name: camera for name, camera in given.items() if camera}
+        self.needs: Needs = _DriverNeeds(
+            modalities=("rgb",), all_cameras=not names, names=names, given=self._given
+        )
 
     def reset(self, obs: Observation) -> None:
         """Begin a session of the driver, and end the one before. Raises PeerError."""
         self._end_session()
         self._origin = np.array(obs.ego.position)
-        session = uuid.uuid4().hex
-        request = self._messages.DriveSessionRequest(session_uuid=session, random_seed=self._seed)
-        cameras = request.rollout_spec.vehicle.available_cameras
-        cameras.extend(self._camera(n, f, obs) for n, f in rgb_frames(obs).items())
-        self._call("start_session", request)
-        self._session = session
+        self._last_us, self._without_plan, self._planned = -1, 0, False
+        there, names = looks_in(obs), getattr(self.needs, "names", ())
+        self._shown = cameras_for(names or there, there, known=ALPASIM_CAMERAS, given=self._given)
+        self._begin_session(obs)
 
     def plan(self, obs: Observation) -> TrajectoryPlan:
         """Show the driver what its cameras see, its motion and route; where it wants to be.
@@ -83,34 +141,113 @@ class AlpasimDriver:
         Raises:
             PeerError: it cannot be reached, ends the session, or answers with what is no way.
         """
-        m = self._messages
-        for name, frame in rgb_frames(obs).items():
+        self._show_images(obs)
+        self._call("submit_egomotion_observation", self._motion(obs))
+        self._call("submit_route", self._route(obs))
+        request = self._messages.DriveRequest(
+            session_uuid=self._session,
+            time_now_us=obs.t_us,
+            time_query_us=obs.t_us + self._until_next(obs.t_us),
+        )
+        try:
+            answer = self._call("drive", request)
+        except _RefusalError as refusal:
+            # NVIDIA's models say so while the past that they are shown is too short.
+            if refusal.status != "FAILED_PRECONDITION" or self._planned:
+                raise
+            return self._meanwhile(obs, refusal.details)
+        if answer.terminate_session:
+            raise PeerError(f"the driver at {self.target} ends the session at {obs.t_us} us")
+        if not answer.trajectory.poses and not self._planned:
+            return self._meanwhile(obs, "an empty trajectory")
+        self._planned = True
+        return self._plan_in(answer, obs.t_us)
+
+    def close(self) -> None:
+        """End the session and close the connection."""
+        try:
+            self._end_session()
+        finally:
+            self._channel.close()
+
+    def _asked_for(self) -> tuple[str, ...]:
+        """Names of the cameras that the driver says it lacks in a session without any."""
+        session = uuid.uuid4().hex
+        try:
+            self._call(
+                "start_session",
+                self._messages.DriveSessionRequest(session_uuid=session, random_seed=self._seed),
+            )
+        except _RefusalError as refusal:
+            return tuple(quoted_cameras(refusal.details))
+        self._call("close_session", self._messages.DriveSessionCloseRequest(session_uuid=session))
+        return ()
+
+    def _begin_session(self, obs: Observation) -> None:
+        session = uuid.uuid4().hex
+        request = self._messages.DriveSessionRequest(session_uuid=session, random_seed=self._seed)
+        frames = rgb_frames(obs)
+        request.rollout_spec.vehicle.available_cameras.extend(
+            self._camera(name, frames[camera], obs) for name, camera in self._shown.items()
+        )
+        self._call("start_session", request)
+        self._session = session
+
+    def _end_session(self) -> None:
+        if self._session:
+            session, self._session = self._session, ""
+            self._call(
+                "close_session", self._messages.DriveSessionCloseRequest(session_uuid=session)
+            )
+
+    def _show_images(self, obs: Observation) -> None:
+        try:
+            self._send_images(obs)
+        except _RefusalError as refusal:
+            if self._in_ftheta or "f-theta" not in refusal.details:
+                raise
+            # A driver that rectifies says so at the first image, and not when a session begins.
+            self._in_ftheta = True
+            self._end_session()
+            self._begin_session(obs)
+            self._send_images(obs)
+
+    def _send_images(self, obs: Observation) -> None:
+        m, frames = self._messages, rgb_frames(obs)
+        encoded: dict[str, bytes] = {}
+        for name, camera in self._shown.items():
+            frame = frames.get(camera)
+            # A slower camera has no image in every observation.
+            if frame is None or (frame.t_us != obs.t_us):
+                continue
             image = m.CameraImage(
                 frame_start_us=frame.t_us,
                 frame_end_us=frame.t_us,
-                image_bytes=_encoded(frame),
+                image_bytes=encoded.get(camera) or encoded.setdefault(camera, _encoded(frame)),
                 logical_id=name,
             )
             request = m.RolloutCameraImage(session_uuid=self._session, camera_image=image)
             self._call("submit_image_observation", request)
-        self._call("submit_egomotion_observation", self._motion(obs))
-        route = m.Route(timestamp_us=obs.t_us, waypoints=[self._vector((*p, 0)) for p in obs.route])
-        self._call("submit_route", m.RouteRequest(session_uuid=self._session, route=route))
-        request = m.DriveRequest(
-            session_uuid=self._session,
-            time_now_us=obs.t_us,
-            time_query_us=obs.t_us + self._step_us,
-        )
-        return self._plan_in(self._call("drive", request), obs.t_us)
 
-    def close(self) -> None:
-        """End the session and close the connection."""
-        self._end_session()
-        self._channel.close()
+    def _meanwhile(self, obs: Observation, said: str) -> TrajectoryPlan:
+        """On along the route at the speed of now."""
+        if not obs.warming_up:
+            self._without_plan += 1
+        if self._without_plan > self._patience:
+            raise PeerError(
+                f"the driver at {self.target} has no plan after {self._without_plan} "
+                f"observations: {said}",
+                hint="see which context it needs, and what --dt-us lies between observations",
+            )
+        delays = delays_of_poses(speed=1.0, horizon=3.0, spacing=0.25)
+        path = Path.along(obs.route)
+        poses = path.poses(max(obs.ego.speed, 0.0) * delays, Comfort().recovery)
+        return TrajectoryPlan(
+            times_us=[obs.t_us + round(delay * 1e6) for delay in delays],
+            poses=[tuple(pose) for pose in poses.tolist()],
+        )
 
     def _plan_in(self, answer: Any, t_us: int) -> TrajectoryPlan:
-        if answer.terminate_session:
-            raise PeerError(f"the driver at {self.target} ends the session at {t_us} us")
         ahead = [p for p in answer.trajectory.poses if p.timestamp_us > t_us]
         if not ahead:
             raise PeerError(f"the driver at {self.target} plans nothing after {t_us} us")
@@ -124,22 +261,37 @@ class AlpasimDriver:
         except ValueError as error:
             raise PeerError(f"{what} is no plan: {error}") from error
 
+    def _until_next(self, t_us: int) -> int:
+        before, self._last_us = self._last_us, t_us
+        if self._step_us is not None:
+            return self._step_us
+        return t_us - before if 0 <= before < t_us else 100_000
+
     def _camera(self, name: str, frame: Frame, obs: Observation) -> Any:
         m = self._messages
-        height, width = frame.array.shape[:2]
-        pinhole = m.OpenCVPinholeCameraParam(
-            principal_point_x=frame.K[0, 2],
-            principal_point_y=frame.K[1, 2],
-            focal_length_x=frame.K[0, 0],
-            focal_length_y=frame.K[1, 1],
-        )
+        height, width = frame.shape[:2]
         intrinsics = m.CameraSpec(
-            opencv_pinhole_param=pinhole,
             logical_id=name,
             resolution_h=height,
             resolution_w=width,
             shutter_type=GLOBAL_SHUTTER,
         )
+        centre = {"principal_point_x": frame.K[0, 2], "principal_point_y": frame.K[1, 2]}
+        if self._in_ftheta:
+            lens = Ftheta.of(frame.K, width, height)
+            intrinsics.ftheta_param.CopyFrom(
+                m.FthetaCameraParam(
+                    **centre,
+                    reference_poly=ANGLE_TO_PIXELS,
+                    pixeldist_to_angle_poly=lens.pixels_to_angle,
+                    angle_to_pixeldist_poly=lens.angle_to_pixels,
+                    max_angle=lens.max_angle,
+                    linear_cde=m.LinearCde(linear_c=lens.stretch),
+                )
+            )
+        else:
+            focal = {"focal_length_x": frame.K[0, 0], "focal_length_y": frame.K[1, 1]}
+            intrinsics.opencv_pinhole_param.CopyFrom(m.OpenCVPinholeCameraParam(**centre, **focal))
         # In spite of its name this is where the camera is in the rig; see AlpaSim's comment on it.
         pose = self._pose(T_ego_camera(obs, frame))
         return m.AvailableCamera(intrinsics=intrinsics, rig_to_camera=pose, logical_id=name)
@@ -152,6 +304,7 @@ class AlpasimDriver:
         state = m.DynamicState(
             angular_velocity=self._vector((0, 0, ego.yaw_rate)),
             linear_velocity=self._vector((ego.speed, ego.lateral_speed, 0)),
+            linear_acceleration=self._vector((ego.acceleration, ego.speed * ego.yaw_rate, 0)),
         )
         return m.RolloutEgoTrajectory(
             session_uuid=self._session,
@@ -159,8 +312,14 @@ class AlpasimDriver:
             dynamic_states=[state],
         )
 
+    def _route(self, obs: Observation) -> Any:
+        m = self._messages
+        points = _spaced(obs.route)
+        route = m.Route(timestamp_us=obs.t_us, waypoints=[self._vector(p) for p in points.tolist()])
+        return m.RouteRequest(session_uuid=self._session, route=route)
+
     def _pose(self, matrix: Matrix) -> Any:
-        w, x, y, z = _quaternion(matrix[:3, :3])
+        w, x, y, z = quaternion_of(matrix[:3, :3])
         quat = self._messages.Quat(w=w, x=x, y=y, z=z)
         return self._messages.Pose(vec=self._vector(matrix[:3, 3]), quat=quat)
 
@@ -170,7 +329,7 @@ class AlpasimDriver:
 
     def _call_of(self, name: str, request: str, answer: str) -> Any:
         return self._channel.unary_unary(
-            f"/{SERVICE}/{name}",
+            f"/{DRIVER}/{name}",
             request_serializer=getattr(self._messages, request).SerializeToString,
             response_deserializer=getattr(self._messages, answer).FromString,
         )
@@ -179,17 +338,75 @@ class AlpasimDriver:
         try:
             return self._calls[name](request, timeout=self._timeout, wait_for_ready=wait)
         except self._grpc.RpcError as error:
-            raise PeerError(
-                f"{name} of the driver at {self.target} failed: {error.code().name}, "
-                f"{error.details()}"
+            raise _RefusalError(
+                f"{name} of the driver at {self.target} failed",
+                status=error.code().name,
+                details=error.details() or "",
             ) from error
 
-    def _end_session(self) -> None:
-        if self._session:
-            session, self._session = self._session, ""
-            self._call(
-                "close_session", self._messages.DriveSessionCloseRequest(session_uuid=session)
-            )
+
+ANGLE_TO_PIXELS = 2
+"""Which polynomial of an f-theta camera is the reference, in AlpaSim's count."""
+
+
+class _RefusalError(PeerError):
+    """A call that the driver did not answer.
+
+    Attributes:
+        status: name of gRPC's.
+        details: the driver's words.
+    """
+
+    def __init__(self, what: str, *, status: str, details: str) -> None:
+        super().__init__(f"{what}: {status}, {details}")
+        self.status, self.details = status, details
+
+
+@dataclass(frozen=True)
+class _DriverNeeds(Needs):
+    """Needs of a driver that names its cameras in its own way.
+
+    Attributes:
+        names: by which it knows them; empty: every camera under its own.
+        given: cameras of the scene by these names.
+    """
+
+    names: tuple[str, ...] = ()
+    given: Mapping[str, str] = field(default_factory=dict)
+
+    def sensors(self, cameras: Sequence[CameraInfo]) -> list[dict[str, Any]]:
+        """Sensors of the cameras that serve. Raises PeerError: none does for a name."""
+        if not self.names:
+            return super().sensors(cameras)
+        chosen = cameras_for(self.names, looks_of(cameras), known=ALPASIM_CAMERAS, given=self.given)
+        return [
+            {"camera": camera, "modalities": list(self.modalities), "width": self.width}
+            for camera in dict.fromkeys(chosen.values())
+        ]
+
+
+def _split(target: str) -> tuple[str, dict[str, str]]:
+    """Address, and the cameras behind it: ``HOST:PORT?cameras=NAME:CAMERA,NAME``."""
+    address, _, query = target.partition("?")
+    cameras: dict[str, str] = {}
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key != "cameras":
+            raise ValueError(f"option {key!r} of {target!r} is unknown; there is: cameras")
+        pairs = [part.partition(":") for part in value.split(",") if part]
+        cameras |= {name: camera for name, _, camera in pairs}
+    return address, cameras
+
+
+def _spaced(route: Matrix) -> Matrix:
+    """[20, 3] waypoints from the vehicle on as AlpaSim spaces them; nan where the route is over."""
+    path = Path.along(route)
+    wanted = np.arange(WAYPOINTS) * WAYPOINT_SPACING
+    found = np.full((WAYPOINTS, 3), np.nan)
+    here = wanted <= path.arc[-1] + 1e-9
+    for axis in (0, 1):
+        found[here, axis] = np.interp(wanted[here], path.arc, path.points[:, axis])
+    found[here, 2] = 0.0
+    return found
 
 
 def _encoded(frame: Frame) -> bytes:
@@ -204,19 +421,3 @@ def _encoded(frame: Frame) -> bytes:
 
 def _yaw(q: Any) -> float:
     return math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-
-
-def _quaternion(R: Matrix) -> tuple[float, float, float, float]:
-    """wxyz of a rotation, by the largest eigenvector of Bar-Itzhack's matrix (2000)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
-    K = np.array(
-        [
-            [xx - yy - zz, 0, 0, 0],
-            [yx + xy, yy - xx - zz, 0, 0],
-            [zx + xz, zy + yz, zz - xx - yy, 0],
-            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(K)[1][:, -1]
-    sign = -1.0 if w < 0 else 1.0
-    return (sign * w, sign * x, sign * y, sign * z)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .._poses import Matrix, pose_matrix
 from ..errors import Real2SimError
 
 if TYPE_CHECKING:
     from real2sim_proto.drive import EgoState
+    from real2sim_proto.scenes import CameraInfo
 
     from ..images import Frame
     from ..observation import Observation
-
-Matrix = NDArray[np.float64]
 
 
 class PeerError(Real2SimError):
@@ -26,15 +28,7 @@ class PeerError(Real2SimError):
 
 def T_world_ego(ego: EgoState) -> Matrix:
     """[4, 4] pose of the vehicle: rear axle on the ground, x forward, y left, z up."""
-    w, x, y, z = ego.quaternion
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = ego.position
-    return pose
+    return pose_matrix(ego.position, ego.quaternion)
 
 
 def T_ego_camera(obs: Observation, frame: Frame) -> Matrix:
@@ -107,6 +101,91 @@ def named_as(
         if name not in found and theirs not in found.values():
             found[name] = theirs
     return found
+
+
+@dataclass(frozen=True)
+class Look:
+    """Where a camera looks and how much of it: radians, ``turn`` positive to the left."""
+
+    turn: float
+    field: float
+
+    @classmethod
+    def of(cls, K: Any, width: int, T_ego_camera: Any) -> Look:
+        """Of a pinhole camera on the vehicle."""
+        K, pose = np.asarray(K, dtype=np.float64), np.asarray(T_ego_camera, dtype=np.float64)
+        left, right = K[0, 2] / K[0, 0], (width - K[0, 2]) / K[0, 0]
+        return cls(_turn(pose), math.atan(left) + math.atan(right))
+
+
+def looks_of(cameras: Iterable[CameraInfo]) -> dict[str, Look]:
+    """Of a scene's cameras, by their names."""
+    return {c.name: Look.of(c.K, c.width, c.T_vehicle_camera) for c in cameras}
+
+
+def looks_in(obs: Observation) -> dict[str, Look]:
+    """Of the cameras whose images an observation has, by their names."""
+    return {
+        name: Look.of(frame.K, frame.shape[1], T_ego_camera(obs, frame))
+        for name, frame in rgb_frames(obs).items()
+    }
+
+
+def cameras_for(
+    names: Iterable[str],
+    there: Mapping[str, Look],
+    *,
+    known: Mapping[str, Look],
+    given: Mapping[str, str],
+) -> dict[str, str]:
+    """The camera here that serves for each name elsewhere.
+
+    That is the one of the same name, or which ``given`` says, or, for names whose look is
+    ``known``, the one that looks most nearly the same way; of two that look the same way, the one
+    that sees most nearly as much. One camera may serve for several names.
+
+    Raises:
+        PeerError: none does.
+    """
+    return {name: _camera_for(name, there, known, given) for name in names}
+
+
+MOST_APART = math.radians(60)
+"""Between the axes of two cameras that stand for each other [rad]."""
+
+
+def _camera_for(
+    name: str, there: Mapping[str, Look], known: Mapping[str, Look], given: Mapping[str, str]
+) -> str:
+    wanted = given.get(name, name)
+    if wanted in there:
+        return wanted
+    cameras = ", ".join(there) or "none"
+    if name in given:
+        raise PeerError(f"camera {wanted!r}, given for {name!r}, is not there; there: {cameras}")
+    if name not in known:
+        raise PeerError(
+            f"the planner wants camera {name!r}, and nothing says which of {cameras} that is",
+            hint=f"say so: cameras={name}:{next(iter(there), 'CAMERA')}",
+        )
+    look = known[name]
+
+    def apart(camera: str) -> float:
+        return abs(math.remainder(there[camera].turn - look.turn, math.tau))
+
+    near = [camera for camera in there if apart(camera) <= MOST_APART]
+    if not near:
+        raise PeerError(
+            f"the planner wants camera {name!r}, and none of {cameras} looks that way",
+            hint=f"take another one: cameras={name}:{next(iter(there), 'CAMERA')}",
+        )
+    return min(near, key=lambda c: (apart(c) + 0.5 * abs(there[c].field - look.field), c))
+
+
+def quoted_cameras(text: str) -> list[str]:
+    """Names of cameras that a refusal lists, as in ``cameras ['a', 'b'] are missing``."""
+    lists: list[str] = re.findall(r"[Cc]ameras?\s*[\[({]([^\])}]*)", text)
+    return list(dict.fromkeys(re.findall(r"['\"]([^'\"]+)['\"]", " ".join(lists))))
 
 
 def _turn(T_ego_camera: Matrix) -> float:

@@ -13,16 +13,26 @@ STRAIGHT = np.stack([np.arange(0.0, 100.0), np.zeros(100)], axis=1)
 
 
 def observation(
-    route, *, speed=0.0, position=(0.0, 0.0, 0.0), yaw=0.0, agents=(), frames=None, t_us=1_000_000
+    route,
+    *,
+    speed=0.0,
+    position=(0.0, 0.0, 0.0),
+    yaw=0.0,
+    agents=(),
+    frames=None,
+    t_us=1_000_000,
+    acceleration=0.0,
+    yaw_rate=0.0,
+    warming_up=False,
 ) -> Observation:
     ego = EgoState(
         position=position,
         quaternion=(math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)),
         yaw=yaw,
         speed=speed,
-        acceleration=0.0,
+        acceleration=acceleration,
         steering=0.0,
-        yaw_rate=0.0,
+        yaw_rate=yaw_rate,
         size=(4.6, 1.9, 1.6),
     )
     return Observation(
@@ -34,6 +44,7 @@ def observation(
         route=np.asarray(route, float),
         command="straight",
         agents=agents,
+        warming_up=warming_up,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import struct
 from concurrent.futures import ThreadPoolExecutor
@@ -11,10 +12,13 @@ import grpc
 import numpy as np
 import pytest
 
+from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS, messages
+from real2sim._poses import quaternion_of
 from real2sim.planners import load_planner, needs_of
-from real2sim.planners._alpasim_messages import METHODS, SERVICE, messages
-from real2sim.planners.alpasim import AlpasimDriver, _quaternion
+from real2sim.planners._ftheta import Ftheta
+from real2sim.planners.alpasim import AlpasimDriver
 from real2sim.planners.peer import PeerError
+from real2sim_proto.scenes import CameraInfo
 from real2sim_server.geometry.rotation import quaternion_to_matrix
 
 from . import rig
@@ -23,11 +27,17 @@ pytestmark = pytest.mark.network
 
 
 class Driver:
-    """Drives straight on along x of its local frame; keeps what it was asked."""
+    """Drives straight on along x of its local frame; keeps what it was asked.
+
+    Refuses as NVIDIA's service does: sessions without the cameras that it wants, images of others,
+    and, of what it calls a rectifier, images of cameras that are not f-theta.
+    """
 
     def __init__(self):
         self.asked: list[tuple[str, object]] = []
         self.answer = self.way(1.0, 2.0, 3.0)
+        self.wants: list[str] = []
+        self.rectifies = self.short_of_past = False
 
     def way(self, *xs: float, terminate: bool = False):
         m = messages()
@@ -42,7 +52,9 @@ class Driver:
         return m.DriveResponse(trajectory=m.Trajectory(poses=poses), terminate_session=terminate)
 
     def handler(self, name: str, request: str, answer: str):
-        def handle(asked, _context):
+        def handle(asked, context):
+            if refused := self.refusal(name, asked):
+                context.abort(*refused)
             self.asked.append((name, asked))
             return self.answer if name == "drive" else getattr(messages(), answer)()
 
@@ -52,13 +64,32 @@ class Driver:
             response_serializer=getattr(messages(), answer).SerializeToString,
         )
 
+    def refusal(self, name: str, asked):
+        if name == "start_session":
+            self.cameras = asked.rollout_spec.vehicle.available_cameras
+            missing = sorted({*self.wants} - {c.logical_id for c in self.cameras})
+            text = f"Unexpected <class 'ValueError'>: Requested cameras {missing} are missing"
+            return missing and (grpc.StatusCode.UNKNOWN, text)
+        if name == "submit_image_observation":
+            given = asked.camera_image.logical_id
+            if self.wants and given not in self.wants:
+                return (grpc.StatusCode.UNKNOWN, f"Camera {given} not in desired cameras")
+            if self.rectifies and not all(
+                c.intrinsics.HasField("ftheta_param") for c in self.cameras
+            ):
+                text = f"Camera {given} does not provide f-theta intrinsics"
+                return (grpc.StatusCode.UNKNOWN, text)
+        if name == "drive" and self.short_of_past:
+            return (grpc.StatusCode.FAILED_PRECONDITION, "ego pose history is too short")
+        return None
+
 
 @pytest.fixture
 def driver():
     peer = Driver()
     server = grpc.server(ThreadPoolExecutor(2))
-    handlers = {name: peer.handler(name, *pair) for name, pair in METHODS.items()}
-    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
+    handlers = {name: peer.handler(name, *pair) for name, pair in DRIVER_METHODS.items()}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(DRIVER, handlers),))
     peer.target = f"127.0.0.1:{server.add_insecure_port('127.0.0.1:0')}"
     server.start()
     yield peer
@@ -77,6 +108,16 @@ def asked(driver, name):
     return [request for kind, request in driver.asked if kind == name]
 
 
+def sessions(driver):
+    """Those that were begun to drive, and not to ask for cameras."""
+    begun = asked(driver, "start_session")
+    return [request for request in begun if request.rollout_spec.vehicle.available_cameras]
+
+
+def reached(driver, suffix="", **options):
+    return AlpasimDriver(driver.target + suffix, timeout=20, **options)
+
+
 def test_it_is_found_by_name_and_wants_all_cameras(driver):
     planner = load_planner(f"alpasim={driver.target}")
     assert needs_of(planner).all_cameras
@@ -93,7 +134,7 @@ def test_poses_after_now_come_back_in_the_world(planner):
 
 
 def test_the_session_tells_of_cameras_and_seed(driver, planner):
-    (request,) = asked(driver, "start_session")
+    (request,) = sessions(driver)
     assert request.random_seed == 7
     assert len(request.session_uuid) == 32
     cameras = {c.logical_id: c for c in request.rollout_spec.vehicle.available_cameras}
@@ -110,7 +151,7 @@ def test_the_session_tells_of_cameras_and_seed(driver, planner):
 
 
 def test_each_step_shows_images_motion_and_route_before_it_asks(driver, planner):
-    planner.plan(rig.seen(position=(103.0, 50.0, 2.0)))
+    planner.plan(rig.seen(position=(103.0, 50.0, 2.0), acceleration=-1.5, yaw_rate=0.1))
     kinds = [kind for kind, _ in driver.asked]
     told = ["submit_image_observation"] * 3 + ["submit_egomotion_observation", "submit_route"]
     assert kinds[-6:] == [*told, "drive"]
@@ -128,17 +169,21 @@ def test_each_step_shows_images_motion_and_route_before_it_asks(driver, planner)
     assert (pose.pose.vec.x, pose.pose.vec.y, pose.pose.vec.z) == (3.0, 0.0, 0.0)
     assert 2 * math.atan2(pose.pose.quat.z, pose.pose.quat.w) == pytest.approx(math.radians(30))
     assert state.linear_velocity.x == 6.0
+    acceleration = state.linear_acceleration
+    assert (acceleration.x, acceleration.y) == pytest.approx((-1.5, 0.6))
     (route,) = asked(driver, "submit_route")
-    assert len(route.route.waypoints) == 100
+    waypoints = [p.x for p in route.route.waypoints]
+    assert waypoints == pytest.approx(np.linspace(0.0, 80.0, 20), abs=1e-3)
     (drive,) = asked(driver, "drive")
     assert (drive.time_now_us, drive.time_query_us) == (1_000_000, 1_100_000)
-    assert len({r.session_uuid for _, r in driver.asked if hasattr(r, "session_uuid")}) == 1
+    driven = driver.asked[driver.asked.index(("start_session", sessions(driver)[0])) :]
+    assert len({r.session_uuid for _, r in driven if hasattr(r, "session_uuid")}) == 1
 
 
 def test_a_new_episode_closes_the_session_before(driver, planner):
     planner.reset(rig.seen())
-    first, second = (r.session_uuid for r in asked(driver, "start_session"))
-    assert [r.session_uuid for r in asked(driver, "close_session")] == [first]
+    first, second = (r.session_uuid for r in sessions(driver))
+    assert asked(driver, "close_session")[-1].session_uuid == first
     assert first != second
 
 
@@ -162,6 +207,155 @@ def test_nobody_there_is_said_by_address():
         AlpasimDriver("127.0.0.1:9", timeout=0.3)
 
 
+FRONT, LEFT = "camera_front_wide_120fov", "camera_cross_left_120fov"
+
+
+@pytest.fixture
+def infos():
+    return [
+        CameraInfo(
+            name=name,
+            width=48,
+            height=32,
+            K=rig.K.tolist(),
+            T_vehicle_camera=rig.camera_on_vehicle(degrees).tolist(),
+        )
+        for name, degrees in rig.CAMERAS.items()
+    ]
+
+
+def shown(driver):
+    return [i.camera_image.logical_id for i in asked(driver, "submit_image_observation")]
+
+
+def test_a_driver_is_shown_the_cameras_that_it_wants_by_its_names(driver, infos):
+    driver.wants = [LEFT, FRONT]
+    planner = reached(driver)
+    assert [s["camera"] for s in planner.needs.sensors(infos)] == ["left", "front"]
+    planner.reset(rig.seen())
+    planner.plan(rig.seen())
+    assert sorted(shown(driver)) == sorted([LEFT, FRONT])
+    (session,) = sessions(driver)
+    cameras = {c.logical_id: c for c in session.rollout_spec.vehicle.available_cameras}
+    assert set(cameras) == {LEFT, FRONT}
+    v, expected = cameras[LEFT].rig_to_camera.quat, rig.camera_on_vehicle(50.0)
+    rotation = quaternion_to_matrix(np.array([v.w, v.x, v.y, v.z]))
+    np.testing.assert_allclose(rotation, expected[:3, :3], atol=1e-6)
+    planner.close()
+
+
+def test_one_camera_serves_for_wide_and_tele(driver, infos):
+    driver.wants = [FRONT, "camera_front_tele_30fov"]
+    planner = reached(driver)
+    assert [s["camera"] for s in planner.needs.sensors(infos)] == ["front"]
+    planner.reset(rig.seen())
+    planner.plan(rig.seen())
+    assert sorted(shown(driver)) == sorted(driver.wants)
+    planner.close()
+
+
+def test_cameras_are_named_behind_the_target(driver, infos):
+    driver.wants = ["middle", FRONT]
+    planner = load_planner(f"alpasim={driver.target}?cameras=middle:CAM_BACK,{FRONT}")
+    assert [s["camera"] for s in needs_of(planner).sensors(infos)] == ["CAM_BACK", "front"]
+    planner.close()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "suffix", "said"),
+    [
+        ("middle", "", "nothing says which of front, left, CAM_BACK"),
+        ("camera_cross_right_120fov", "", "none of front, left looks that way"),
+        ("middle", "?cameras=middle:roof", "camera 'roof', given for 'middle', is not there"),
+    ],
+)
+def test_a_camera_that_nothing_here_stands_for_is_said(driver, infos, wanted, suffix, said):
+    driver.wants = [wanted]
+    planner = reached(driver, suffix)
+    cameras = infos if "CAM_BACK" in said else infos[:2]
+    with pytest.raises(PeerError, match=said):
+        planner.needs.sensors(cameras)
+    planner.close()
+
+
+def test_an_unknown_option_behind_the_target_is_refused(driver):
+    with pytest.raises(ValueError, match=r"option 'camera' of .* is unknown; there is: cameras"):
+        reached(driver, "?camera=front")
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_until_its_context_is_full_a_driver_without_plan_keeps_the_vehicle_on_its_route(
+    driver, planner, refused
+):
+    driver.answer, driver.short_of_past = messages().DriveResponse(), refused
+    plan = planner.plan(rig.seen(speed=6.0))
+    assert plan.frame == "vehicle"
+    assert plan.times_us[-1] == 4_000_000
+    assert plan.poses[-1][0] == pytest.approx(18.0, abs=0.01)
+    driver.answer, driver.short_of_past = driver.way(1.0, 2.0), False
+    assert planner.plan(rig.seen()).frame == "world"
+    # From then on, no plan is a failure.
+    driver.answer = messages().DriveResponse()
+    with pytest.raises(PeerError, match="plans nothing"):
+        planner.plan(rig.seen())
+
+
+def test_a_driver_that_never_plans_is_given_up(driver):
+    planner = reached(driver, patience=2)
+    planner.reset(rig.seen())
+    driver.answer = messages().DriveResponse()
+    planner.plan(rig.seen(warming_up=True))
+    for _ in range(2):
+        planner.plan(rig.seen())
+    with pytest.raises(PeerError, match="has no plan after 3 observations: an empty trajectory"):
+        planner.plan(rig.seen())
+    planner.close()
+
+
+def test_a_driver_that_rectifies_is_told_of_f_theta_cameras(driver, planner):
+    driver.rectifies = True
+    planner.plan(rig.seen())
+    assert len(sessions(driver)) == 2
+    (camera,) = [c for c in driver.cameras if c.logical_id == "front"]
+    lens = camera.intrinsics.ftheta_param
+    angles = np.linspace(0.0, lens.max_angle, 50)
+    pixels = np.polynomial.polynomial.polyval(angles, lens.angle_to_pixeldist_poly)
+    np.testing.assert_allclose(pixels, 310.0 * np.tan(angles), atol=1e-6)
+    assert lens.linear_cde.linear_c == pytest.approx(300.0 / 310.0)
+    assert len(shown(driver)) == 3
+
+
+@pytest.mark.parametrize("field", [30, 70, 120])
+def test_a_pinhole_in_f_theta_is_itself(field):
+    focal = 960.0 / math.tan(math.radians(field / 2))
+    K = np.array([[focal, 0, 960.0], [0, focal, 540.0], [0, 0, 1]])
+    lens = Ftheta.of(K, 1920, 1080)
+    angles = np.linspace(0.0, lens.max_angle, 333)
+    exact = focal * np.tan(angles)
+    there = np.polynomial.polynomial.polyval(angles, lens.angle_to_pixels)
+    np.testing.assert_allclose(there, exact, atol=0.02)
+    back = np.polynomial.polynomial.polyval(exact, lens.pixels_to_angle)
+    np.testing.assert_allclose(back * focal, angles * focal, atol=0.02)
+
+
+def test_a_route_that_ends_is_filled_up_with_what_is_no_number(driver, planner):
+    short = dataclasses.replace(rig.seen(), route=np.array([[2.0, 0.0], [10.0, 0.0]]))
+    planner.plan(short)
+    (route,) = asked(driver, "submit_route")
+    xs = [p.x for p in route.route.waypoints]
+    assert xs[:3] == pytest.approx([0.0, 80 / 19, 160 / 19])
+    assert len(xs) == 20
+    assert all(math.isnan(x) for x in xs[3:])
+
+
+def test_the_time_of_the_next_question_follows_the_clock(driver, planner):
+    planner.plan(rig.seen())
+    planner.plan(dataclasses.replace(rig.seen(), t_us=1_050_000))
+    first, second = asked(driver, "drive")
+    assert second.time_query_us - second.time_now_us == 50_000
+    assert first.time_query_us - first.time_now_us == 100_000
+
+
 def nested(number: int, content: bytes) -> bytes:
     return bytes([number << 3 | 2, len(content)]) + content
 
@@ -182,5 +376,5 @@ def test_bytes_on_the_wire_are_those_of_the_field_numbers_of_alpasim():
     "q", [(1.0, 0, 0, 0), (0.5, -0.5, 0.5, -0.5), (0.0, 0, 1, 0), (0.6, 0, 0, 0.8)]
 )
 def test_rotations_become_quaternions(q):
-    found = np.array(_quaternion(quaternion_to_matrix(np.array(q))))
+    found = np.array(quaternion_of(quaternion_to_matrix(np.array(q))))
     assert min(np.abs(found - q).max(), np.abs(found + q).max()) < 1e-12

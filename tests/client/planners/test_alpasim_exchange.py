@@ -1,0 +1,84 @@
+"""A drive by NVIDIA's own driver service, recorded once and played back.
+
+``alpasim_exchange.json`` holds what the service answered, call by call, and where it came from.
+With REAL2SIM_ALPASIM naming a checkout, ``tests/server/service/sessions/test_alpasim_driver.py``
+drives by the service itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import grpc
+import pytest
+
+from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS
+from real2sim.planners.alpasim import AlpasimDriver
+
+from . import rig
+
+pytestmark = pytest.mark.network
+
+EXCHANGE = json.loads(Path(__file__).with_name("alpasim_exchange.json").read_text())
+
+
+@pytest.fixture
+def service():
+    """Answers as recorded, and refuses calls that come out of order."""
+    left = list(EXCHANGE["calls"])
+
+    def handler(name: str):
+        def handle(_request: bytes, context) -> bytes:
+            call = left.pop(0) if left else {"method": "nothing more"}
+            if call["method"] != name:
+                context.abort(grpc.StatusCode.ABORTED, f"{name}, not {call['method']}, is called")
+            if call.get("status"):
+                context.abort(grpc.StatusCode[call["status"]], call["details"])
+            return bytes.fromhex(call["answer"])
+
+        return grpc.unary_unary_rpc_method_handler(handle)
+
+    server = grpc.server(ThreadPoolExecutor(1))
+    handlers = {name: handler(name) for name in DRIVER_METHODS}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(DRIVER, handlers),))
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    yield f"127.0.0.1:{port}", left
+    server.stop(None).wait()
+
+
+def observations(count: int):
+    """A vehicle at 6 m/s, ten times a second."""
+    for k in range(count):
+        t_us = 1_000_000 + 100_000 * k
+        seen = rig.seen(position=(100.0 + 0.6 * k, 50.0, 2.0), yaw=0.0)
+        frames = {
+            name: {"rgb": dataclasses.replace(found["rgb"], t_us=t_us)}
+            for name, found in seen.frames.items()
+        }
+        yield dataclasses.replace(seen, t_us=t_us, frames=frames)
+
+
+def drive(target: str):
+    planner = AlpasimDriver(target, timeout=20)
+    first, *_ = seen = list(observations(6))
+    planner.reset(first)
+    plans = [planner.plan(obs) for obs in seen]
+    planner.close()
+    return plans
+
+
+def test_the_recorded_service_drives(service):
+    target, left = service
+    plans = drive(target)
+    assert not left
+    # Its context is four images of each of two cameras; then it goes straight on at 6 m/s.
+    assert [plan.frame for plan in plans] == ["vehicle"] * 3 + ["world"] * 3
+    for k, plan in enumerate(plans[3:], start=3):
+        now = 1_000_000 + 100_000 * k
+        assert plan.times_us == [now + 100_000 * (i + 1) for i in range(20)]
+        xs = [pose[0] for pose in plan.poses]
+        assert xs == pytest.approx([100.0 + 0.6 * (k + i + 1) for i in range(20)], abs=1e-3)
