@@ -1,4 +1,4 @@
-"""Runs a target in a process of its own, and fails with what it found."""
+"""Runs targets in a process of their own, and fails with what they found."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-SCRIPT = Path(__file__).with_name("run_target.py")
+FOLDER = Path(__file__).parent
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
@@ -16,10 +17,24 @@ def check_target(name: str, config, *, drive: Path | None = None, inputs: int = 
     """Give a reader ``inputs`` damaged inputs, or as many as ``REAL2SIM_FUZZ_INPUTS`` says."""
     given = os.environ.get("REAL2SIM_FUZZ_CORPUS")
     corpus = Path(given) if given else config.cache.mkdir("fuzz")
-    command = [sys.executable, SCRIPT, name, "--corpus", corpus]
-    command += ["--inputs", os.environ.get("REAL2SIM_FUZZ_INPUTS", str(inputs))]
+    options = ["--drive", drive] if drive is not None else []
+    _check(_run("run_target.py", name, "--corpus", corpus, *options, inputs=_inputs(inputs)))
+
+
+def check_service(*names: str, inputs: int) -> None:
+    """Give a worker ``inputs`` damaged inputs by each of the ways that are named."""
+    for report in _run("run_service.py", *names, inputs=inputs):
+        _check(report)
+        assert report["steps_beside"] > 0
+
+
+def _inputs(usual: int) -> int:
+    return int(os.environ.get("REAL2SIM_FUZZ_INPUTS", usual))
+
+
+def _run(script: str, *words: object, inputs: int) -> Any:
+    command = [sys.executable, FOLDER / script, *words, "--inputs", inputs]
     command += ["--seed", os.environ.get("REAL2SIM_FUZZ_SEED", "0")]
-    command += ["--drive", drive] if drive is not None else []
     paths = os.pathsep.join(path for path in sys.path if path)
     done = subprocess.run(
         [str(word) for word in command],
@@ -28,9 +43,11 @@ def check_target(name: str, config, *, drive: Path | None = None, inputs: int = 
         check=False,
         env={**os.environ, **ONE_THREAD, "PYTHONPATH": paths},
     )
-    assert done.returncode == 0, (
-        f"{name} ended by {done.returncode}; see {corpus}: {done.stderr[-3000:]}"
-    )
-    report = json.loads(done.stdout.splitlines()[-1])
-    assert not report["failures"], json.dumps(report, indent=1)
+    assert done.returncode == 0, f"{words} ended by {done.returncode}: {done.stderr[-3000:]}"
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _check(report: dict[str, Any]) -> None:
+    print(json.dumps(report))
+    assert not report["failures"], json.dumps(report["failures"], indent=1)
     assert report["inputs"] > 0

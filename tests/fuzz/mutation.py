@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -143,3 +144,8 @@ def _damaged_tree(tree: Any, rng: random.Random, other: Callable[[], Any]) -> An
     if isinstance(tree, int | float) and not isinstance(tree, bool) and rng.random() < 0.5:
         return rng.choice((-tree, tree + 1, tree * 1000, tree / 3, tree * 1e30))
     return other()
+
+
+def shape_of(text: str) -> str:
+    """What is said, without the numbers and names that it is said of."""
+    return re.sub(r"[0-9]+|'[^']*'|\"[^\"]*\"", "#", text)[:120]

@@ -16,7 +16,6 @@ import hashlib
 import json
 import pickle
 import random
-import re
 import resource
 import sys
 import tempfile
@@ -131,7 +130,7 @@ def attempt(target: readers.Target, parts: readers.Parts, folder: Path) -> tuple
         outcome, failure = "read", ""
     except target.errors as error:
         reason = str(error).replace(str(path), "")
-        outcome, failure = re.sub(r"[0-9]+|'[^']*'|\"[^\"]*\"", "#", reason)[:120], ""
+        outcome, failure = mutation.shape_of(reason), ""
     except BaseException as error:
         outcome = failure = "".join(traceback.format_exception(error))[-3000:]
         if isinstance(error, KeyboardInterrupt):

@@ -63,6 +63,8 @@ CLOSING = ((25.0, 1.5), (REACH, 4.0))
 DRIVEN = 3.0
 """So far aside of the drive there is ground, measured or not [m]."""
 
+FURTHEST = 1e6
+"""From the origin, of the driven path [m]; the wire allows no more either."""
 SPACING = 0.5
 """Of places along the driven path [m]."""
 TRUSTED = 10.0
@@ -213,7 +215,17 @@ class DrivenPath:
 
     @classmethod
     def of(cls, ego: Trajectory) -> DrivenPath:
-        """The path of a trajectory ``T_world_vehicle``, whose origin moves on the ground."""
+        """The path of a trajectory ``T_world_vehicle``, whose origin moves on the ground.
+
+        Raises:
+            SceneError: it is further from the origin than numbers can tell metres apart.
+        """
+        furthest = float(np.abs(ego.positions).max())
+        if furthest > FURTHEST:
+            raise SceneError(
+                f"the vehicle is {furthest:.3g} m from the origin; at most {FURTHEST:g} m are "
+                "allowed: move the scene to its origin, or give the right scale"
+            )
         kept = _apart(ego.positions)
         positions = ego.positions[kept]
         normals = quaternion_to_matrix(ego.quaternions[kept])[:, :, 2]

@@ -181,6 +181,14 @@ def street(seed: int = 0) -> np.ndarray:
     return np.concatenate([road, wall, below])
 
 
+@pytest.mark.parametrize("place", [2e29, -1.1e6])
+def test_a_path_at_the_end_of_the_world_is_refused(tiny_scene, place):
+    positions = np.array([[place, 0.0, 0.0]] * 2)
+    ego = Trajectory(np.array([0, 1]), positions, np.array([[1.0, 0, 0, 0]] * 2))
+    with pytest.raises(SceneError, match="from the origin"):
+        fit_scene_ground(tiny_scene.background, ego, ())
+
+
 def test_heights_follow_the_road_in_spite_of_walls_and_reflections():
     surface = fit_ground(street(), DrivenPath.of(straight()), NO_BOXES).surface
     xy = np.stack(np.meshgrid(np.arange(-10, 50, 0.5), np.arange(-8, 8, 0.5)), -1).reshape(-1, 2)

@@ -21,12 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
+import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from real2sim_proto import DRIVE_SUBPROTOCOL, encode
+from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.routes import view as view_route
@@ -397,7 +398,15 @@ def test_the_reason_of_a_close_fits_its_frame(client):
 
 @pytest.mark.network
 @pytest.mark.parametrize(
-    "data", [b"\x91" * 100_000 + b"\x90", b"\x81\xa5token\xa3\xed\xa0\x80", b"\xc1", b"", "text"]
+    "data",
+    [
+        b"\x91" * 100_000 + b"\x90",
+        b"\x81\xa5token\xa3\xed\xa0\x80",
+        b"\xc1",
+        b"",
+        "text",
+        encode({"type": "hello", "id": np.zeros(2)}),
+    ],
 )
 def test_a_first_message_that_is_no_hello_closes_the_drive_socket(site, data):
     info = create_session(site)
@@ -409,6 +418,49 @@ def test_a_first_message_that_is_no_hello_closes_the_drive_socket(site, data):
         with contextlib.suppress(Exception):
             drive.recv(timeout=WAIT_S)
         assert drive.close_code == 1008
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("version", [np.ones(3), np.zeros(0), [1], "1", 1.0, True, 2])
+def test_a_message_of_no_version_of_ours_is_told_so(site, logged, version):
+    info = create_session(site)
+    with joined(info) as drive:
+        drive.send(encode({"v": version, "type": "bye", "id": 7}))
+        told = decode(drive.recv(timeout=WAIT_S, decode=False))
+        assert (told["code"], told["id"]) == ("UNSUPPORTED_PROTOCOL", 7)
+    assert not any("exc_info" in entry for entry in logged)
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("text", [b"\xff\xfe", b"\xed\xa0\x80", b"\xf0\x9f"])
+def test_text_that_is_no_utf8_closes_the_socket_and_leaves_no_traceback(site, caplog, text):
+    with connect(
+        create_session(site)["ws_url"],
+        subprotocols=[DRIVE_SUBPROTOCOL],
+        compression=None,
+        proxy=None,
+    ) as drive:
+        drive.protocol.send_text(text)
+        drive.socket.sendall(b"".join(drive.protocol.data_to_send()))
+        with pytest.raises(ConnectionClosed):
+            drive.recv(timeout=WAIT_S)
+        assert drive.close_code == 1007
+    assert caplog.records == []
+
+
+@pytest.mark.network
+def test_handshakes_that_are_refused_leave_no_error(site, caplog):
+    path = create_session(site)["ws_url"].split("/", 3)[3]
+    request = (
+        f"GET /{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+    )
+    for _ in range(200):
+        with opened(site.url) as connection:
+            connection.sendall(request.encode())
+            assert status_of(connection.recv(65536)) == 426
+    assert caplog.records == []
 
 
 @pytest.mark.network

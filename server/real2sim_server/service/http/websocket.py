@@ -31,6 +31,8 @@ EXTENSION = "websocket.send_parts"
 
 MAX_REASON_BYTES = 123
 FIN = 0x80
+CLOSED_NO_UTF8 = 1007
+"""Code that RFC 6455, 7.4.1, has for text that is none."""
 SHORT, LONG = 126, 127
 """Stand for a length of 2 and of 8 bytes behind the first two of a frame (RFC 6455, 5.2)."""
 
@@ -111,11 +113,29 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[EXTENSION] = self._send_parts
 
+    async def run_asgi(self) -> None:
+        """Serve the connection; one that was answered by HTTP, or has left, is no error."""
+        app = self.app
+
+        async def served(*asgi: Any) -> None:
+            await app(*asgi)
+            self.handshake_complete |= self.transport.is_closing()
+
+        self.app = served
+        await super().run_asgi()
+
     def send_receive_event_to_app(self) -> None:
         """A message is whole; from the first on, the connection gives way to no other."""
         if not self._has_spoken:
             self._has_spoken = True
             self._watch.heard(self, more=False)
+        if self.curr_msg_data_type == "text" and not _is_utf8(self.frames):
+            # Refused here: the base class would write a traceback for each.
+            self.frames = []
+            if self.conn.state is State.OPEN:
+                self.conn.send_close(CLOSED_NO_UTF8)
+                self.handle_parser_exception()
+            return
         super().send_receive_event_to_app()
 
     def overdue(self, now: float) -> DropReason | None:
@@ -132,6 +152,14 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
             return False
         self.transport.writelines([_header(sum(map(len, parts))), *parts])
         return True
+
+
+def _is_utf8(parts: Sequence[bytes]) -> bool:
+    try:
+        b"".join(parts).decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _header(size: int) -> bytes:

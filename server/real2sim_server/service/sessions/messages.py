@@ -65,7 +65,8 @@ def read_message(data: bytes) -> ReceivedMessage:
         raise BadMessageError(bad_message(str(error))) from error
     message_id = _id_of(fields)
     version = fields.get("v", PROTOCOL_VERSION)
-    if version != PROTOCOL_VERSION:
+    # An array would be compared value by value.
+    if type(version) is not int or version != PROTOCOL_VERSION:
         detail = (
             f"the message has protocol version {version!r}; this worker speaks {PROTOCOL_VERSION}. "
             "Install a client and a worker of the same major version."
