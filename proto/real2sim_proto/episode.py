@@ -226,7 +226,7 @@ class LatencySpec(Model):
 
 
 class ContactSpec(Model):
-    """What happens between bodies in contact where `on_collision` is 'continue'."""
+    """What counts as contact, and what happens then where `on_collision` is 'continue'."""
 
     restitution: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.1, description="separation speed per approach speed along the normal"
@@ -236,6 +236,11 @@ class ContactSpec(Model):
     )
     background: bool = Field(
         default=False, description="walls, poles and other parts of the background are hit too"
+    )
+    swept: bool = Field(
+        default=True,
+        description="contact between two instants of the clock counts too; false: only what "
+        "overlaps at an instant, as in episodes recorded before this option was there",
     )
     masses: dict[Identifier, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         default_factory=dict, description="[kg] by object; default: by category and box"

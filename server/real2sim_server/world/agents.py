@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..edit import ObjectState, PlacedObjects
 
 Agents = PlacedObjects[ObjectState]
@@ -13,6 +16,14 @@ Agents = PlacedObjects[ObjectState]
 def rows_of(agents: Agents) -> dict[str, int]:
     """The row of each object, by id."""
     return {o.object_id: k for k, o in enumerate(agents.objects)}
+
+
+def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
+    """The row in ``before`` of each object of ``after``, [K] int64; -1 where it was not there."""
+    if before.objects is after.objects:
+        return np.arange(len(after.objects))
+    rows = rows_of(before)
+    return np.array([rows.get(o.object_id, -1) for o in after.objects], np.int64)
 
 
 def agent_fields(agents: Agents) -> list[dict[str, Any]]:

@@ -77,6 +77,49 @@ def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
 
 
 @kernel
+def may_meet_any(ego, size, rows, start, end, sizes):
+    """Whether a vehicle could touch one of K boxes within a step, by boxes along its heading.
+
+    Args:
+        ego: x, y of the middle of its box at the start [m], yaw [rad], how far it may get along
+            its heading and across it [m].
+        size: length and width of its box [m].
+        rows: [K] int64, where each box stands in ``start``; -1 where it was not there.
+        start, end: positions [., 3] [m] and quaternions [., 4] of the boxes at the start and the
+            end of the step; in between they go straight and turn evenly.
+        sizes: [K, 3] float64 [m].
+    """
+    x, y, yaw, far, aside = ego
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    for k in range(len(rows)):
+        positions, quaternions = end
+        dx, dy = positions[k, 0] - x, positions[k, 1] - y
+        along = low_along = high_along = dx * cos + dy * sin
+        across = low_across = high_across = dy * cos - dx * sin
+        turned = heading(quaternions[k]) - yaw
+        c, s = abs(math.cos(turned)), abs(math.sin(turned))
+        if rows[k] >= 0:
+            before, before_turned = start
+            dx, dy = before[rows[k], 0] - x, before[rows[k], 1] - y
+            along, across = dx * cos + dy * sin, dy * cos - dx * sin
+            low_along, high_along = min(low_along, along), max(high_along, along)
+            low_across, high_across = min(low_across, across), max(high_across, across)
+            if abs(heading(before_turned[rows[k]]) - yaw - turned) > 1e-9:
+                c = s = 1.0
+        length, width = sizes[k, 0], sizes[k, 1]
+        reach_along = (size[0] + length * c + width * s) / 2 + far
+        reach_across = (size[1] + length * s + width * c) / 2 + aside
+        if (
+            low_along < reach_along
+            and high_along > -reach_along
+            and low_across < reach_across
+            and high_across > -reach_across
+        ):
+            return True
+    return False
+
+
+@kernel
 def headings(quaternions):
     """Headings [K] [rad] of quaternions [K, 4] wxyz, as ``geometry.rotation.quaternion_yaw``."""
     found = np.empty(len(quaternions))

@@ -13,6 +13,7 @@ from ..scene import Scene
 from .agents import Agents
 from .broad_phase_kernels import headings
 from .collision.step_contacts import StepContacts
+from .collision.sweep import StepStart
 from .ego.box import REAR_OVERHANG
 from .ego.motion import Motion, logged_motion
 from .ego.reference import PlannedTrajectory
@@ -28,11 +29,13 @@ class PendingStep(NamedTuple):
     """A step that has been made and not evaluated yet.
 
     Attributes:
+        start: the world before it.
         plan: new trajectory of the ego; None where there was none.
         events: that led to it.
         contacts: of its impacts; None where bodies pass through each other.
     """
 
+    start: StepStart
     plan: PlannedTrajectory | None
     events: tuple[Event, ...]
     contacts: StepContacts | None

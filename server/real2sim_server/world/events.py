@@ -22,10 +22,11 @@ EventType = Literal[
 class Event:
     """Something that happened; the fields of the wire's Event.
 
-    Data of a ``collision``: ``relative_speed`` [m/s] and ``at_fault`` (0 or 1), and where momentum
-    is exchanged :meth:`.collision.impact.Impact.event_data`; ``object_id`` is None for the
-    background, ``other_id`` the second object where the ego had no part. Of ``left_log`` and
-    ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
+    Data of a ``collision``: when it began (``contact_us``, simulation time, within the step before
+    ``t_us``), where (``x``, ``y`` [m], world) and ``relative_speed`` there [m/s]; where momentum is
+    exchanged also the rest of :meth:`.collision.impact.Impact.event_data`. ``object_id`` is None
+    for the background, ``other_id`` the second object where the ego had no part. Of ``left_log``
+    and ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
     """
 
     type: EventType

@@ -12,6 +12,8 @@ from real2sim_proto.plans import TrajectoryPlan
 from .._numba import is_on_disk
 from ..edit import ScenarioState
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
+from .collision.obstacles import ObstacleGrid
+from .collision.sweep import StepStart, swept_contacts
 from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
 from .ego.motion import Motion
 from .ego.reference import PlannedTrajectory, ReferenceTrajectory
@@ -42,6 +44,7 @@ def warm_up() -> None:
         poses = [(x + 0.1 * k, y, yaw) for k in range(1, 11)]
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
+    _sweep(world)
     # What only perfect tracking and sliding vehicles call.
     _track(EgoSpec(tracker="perfect"))
     # What edits, views and rollouts ask of the ground.
@@ -71,6 +74,23 @@ def planning_on_disk() -> bool:
 def plans_ahead(ego: EgoSpec) -> bool:
     """Whether a vehicle needs what :func:`warm_up_planning` compiles."""
     return KINDS.get(ego.tracker) in PLANNING_AHEAD
+
+
+def _sweep(world: World) -> None:
+    """A step beside objects and into the background."""
+    start = StepStart(
+        world.motion, world.T_world_vehicle, world.agents, t_us=0, dt_us=PERIOD_US, at=None
+    )
+    swept_contacts(
+        start,
+        world.motion,
+        world.T_world_vehicle,
+        world.agents,
+        spec=world.spec,
+        ego_size=world.scene.ego_size,
+        obstacles=ObstacleGrid(np.array([-50.0, -50.0]), np.ones((400, 400), np.bool_)),
+        before=frozenset(),
+    )
 
 
 def _track(ego: EgoSpec) -> None:

@@ -21,8 +21,9 @@ from .collision.deformation import Deformation, DeformationTracker
 from .collision.impact import Impact
 from .collision.obstacles import obstacle_grid
 from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
+from .collision.sweep import StepStart
 from .ego.controller import EgoController, Plan, emergency_brake
-from .ego.motion import logged_motion
+from .ego.motion import Motion, logged_motion
 from .ego.reference import PlannedTrajectory
 from .ego.route import command_ahead, route_ahead
 from .episode import episode_clock, takes_effect_us
@@ -163,21 +164,21 @@ class World:
         trajectory = controller.pending[-1].trajectory if plan is not None else None
         controller, late_events = self._with_fallback(controller, missed=missed)
         reaction_events = self._let_agents_react()
-        before = self.agents
+        start = self._step_start(controller)
         moved = self._advance(controller)
         self._commit_motion(moved)
-        contacts = self._apply_impacts(moved.impacts, before)
+        contacts = self._apply_impacts(moved.impacts, start.agents)
         events = (*self._edit_events, *late_events, *reaction_events)
-        self._pending = PendingStep(trajectory, events, contacts)
+        self._pending = PendingStep(start, trajectory, events, contacts)
         self._edit_events = ()
 
     def evaluate(self) -> list[Event]:
         """The second half, if it is still pending: contacts, scores and events. All that images
         show stays as it is, so they may be drawn meanwhile."""
         if self._pending is not None:
-            plan, events, contacts = self._pending
+            start, plan, events, contacts = self._pending
             self._pending = None
-            contacts = self._overlap_contacts() if contacts is None else contacts
+            contacts = self._overlap_contacts(start) if contacts is None else contacts
             self._contacts = replace(self._contacts, touching=contacts.touching)
             self.instant = self._instant(contacts, plan)
             self.accumulator = scoring.update_accumulator(
@@ -370,9 +371,24 @@ class World:
         touching = self._contacts.touching
         return contacts_of_impacts(impacts, self.t_us, touching=touching, before=before)
 
-    def _overlap_contacts(self) -> StepContacts:
-        """Contacts where bodies pass through each other; the first may end the episode."""
-        found = self._contacts.ego_contacts(self.T_world_vehicle, self.motion, self.agents)
+    def _step_start(self, controller: EgoController) -> StepStart:
+        """The world before a step, and how the ego goes on from there under its controller."""
+        motion, t_us, at = self.motion, self.t_us, None
+        if self.spec.action != "pose" and not self.warming_up:
+
+            def at(since_us: int) -> Motion:
+                return controller.advance(motion, t_us, since_us)[1]
+
+        dt_us = self._clock.dt_us
+        return StepStart(motion, self.T_world_vehicle, self.agents, t_us, dt_us, at)
+
+    def _overlap_contacts(self, start: StepStart) -> StepContacts:
+        """Contacts where bodies pass through each other; the first may end the episode. While the
+        ego moves as recorded, nobody drives into anybody."""
+        found = self._contacts.ego_contacts(start, self.T_world_vehicle, self.motion, self.agents)
+        if self.t_us <= self._clock.start_us + self.spec.warmup_us:
+            self._contacts = self._contacts.after_warm_up(found.touching)
+            return StepContacts(touching=found.touching)
         contacts = contacts_of_overlaps(found, self.t_us)
         if contacts.events and self.spec.on_collision == "terminate":
             self.terminated, self.reason = True, "collision"

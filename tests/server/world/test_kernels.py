@@ -19,6 +19,7 @@ from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.world import broad_phase_kernels, path_kernels, warm_up
+from real2sim_server.world.collision import sweep_kernels
 from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.reference import PlannedTrajectory
 from real2sim_server.world.scoring import comfort_kernels, hazard_kernels, road_kernels
@@ -376,9 +377,10 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         road_kernels,
         hazard_kernels,
         comfort_kernels,
+        sweep_kernels,
     )
     kernels = [v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)]
-    before = [len(k.signatures) for k in kernels]
+    before = {k.__name__: len(k.signatures) for k in kernels}
     world = make_world(
         car=moving(25, 0, z=0.8),
         aside=moving(12, 3, z=0.8, speed=3.0),
@@ -395,4 +397,4 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         world.step(PLANS[action](world.t_us))
         world.observe()
 
-    assert [len(k.signatures) for k in kernels] == before
+    assert {k.__name__: len(k.signatures) for k in kernels} == before

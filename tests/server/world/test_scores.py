@@ -214,7 +214,7 @@ HERE = (0.0, 0.0, 0.0, 4.6, 1.85)
     ],
 )
 def test_sides_of_a_contact_are_those_of_nuplan(box, ego_speed, speed, side):
-    assert side_of_contact(HERE, ego_speed, box, speed) == side
+    assert side_of_contact(HERE, ego_speed, box, speed, axle=1.35) == side
 
 
 # --- time to collision ------------------------------------------------------------------------

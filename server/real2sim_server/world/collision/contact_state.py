@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from real2sim_proto.episode import ResetSpec
+from real2sim_proto.episode import EgoSpec, ResetSpec
 
-from ..agents import Agents
-from ..broad_phase_kernels import may_overlap
+from ..agents import Agents, rows_in
+from ..broad_phase_kernels import may_meet_any, may_overlap
 from ..driving import Command
 from ..ego.box import REAR_OVERHANG
 from ..ego.controller import EgoController
@@ -22,6 +22,10 @@ from .impact import Impact
 from .obstacles import ObstacleGrid
 from .overlaps import EgoContacts, ego_contacts
 from .solver import CollisionStep, solve_collisions
+from .sweep import StepStart, swept_contacts
+
+WIDEN = 0.3
+"""By how much places that the ego may reach are widened [m]."""
 
 HeightAt = Callable[[float, float], float]
 """Height of the ground [m] at x, y [m]."""
@@ -78,7 +82,8 @@ class ContactState:
     ) -> ContactState:
         """At the start of an episode."""
         contacts = cls(spec, ego_size, obstacles)
-        touching = contacts.ego_contacts(T_world_vehicle, motion, agents).touching
+        instant = StepStart(motion, T_world_vehicle, agents, t_us=0, dt_us=spec.dt_us, at=None)
+        touching = contacts.ego_contacts(instant, T_world_vehicle, motion, agents).touching
         ignored = frozenset(frozenset(("", name)) for name in touching)
         return replace(contacts, touching=touching, ignored_pairs=ignored)
 
@@ -87,8 +92,21 @@ class ContactState:
         """Whether bodies push each other; one that is put somewhere by poses cannot be pushed."""
         return self.spec.on_collision == "continue" and self.spec.action != "pose"
 
-    def ego_contacts(self, T_world_vehicle: Float, motion: Motion, agents: Agents) -> EgoContacts:
-        """Contacts of the ego that stands so, and which of them were not there before."""
+    def ego_contacts(
+        self, start: StepStart, T_world_vehicle: Float, motion: Motion, agents: Agents
+    ) -> EgoContacts:
+        """Contacts of the ego that stands so after a step, and which of them began in it."""
+        if self.spec.contact.swept:
+            return swept_contacts(
+                start,
+                motion,
+                T_world_vehicle,
+                agents,
+                spec=self.spec,
+                ego_size=self.ego_size,
+                obstacles=self.obstacles,
+                before=self.touching,
+            )
         return ego_contacts(
             T_world_vehicle,
             motion,
@@ -118,7 +136,7 @@ class ContactState:
             t_us: at the start [us].
             height: of the ground at x, y [m].
         """
-        if not self.exchanges_momentum or not self._may_collide(motion, traffic):
+        if not self.exchanges_momentum or not self._may_collide(motion, before, traffic):
             controller, motion = controller.advance(motion, t_us, self.spec.dt_us)
             impacts = () if self.exchanges_momentum else None
             return StepMotion(controller, motion, traffic, self, impacts)
@@ -146,15 +164,64 @@ class ContactState:
         collided = traffic.with_drivers(result.impacted, traffic.agents)
         return StepMotion(steered.controller, result.motion, collided, contacts, result.impacts)
 
-    def _may_collide(self, motion: Motion, traffic: Traffic) -> bool:
+    def after_warm_up(self, touching: frozenset[str]) -> ContactState:
+        """After a step in which the ego moved as recorded: what it touches there counts no more
+        than what it touches at the start."""
+        ignored = frozenset(frozenset(("", name)) for name in touching)
+        return replace(self, touching=touching, ignored_pairs=ignored)
+
+    def _may_collide(self, motion: Motion, before: Agents, traffic: Traffic) -> bool:
         """Whether anything could touch anything within the step."""
         if self.sliding or self.obstacles is not None:
             return True
         if any(isinstance(driver, ImpactedObject) for driver in traffic.drivers.values()):
             return True
-        return may_collide(
-            motion, traffic.agents, ego_size=self.ego_size, dt=self.spec.dt_us * 1e-6
+        dt = self.spec.dt_us * 1e-6
+        if self.spec.contact.swept:
+            ego = self.spec.ego
+            return may_meet(motion, before, traffic.agents, ego, ego_size=self.ego_size, dt=dt)
+        return may_collide(motion, traffic.agents, ego_size=self.ego_size, dt=dt)
+
+
+def may_meet(
+    motion: Motion,
+    before: Agents,
+    after: Agents,
+    spec: EgoSpec,
+    *,
+    ego_size: tuple[float, float, float],
+    dt: float,
+) -> bool:
+    """Whether the ego could touch an object within the step, wherever it can drive in it.
+
+    Args:
+        motion: of the ego at the start of the step.
+        before, after: objects at its start and its end.
+        spec: limits of the vehicle.
+        ego_size: of its box [m].
+        dt: the step [s].
+    """
+    if not after.objects:
+        return False
+    fastest = math.hypot(motion.speed, motion.lateral_speed)
+    fastest += max(spec.max_acceleration, spec.max_braking) * dt
+    steering = min(abs(motion.steering) + spec.max_steer_rate * dt, spec.max_steer)
+    rate = max(abs(motion.yaw_rate), math.tan(steering) / spec.wheelbase * fastest)
+    turn = min(rate * dt, math.pi / 2)
+    centre_ahead = ego_size[0] / 2 - REAR_OVERHANG
+    cos, sin = math.cos(motion.yaw), math.sin(motion.yaw)
+    place = (motion.x + centre_ahead * cos, motion.y + centre_ahead * sin, motion.yaw)
+    aside = (fastest * dt + ego_size[0]) * math.sin(turn) + abs(motion.lateral_speed) * dt
+    return bool(
+        may_meet_any(
+            (*place, fastest * dt + WIDEN, aside + WIDEN),
+            ego_size[:2],
+            rows_in(before, after),
+            (before.positions, before.quaternions),
+            (after.positions, after.quaternions),
+            after.sizes,
         )
+    )
 
 
 def may_collide(

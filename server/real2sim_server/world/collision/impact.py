@@ -76,4 +76,7 @@ class Impact:
             "object_delta_v": self.object_delta_v,
             "energy": self.energy,
             "crush": self.crush,
+            "contact_us": float(self.began_us),
+            "x": self.point[0],
+            "y": self.point[1],
         }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -44,6 +45,13 @@ class ObstacleGrid:
 
     origin: Float
     occupied: NDArray[np.bool_]
+
+    @cached_property
+    def sums(self) -> NDArray[np.int64]:
+        """[nx + 1, ny + 1], occupied cells below and left of each corner of a cell."""
+        sums = np.zeros((self.occupied.shape[0] + 1, self.occupied.shape[1] + 1), np.int64)
+        sums[1:, 1:] = self.occupied.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+        return sums
 
     def manifold(self, body: BodyState, properties: BodyProperties) -> ContactManifold | None:
         """Where a body overlaps occupied cells; the normal points from their middle to its box."""

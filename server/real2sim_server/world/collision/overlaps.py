@@ -1,4 +1,7 @@
-"""Contacts of the ego where no momentum is exchanged: overlaps of boxes."""
+"""Contacts of the ego at an instant where no momentum is exchanged: overlaps of boxes.
+
+What begins and ends between two instants is found by :mod:`.sweep`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from ...geometry.box_kernels import boxes_overlap
 from ...geometry.rotation import quaternion_yaw
 from ..agents import Agents
 from ..broad_phase_kernels import within_reach
-from ..ego.box import ego_box
+from ..ego.box import REAR_OVERHANG, ego_box
 from ..ego.motion import Motion
 from ..path import Float
 from ..scoring.contact_side import side_of_contact
@@ -33,10 +36,21 @@ class OverlapContact:
     Attributes:
         object_id: the object; None for the background.
         relative_speed: length of the difference of the two velocities [m/s].
+        t_us: when it began [us]; None where only instants are looked at.
+        place: where it began, x, y [m], where ``t_us`` says when.
     """
 
     object_id: str | None
     relative_speed: float
+    t_us: float | None = None
+    place: tuple[float, float] = (0.0, 0.0)
+
+    def event_data(self) -> dict[str, float]:
+        """Data of its event on the wire."""
+        data = {"relative_speed": self.relative_speed}
+        if self.t_us is not None:
+            data |= {"contact_us": self.t_us, "x": self.place[0], "y": self.place[1]}
+        return data
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +96,8 @@ def ego_contacts(
         relative = velocity - agents.velocities[k]
         speed = float(np.sqrt(relative @ relative))
         contacts.append(OverlapContact(name, speed))
-        records.append(_object_record(box, motion.speed, agents, k, relative_speed=speed))
+        driven = math.hypot(motion.speed, motion.lateral_speed)
+        records.append(_object_record(box, driven, agents, k, relative_speed=speed))
     if obstacles is not None:
         body, properties = ego_body(motion, spec.ego), ego_properties(spec.ego, ego_size)
         if obstacles.manifold(body, properties) is not None:
@@ -121,7 +136,7 @@ def _object_record(
     return ContactRecord(
         object_id=subject.object_id,
         category=subject.category,
-        side=side_of_contact(box, ego_speed, other, speed),
+        side=side_of_contact(box, ego_speed, other, speed, axle=box[3] / 2 - REAR_OVERHANG),
         relative_speed=relative_speed,
         ego_speed=ego_speed,
         object_speed=speed,

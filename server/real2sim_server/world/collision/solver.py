@@ -13,6 +13,7 @@ from real2sim_proto.episode import ContactSpec, EgoSpec
 from ...geometry.rotation import multiply_quaternions, quaternion_yaw, yaw_quaternion
 from ..agents import Agents, rows_of
 from ..driving import Command
+from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
 from ..scoring.contact_side import side_of_contact
 from ..scoring.instant import Side
@@ -361,7 +362,8 @@ def _side(
         x = body.x + properties.box_ahead * math.cos(body.yaw)
         y = body.y + properties.box_ahead * math.sin(body.yaw)
         boxes.append((x, y, body.yaw, properties.length, properties.width))
-    return side_of_contact(boxes[0], speeds[0], boxes[1], speeds[1])
+    axle = boxes[0][3] / 2 - REAR_OVERHANG
+    return side_of_contact(boxes[0], speeds[0], boxes[1], speeds[1], axle=axle)
 
 
 def _separated(body: BodyState, manifold: ContactManifold, fraction: float) -> BodyState:

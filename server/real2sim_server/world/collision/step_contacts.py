@@ -29,10 +29,7 @@ class StepContacts(NamedTuple):
 
 def contacts_of_overlaps(found: EgoContacts, t_us: int) -> StepContacts:
     """Where bodies pass through each other."""
-    events = (
-        Event("collision", t_us, c.object_id, data={"relative_speed": c.relative_speed})
-        for c in found.begun
-    )
+    events = (Event("collision", t_us, c.object_id, data=c.event_data()) for c in found.begun)
     return StepContacts(tuple(events), found.records, found.touching)
 
 

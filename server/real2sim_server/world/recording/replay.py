@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,8 @@ from ...scene import Scene
 from ..world import World
 
 KINDS = ("reset", "action", "edit", "agent", "snapshot", "restore", "stop")
+YOUNGER_CONTACT = {"swept": False}
+"""Options of contact that old episodes lack, and what they ran with."""
 _OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 
 
@@ -111,7 +113,7 @@ class Replayer:
         """
         fields = decode(entry.payload)
         if entry.kind == "reset":
-            self.world = self.begin(ResetSpec.model_validate(fields["spec"]))
+            self.world = self.begin(_recorded_spec(fields))
             return self.world
         if self.world is None:
             raise ValueError(f"a log cannot begin with {entry.kind!r}; a reset comes first")
@@ -124,6 +126,14 @@ class Replayer:
         self.world = self.world.fork()
         _apply_entry(self.world, entry.kind, fields)
         return self.world
+
+
+def _recorded_spec(fields: Mapping[str, Any]) -> ResetSpec:
+    """How a recorded episode runs. All options are recorded, so one that is absent is younger than
+    the episode, which ran as if it were off."""
+    spec = dict(fields["spec"])
+    spec["contact"] = YOUNGER_CONTACT | dict(spec.get("contact", {}))
+    return ResetSpec.model_validate(spec)
 
 
 def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
@@ -163,7 +173,7 @@ def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:
         entries: of the episode, its reset first.
     """
     first, *rest = entries
-    spec = ResetSpec.model_validate(decode(first.payload)["spec"])
+    spec = _recorded_spec(decode(first.payload))
     steady = spec.model_copy(update={"on_collision": "terminate", "deadline_ms": None})
     world = replayer.begin(steady)
     requests: dict[int, list[Entry]] = {}

@@ -16,12 +16,16 @@ def side_of_contact(
     ego_speed: float,
     box: tuple[float, float, float, float, float],
     speed: float,
+    *,
+    axle: float,
 ) -> Side:
     """The side of the ego on which two boxes came into contact, after nuPlan's ``CollisionType``.
 
     Args:
         ego_box, box: centre x, y [m], yaw [rad], length, width [m].
-        ego_speed, speed: before the contact [m/s].
+        ego_speed, speed: before the contact, along and across [m/s].
+        axle: from the middle of the ego box back to the rear axle, from which what is behind is
+            seen [m].
     """
     if abs(ego_speed) <= STOPPED:
         return "stopped_ego"
@@ -29,7 +33,7 @@ def side_of_contact(
         return "stopped_track"
     x, y, yaw, length, width = ego_box
     cos, sin = math.cos(yaw), math.sin(yaw)
-    bearing = math.atan2(box[1] - y, box[0] - x) - yaw
+    bearing = math.atan2(box[1] - y + axle * sin, box[0] - x + axle * cos) - yaw
     if abs(math.remainder(bearing, math.tau)) > BEHIND:
         return "rear"
     half = width / 2

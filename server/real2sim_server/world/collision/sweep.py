@@ -1,0 +1,294 @@
+"""Contacts of the ego within a step where no momentum is exchanged: boxes swept from the instant
+before to the instant after.
+
+The motion of the ego in between is its controller's, looked at every 50 ms; other objects move
+straight from instant to instant and turn evenly. Boxes are seen from above, and are above one
+another where their heights do not overlap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from real2sim_proto.episode import EgoSpec, ResetSpec
+
+from ...geometry.rotation import quaternion_yaw
+from ..agents import Agents, rows_in
+from ..ego.box import REAR_OVERHANG
+from ..ego.motion import Motion
+from ..path import Float
+from ..scoring.contact_side import side_of_contact
+from ..scoring.instant import ContactRecord
+from .manifold import contact_manifold, corners
+from .obstacles import CELL, ObstacleGrid
+from .overlaps import BACKGROUND, EgoContacts, OverlapContact
+from .rigid_body import BodyProperties, BodyState
+from .sweep_kernels import first_contacts, first_occupied, holds_any
+
+Size = tuple[float, float, float]
+Box = tuple[float, float, float, float, float]
+"""Centre x, y [m], yaw [rad], length, width [m], seen from above."""
+
+PIECE_US = 50_000
+"""The ego's way is straight between two looks; at 1 g it is 3 mm off in between."""
+
+TOLERANCE = 1e-3
+COARSE = 2e-2
+"""How far bodies move from look to look where they nearly touch [m]."""
+
+
+class StepStart(NamedTuple):
+    """The world before a step, and how the ego went on from there.
+
+    Attributes:
+        motion, T_world_vehicle: of the ego.
+        agents: the objects.
+        t_us, dt_us: of the step [us].
+        at: motion of the ego so many microseconds later; None where it is put to its place, which
+            it reaches straight.
+    """
+
+    motion: Motion
+    T_world_vehicle: Float
+    agents: Agents
+    t_us: int
+    dt_us: int
+    at: Callable[[int], Motion] | None
+
+
+class _Contact(NamedTuple):
+    """A contact that begins: the fraction of the step, and the row of the object; None for the
+    background, with the place where it is hit."""
+
+    fraction: float
+    row: int | None
+    place: tuple[float, float] = (0.0, 0.0)
+
+
+def swept_contacts(
+    start: StepStart,
+    motion: Motion,
+    T_world_vehicle: Float,
+    agents: Agents,
+    *,
+    spec: ResetSpec,
+    ego_size: Size,
+    obstacles: ObstacleGrid | None,
+    before: frozenset[str],
+) -> EgoContacts:
+    """Contacts of the ego in a step, those that begin in the order in which they do.
+
+    Args:
+        start: the world before.
+        motion, T_world_vehicle: of the ego after the step.
+        agents: the objects after the step.
+        spec: of the episode.
+        ego_size: of the ego's box [m].
+        obstacles: of the background; None where it does not count.
+        before: names of what was in contact before the step; nothing of it begins.
+    """
+    sweep = _Sweep(start, motion, T_world_vehicle, agents, ego=spec.ego, size=ego_size)
+    begun, touching = sweep.objects(before)
+    if obstacles is not None:
+        hit, lies_on = sweep.background(obstacles)
+        if hit is not None and BACKGROUND not in before:
+            begun.append(hit)
+        if lies_on:
+            touching.append(BACKGROUND)
+    # Objects in the order of their rows where they are hit at once, the background last.
+    begun.sort(key=lambda c: (c.fraction, math.inf if c.row is None else c.row))
+    found = [sweep.described(contact) for contact in begun]
+    return EgoContacts(
+        frozenset(touching), tuple(c for c, _ in found), tuple(record for _, record in found)
+    )
+
+
+class _Sweep:
+    """The boxes of one step."""
+
+    def __init__(
+        self,
+        start: StepStart,
+        motion: Motion,
+        T_world_vehicle: Float,
+        agents: Agents,
+        *,
+        ego: EgoSpec,
+        size: Size,
+    ) -> None:
+        self._start, self._motion, self._agents = start, motion, agents
+        self._size = size
+        self._low = _height(start.T_world_vehicle, self._axle)
+        self._low_after = _height(T_world_vehicle, self._axle)
+        self._rows = rows_in(start.agents, agents)
+        self._rough = self._way([start.motion, motion])
+        self._exact: Float | None = self._rough
+        self._slack = 0.0
+        if start.at is not None and start.dt_us > PIECE_US:
+            self._exact = None
+            # A vehicle that is put on its plan may have been anywhere.
+            self._slack = _deviation(start, motion, ego, size)
+            if ego.tracker == "perfect":
+                self._rough, self._slack = self.way, 0.0
+
+    def objects(self, before: frozenset[str]) -> tuple[list[_Contact], list[str]]:
+        """Contacts with objects that begin, and names of what is in contact at the end."""
+        objects = self._agents.objects
+        if not objects:
+            return [], []
+        if self._slack > 0.0:
+            near, _ = self._first(self._rough, self._slack, COARSE)
+            if not np.isfinite(near).any():
+                return [], []
+        first, touching = self._first(self.way, 0.0, TOLERANCE)
+        if not np.isfinite(first).any():
+            return [], []
+        names = [objects[k].object_id for k in np.flatnonzero(touching).tolist()]
+        begun = [
+            _Contact(float(first[k]), k)
+            for k in np.flatnonzero(np.isfinite(first)).tolist()
+            if objects[k].object_id not in before
+        ]
+        return begun, names
+
+    def background(self, obstacles: ObstacleGrid) -> tuple[_Contact | None, bool]:
+        """The first contact with the background, and whether there is one at the end."""
+        grid = (obstacles.origin, CELL, obstacles.sums)
+        reach = math.hypot(*self._size[:2]) / 2 + self._slack
+        if not holds_any(self._rough, reach, *grid):
+            return None, False
+        first, x, y, touching = first_occupied(
+            self.way,
+            self._size,
+            CELL / 2,
+            obstacles.origin,
+            CELL,
+            obstacles.occupied,
+            obstacles.sums,
+        )
+        return (_Contact(first, None, (x, y)) if math.isfinite(first) else None), touching
+
+    def described(self, contact: _Contact) -> tuple[OverlapContact, ContactRecord]:
+        """The contact for the event and for the scores."""
+        motion, box = self._ego_at(contact.fraction)
+        vx, vy = motion.velocity
+        ego_speed = math.hypot(motion.speed, motion.lateral_speed)
+        t_us = self._start.t_us + contact.fraction * self._start.dt_us
+        if contact.row is None:
+            record = ContactRecord(None, BACKGROUND, "stopped_track", ego_speed, ego_speed, 0.0)
+            return OverlapContact(None, ego_speed, t_us, contact.place), record
+        subject = self._agents.objects[contact.row]
+        other, (wx, wy) = self._object_at(contact.row, contact.fraction)
+        relative, object_speed = math.hypot(vx - wx, vy - wy), math.hypot(wx, wy)
+        record = ContactRecord(
+            object_id=subject.object_id,
+            category=subject.category,
+            side=side_of_contact(box, ego_speed, other, object_speed, axle=self._axle),
+            relative_speed=relative,
+            ego_speed=ego_speed,
+            object_speed=object_speed,
+        )
+        return OverlapContact(subject.object_id, relative, t_us, _place(box, other)), record
+
+    @property
+    def way(self) -> Float:
+        """Of the ego's box, as near as it is known."""
+        if self._exact is None:
+            at, dt_us = self._start.at, self._start.dt_us
+            assert at is not None
+            pieces = -(-dt_us // PIECE_US)
+            between = [at(dt_us * k // pieces) for k in range(1, pieces)]
+            self._exact = self._way([self._start.motion, *between, self._motion])
+        return self._exact
+
+    @property
+    def _axle(self) -> float:
+        return self._size[0] / 2 - REAR_OVERHANG
+
+    def _way(self, motions: list[Motion]) -> Float:
+        """Rows for the kernels, evenly over the step."""
+        rows, yaw = [], motions[0].yaw
+        for k, motion in enumerate(motions):
+            fraction = k / (len(motions) - 1)
+            yaw += math.remainder(motion.yaw - yaw, math.tau)
+            x, y = motion.x + self._axle * math.cos(yaw), motion.y + self._axle * math.sin(yaw)
+            low = self._low + (self._low_after - self._low) * fraction
+            rows.append((fraction, x, y, yaw, low))
+        return np.array(rows)
+
+    def _first(self, way: Float, slack: float, tolerance: float) -> tuple[Float, Float]:
+        before, after = self._start.agents, self._agents
+        first, touching = first_contacts(
+            way,
+            self._size,
+            self._rows,
+            (before.positions, before.quaternions),
+            (after.positions, after.quaternions),
+            after.sizes,
+            slack,
+            tolerance,
+        )
+        return first, touching
+
+    def _ego_at(self, fraction: float) -> tuple[Motion, Box]:
+        """The ego at a fraction of the step: velocity, and box seen from above."""
+        way = self.way
+        x, y, yaw = (float(np.interp(fraction, way[:, 0], way[:, c])) for c in (1, 2, 3))
+        box = (x, y, yaw, *self._size[:2])
+        at, since_us = self._start.at, round(fraction * self._start.dt_us)
+        if at is None or since_us == self._start.dt_us:
+            return self._motion._replace(yaw=yaw), box
+        return (at(since_us) if since_us else self._start.motion), box
+
+    def _object_at(self, row: int, fraction: float) -> tuple[Box, tuple[float, float]]:
+        """An object at a fraction of the step: its box seen from above, its velocity."""
+        after, before, k = self._agents, self._start.agents, int(self._rows[row])
+        x, y = after.positions[row, :2].tolist()
+        vx, vy = after.velocities[row, :2].tolist()
+        yaw = float(quaternion_yaw(after.quaternions[row]))
+        if k >= 0:
+            rest = 1 - fraction
+            ax, ay = before.positions[k, :2].tolist()
+            wx, wy = before.velocities[k, :2].tolist()
+            a_yaw = float(quaternion_yaw(before.quaternions[k]))
+            x, y = rest * ax + fraction * x, rest * ay + fraction * y
+            vx, vy = rest * wx + fraction * vx, rest * wy + fraction * vy
+            yaw = a_yaw + fraction * math.remainder(yaw - a_yaw, math.tau)
+        length, width = after.sizes[row, :2].tolist()
+        return (x, y, yaw, length, width), (vx, vy)
+
+
+def _height(T_world_vehicle: Float, ahead: float) -> float:
+    """Of the vehicle's floor [m], so far ahead of the rear axle."""
+    return float(T_world_vehicle[2, 3]) + ahead * float(T_world_vehicle[2, 0])
+
+
+def _deviation(start: StepStart, motion: Motion, ego: EgoSpec, size: Size) -> float:
+    """How far the ego's box may have been, within the step, from one that goes straight and turns
+    evenly [m]: no way to its place is longer than the vehicle can drive."""
+    before, seconds = start.motion, start.dt_us * 1e-6
+    fastest = max(
+        math.hypot(before.speed, before.lateral_speed),
+        math.hypot(motion.speed, motion.lateral_speed),
+    )
+    fastest += max(ego.max_acceleration, ego.max_braking) * seconds / 2
+    chord = math.hypot(motion.x - before.x, motion.y - before.y)
+    aside = math.sqrt(max((fastest * seconds) ** 2 - chord * chord, 0.0)) / 2
+    steering = max(abs(before.steering), abs(motion.steering)) + ego.max_steer_rate * seconds / 2
+    curvature = math.tan(min(steering, ego.max_steer)) / ego.wheelbase
+    rate = max(abs(before.yaw_rate), abs(motion.yaw_rate), curvature * fastest)
+    return aside + math.hypot(*size[:2]) / 2 * min(rate * seconds, 2.0)
+
+
+def _place(box: Box, other: Box) -> tuple[float, float]:
+    """The middle of where two boxes touch [m]."""
+    shapes = []
+    for x, y, yaw, length, width in (box, other):
+        body = BodyState(x, y, yaw, 0.0, 0.0, 0.0)
+        shapes.append(corners(body, BodyProperties(1.0, 1.0, length, width)))
+    manifold = contact_manifold(shapes[0], shapes[1])
+    return (manifold.x, manifold.y) if manifold is not None else (other[0], other[1])

@@ -1,0 +1,235 @@
+"""First contact of boxes that move and turn through a step, each in one call.
+
+Conservative advancement (Mirtich 1996): two boxes that are ``d`` apart, no point of which moves
+faster than ``u`` against the other, cannot touch before ``d / u``. The largest gap along a normal
+of a side is never more than ``d``, so time goes on by gap over speed until the gap is gone.
+"""
+# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..._numba import kernel
+from ..broad_phase_kernels import heading
+
+WAY = 5
+"""Columns of a way: fraction of the step, centre x, y [m], yaw [rad], height of the bottom [m]."""
+
+LEAST_OVERLAP = 1e-9
+"""Boxes that overlap by no more than this only touch [m]."""
+
+MOST_PIECES = 64
+"""Parts of a piece in which boxes above one another are looked at again."""
+
+
+@kernel
+def first_contacts(way, size, rows, start, end, sizes, slack, tolerance):
+    """When the box of a vehicle first overlaps each of K boxes within a step.
+
+    Args:
+        way: [M, 5] float64, the vehicle's box by fraction of the step, straight between rows; see
+            ``WAY``; its yaws are continuous.
+        size: (length, width, height) of that box [m].
+        rows: [K] int64, where each object stands in ``start``; -1 where it was not there, and
+            stands where it is at the end.
+        start, end: positions [., 3] [m] and quaternions [., 4] of the objects, world.
+        sizes: [K, 3] float64 [m].
+        slack: how far the vehicle's box is grown to all sides [m].
+        tolerance: boxes that come nearer than this are looked at again after as much motion [m].
+
+    Returns:
+        Fractions [K] float64 of the step, inf where there is no contact; and whether the boxes
+        overlap at its end, [K] bool.
+    """
+    count = len(sizes)
+    first, touching = np.full(count, np.inf), np.zeros(count, np.bool_)
+    length, width, height = size[0] + 2 * slack, size[1] + 2 * slack, size[2] + 2 * slack
+    reach = math.sqrt(length * length + width * width) / 2
+    for k in range(count):
+        positions, quaternions = end
+        bx, by, bz = positions[k, 0], positions[k, 1], positions[k, 2]
+        b_yaw = heading(quaternions[k])
+        ax, ay, az, a_yaw = bx, by, bz, b_yaw
+        if rows[k] >= 0:
+            before, before_turned = start
+            ax, ay, az = before[rows[k], 0], before[rows[k], 1], before[rows[k], 2]
+            a_yaw = heading(before_turned[rows[k]])
+        turn = (b_yaw - a_yaw + math.pi) % math.tau - math.pi
+        other_reach = math.hypot(sizes[k, 0], sizes[k, 1]) / 2
+        for i in range(len(way) - 1):
+            f, g = way[i, 0], way[i + 1, 0]
+            # Centre of the object from that of the vehicle, at both ends of this piece.
+            px, py = ax + (bx - ax) * f - way[i, 1], ay + (by - ay) * f - way[i, 2]
+            qx, qy = ax + (bx - ax) * g - way[i + 1, 1], ay + (by - ay) * g - way[i + 1, 2]
+            if _nearest(px, py, qx - px, qy - py) > reach + other_reach:
+                continue
+            low_p = az + (bz - az) * f - sizes[k, 2] / 2 - way[i, 4] + slack
+            low_q = az + (bz - az) * g - sizes[k, 2] / 2 - way[i + 1, 4] + slack
+            if min(low_p, low_q) >= height or max(low_p, low_q) + sizes[k, 2] <= 0.0:
+                continue
+            yaw, yaw_change = way[i, 3], way[i + 1, 3] - way[i, 3]
+            other, other_change = a_yaw + turn * f, turn * (g - f)
+            if first[k] == np.inf:
+                speed = math.hypot(qx - px, qy - py) + abs(yaw_change) * reach
+                speed += abs(other_change) * other_reach
+                t = 0.0
+                while t <= 1.0:
+                    gap = _gap(
+                        px + (qx - px) * t,
+                        py + (qy - py) * t,
+                        yaw + yaw_change * t,
+                        length,
+                        width,
+                        other + other_change * t,
+                        sizes[k, 0],
+                        sizes[k, 1],
+                    )
+                    step = max(gap, tolerance)
+                    if gap < -LEAST_OVERLAP:
+                        low = low_p + (low_q - low_p) * t
+                        if low < height and low + sizes[k, 2] > 0.0:
+                            first[k] = f + (g - f) * t
+                            break
+                        step = max(tolerance, speed / MOST_PIECES)
+                    if t == 1.0:
+                        break
+                    t = min(t + step / speed, 1.0) if speed > 0.0 else 1.0
+            if i == len(way) - 2 and low_q < height and low_q + sizes[k, 2] > 0.0:
+                gap = _gap(
+                    qx,
+                    qy,
+                    yaw + yaw_change,
+                    length,
+                    width,
+                    b_yaw,
+                    sizes[k, 0],
+                    sizes[k, 1],
+                )
+                touching[k] = gap < -LEAST_OVERLAP
+    return first, touching
+
+
+@kernel
+def _nearest(x, y, dx, dy):
+    """Distance [m] from the origin to the way from (x, y) on by (dx, dy) [m]."""
+    squared = dx * dx + dy * dy
+    t = min(max(-(x * dx + y * dy) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+    return math.hypot(x + dx * t, y + dy * t)
+
+
+@kernel
+def _gap(x, y, yaw, length, width, other_yaw, other_length, other_width):
+    """Largest gap [m] of two boxes along a normal of a side, the second's middle being (x, y) off;
+    below 0 where they overlap."""
+    cos_a, sin_a = math.cos(yaw), math.sin(yaw)
+    cos_b, sin_b = math.cos(other_yaw), math.sin(other_yaw)
+    c, s = abs(cos_a * cos_b + sin_a * sin_b), abs(sin_b * cos_a - cos_b * sin_a)
+    la, wa, lb, wb = length / 2, width / 2, other_length / 2, other_width / 2
+    return max(
+        abs(x * cos_a + y * sin_a) - la - lb * c - wb * s,
+        abs(y * cos_a - x * sin_a) - wa - lb * s - wb * c,
+        abs(x * cos_b + y * sin_b) - lb - la * c - wa * s,
+        abs(y * cos_b - x * sin_b) - wb - la * s - wa * c,
+    )
+
+
+@kernel
+def first_occupied(way, size, spacing, origin, cell, occupied, sums):
+    """When the box of a vehicle first lies on an occupied cell within a step.
+
+    Args:
+        way: [M, 5] float64, as in :func:`first_contacts`.
+        size: (length, width, height) of that box [m].
+        spacing: of the points all over the box that are looked at, and how far its corners move
+            from one look to the next, at most [m].
+        origin: [2] float64, lowest corner of the grid [m].
+        cell: edge of a cell [m].
+        occupied: [nx, ny] bool.
+        sums: [nx + 1, ny + 1] int64, occupied cells below and left of each corner of a cell.
+
+    Returns:
+        Fraction of the step, inf where there is none; the middle x, y [m] of what is hit; and
+        whether the box lies on an occupied cell at the end.
+    """
+    half = math.hypot(size[0], size[1]) / 2
+    first, at_x, at_y, touching = np.inf, 0.0, 0.0, False
+    for i in range(len(way) - 1):
+        last = i == len(way) - 2
+        dx, dy = way[i + 1, 1] - way[i, 1], way[i + 1, 2] - way[i, 2]
+        turn = way[i + 1, 3] - way[i, 3]
+        low_x, high_x = min(way[i, 1], way[i + 1, 1]) - half, max(way[i, 1], way[i + 1, 1]) + half
+        low_y, high_y = min(way[i, 2], way[i + 1, 2]) - half, max(way[i, 2], way[i + 1, 2]) + half
+        if not _any_occupied(low_x, high_x, low_y, high_y, origin, cell, sums):
+            continue
+        if first == np.inf:
+            looks = max(math.ceil((math.hypot(dx, dy) + abs(turn) * half) / spacing), 1)
+            for n in range(looks + 1):
+                t = n / looks
+                hits, x, y = _hits(
+                    way[i, 1] + dx * t,
+                    way[i, 2] + dy * t,
+                    way[i, 3] + turn * t,
+                    size,
+                    spacing,
+                    origin,
+                    cell,
+                    occupied,
+                )
+                if hits:
+                    first, at_x, at_y = way[i, 0] + (way[i + 1, 0] - way[i, 0]) * t, x, y
+                    break
+        if last:
+            hits, x, y = _hits(
+                way[i + 1, 1], way[i + 1, 2], way[i + 1, 3], size, spacing, origin, cell, occupied
+            )
+            touching = hits > 0
+    return first, at_x, at_y, touching
+
+
+@kernel
+def holds_any(way, reach, origin, cell, sums):
+    """Whether a rectangle along the axes around a way and all within ``reach`` [m] of it holds an
+    occupied cell; see :func:`first_occupied`."""
+    return _any_occupied(
+        way[:, 1].min() - reach,
+        way[:, 1].max() + reach,
+        way[:, 2].min() - reach,
+        way[:, 2].max() + reach,
+        origin,
+        cell,
+        sums,
+    )
+
+
+@kernel
+def _any_occupied(low_x, high_x, low_y, high_y, origin, cell, sums):
+    """Whether a rectangle along the axes [m] holds an occupied cell."""
+    nx, ny = sums.shape[0] - 1, sums.shape[1] - 1
+    a = min(max(math.floor((low_x - origin[0]) / cell), 0), nx)
+    b = min(max(math.floor((high_x - origin[0]) / cell) + 1, 0), nx)
+    c = min(max(math.floor((low_y - origin[1]) / cell), 0), ny)
+    d = min(max(math.floor((high_y - origin[1]) / cell) + 1, 0), ny)
+    return sums[b, d] - sums[a, d] - sums[b, c] + sums[a, c] > 0
+
+
+@kernel
+def _hits(x, y, yaw, size, spacing, origin, cell, occupied):
+    """How many points all over a box lie on occupied cells, and their middle [m]."""
+    rows = max(math.ceil(size[0] / spacing), 1) + 1
+    columns = max(math.ceil(size[1] / spacing), 1) + 1
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    hits, sum_x, sum_y = 0, 0.0, 0.0
+    for i in range(rows):
+        u = size[0] * (i / (rows - 1) - 0.5)
+        for j in range(columns):
+            v = size[1] * (j / (columns - 1) - 0.5)
+            px, py = x + u * cos - v * sin, y + u * sin + v * cos
+            a = math.floor((px - origin[0]) / cell)
+            b = math.floor((py - origin[1]) / cell)
+            inside = 0 <= a < occupied.shape[0] and 0 <= b < occupied.shape[1]
+            if inside and occupied[a, b]:
+                hits, sum_x, sum_y = hits + 1, sum_x + px, sum_y + py
+    return hits, sum_x / max(hits, 1), sum_y / max(hits, 1)

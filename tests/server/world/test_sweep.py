@@ -1,0 +1,303 @@
+"""Contact between the instants of the clock."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from real2sim_proto import decode, encode
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
+from real2sim_server.edit import ScenarioState
+from real2sim_server.geometry.rotation import yaw_quaternion
+from real2sim_server.scene import CameraRig, GaussianCloud, Scene, Trajectory
+from real2sim_server.world import World
+from real2sim_server.world.collision.sweep_kernels import first_contacts
+from real2sim_server.world.recording.recording import first_difference, record
+from real2sim_server.world.recording.replay import (
+    Entry,
+    Replayer,
+    action_payload,
+    no_action_impact,
+    reset_payload,
+)
+
+COAST = Control(acceleration=0.0, steering=0.0)
+CAR = (4.0, 2.0)
+FRONT = 3.65
+"""Rear axle to the front bumper of the ego [m]."""
+
+
+def gaps(centres, yaws, sizes):
+    """Largest gap of two boxes along a normal of a side, for [T, 2] centres, [T] yaws of both."""
+    apart = centres[1] - centres[0]
+    found = []
+    for yaw in yaws:
+        for axis in (
+            np.stack([np.cos(yaw), np.sin(yaw)], 1),
+            np.stack([-np.sin(yaw), np.cos(yaw)], 1),
+        ):
+            reach = 0.0
+            for (length, width), other in zip(sizes, yaws, strict=True):
+                along = np.stack([np.cos(other), np.sin(other)], 1)
+                across = np.stack([-np.sin(other), np.cos(other)], 1)
+                reach = reach + length / 2 * np.abs((axis * along).sum(1))
+                reach = reach + width / 2 * np.abs((axis * across).sum(1))
+            found.append(np.abs((axis * apart).sum(1)) - reach)
+    return np.max(found, axis=0)
+
+
+def drive(world, plan=COAST):
+    """Collisions until the end of an episode."""
+    found = []
+    while not world.over:
+        found += [e for e in world.step(plan) if e.type == "collision"]
+    return found
+
+
+# --- the kernel -------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=100)
+@given(seed=st.integers(0, 100_000))
+def test_the_first_contact_is_that_of_a_dense_sampling(seed):
+    rng = np.random.default_rng(seed)
+    fractions = np.linspace(0, 1, int(rng.integers(2, 5)))
+    way = np.zeros((len(fractions), 5))
+    way[:, 0] = fractions
+    way[:, 1:3] = np.cumsum(rng.normal(scale=8.0, size=(len(fractions), 2)), axis=0)
+    way[:, 3] = np.cumsum(rng.normal(scale=0.5, size=len(fractions)))
+    a, b = rng.normal(scale=8.0, size=(2, 3)) * [1, 1, 0]
+    yaws = rng.uniform(-4, 4, 2)
+    size, other = (4.6, 1.85, 1.6), rng.uniform(0.4, 5.0, 3)
+    t = np.linspace(0, 1, 10_001)
+    turn = math.remainder(yaws[1] - yaws[0], math.tau)
+    centres = np.stack([np.interp(t, way[:, 0], way[:, c]) for c in (1, 2)], 1)
+    others = a[:2] + t[:, None] * (b - a)[:2]
+    turned = (np.interp(t, way[:, 0], way[:, 3]), yaws[0] + t * turn)
+    gap = gaps((centres, others), turned, (size[:2], other[:2]))
+
+    first, touching = first_contacts(
+        way,
+        size,
+        np.zeros(1, np.int64),
+        (a[None], yaw_quaternion(yaws[:1])),
+        (b[None], yaw_quaternion(yaws[1:])),
+        other[None],
+        0.0,
+        1e-3,
+    )
+    # A touch less deep than the tolerance may be missed, and none is found where there is none.
+    if math.isfinite(first[0]):
+        before = gap[t < first[0] - 2e-4]
+        assert before.min(initial=1.0) > -2e-3
+        assert np.interp(first[0], t, gap) < 1e-3
+    else:
+        assert gap.min() > -2e-3
+    assert touching[0] == (gap[-1] < 0.0)
+
+
+# --- drives -----------------------------------------------------------------------------------
+
+
+def test_of_a_thousand_fast_drives_none_passes_through_a_car(make_scene):
+    rng = np.random.default_rng(20)
+    times = 5_000_000 + np.array([0, 3_000_000])
+    t = np.linspace(0, 3, 1501)
+    met, flat = 0, make_scene().ground
+    for _ in range(1000):
+        speed, yaw = rng.uniform(10, 40), rng.uniform(-math.pi, math.pi)
+        other = rng.uniform(0, 30) * np.array([math.cos(yaw), math.sin(yaw)])
+        # Around where the ego's middle is at some time of the drive.
+        when = rng.uniform(0.4, 2.6)
+        place = np.array([1.35 + speed * when, 0.0]) + rng.uniform(-3, 3, 2) - other * when
+        positions = np.zeros((2, 3))
+        positions[:, :2], positions[:, 2] = [place, place + 3 * other], 0.8
+        car = Trajectory(times, positions, np.tile(yaw_quaternion(yaw), (2, 1)))
+        way = np.zeros((2, 3))
+        way[1, 0] = 3 * speed
+        ego = Trajectory(times, way, np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+        # Fitting the ground to each scene would take most of the time.
+        scene = replace(make_scene(ego, car=car), stored_ground=flat)
+        dt_us = int(rng.choice([50_000, 100_000, 200_000, 500_000, 1_000_000]))
+        spec = ResetSpec(action="control", dt_us=dt_us)
+        found = drive(World(scene, ScenarioState.of(scene), spec))
+
+        centres = np.stack([1.35 + speed * t, 0 * t], 1), place + t[:, None] * other
+        size = scene.ego_size[:2]
+        gap = gaps(centres, (0 * t, yaw + 0 * t), (size, CAR))
+        begins = np.flatnonzero(gap < -0.01)
+        if gap[0] > 0 and len(begins):
+            met += 1
+            (event,) = found
+            contact = (event.data["contact_us"] - 5_000_000) * 1e-6
+            assert t[np.argmax(gap < 0)] - 3e-3 <= contact <= t[begins[0]] + 3e-3
+            velocity = np.array([speed, 0.0]) - other
+            assert event.data["relative_speed"] == pytest.approx(np.hypot(*velocity), abs=1e-3)
+        elif gap.min() > 0.01:
+            assert not found
+    assert met > 500
+
+
+@pytest.mark.parametrize("dt_us", [50_000, 100_000, 500_000, 1_000_000])
+def test_time_place_and_speed_of_a_contact_do_not_depend_on_the_clock(make_world, moving, dt_us):
+    world = make_world(car=moving(45, 0, z=0.8), spec={"action": "control", "dt_us": dt_us})
+    (event,) = drive(world, Control(acceleration=4.0, steering=0.0))
+
+    # 10 t + 2 t^2 = 43 - 3.65.
+    t = (-10 + math.sqrt(100 + 8 * (43 - FRONT))) / 4
+    assert event.data["contact_us"] * 1e-6 == pytest.approx(5 + t, abs=1e-3)
+    assert event.data["relative_speed"] == pytest.approx(10 + 4 * t, abs=0.05)
+    assert (event.data["x"], event.data["y"]) == (pytest.approx(43, abs=0.01), 0.0)
+    assert event.t_us == world.t_us
+    assert (world.reason, world.metrics()["collisions"]) == ("collision", 1)
+
+
+def test_a_turn_into_a_car_between_two_instants_is_found(make_world, moving):
+    # A circle of 7 m: halfway round within the step, far from the straight way of it.
+    spec = {"action": "control", "dt_us": 1_000_000, "ego": {"max_steer_rate": 10.0}}
+    turn = Control(acceleration=0.0, steering=math.atan(2.8 / 7.0))
+    aside = moving(7.6, 5.5, z=0.8)
+    events = drive(make_world(aside=aside, spec=spec), turn)
+    finely = drive(make_world(aside=aside, spec=spec | {"dt_us": 20_000}), turn)
+
+    assert [e.object_id for e in events] == ["aside"]
+    assert events[0].data["contact_us"] == pytest.approx(finely[0].data["contact_us"], abs=2e3)
+
+
+@pytest.mark.parametrize("on_collision", ["terminate", "continue"])
+def test_poses_that_jump_over_a_car_hit_it(make_world, moving, on_collision):
+    spec = {"action": "pose", "dt_us": 500_000, "on_collision": on_collision}
+    world = make_world(car=moving(15, 0, z=0.8), spec=spec)
+
+    assert [e.object_id for e in world.step(PoseCommand(x=30, y=0, yaw=0))] == ["car"]
+
+
+def test_a_plan_that_is_followed_perfectly_hits_what_lies_on_it(make_world, moving):
+    spec = {"dt_us": 1_000_000, "ego": {"tracker": "perfect"}}
+    world = make_world(aside=moving(12, 7, z=0.8), spec=spec)
+    times = [world.t_us + 250_000 * k for k in range(1, 5)]
+    # Out to the car and back within the step.
+    poses = [(5.0, 3.0, 0.5), (12.0, 7.0, 0.0), (17.0, 3.0, -0.5), (20.0, 0.0, 0.0)]
+    events = world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
+
+    assert [e.object_id for e in events] == ["aside"]
+
+
+def test_an_ego_that_stands_is_hit_by_a_car_that_passes_through_within_a_step(make_world, moving):
+    spec = {"action": "control", "dt_us": 1_000_000}
+    crossing = moving(1.35, -20, z=0.8, speed=35.0, yaw=math.pi / 2)
+    world = make_world(moving(), crossing=crossing, spec=spec)
+
+    (event,) = drive(world)
+    assert event.data["contact_us"] * 1e-6 == pytest.approx(5 + (20 - 2 - 0.925) / 35, abs=1e-3)
+    assert event.data["relative_speed"] == pytest.approx(35.0)
+
+
+def test_of_two_contacts_in_a_step_the_first_counts_for_the_speed(make_world, moving):
+    cars = {"far": moving(25, 0, z=0.8), "near": moving(15, 0, z=0.8, speed=4.0)}
+    spec = {"action": "control", "dt_us": 1_000_000}
+    world = make_world(moving(speed=30.0), **cars, spec=spec)
+
+    assert [e.object_id for e in drive(world)] == ["near", "far"]
+    assert world.accumulator.first_impact == pytest.approx(26.0)
+
+
+def test_a_bridge_is_passed_under_at_any_speed(make_world, moving):
+    world = make_world(moving(speed=30.0), bridge=moving(20, 0, z=6.0), spec={"dt_us": 1_000_000})
+
+    assert drive(world, None) == []
+
+
+def test_what_moves_with_momentum_is_met_wherever_the_ego_can_turn_to(make_world, moving):
+    spec = {"dt_us": 1_000_000, "action": "control", "on_collision": "continue"}
+    world = make_world(moving(speed=6.0), aside=moving(5.0, 4.3, z=0.8), spec=spec)
+    world.motion = world.motion._replace(steering=0.6)
+
+    first, *_ = world.step(Control(acceleration=2.0, steering=0.6))
+    assert (first.type, first.object_id) == ("collision", "aside")
+
+
+# --- the background ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def walled(make_scene) -> Scene:
+    """A wall, one cell thick, beside the recorded way."""
+    street = make_scene()
+    x, z = np.meshgrid(np.arange(0.0, 60.0, 0.05), np.arange(0.5, 1.5, 0.2))
+    points = np.stack([x, np.full_like(x, 6.1), z], -1).reshape(-1, 3)
+    count = len(points)
+    wall = GaussianCloud(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        scales=torch.full((count, 3), 0.05),
+        opacities=torch.full((count,), 0.9),
+        sh=torch.zeros(count, 1, 3),
+    )
+    rig = CameraRig(tuple(street.rig.cameras))
+    return Scene("walled", wall, {}, None, rig, street.ego, street.ego.times_us)
+
+
+@pytest.mark.parametrize("dt_us", [50_000, 1_000_000])
+def test_no_wall_is_driven_through(walled, dt_us):
+    spec = ResetSpec(dt_us=dt_us, contact={"background": True}, ego={"tracker": "perfect"})
+    world = World(walled, ScenarioState.of(walled), spec)
+    times = [world.t_us + 1_000_000 * k for k in (1, 2)]
+    # Straight across the wall at 20 m/s.
+    poses = [(16.0, 12.0, 0.6435), (32.0, 24.0, 0.6435)]
+    events = drive(world, TrajectoryPlan(times_us=times, poses=poses, frame="world"))
+
+    (event,) = events
+    assert (event.object_id, world.reason) == (None, "collision")
+    assert event.data["y"] == pytest.approx(6.1, abs=0.3)
+    assert event.data["contact_us"] < 5_600_000
+
+
+def test_driving_along_a_wall_is_no_contact(walled):
+    spec = ResetSpec(dt_us=500_000, action="control", contact={"background": True})
+
+    assert drive(World(walled, ScenarioState.of(walled), spec)) == []
+
+
+# --- warm-up and recordings -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("on_collision", ["terminate", "continue"])
+def test_what_the_recorded_drive_runs_into_during_warm_up_is_no_contact(
+    make_world, moving, on_collision
+):
+    spec = {"warmup_us": 3_000_000, "horizon": 60, "on_collision": on_collision}
+    world = make_world(car=moving(25, 0.0, z=0.8), spec=spec)
+
+    assert drive(world, None) == []
+    assert world.metrics()["collisions"] == 0
+    assert world.steps == 60
+
+
+def test_an_episode_from_before_goes_on_through_what_it_passed_through(make_scene, moving):
+    scene = make_scene(moving(speed=30.0), car=moving(20, 0, z=0.8))
+    spec = ResetSpec(dt_us=1_000_000, action="control", contact={"swept": False})
+    fields = decode(reset_payload(spec))
+    del fields["spec"]["contact"]["swept"]
+    log = [Entry("reset", 0, encode(fields))]
+    log += [Entry("action", k, action_payload(COAST)) for k in range(5)]
+    made = record(Replayer.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
+
+    assert len(made.instants) == 6
+    assert first_difference(made, Replayer.on(scene, ScenarioState.of(scene))) is None
+
+
+def test_the_reference_of_neuroncap_is_the_speed_at_the_first_contact(make_scene, moving):
+    scene = make_scene(moving(speed=30.0), car=moving(20, 0, z=0.8, speed=5.0))
+    log = [Entry("reset", 0, reset_payload(ResetSpec(dt_us=1_000_000)))]
+
+    assert no_action_impact(Replayer.on(scene, ScenarioState.of(scene)), log) == pytest.approx(
+        25.0, abs=1e-6
+    )
