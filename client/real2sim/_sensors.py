@@ -10,6 +10,7 @@ from real2sim_proto.episode import (
     ContactSpec,
     EgoSpec,
     LatencySpec,
+    Randomization,
     ResetSpec,
     ScoringSpec,
     SensorSpec,
@@ -25,9 +26,11 @@ class ResetOptions(TypedDict, total=False):
     """Options of reset, besides its sensors; meaning and defaults as in ``ResetSpec``."""
 
     seed: int
+    randomization: Randomization | Mapping[str, Any]
     start_us: int | None
     dt_us: int
     horizon: int | None
+    beyond_log: Literal["end", "loop", "extend"]
     warmup_us: int
     ego: EgoSpec | Mapping[str, Any]
     action: Literal["trajectory", "control", "pose"]

@@ -46,8 +46,11 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     uint8 [H, W, 3].
 
     Reward: metres of way along the route, less 10 for a contact that the ego is to blame for, less
-    0.1 for a step off the road. ``info`` has ``metrics`` and ``events``; :attr:`last` is the
-    whole observation.
+    0.1 for a step off the road. ``info`` has ``metrics``, ``events`` and what the seed has
+    ``drawn`` for the episode; :attr:`last` is the whole observation.
+
+    The seed of ``reset`` draws what ``options`` name in ``randomization`` and ``agents.spawn``;
+    without them episodes of all seeds are the same.
 
     Args:
         url, token: of the worker; defaults as of :func:`real2sim.connect`.
@@ -178,7 +181,11 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
 
     @staticmethod
     def _info(obs: Observation) -> dict[str, Any]:
-        return {"metrics": dict(obs.metrics), "events": [e.model_dump() for e in obs.events]}
+        return {
+            "metrics": dict(obs.metrics),
+            "events": [e.model_dump() for e in obs.events],
+            "drawn": dict(obs.drawn),
+        }
 
 
 def _reward(before: Observation, now: Observation) -> float:

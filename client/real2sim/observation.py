@@ -79,6 +79,10 @@ class Observation(View):
         truncated: the episode ended because its time was over.
         reason: why it ended.
         warming_up: whether the vehicle still moves as recorded; plans wait.
+        lap: times that the vehicle of a loop has been put back to the start of the route.
+        drawn: what the seed has drawn for this episode in the step that led here, by name.
+        ego_truth: where the vehicle is, in a privileged episode whose ``ego`` is an estimate with
+            errors; None elsewhere.
 
     Examples:
         >>> client = real2sim.connect()
@@ -99,6 +103,9 @@ class Observation(View):
     truncated: bool = False
     reason: str | None = None
     warming_up: bool = False
+    lap: int = 0
+    drawn: Mapping[str, float] = field(default_factory=dict, repr=False)
+    ego_truth: EgoState | None = field(default=None, repr=False)
 
     @property
     def over(self) -> bool:
@@ -137,6 +144,9 @@ def observation_from_wire(obs: Obs) -> Observation:
         truncated=obs.truncated,
         reason=obs.reason,
         warming_up=obs.warming_up,
+        lap=obs.lap,
+        drawn=obs.drawn,
+        ego_truth=obs.ego_truth,
         timing=obs.timing,
     )
 

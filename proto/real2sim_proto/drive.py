@@ -89,6 +89,7 @@ class Event(ServerModel):
         "horizon",
         "edited",
         "stopped",
+        "looped",
     ]
     t_us: Microseconds
     object_id: str | None = None
@@ -267,6 +268,15 @@ class Obs(ServerEnvelope):
     truncated: bool = False
     reason: str | None = None
     warming_up: bool = Field(default=False, description="the ego still moves as recorded")
+    lap: int = Field(default=0, description="times the ego has been put back to the route's start")
+    drawn: dict[str, float] = Field(
+        default_factory=dict,
+        description="what the seed has drawn for this episode in the step that led here, by name",
+    )
+    ego_truth: EgoState | None = Field(
+        default=None,
+        description="of a privileged episode whose `ego` is an estimate with errors",
+    )
     timing: dict[str, float] = Field(default_factory=dict, description="milliseconds by stage")
 
 

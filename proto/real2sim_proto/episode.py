@@ -197,6 +197,53 @@ AgentDriver = Annotated[
 ]
 
 
+class LaneSpec(Model):
+    """A lane along the ego's route in which road users come and go."""
+
+    offset: Annotated[float, Field(ge=-20, le=20)] = Field(
+        default=0.0, description="of its middle from the route, positive on the left [m]"
+    )
+    oncoming: bool = Field(default=False, description="against the direction of the route")
+
+
+class SpawnSpec(Model):
+    """Road users that come and go along the ego's route; drawn by the episode's seed.
+
+    One appears at the edge of the stretch around the ego, where the way is free, and leaves once
+    it is `margin` beyond the stretch. It looks like a vehicle of the scene and drives by IDM.
+    """
+
+    density: Annotated[float, Field(gt=0, le=200)] = Field(
+        default=20.0, description="of each lane [vehicles per km]"
+    )
+    lanes: list[LaneSpec] = Field(default=[LaneSpec()], min_length=1, max_length=8)
+    ahead: Annotated[float, Field(ge=20, le=500)] = Field(
+        default=60.0, description="where the stretch ends, from the ego along the route [m]"
+    )
+    behind: Annotated[float, Field(ge=10, le=500)] = Field(
+        default=40.0, description="where the stretch begins, behind the ego [m]"
+    )
+    margin: Annotated[float, Field(ge=5, le=200)] = Field(
+        default=15.0, description="beyond either edge, after which one leaves [m]"
+    )
+    gap: Annotated[float, Field(ge=2, le=200)] = Field(
+        default=12.0, description="free way before and behind where one appears [m]"
+    )
+    most: int = Field(default=16, ge=1, le=64, description="at a time")
+    speed_spread: Annotated[float, Field(ge=0, le=0.9)] = Field(
+        default=0.15, description="desired speeds are drawn within this fraction of the driver's"
+    )
+    looks: list[Identifier] = Field(
+        default_factory=list,
+        max_length=64,
+        description="objects of the scene whose look they have; default: all its vehicles",
+    )
+    driver: IdmDriver = Field(
+        default=IdmDriver(),
+        description="its desired speed defaults to the highest one of the recorded drive",
+    )
+
+
 class AgentsSpec(Model):
     """Who drives the other road users."""
 
@@ -210,6 +257,72 @@ class AgentsSpec(Model):
         "that the ego is `off_log_distance` from where it was recorded at that time",
     )
     off_log_distance: Metre = Field(default=3.0, description="[m]")
+    spawn: SpawnSpec | None = Field(
+        default=None, description="road users that come and go along the route; None: nobody does"
+    )
+
+
+# --- what the seed draws ----------------------------------------------------------------------
+
+
+class StartRandomization(Model):
+    """Where and how fast the ego begins: uniform around the recorded start, this far either way."""
+
+    longitudinal: Annotated[float, Field(ge=0, le=50)] = Field(
+        default=0.0, description="along the recorded drive [m]"
+    )
+    lateral: Annotated[float, Field(ge=0, le=3)] = Field(default=0.0, description="[m]")
+    heading: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.0, description="[rad]")
+    speed: Annotated[float, Field(ge=0, le=20)] = Field(
+        default=0.0, description="never below standstill [m/s]"
+    )
+
+
+Fraction = Annotated[float, Field(ge=0, le=0.9)]
+
+
+class TrafficRandomization(Model):
+    """Parameters of IDM drivers: each is multiplied by a factor that is drawn once per object,
+    uniform within 1 plus or minus this."""
+
+    desired_speed: Fraction = 0.0
+    headway: Fraction = 0.0
+    gap: Fraction = 0.0
+    acceleration: Fraction = 0.0
+    braking: Fraction = 0.0
+
+
+class EstimateRandomization(Model):
+    """Errors of the ego's estimate of itself, normal with these standard deviations.
+
+    Observations then hold the estimate: `ego`, `route`, `command` and `T_world_sensor` of frames.
+    Images, contact and scores are of the truth, which `ego_truth` holds where the episode is
+    `privileged`. Plans in the vehicle's frame go from where the vehicle is.
+    """
+
+    position: Annotated[float, Field(ge=0, le=5)] = Field(
+        default=0.0, description="along x and y of the world each [m]"
+    )
+    heading: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.0, description="[rad]")
+    speed: Annotated[float, Field(ge=0, le=5)] = Field(default=0.0, description="[m/s]")
+    correlation: Annotated[float, Field(ge=0, le=600)] = Field(
+        default=0.0,
+        description="time in which errors change (Gauss-Markov) [s]; 0: anew at every step",
+    )
+
+
+class Randomization(Model):
+    """What the episode's seed draws; nothing by default."""
+
+    start: StartRandomization = StartRandomization()
+    traffic: TrafficRandomization = TrafficRandomization()
+    estimate: EstimateRandomization = EstimateRandomization()
+    latency_us: int = Field(
+        default=0,
+        ge=0,
+        le=5_000_000,
+        description="a wait, uniform from 0 to this, is added to the latency of every plan",
+    )
 
 
 # --- time, contact, scoring -------------------------------------------------------------------
@@ -266,14 +379,27 @@ class ScoringSpec(Model):
 class ResetSpec(Model):
     """How an episode begins and runs."""
 
-    seed: int = Field(default=0, ge=0, lt=2**63)
+    seed: int = Field(
+        default=0,
+        ge=0,
+        lt=2**63,
+        description="of what `randomization` and `agents.spawn` draw; without them episodes of all "
+        "seeds are the same",
+    )
+    randomization: Randomization = Randomization()
     start_us: Microseconds | None = Field(default=None, description="default: start of the log")
     dt_us: int = Field(default=100_000, ge=1_000, le=1_000_000, description="clock step")
     horizon: int | None = Field(
         default=None,
         ge=1,
         le=1_000_000,
-        description="steps; default and most: to the end of the log",
+        description="steps; default, and most where `beyond_log` is 'end': to the end of the log",
+    )
+    beyond_log: Literal["end", "loop", "extend"] = Field(
+        default="end",
+        description="what a horizon beyond the recording leads to: 'end' refuses it; 'loop' puts "
+        "the ego back to the start of the recorded drive whenever it has reached its end, with an "
+        "event `looped`; 'extend' lets the route go on, its last bend fading into a straight line",
     )
     warmup_us: int = Field(
         default=0, ge=0, description="the ego moves as recorded for so long; plans wait"

@@ -57,13 +57,17 @@ class SessionState(Reply):
     step: int
     t_us: Microseconds
     revision: int
-    ego: EgoState
+    ego: EgoState = Field(description="where it is, whatever its own estimate")
     agents: list[AgentState]
     events: list[Event] = Field(default_factory=list, description="since the previous step answer")
     metrics: dict[str, float]
     terminated: bool
     truncated: bool
     reason: str | None = None
+    lap: int = Field(default=0, description="times the ego has been put back to the route's start")
+    drawn: dict[str, float] = Field(
+        default_factory=dict, description="what the seed drew for the start and for objects so far"
+    )
     timing: dict[str, float] = Field(default_factory=dict)
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -51,9 +52,17 @@ def evaluate_policy(
         typer.Option(
             min=1,
             max=1000,
-            help="How many, from 0 on, of each case that has jitter; others are driven once.",
+            help="How many, from 0 on, of each case in which something is random: jitter, or "
+            "randomization or agents.spawn of its reset. Others are driven once.",
         ),
     ] = 3,
+    reset: Annotated[
+        str | None,
+        typer.Option(
+            help="Options of reset for --scene and --scenario, as JSON, for example "
+            '\'{"randomization": {"start": {"lateral": 0.5}}}\'.'
+        ),
+    ] = None,
     url: Annotated[
         str | None, typer.Option(help="Of a running worker; default: one is started.")
     ] = None,
@@ -73,7 +82,8 @@ def evaluate_policy(
     from ..policies.suite import EpisodeGrid
     from ..policies.summary import report_figures, unconfirmed_scores
 
-    cases = _cases(scenes or (), scenarios or (), suite, demo=url is None and scenes_dir is None)
+    own_worker = url is None and scenes_dir is None
+    cases = _cases(scenes or (), scenarios or (), suite, demo=own_worker, reset=reset)
     grid = EpisodeGrid(cases, policies, range(seeds))
     with contextlib.ExitStack() as stack:
         if url is None:
@@ -100,19 +110,36 @@ def evaluate_policy(
 
 
 def _cases(
-    scenes: Sequence[str], scenarios: Sequence[str], suite: Path | None, *, demo: bool
+    scenes: Sequence[str],
+    scenarios: Sequence[str],
+    suite: Path | None,
+    *,
+    demo: bool,
+    reset: str | None = None,
 ) -> Sequence[Case]:
     from ..policies.suite import DEMO_SUITE, cases_as_recorded, load_suite
 
+    if reset is not None and not (scenes or scenarios):
+        raise CommandError("--reset goes with --scene and --scenario; a suite names its own")
     if suite is not None:
         if scenes or scenarios:
             raise CommandError("give scenes and scenarios, or a suite that names its own")
         return load_suite(suite)
     if scenes or scenarios:
-        return cases_as_recorded(scenes, scenarios)
+        return cases_as_recorded(scenes, scenarios, _options(reset))
     if not demo:
         raise CommandError("name what to drive: --scene, --scenario or --suite")
     return load_suite(DEMO_SUITE)
+
+
+def _options(reset: str | None) -> dict[str, Any]:
+    try:
+        options = json.loads(reset or "{}")
+    except ValueError as error:
+        raise CommandError(f"--reset is no JSON: {error}") from error
+    if not isinstance(options, dict):
+        raise CommandError("--reset is no JSON object of options")
+    return options
 
 
 @contextlib.contextmanager
@@ -156,7 +183,8 @@ def _print_what_ran_once(grid: EpisodeGrid) -> None:
     if fixed and len(grid.seeds) > 1:
         console.print(
             f"driven once, not with {len(grid.seeds)} seeds: {', '.join(fixed)}; nothing in an "
-            "episode is random but the jitter of a suite's case",
+            "episode is random but the jitter of a suite's case, and randomization and "
+            "agents.spawn of its reset",
             highlight=False,
             markup=False,
             soft_wrap=True,

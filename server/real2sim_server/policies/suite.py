@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from real2sim_proto.episode import ResetSpec
+from real2sim_proto.episode import Randomization, ResetSpec
 from real2sim_proto.operations import Operation
 
 from ..console import CommandError
@@ -34,8 +34,9 @@ class Case(BaseModel):
 
     Each seed but 0 varies it: every number of ``reset`` that ``jitter`` names by its path, such as
     ``agents.drivers.car_3.gap``, is drawn uniformly from its value plus or minus the one given.
-    Times (``_us``) are rounded to clock steps. Seed 0 is the case as it is written. Nothing else in
-    an episode is random: a case without jitter is the same for every seed.
+    Times (``_us``) are rounded to clock steps. Seed 0 is the case as it is written. For every seed
+    the worker draws what ``randomization`` and ``agents.spawn`` of ``reset`` name. Nothing else in
+    an episode is random: a case with none of them is the same for every seed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -61,7 +62,9 @@ class Case(BaseModel):
     @property
     def is_random(self) -> bool:
         """Whether its episodes differ by their seeds."""
-        return any(width != 0 for width in self.jitter.values())
+        spec = ResetSpec.model_validate(self.reset)
+        drawn = spec.agents.spawn is not None or spec.randomization != Randomization()
+        return drawn or any(width != 0 for width in self.jitter.values())
 
     def reset_for(self, seed: int) -> dict[str, Any]:
         """Options of reset for a seed; the same for every planner."""
@@ -120,15 +123,18 @@ def load_suite(suite: str | Path) -> list[Case]:
         raise CommandError(f"{path} is no suite: {_sentence(error)}") from error
 
 
-def cases_as_recorded(scenes: Sequence[str], scenarios: Sequence[str]) -> list[Case]:
-    """One case for each scene and each scenario, as it is.
+def cases_as_recorded(
+    scenes: Sequence[str], scenarios: Sequence[str], reset: Mapping[str, Any] | None = None
+) -> list[Case]:
+    """One case for each scene and each scenario, as it is, with options of ``reset``.
 
     Raises:
-        CommandError: none is given, or two that have one name.
+        CommandError: none is given, two that have one name, or an option that is not allowed.
     """
+    options = dict(reset or {})
     try:
-        cases = [Case(name=_case_name(scene), scene=scene) for scene in scenes]
-        cases += [Case(name=_case_name(scenario), scenario=scenario) for scenario in scenarios]
+        cases = [Case(name=_case_name(s), scene=s, reset=options) for s in scenes]
+        cases += [Case(name=_case_name(s), scenario=s, reset=options) for s in scenarios]
         return _checked(cases)
     except ValidationError as error:
         raise CommandError(_sentence(error)) from error

@@ -5,7 +5,7 @@ from .ego.controller import Plan
 from .ego.motion import Motion
 from .errors import WorldError
 from .events import Event
-from .observation import Observation
+from .observation import Observation, ego_fields
 from .path import LoggedPath
 from .scoring import Score, metrics_version
 from .warm_up import (
@@ -28,6 +28,7 @@ __all__ = [
     "World",
     "WorldError",
     "agent_fields",
+    "ego_fields",
     "kernels_on_disk",
     "metrics_version",
     "planning_on_disk",

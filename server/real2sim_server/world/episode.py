@@ -35,8 +35,8 @@ def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
 
     Raises:
         WorldError: TIME_OUT_OF_RANGE when start or horizon leave the log; UNKNOWN_CAMERA;
-            INVALID_REQUEST when a sensor's period and the clock step do not divide, or a camera
-            is listed twice.
+            INVALID_REQUEST when a sensor's period and the clock step do not divide, a camera
+            is listed twice, or a start is drawn for a warm-up.
     """
     clock = _clock(scene, spec)
     for sensor in spec.sensors:
@@ -52,7 +52,9 @@ def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     return clock
 
 
-def takes_effect_us(spec: ResetSpec, clock: EpisodeClock, t_us: int, latency_us: int) -> int:
+def takes_effect_us(
+    spec: ResetSpec, clock: EpisodeClock, t_us: int, latency_us: int, *, jitter_us: int = 0
+) -> int:
     """When a plan that comes at ``t_us`` takes effect [us]: after its latency and the warm-up.
 
     Args:
@@ -60,6 +62,7 @@ def takes_effect_us(spec: ResetSpec, clock: EpisodeClock, t_us: int, latency_us:
         clock: of the episode.
         t_us: now [us].
         latency_us: measured time to make the plan [us].
+        jitter_us: wait that the seed drew, on top of the model's [us].
     """
     latency = spec.latency
     wait_us = {
@@ -67,7 +70,7 @@ def takes_effect_us(spec: ResetSpec, clock: EpisodeClock, t_us: int, latency_us:
         "fixed": latency.fixed_us,
         "measured": min(max(latency_us, 0), latency.longest_us),
     }[latency.model]
-    return max(t_us + wait_us, clock.start_us + spec.warmup_us)
+    return max(t_us + wait_us + jitter_us, clock.start_us + spec.warmup_us)
 
 
 def _clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
@@ -90,12 +93,19 @@ def _clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
             f"the {longest} that are left of the log",
             hint="the warm-up follows the log in clock steps; choose a multiple of dt_us",
         )
-    if spec.horizon is not None and spec.horizon > longest:
+    if spec.warmup_us and any(spec.randomization.start.model_dump().values()):
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            "a warm-up follows the log, and randomization.start begins beside it",
+            hint="leave out one of warmup_us and randomization.start",
+        )
+    if spec.beyond_log == "end" and spec.horizon is not None and spec.horizon > longest:
         raise WorldError(
             ErrorCode.TIME_OUT_OF_RANGE,
             f"horizon {spec.horizon} is longer than the {longest} steps of {spec.dt_us} us that "
             f"are left of the log after {start}",
-            hint=f"ask for {longest} steps at most, or leave horizon out",
+            hint=f"ask for {longest} steps at most, leave horizon out, or let beyond_log be "
+            "'loop' or 'extend'",
         )
     return EpisodeClock(start, spec.dt_us, spec.horizon or longest)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from real2sim_proto.episode import ResetSpec
 
@@ -23,6 +24,7 @@ from .path import LoggedPath, PathPoint
 from .scoring import EgoSample, ObjectSamples, ScoringContext
 from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES
+from .seam import Seam
 
 
 class PendingStep(NamedTuple):
@@ -33,12 +35,14 @@ class PendingStep(NamedTuple):
         plan: new trajectory of the ego; None where there was none.
         events: that led to it.
         contacts: of its impacts; None where bodies pass through each other.
+        seam: over which the ego was put back before it moved; None where it was not.
     """
 
     start: StepStart
     plan: PlannedTrajectory | None
     events: tuple[Event, ...]
     contacts: StepContacts | None
+    seam: Seam | None = None
 
 
 LANE_LENGTH = 5.0
@@ -50,11 +54,13 @@ def scoring_context(
 ) -> ScoringContext:
     """What stays the same over an episode on ``scene``."""
     times = clock.start_us + clock.dt_us * np.arange(clock.horizon + 1)
-    transforms, _ = sample(scene.ego, np.minimum(times, scene.end_us))
-    s, expert = start_s, []
+    within = times[times <= scene.end_us]
+    transforms, _ = sample(scene.ego, within)
+    s, expert = start_s, list[float]()
     for x, y in transforms[:, :2, 3].tolist():
         s = path.nearest(x, y, near_s=s).s
         expert.append(s)
+    expert += _expert_beyond_log(scene, spec, times[len(within) :])
     lanes = tuple(
         o.trajectory.positions[:, :2]
         for o in scene.objects.values()
@@ -78,6 +84,24 @@ def scoring_context(
     )
 
 
+def _expert_beyond_log(scene: Scene, spec: ResetSpec, times: NDArray[np.int64]) -> list[float]:
+    """Where the recorded drive would be along the route [m] at times after its end: driven once
+    more in each lap of a loop, else going on at its mean speed."""
+    if not len(times):
+        return []
+    ego, path = scene.ego, LoggedPath(scene.ego)
+    if spec.beyond_log != "loop":
+        speed = path.length / (ego.end_us - ego.start_us)
+        return [path.length + speed * (t - ego.end_us) for t in times.tolist()]
+    s, places = 0.0, []
+    for x, y in ego.positions[:, :2].tolist():
+        s = max(path.nearest(x, y, near_s=s).s, s)
+        places.append(s)
+    laps, within = np.divmod(times - ego.start_us, ego.end_us - ego.start_us)
+    found = laps * path.length + np.interp(within, ego.times_us - ego.start_us, places)
+    return [float(s) for s in found]
+
+
 def _history(scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> tuple[tuple[float, float], ...]:
     """Speed and yaw of the log at the clock steps before the start, as far as it goes back."""
     window = comfort_window(clock.dt_us * 1e-6) - 1
@@ -87,8 +111,8 @@ def _history(scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> tuple[tuple[
     return tuple((m.speed, yaw) for m, yaw in zip(motions, yaws, strict=True))
 
 
-def ego_sample(motion: Motion, near: PathPoint, z: float) -> EgoSample:
-    """The ego for the scores."""
+def ego_sample(motion: Motion, near: PathPoint, z: float, *, laps: float = 0.0) -> EgoSample:
+    """The ego for the scores; ``laps``: length of those that it has driven in a loop [m]."""
     return EgoSample(
         x=motion.x,
         y=motion.y,
@@ -98,7 +122,7 @@ def ego_sample(motion: Motion, near: PathPoint, z: float) -> EgoSample:
         acceleration=motion.acceleration,
         yaw_rate=motion.yaw_rate,
         steering=motion.steering,
-        s=near.s,
+        s=near.s + laps,
         offset=near.offset,
         path_yaw=near.yaw,
         z=z,

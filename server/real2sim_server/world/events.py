@@ -15,6 +15,7 @@ EventType = Literal[
     "horizon",
     "edited",
     "stopped",
+    "looped",
 ]
 
 
@@ -27,6 +28,7 @@ class Event:
     exchanged also the rest of :meth:`.collision.impact.Impact.event_data`. ``object_id`` is None
     for the background, ``other_id`` the second object where the ego had no part. Of ``left_log``
     and ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
+    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of the :class:`.seam.Seam`.
     """
 
     type: EventType

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from .agents import Agents, agent_fields
@@ -29,6 +30,10 @@ class Observation:
         metrics: see :func:`~.scoring.running_metrics`.
         terminated, truncated, reason: how the episode ended, if it did.
         warming_up: whether the ego still moves as recorded.
+        lap: times that the ego has been put back to the start of the route.
+        drawn: what the seed has drawn in the step, by name.
+        truth: of an ego whose ``motion`` and ``T_world_vehicle`` are an estimate with errors; None
+            where they are the truth, or the episode is not privileged.
     """
 
     step: int
@@ -46,24 +51,24 @@ class Observation:
     truncated: bool
     reason: str | None
     warming_up: bool = False
+    lap: int = 0
+    drawn: Mapping[str, float] = field(default_factory=dict)
+    truth: tuple[Motion, Float] | None = None
 
     def ego_fields(self) -> dict[str, Any]:
         """The wire's EgoState as a plain map."""
-        motion = self.motion
-        return {
-            "position": self.T_world_vehicle[:3, 3].tolist(),
-            "quaternion": _quaternion(self.T_world_vehicle),
-            "yaw": math.remainder(motion.yaw, math.tau),
-            "speed": motion.speed,
-            "lateral_speed": motion.lateral_speed,
-            "acceleration": motion.acceleration,
-            "steering": motion.steering,
-            "yaw_rate": motion.yaw_rate,
-            "size": self.ego_size,
-        }
+        return ego_fields(self.motion, self.T_world_vehicle, self.ego_size)
 
     def obs_fields(self) -> dict[str, Any]:
-        """The wire's Obs as a plain map, without ``frames`` and ``timing``."""
+        """The wire's Obs as a plain map, without ``frames`` and ``timing``; what few episodes have
+        is there where it is more than its default."""
+        extra: dict[str, Any] = {}
+        if self.lap:
+            extra["lap"] = self.lap
+        if self.drawn:
+            extra["drawn"] = dict(self.drawn)
+        if self.truth is not None:
+            extra["ego_truth"] = ego_fields(*self.truth, self.ego_size)
         return {
             "step": self.step,
             "t_us": self.t_us,
@@ -78,7 +83,25 @@ class Observation:
             "truncated": self.truncated,
             "reason": self.reason,
             "warming_up": self.warming_up,
+            **extra,
         }
+
+
+def ego_fields(
+    motion: Motion, T_world_vehicle: Float, size: tuple[float, float, float]
+) -> dict[str, Any]:
+    """The wire's EgoState as a plain map; ``size`` of the ego's box [m]."""
+    return {
+        "position": T_world_vehicle[:3, 3].tolist(),
+        "quaternion": _quaternion(T_world_vehicle),
+        "yaw": math.remainder(motion.yaw, math.tau),
+        "speed": motion.speed,
+        "lateral_speed": motion.lateral_speed,
+        "acceleration": motion.acceleration,
+        "steering": motion.steering,
+        "yaw_rate": motion.yaw_rate,
+        "size": size,
+    }
 
 
 def _quaternion(T_world_vehicle: Float) -> tuple[float, float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,14 +53,17 @@ class LoggedPath:
 
     def __init__(self, ego: Trajectory) -> None:
         kept = _apart(ego.positions)
-        self.positions = ego.positions[kept]
-        self.yaws: Float = np.unwrap(quaternion_yaw(ego.quaternions[kept]))
-        self.ups: Float = quaternion_to_matrix(ego.quaternions[kept])[:, :, 2]
+        positions = ego.positions[kept]
+        yaws: Float = np.unwrap(quaternion_yaw(ego.quaternions[kept]))
+        ups: Float = quaternion_to_matrix(ego.quaternions[kept])[:, :, 2]
         if len(kept) == 1:
-            yaw = self.yaws[0]
-            ahead = STUB * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-            self.positions = np.stack([self.positions[0], self.positions[0] + ahead])
-            self.yaws, self.ups = np.repeat(self.yaws, 2), np.repeat(self.ups, 2, axis=0)
+            ahead = STUB * np.array([np.cos(yaws[0]), np.sin(yaws[0]), 0.0])
+            positions = np.stack([positions[0], positions[0] + ahead])
+            yaws, ups = np.repeat(yaws, 2), np.repeat(ups, 2, axis=0)
+        self._measure(positions, yaws, ups)
+
+    def _measure(self, positions: Float, yaws: Float, ups: Float) -> None:
+        self.positions, self.yaws, self.ups = positions, yaws, ups
         plane = self.positions[:, 0] + 1j * self.positions[:, 1]
         steps = np.diff(plane)
         lengths = np.abs(steps)
@@ -71,6 +74,23 @@ class LoggedPath:
         self.knots[:, 4], self.knots[:, 5:8] = self.yaws, self.ups
         self.knots[:-1, 8], self.knots[:-1, 9] = turns.real, turns.imag
         self.knots[:-1, 10] = lengths**2
+
+    @classmethod
+    def through(cls, positions: Float, yaws: Float, ups: Float) -> Self:
+        """The path through places [P, 3] [m], P >= 2, with continuous headings [P] [rad] and unit
+        floor normals [P, 3]; places nearer than 5 cm to the one before are left out."""
+        made = cls.__new__(cls)
+        kept = _apart(positions)
+        made._measure(positions[kept], yaws[kept], ups[kept])
+        return made
+
+    def beside(self, offset: float, *, reverse: bool = False) -> Self:
+        """The path ``offset`` metres to the left of this one; ``reverse``: the other way round."""
+        left = np.stack([-np.sin(self.yaws), np.cos(self.yaws), np.zeros(len(self.yaws))], axis=1)
+        positions, yaws, ups = self.positions + offset * left, self.yaws, self.ups
+        if reverse:
+            positions, yaws, ups = positions[::-1], yaws[::-1] + np.pi, ups[::-1]
+        return self.through(positions, yaws, ups)
 
     @property
     def length(self) -> float:

@@ -4,24 +4,36 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
-from ..edit import EditError, EditOutcome, ScenarioState, apply_operations, compose
+from ..edit import (
+    EditError,
+    EditOutcome,
+    ObjectState,
+    ScenarioState,
+    apply_operations,
+    compose,
+)
+from ..edit.tracks import PackedTracks
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
 from .agents import Agents
+from .beyond_log import at_start_again, driven_route, lanes_route, tracks_beyond_log
 from .collision.contact_state import ContactState, StepMotion
 from .collision.deformation import Deformation, DeformationTracker
 from .collision.impact import Impact
 from .collision.obstacles import obstacle_grid
+from .collision.overlaps import overlapping_rows
 from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
 from .collision.sweep import StepStart
+from .draws import Draws
+from .ego.box import ego_box
 from .ego.controller import EgoController, Plan, emergency_brake
 from .ego.motion import Motion, logged_motion
 from .ego.reference import PlannedTrajectory
@@ -32,8 +44,16 @@ from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
+from .randomization import (
+    RandomizedIdm,
+    estimate_error,
+    latency_jitter_us,
+    randomized_start,
+)
 from .scoring import Instant, MetricAccumulator, Score
+from .seam import Seam
 from .traffic import ObservedEgo, Surroundings, Traffic
+from .traffic.spawner import begin_spawner
 
 OFF_ROUTE_DISTANCE = 10.0
 """Beyond this distance from the recorded path an event says so [m]; images get poor there."""
@@ -61,6 +81,8 @@ class World:
         deformation: of objects after impacts; None where there is none.
         terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
             ``deadline``, ``wall_clock``.
+        lap: times that the ego has been put back to the start of the route.
+        drawn: what the seed has drawn for the start and for objects so far, by name.
     """
 
     def __init__(
@@ -86,15 +108,21 @@ class World:
         self.terminated = False
         self.truncated = False
         self.reason: str | None = None
+        self.lap = 0
         self._clock = episode_clock(scene, spec)
-        self._path = LoggedPath(scene.ego)
+        self._draws = Draws(spec.seed)
+        self._path = driven_route(scene, spec, self._clock.horizon)
+        self._lap_length = LoggedPath(scene.ego).length if spec.beyond_log == "loop" else math.inf
+        self._tracks = self._tracks_of(state)
         self.ground = scene.ground
-        self.motion = logged_motion(scene.ego, self.t_us, spec.ego)
+        self.motion, drawn = self._first_motion()
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
+        self._estimate_error = estimate_error(spec.randomization.estimate, self._draws, 0)
         self._controller = EgoController(spec, scene.ego)
-        surroundings = self._surroundings(state.tracks.at(self.t_us))
-        self.traffic = Traffic.begin(state, spec.agents, surroundings)
+        self.traffic = self._first_traffic()
+        self._start_drawn = drawn
+        self._step_drawn: Mapping[str, float] = drawn | dict(self.traffic.drawn)
         self._off_route = self._off_road = False
         self._contacts = self._initial_contacts()
         if deformation is None and self._contacts.exchanges_momentum and spec.contact.dents:
@@ -104,6 +132,7 @@ class World:
         self._edit_events: tuple[Event, ...] = ()
         self._pending: PendingStep | None = None
         self._context = scoring_context(scene, spec, self._clock, self._path, self._path_point.s)
+        self._seam: Seam | None = None
         self.instant = self._instant(StepContacts())
         self.accumulator: MetricAccumulator = scoring.begin_accumulator(self.instant, self._context)
 
@@ -133,6 +162,20 @@ class World:
         return self.t_us < self._clock.start_us + self.spec.warmup_us
 
     @property
+    def drawn(self) -> dict[str, float]:
+        """What the seed has drawn for the start and for objects so far, by name."""
+        return self._start_drawn | dict(self.traffic.drawn)
+
+    @property
+    def T_world_estimate(self) -> Float:
+        """[4, 4] float64, the ego where it takes itself to be; ``T_world_vehicle`` where its
+        estimate has no errors."""
+        if self._estimate_error is None:
+            return self.T_world_vehicle
+        estimate = self._estimate_error.applied(self.motion)
+        return self.ground.pose_on(estimate.x, estimate.y, estimate.yaw)
+
+    @property
     def context(self) -> scoring.ScoringContext:
         """What stays the same for the scores."""
         return self._context
@@ -148,7 +191,8 @@ class World:
     def move(self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False) -> None:
         """The first half of a step: all that images show. Let :meth:`evaluate` follow.
 
-        Order: edits made since the last step are in effect, then ego, objects, contact.
+        Order: edits made since the last step are in effect, the ego of a loop that has reached its
+        end is put back to its start, then ego, objects, contact.
 
         Args:
             plan: what the ego does. None keeps the last plan; before any, the ego follows the log.
@@ -160,27 +204,33 @@ class World:
                 named or with times that are over; the world is as before.
         """
         self._check_running()
-        controller = self._with_plan(plan, latency_us)
+        drawn_before = self.traffic.drawn
+        jitter_us = latency_jitter_us(
+            self.spec.randomization.latency_us if plan is not None else 0, self._draws, self.steps
+        )
+        controller = self._with_plan(plan, latency_us, jitter_us)
+        controller, loop_events = self._put_back(controller)
         trajectory = controller.pending[-1].trajectory if plan is not None else None
         controller, late_events = self._with_fallback(controller, missed=missed)
         reaction_events = self._let_agents_react()
         start = self._step_start(controller)
         moved = self._advance(controller)
         self._commit_motion(moved)
+        self._step_drawn = _newly_drawn(self.traffic.drawn, drawn_before, jitter_us)
         contacts = self._apply_impacts(moved.impacts, start.agents)
-        events = (*self._edit_events, *late_events, *reaction_events)
-        self._pending = PendingStep(start, trajectory, events, contacts)
+        events = (*self._edit_events, *loop_events, *late_events, *reaction_events)
+        self._pending = PendingStep(start, trajectory, events, contacts, self._seam)
         self._edit_events = ()
 
     def evaluate(self) -> list[Event]:
         """The second half, if it is still pending: contacts, scores and events. All that images
         show stays as it is, so they may be drawn meanwhile."""
         if self._pending is not None:
-            start, plan, events, contacts = self._pending
+            start, plan, events, contacts, seam = self._pending
             self._pending = None
             contacts = self._overlap_contacts(start) if contacts is None else contacts
             self._contacts = replace(self._contacts, touching=contacts.touching)
-            self.instant = self._instant(contacts, plan)
+            self.instant = self._instant(contacts, plan, seam)
             self.accumulator = scoring.update_accumulator(
                 self.accumulator, self.instant, self._context
             )
@@ -233,9 +283,9 @@ class World:
                 hint="look at the objects again and send the edit for the present revision",
             )
         outcome = apply_operations(self.state, operations)
-        self.state = outcome.state
+        self.state, self._tracks = outcome.state, self._tracks_of(outcome.state)
         self.traffic = self.traffic.edited(
-            self.state, self._surroundings(self.state.tracks.at(self.t_us))
+            self._tracks, self._surroundings(self._tracks.at(self.t_us))
         )
         self.revision += 1
         edited = Event("edited", self.t_us, data={"revision": float(self.revision)})
@@ -244,13 +294,17 @@ class World:
 
     def observe(self) -> Observation:
         """What the policy gets at this instant, apart from images."""
-        motion, s = self.motion, self._path_point.s
+        motion, s, truth = self.motion, self._path_point.s, None
+        if self._estimate_error is not None:
+            truth = (motion, self.T_world_vehicle) if self.spec.privileged else None
+            motion = self._estimate_error.applied(motion)
+            s = self._path.nearest(motion.x, motion.y, near_s=s).s
         return Observation(
             step=self.steps,
             t_us=self.t_us,
             revision=self.revision,
             motion=motion,
-            T_world_vehicle=self.T_world_vehicle,
+            T_world_vehicle=self.T_world_estimate,
             ego_size=self.scene.ego_size,
             command=command_ahead(self._path, s),
             route=route_ahead(self._path, s, motion.x, motion.y, motion.yaw),
@@ -261,6 +315,9 @@ class World:
             truncated=self.truncated,
             reason=self.reason,
             warming_up=self.warming_up,
+            lap=self.lap,
+            drawn=self._step_drawn,
+            truth=truth,
         )
 
     def metrics(self) -> dict[str, float]:
@@ -273,7 +330,8 @@ class World:
 
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
-        drawn = compose(self.scene, self.state, self.agents, self.t_us)
+        shown_us = min(self.t_us, self.scene.end_us)
+        drawn = compose(self.scene, self.state, self.agents, shown_us)
         if self.deformation is not None:
             # Background first, then the objects, then shadows.
             for k, subject in enumerate(self.agents.objects, start=1):
@@ -301,11 +359,13 @@ class World:
                 hint="reset the session to start another",
             )
 
-    def _with_plan(self, plan: Plan | None, latency_us: int) -> EgoController:
+    def _with_plan(self, plan: Plan | None, latency_us: int, jitter_us: int) -> EgoController:
         """The controller with a plan of the policy, which takes effect after its latency."""
         if plan is None:
             return self._controller
-        from_us = takes_effect_us(self.spec, self._clock, self.t_us, latency_us)
+        from_us = takes_effect_us(
+            self.spec, self._clock, self.t_us, latency_us, jitter_us=jitter_us
+        )
         return self._controller.with_plan(plan, self.motion, self.t_us, from_us)
 
     def _with_fallback(
@@ -319,24 +379,44 @@ class World:
             controller = replace(controller, controller=brake, since_us=self.t_us, pending=())
         return controller, [Event("deadline_missed", self.t_us)]
 
+    def _put_back(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
+        """The ego of a loop, back at the start of the recorded drive once it is at its end."""
+        laps = max(math.floor(self._path_point.s / self._lap_length), 0)
+        self._seam = None
+        if laps == 0:
+            return controller, []
+        way, near, before = laps * self._lap_length, self._path_point, self.motion
+        surroundings = self._surroundings(self.agents)
+        self.motion = at_start_again(before, near, self._path, near.s - way)
+        self._path_point = self._path.nearest(self.motion.x, self.motion.y, near_s=near.s - way)
+        self.T_world_vehicle = self._ego_pose()
+        self.lap += laps
+        self._tracks = self._tracks_of(self.state)
+        self.traffic = self.traffic.put_back(self._tracks, surroundings, way)
+        self._seam = Seam.between(before[:3], self.motion[:3])
+        data = {"lap": float(self.lap), **self._seam._asdict()}
+        return controller.put_back(self._seam), [Event("looped", self.t_us, data=data)]
+
     def _let_agents_react(self) -> list[Event]:
         """Objects stop repeating the log once the ego is too far from where it was recorded."""
         agents = self.spec.agents
         if agents.ego_off_log == "replay" or self.traffic.reacting:
+            return []
+        if self.t_us > self.scene.end_us:
             return []
         (x, y, _), _ = self.scene.ego.pose(self.t_us)
         distance = math.hypot(self.motion.x - x, self.motion.y - y)
         if distance <= agents.off_log_distance:
             return []
         surroundings = self._surroundings(self.agents)
-        self.traffic = self.traffic.with_reacting_agents(self.state, surroundings)
+        self.traffic = self.traffic.with_reacting_agents(self._tracks, surroundings)
         return [Event("agents_react", self.t_us, data={"distance": distance})]
 
     def _advance(self, controller: EgoController) -> StepMotion:
         """Objects, then the ego, one clock step on from this instant."""
         t_us, before = self.t_us, self.agents
         end_us = t_us + self._clock.dt_us
-        traffic = self.traffic.advance(self.state, end_us, lambda: self._surroundings(before))
+        traffic = self.traffic.advance(self._tracks, end_us, lambda: self._surroundings(before))
         if end_us <= self._clock.start_us + self.spec.warmup_us:
             recorded = logged_motion(self.scene.ego, end_us, self.spec.ego)
             return StepMotion(controller, recorded, traffic, self._contacts, None)
@@ -356,6 +436,14 @@ class World:
             self.motion.x, self.motion.y, near_s=self._path_point.s
         )
         self.T_world_vehicle = self._ego_pose()
+        if self._estimate_error is not None:
+            self._estimate_error = estimate_error(
+                self.spec.randomization.estimate,
+                self._draws,
+                self.steps,
+                before=self._estimate_error,
+                dt=seconds,
+            )
 
     def _apply_impacts(
         self, impacts: tuple[Impact, ...] | None, before: Agents
@@ -415,12 +503,56 @@ class World:
 
     # --- views of the instant ---------------------------------------------------------------
 
+    def _first_motion(self) -> tuple[Motion, dict[str, float]]:
+        """The ego at the start, and what the seed drew for it by name."""
+        recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
+        others, size = self._tracks.at(self.t_us), self.scene.ego_size
+
+        def touched(motion: Motion) -> set[int]:
+            pose = self.ground.pose_on(motion.x, motion.y, motion.yaw)
+            return set(overlapping_rows(ego_box(pose, size), size, others))
+
+        # Boxes of a recording may overlap slightly; a drawn start must not touch anybody else.
+        return randomized_start(
+            recorded,
+            self._path,
+            self.spec.randomization.start,
+            self._draws,
+            is_free=lambda motion: touched(motion) <= touched(recorded),
+        )
+
+    def _first_traffic(self) -> Traffic:
+        spec, scene = self.spec, self.scene
+        randomized = RandomizedIdm(spec.randomization.traffic, self._draws)
+        return Traffic.begin(
+            self._tracks,
+            spec.agents,
+            self._surroundings(self._tracks.at(self.t_us)),
+            spawner=begin_spawner(
+                spec.agents,
+                self.state,
+                self._draws,
+                route=lanes_route(self._path, scene, spec),
+                ego=scene.ego,
+            ),
+            randomized=randomized if randomized.widths else None,
+        )
+
+    def _tracks_of(self, state: ScenarioState) -> PackedTracks[ObjectState]:
+        """Where the recording and edits have the objects; in later laps without those that moved
+        in the recording, which are over."""
+        if self.spec.beyond_log == "end":
+            return state.tracks
+        until_us = self._clock.at(self._clock.horizon)
+        left = self.traffic.recorded_movers(state.visible) if self.lap else frozenset[str]()
+        return tracks_beyond_log(state, until_us, left=left)
+
     def _initial_contacts(self) -> ContactState:
         background = self.spec.contact.background
         return ContactState.begin(
             self.spec,
             self.scene.ego_size,
-            obstacles=obstacle_grid(self.scene, self._path) if background else None,
+            obstacles=obstacle_grid(self.scene, LoggedPath(self.scene.ego)) if background else None,
             T_world_vehicle=self.T_world_vehicle,
             motion=self.motion,
             agents=self.agents,
@@ -437,14 +569,29 @@ class World:
             self.t_us, clock.start_us, clock.dt_us, ego, others, self._path, self.ground
         )
 
-    def _instant(self, contacts: StepContacts, plan: PlannedTrajectory | None = None) -> Instant:
+    def _instant(
+        self,
+        contacts: StepContacts,
+        plan: PlannedTrajectory | None = None,
+        seam: Seam | None = None,
+    ) -> Instant:
         height = float(self.T_world_vehicle[2, 3])
+        laps = self.lap * self._lap_length if self.lap else 0.0
         return Instant(
             step=self.steps,
             t_us=self.t_us,
-            ego=ego_sample(self.motion, self._path_point, height),
+            ego=ego_sample(self.motion, self._path_point, height, laps=laps),
             others=object_samples(self.agents),
             contacts=contacts.records,
             secondary=contacts.secondary,
             plan=plan,
+            seam=seam,
         )
+
+
+def _newly_drawn(
+    now: Mapping[str, float], before: Mapping[str, float], jitter_us: int
+) -> Mapping[str, float]:
+    """What has been drawn in a step, by name."""
+    drawn = {} if now is before else {k: v for k, v in now.items() if k not in before}
+    return drawn | {"latency_us": float(jitter_us)} if jitter_us else drawn

@@ -111,3 +111,24 @@ def test_a_case_in_which_nothing_is_random_is_driven_once(jitter):
     case = Case(name="a", scene="s", reset=BRAKES, jitter=jitter)
     grid = EpisodeGrid([case], ("pid", "idm"), (0, 1, 2))
     assert [(policy, seed) for policy, _, seed in grid.episodes()] == [("pid", 0), ("idm", 0)]
+
+
+@pytest.mark.parametrize(
+    "reset",
+    [
+        {"randomization": {"start": {"lateral": 0.5}}},
+        {"randomization": {"latency_us": 50_000}},
+        {"agents": {"spawn": {}}},
+    ],
+)
+def test_a_case_whose_reset_draws_is_driven_with_every_seed(reset):
+    grid = EpisodeGrid([Case(name="a", scene="s", reset=reset)], ["pid"], range(3))
+    assert [seed for _, _, seed in grid.episodes()] == [0, 1, 2]
+    assert [case.reset_for(seed)["seed"] for _, case, seed in grid.episodes()] == [0, 1, 2]
+
+
+def test_options_of_reset_hold_for_scenes_as_recorded():
+    (case,) = cases_as_recorded(["street"], [], {"randomization": {"latency_us": 10_000}})
+    assert case.is_random
+    with pytest.raises(CommandError, match="randomisation"):
+        cases_as_recorded(["street"], [], {"randomisation": {}})

@@ -13,7 +13,7 @@ from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionInfo, SessionState
 
-from ...world import Event, World, agent_fields, metrics_version
+from ...world import Event, World, agent_fields, ego_fields, metrics_version
 from ..library.views import camera_infos, edited_objects
 from .session import Session
 
@@ -45,13 +45,15 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
             "step": world.steps,
             "t_us": world.t_us,
             "revision": world.revision,
-            "ego": seen.ego_fields(),
+            "ego": ego_fields(world.motion, world.T_world_vehicle, world.scene.ego_size),
             "agents": agent_fields(world.agents),
             "events": [event.fields() for event in events],
             "metrics": seen.metrics,
             "terminated": world.terminated,
             "truncated": world.truncated,
             "reason": world.reason,
+            "lap": world.lap,
+            "drawn": world.drawn,
         }
     )
 

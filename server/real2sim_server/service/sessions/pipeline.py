@@ -27,7 +27,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -36,6 +36,7 @@ from real2sim_proto.codec import DEFAULT_MAX_BYTES
 from real2sim_proto.episode import SensorSpec
 
 from ...edit import ScenarioState, instances_at
+from ...geometry.transform import invert_transform
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
 from ...world import World
@@ -242,7 +243,7 @@ class StepPipeline:
         members = pack_members(world.observe().obs_fields())
         if any(sensor.codec != "raw" for sensor in sensors):
             return members, None
-        return members, raw_headers(sensors, cameras, world.T_world_vehicle, world.t_us)
+        return members, raw_headers(sensors, cameras, world.T_world_estimate, world.t_us)
 
     def encode(
         self, rendered: RenderedObservation, headers: Sequence[FrameHeader]
@@ -331,7 +332,11 @@ class StepPipeline:
             sensors=sensors,
         )
         images, _ = self._renderer.render_images(request, cameras, between=between)
-        return images
+        if world.T_world_estimate is world.T_world_vehicle:
+            return images
+        # Images are of where the ego is; what they say of it is its own estimate.
+        believed = world.T_world_estimate @ invert_transform(world.T_world_vehicle)
+        return [replace(i, T_world_sensor=believed @ i.T_world_sensor) for i in images]
 
     async def _finish(
         self, observation: RenderedObservation | EncodedObservation

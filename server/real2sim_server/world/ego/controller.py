@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, assert_never
+from typing import Protocol, Self, assert_never
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ...edit.tracks import sample
 from ...scene import Trajectory
 from ..driving import Command
 from ..errors import WorldError
+from ..seam import Seam
 from .motion import Motion, advance_motion, constant_law, teleported
 from .reference import PlannedTrajectory, Pose, ReferenceTrajectory
 from .trackers import make_tracker
@@ -38,6 +39,9 @@ class Controller(Protocol):
     def command(self, motion: Motion, t: float) -> Command:
         """What it would do in a motion, ``t`` seconds after it began."""
 
+    def put_back(self, seam: Seam) -> Self:
+        """The controller of an ego that was put back over the seam."""
+
 
 @dataclass(frozen=True)
 class ConstantCommand:
@@ -54,6 +58,10 @@ class ConstantCommand:
         """That command."""
         return self.constant
 
+    def put_back(self, seam: Seam) -> Self:
+        """Itself: a command has no place."""
+        return self
+
 
 @dataclass(frozen=True)
 class Teleport:
@@ -69,6 +77,11 @@ class Teleport:
     def command(self, motion: Motion, t: float) -> Command:
         """Brakes: a teleported vehicle has no controller."""
         return Command(-EMERGENCY_BRAKING, motion.steering)
+
+    def put_back(self, seam: Seam) -> Self:
+        """The pose beyond the seam."""
+        x, y, yaw = seam.poses(np.array([self.pose]))[0].tolist()
+        return replace(self, pose=(x, y, yaw))
 
 
 @dataclass(frozen=True)
@@ -87,6 +100,15 @@ class PendingPlan:
     def trajectory(self) -> PlannedTrajectory | None:
         """The plan where it is a trajectory."""
         return self.plan if isinstance(self.plan, PlannedTrajectory) else None
+
+    def put_back(self, seam: Seam) -> PendingPlan:
+        """The plan of an ego that was put back over the seam."""
+        if isinstance(self.plan, PlannedTrajectory):
+            return replace(self, plan=replace(self.plan, poses=seam.poses(self.plan.poses)))
+        if isinstance(self.plan, PoseCommand):
+            (x, y), yaw = seam.place(self.plan.x, self.plan.y), self.plan.yaw + seam.turn
+            return replace(self, plan=self.plan.model_copy(update={"x": x, "y": y, "yaw": yaw}))
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +170,12 @@ class EgoController:
             motion = current.controller.advance(motion, since, until - t_us)
             t_us = until
         return current, motion
+
+    def put_back(self, seam: Seam) -> EgoController:
+        """The controller and its plans of an ego that was put back over the seam."""
+        controller = self.controller.put_back(seam) if self.controller is not None else None
+        pending = tuple(plan.put_back(seam) for plan in self.pending)
+        return replace(self, controller=controller, pending=pending)
 
     def command(self, motion: Motion, t_us: int) -> Command:
         """Of the active controller in a motion at ``t_us``."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +14,7 @@ from real2sim_proto.episode import EgoSpec
 
 from ..driving import curve_at, plan_curve, vehicle_parameters, world_poses
 from ..path import Float
+from ..seam import Seam
 from .motion import ControlLaw, Motion
 
 Pose = tuple[float, float, float]
@@ -87,6 +90,17 @@ class ReferenceTrajectory:
         """x, y [m], yaw [rad] in the world."""
         _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
         return x, y, yaw
+
+    def put_back(self, seam: Seam) -> ReferenceTrajectory:
+        """The curve of a vehicle that was put back over the seam."""
+        knots = self._curve[0].copy()
+        knots[:, 1:4] = seam.poses(knots[:, 1:4])
+        # The tangents turn, and have no place.
+        vx, vy, cos, sin = knots[:, 4], knots[:, 5], math.cos(seam.turn), math.sin(seam.turn)
+        knots[:, 4:6] = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+        moved = copy.copy(self)
+        moved._curve = (knots, *self._curve[1:])
+        return moved
 
     def control_law(self, kind: int) -> ControlLaw:
         """Follows the plan by PURSUIT, LQR or ILQR."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from real2sim_proto.episode import EgoSpec
 
 from ..driving import KINDS, LQR, MOVING, Command
+from ..seam import Seam
 from .motion import Motion, advance_motion, commanded, teleported
 from .reference import ReferenceTrajectory
 
@@ -43,6 +45,10 @@ class ControlledTracker:
         """What to do in a motion, ``t`` seconds after the reference began."""
         return commanded(motion, self.reference.control_law(self.kind), self.spec, since=t)
 
+    def put_back(self, seam: Seam) -> Self:
+        """The tracker of a vehicle that was put back over the seam."""
+        return replace(self, reference=self.reference.put_back(seam))
+
 
 @dataclass(frozen=True, eq=False)
 class PerfectTracker:
@@ -70,6 +76,10 @@ class PerfectTracker:
     def command(self, motion: Motion, t: float) -> Command:
         """What an LQR would do; for vehicles that were pushed."""
         return commanded(motion, self.reference.control_law(LQR), self.spec, since=t)
+
+    def put_back(self, seam: Seam) -> Self:
+        """The tracker of a vehicle that was put back over the seam."""
+        return replace(self, reference=self.reference.put_back(seam))
 
 
 def make_tracker(

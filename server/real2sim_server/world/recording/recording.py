@@ -2,7 +2,8 @@
 
 The file is a zip archive:
 
-- ``episode.json``: format, scene and hash, scenario, seed, versions of scores, scores, cameras;
+- ``episode.json``: format, scene and hash, scenario, versions of scores, scores, and what the
+  seed drew for the start and for objects;
 - ``log.msgpack``: entries of the session from its reset on (kind, step, payload);
 - ``instants.msgpack``: what the scores need of every step, and a digest of its observation;
 - ``context.msgpack``: what stays the same for the scores;
@@ -72,6 +73,7 @@ class Recording:
         state: the objects that it began with, see :func:`~real2sim_server.edit.pack_state`; None
             for the bare scene.
         frames: file names in the archive by camera and step, for images.
+        drawn: what the seed drew for the start and for objects, by name.
     """
 
     scene: str
@@ -86,6 +88,7 @@ class Recording:
     metrics: str
     state: bytes | None = field(default=None, repr=False)
     frames: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+    drawn: Mapping[str, float] = field(default_factory=dict)
 
     def replayer(self, scene: Scene, assets: AssetLookup | None = None) -> Replayer:
         """The session before its first entry.
@@ -177,6 +180,7 @@ def record(
         scores=tuple(s.fields() for s in scores),
         metrics=metrics_version(),
         state=pack_state(state) if state is not None else None,
+        drawn=world.drawn,
     )
 
 
@@ -201,6 +205,7 @@ def to_bytes(recording: Recording) -> bytes:
         "metrics": recording.metrics,
         "scores": list(recording.scores),
         "steps": len(recording.instants) - 1,
+        **({"drawn": dict(recording.drawn)} if recording.drawn else {}),
     }
     entries = [[e.kind, e.step, e.payload] for e in recording.entries]
     rows = [instant_row(i, d) for i, d in zip(recording.instants, recording.digests, strict=True)]
@@ -301,6 +306,7 @@ def _of_parts(parts: Mapping[str, bytes]) -> Recording:
         metrics=_text(about, "metrics"),
         state=parts.get("state.msgpack"),
         frames=frames,
+        drawn={str(k): float(v) for k, v in about.get("drawn", {}).items()},
     )
 
 

@@ -16,6 +16,7 @@ from ...geometry.rotation import Float
 from ..ego.reference import PlannedTrajectory
 from ..scoring import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
 from ..scoring.instant import Side
+from ..seam import Seam
 
 MAX_WAY_M = 1e6
 """Length of a route or lane [m]: they are cut into pieces of less than a metre."""
@@ -43,6 +44,8 @@ def instant_row(instant: Instant, digest: str) -> dict[str, Any]:
     }
     if instant.plan is not None:
         row["plan"] = [instant.plan.times_us.tolist(), instant.plan.poses.tolist()]
+    if instant.seam is not None:
+        row["seam"] = list(instant.seam)
     return row
 
 
@@ -72,6 +75,7 @@ def read_instant(row: Mapping[str, Any]) -> tuple[Instant, str]:
         contacts=tuple(_contact(c) for c in _list(row["contacts"])),
         secondary=_integer(row["secondary"]),
         plan=_plan(row["plan"]) if "plan" in row else None,
+        seam=Seam(*_numbers(row["seam"], (3,), "seam").tolist()) if "seam" in row else None,
     )
     return instant, _text(row["digest"])
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
+from ..seam import Seam
 from .road_kernels import DENSITY, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
@@ -96,6 +97,8 @@ class Instant:
         contacts: of the step that led here.
         secondary: contacts between objects that began in it.
         plan: that the step was made with; None where there was no new trajectory.
+        seam: over which the ego was put back before it moved; places of the instant before are
+            where it takes them. None where it was not.
     """
 
     step: int
@@ -105,6 +108,7 @@ class Instant:
     contacts: tuple[ContactRecord, ...] = ()
     secondary: int = 0
     plan: PlannedTrajectory | None = None
+    seam: Seam | None = None
 
 
 @dataclass(frozen=True, eq=False)

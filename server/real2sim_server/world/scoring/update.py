@@ -15,6 +15,7 @@ from .fault import ego_at_fault, fault_class
 from .hazard import time_to_collision
 from .instant import EgoSample, Instant, ScoringContext
 from .metric import METRICS
+from .put_back import put_back
 
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
 ONCOMING_WINDOW_S = 1.0
@@ -51,6 +52,8 @@ def update_accumulator(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> MetricAccumulator:
     """The accumulator one step later."""
+    if instant.seam is not None:
+        accumulator = put_back(accumulator, instant.seam)
     ego, dt = instant.ego, context.dt
     assert accumulator.ego is not None
     before = accumulator.ego

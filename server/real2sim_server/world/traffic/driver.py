@@ -175,3 +175,24 @@ def pose_on_path(
         heading,
         (speed * cos - drift * sin, speed * sin + drift * cos, 0.0),
     )
+
+
+def pose_put_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
+    """The pose ``way`` metres back along a route: beside it and turned against it as before; its
+    height is left as it is."""
+    x, y, z = pose.position
+    near = route.nearest(x, y)
+    # Beyond the ends of the route it goes straight on, where the nearest point is the end.
+    beyond = (x - near.position[0]) * math.cos(near.yaw)
+    beyond += (y - near.position[1]) * math.sin(near.yaw)
+    px, py, _, yaw = route.at(near.s + beyond - way)
+    turn = yaw - near.yaw
+    cos, sin = math.cos(turn), math.sin(turn)
+    vx, vy, vz = pose.velocity
+    heading = pose.yaw + turn
+    return AgentPose(
+        (px - near.offset * math.sin(yaw), py + near.offset * math.cos(yaw), z),
+        level_quaternion(heading),
+        heading,
+        (cos * vx - sin * vy, sin * vx + cos * vy, vz),
+    )

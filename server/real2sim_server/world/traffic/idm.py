@@ -11,8 +11,9 @@ import numpy as np
 from real2sim_proto.episode import IdmDriver
 
 from ...edit import ObjectState
+from ...scene import Ground, Trajectory
 from ..path import LoggedPath
-from .driver import AgentPose, Surroundings, pose_on_path
+from .driver import AgentPose, Surroundings, pose_on_path, pose_put_back
 from .leader import Leader, leading_agent
 from .replay import recorded_pose
 
@@ -41,6 +42,7 @@ class Idm:
         desired: speed on a free and straight road [m/s].
         s, offset, speed: along and beside the path [m], [m/s].
         pose, present: see :class:`~.driver.AgentDriver`.
+        along_route: whether the path is a lane beside the ego's route, at no height of its own.
     """
 
     subject: ObjectState
@@ -52,6 +54,7 @@ class Idm:
     speed: float
     pose: AgentPose
     present: bool = True
+    along_route: bool = False
 
     @classmethod
     def begin(cls, subject: ObjectState, spec: IdmDriver, surroundings: Surroundings) -> Idm:
@@ -68,10 +71,29 @@ class Idm:
         near = path.nearest(now.position[0], now.position[1])
         vx, vy, _ = now.velocity
         speed = max(vx * math.cos(near.yaw) + vy * math.sin(near.yaw), 0.0)
-        desired = spec.desired_speed
-        if desired is None:
-            desired = max(highest_speed(subject), SLOWEST_DESIRED)
+        desired = desired_speed(subject, spec)
         return cls(subject, spec, path, desired, near.s, near.offset, speed, now)
+
+    @classmethod
+    def in_lane(
+        cls, subject: ObjectState, spec: IdmDriver, lane: LoggedPath, s: float, *, speed: float
+    ) -> Idm:
+        """In the middle of a lane beside the ego's route, ``s`` metres along it at ``speed``
+        [m/s]; ``spec`` holds the desired speed."""
+        pose, desired = pose_on_path(lane, s, speed), desired_speed(subject, spec)
+        return cls(subject, spec, lane, desired, s, 0.0, speed, pose, along_route=True)
+
+    def on(self, ground: Ground) -> Self:
+        """The driver with its object standing on the ground."""
+        x, y, _ = self.pose.position
+        z = ground.height(x, y) + self.subject.scaled_size[2] / 2
+        return replace(self, pose=self.pose._replace(position=(x, y, z)))
+
+    def put_back(self, route: LoggedPath, way: float, ground: Ground) -> Self:
+        """The driver ``way`` metres back along the route: beside it and turned as it is now."""
+        pose = pose_put_back(self.pose, route, way)
+        near = self.path.nearest(pose.position[0], pose.position[1])
+        return replace(self, s=near.s, offset=near.offset, pose=pose).on(ground)
 
     def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
@@ -97,7 +119,8 @@ class Idm:
         drift = (offset - self.offset) / surroundings.dt
         pose = pose_on_path(self.path, s, speed, offset=offset, drift=drift)
         present = s < self.path.length
-        return replace(self, s=s, speed=speed, offset=offset, pose=pose, present=present)
+        moved = replace(self, s=s, speed=speed, offset=offset, pose=pose, present=present)
+        return moved.on(surroundings.ground) if self.along_route else moved
 
 
 def acceleration(spec: IdmDriver, speed: float, desired: float, leader: Leader | None) -> float:
@@ -121,9 +144,15 @@ def advance_along(s: float, speed: float, acceleration: float, dt: float) -> tup
     return s + (speed + acceleration * dt / 2) * dt, speed + acceleration * dt
 
 
-def highest_speed(subject: ObjectState) -> float:
+def desired_speed(subject: ObjectState, spec: IdmDriver) -> float:
+    """Speed on a free, straight road [m/s]: what the spec says, else the highest recorded one."""
+    if spec.desired_speed is not None:
+        return spec.desired_speed
+    return max(highest_speed(subject.trajectory), SLOWEST_DESIRED)
+
+
+def highest_speed(trajectory: Trajectory) -> float:
     """Highest recorded speed [m/s], over half a second against noise."""
-    trajectory = subject.trajectory
     times = trajectory.times_us * 1e-6
     if len(times) == 1:
         return 0.0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Protocol
 
 import numpy as np
 
@@ -12,20 +13,40 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentDriver as DriverSpec
 from real2sim_proto.episode import AgentsSpec, ConstantVelocityDriver, IdmDriver
 
-from ...edit import ObjectState, ScenarioState
+from ...edit import ObjectState
+from ...edit.tracks import PackedTracks
 from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
 from ..errors import WorldError
 from ..path import Float
+from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import AgentDriver, Surroundings
 from .drivers import begin_driver
 from .external import External
+from .idm import Idm
+from .replay import ConstantVelocity, Replay
+from .spawner import PREFIX as SPAWNED
+from .spawner import Spawner
 
 MOVING = 2.0
 """Objects that cover less than this in the recording stand and get no driver [m]."""
 
 DRIVEN = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle", "cyclist"})
 """Categories that a default driver drives; pedestrians keep to the log."""
+
+SCRIPTED = (Replay, ConstantVelocity, Idm, CutIn, HardBrake, JunctionCrossing)
+"""Drivers that move an object by themselves."""
+
+NOTHING_DRAWN: Mapping[str, float] = MappingProxyType({})
+
+
+class RandomizedDrivers(Protocol):
+    """Draws parameters of IDM drivers."""
+
+    def driver_of(
+        self, subject: ObjectState, spec: IdmDriver
+    ) -> tuple[IdmDriver, dict[str, float]]:
+        """The parameters of an object's driver, and those that were drawn by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,26 +58,42 @@ class Traffic:
         drivers: by object id; of objects that have appeared.
         agents: poses of all objects.
         reacting: whether objects that repeated the log have begun to drive by IDM.
+        spawner: lets objects appear and leave; None where nobody does.
+        randomized: draws parameters of drivers; None where nothing is drawn.
+        drawn: all that has been drawn for objects so far, by name.
     """
 
     spec: AgentsSpec
     drivers: Mapping[str, AgentDriver]
     agents: Agents
     reacting: bool = False
+    spawner: Spawner | None = None
+    randomized: RandomizedDrivers | None = None
+    drawn: Mapping[str, float] = field(default_factory=lambda: NOTHING_DRAWN)
 
     @classmethod
-    def begin(cls, state: ScenarioState, spec: AgentsSpec, surroundings: Surroundings) -> Traffic:
+    def begin(
+        cls,
+        tracks: PackedTracks[ObjectState],
+        spec: AgentsSpec,
+        surroundings: Surroundings,
+        *,
+        spawner: Spawner | None = None,
+        randomized: RandomizedDrivers | None = None,
+    ) -> Traffic:
         """Objects at the start of an episode.
 
         Args:
-            state: all objects.
+            tracks: all objects.
             spec: their drivers.
             surroundings: the start; its ``others`` are where the log has them.
+            spawner: lets objects appear and leave.
+            randomized: draws parameters of drivers.
 
         Raises:
             WorldError: UNKNOWN_OBJECT for a driver of an object that does not exist.
         """
-        unknown = sorted(set(spec.drivers) - {o.object_id for o in state.visible})
+        unknown = sorted(set(spec.drivers) - {o.object_id for o in tracks.objects})
         if unknown:
             raise WorldError(
                 ErrorCode.UNKNOWN_OBJECT,
@@ -64,48 +101,93 @@ class Traffic:
                 hint="insert or duplicate it first; GET /v1/scenes/{scene} lists the objects",
             )
         none: Mapping[str, AgentDriver] = MappingProxyType({})
-        return cls(spec, none, surroundings.others)._with_new_drivers(
-            state, surroundings.others, surroundings
-        )
+        begun = cls(spec, none, surroundings.others, spawner=spawner, randomized=randomized)
+        begun = begun._with_new_drivers(surroundings.others, surroundings)
+        if spawner is None:
+            return begun
+        spawner, added = spawner.filled(begun.agents, surroundings)
+        return replace(begun, spawner=spawner)._with_spawned(added, surroundings.others)
 
     def advance(
-        self, state: ScenarioState, t_us: int, surroundings: Callable[[], Surroundings]
+        self,
+        tracks: PackedTracks[ObjectState],
+        t_us: int,
+        surroundings: Callable[[], Surroundings],
     ) -> Traffic:
         """Objects one step later.
 
         Args:
-            state: objects after all edits.
+            tracks: objects after all edits.
             t_us: the instant after the step [us].
             surroundings: of the instant before, whose ``others`` are ``agents``; only called
                 where an object has a driver.
         """
-        base = state.tracks.at(t_us)
-        if not (self.drivers or self._assigns_drivers):
-            return Traffic(self.spec, self.drivers, base, self.reacting)
+        base = tracks.at(t_us)
+        if not (self.drivers or self.spawner or self._assigns_drivers):
+            return replace(self, agents=base)
         before = surroundings()
         drivers = {i: d.advance(before) for i, d in self.drivers.items()}
         moved = replace(self, drivers=MappingProxyType(drivers))
-        return moved._with_new_drivers(state, base, replace(before, t_us=t_us))
+        moved = moved._with_new_drivers(base, replace(before, t_us=t_us))
+        return moved._with_comers_and_goers(base, before) if self.spawner else moved
 
-    def edited(self, state: ScenarioState, surroundings: Surroundings) -> Traffic:
+    def edited(self, tracks: PackedTracks[ObjectState], surroundings: Surroundings) -> Traffic:
         """Objects after an edit: drivers of objects whose trajectory was edited begin anew."""
+        objects = {o.object_id: o for o in tracks.objects}
         kept = {
             i: d
             for i, d in self.drivers.items()
-            if (edited := state.objects.get(i)) is not None
-            and not edited.deleted
-            and edited.trajectory is d.subject.trajectory
-            and edited.scale == d.subject.scale
+            if i.startswith(SPAWNED)
+            or (
+                (edited := objects.get(i)) is not None
+                and edited.trajectory is d.subject.trajectory
+                and edited.scale == d.subject.scale
+            )
         }
-        base = state.tracks.at(surroundings.t_us)
-        return replace(self, drivers=MappingProxyType(kept))._with_new_drivers(
-            state, base, surroundings
-        )
+        base = tracks.at(surroundings.t_us)
+        return replace(self, drivers=MappingProxyType(kept))._with_new_drivers(base, surroundings)
 
-    def with_reacting_agents(self, state: ScenarioState, surroundings: Surroundings) -> Traffic:
+    def with_reacting_agents(
+        self, tracks: PackedTracks[ObjectState], surroundings: Surroundings
+    ) -> Traffic:
         """Objects that repeat the log drive by IDM from now on."""
         return replace(self, reacting=True)._with_new_drivers(
-            state, state.tracks.at(surroundings.t_us), surroundings
+            tracks.at(surroundings.t_us), surroundings
+        )
+
+    def recorded_movers(self, objects: Iterable[ObjectState]) -> frozenset[str]:
+        """Ids of those that move as the recording has it or as a driver of the episode does: not
+        those that an edit has put there, that a client drives, or that physics has taken over."""
+        return frozenset(
+            o.object_id
+            for o in objects
+            if not o.edited
+            and _moves(o)
+            and isinstance(self.drivers.get(o.object_id), (*SCRIPTED, type(None)))
+        )
+
+    def put_back(
+        self, tracks: PackedTracks[ObjectState], surroundings: Surroundings, way: float
+    ) -> Traffic:
+        """Objects after the ego was put back by ``way`` metres along its route: those that drive
+        along the route come along, drivers of recorded objects begin anew, and ``tracks`` names
+        those that stay.
+
+        Args:
+            tracks: without the objects that have left.
+            surroundings: before the ego was put back.
+            way: along the route [m].
+        """
+        here = {o.object_id for o in tracks.objects}
+        route, ground = surroundings.route, surroundings.ground
+        drivers = {
+            i: d.put_back(route, way, ground) if isinstance(d, Idm) and d.along_route else d
+            for i, d in self.drivers.items()
+            if i.startswith(SPAWNED)
+            or (i in here and (d.subject.edited or not isinstance(d, SCRIPTED)))
+        }
+        return replace(self, drivers=MappingProxyType({})).with_drivers(
+            drivers, tracks.at(surroundings.t_us)
         )
 
     def with_plan(
@@ -142,31 +224,62 @@ class Traffic:
         merged = MappingProxyType({**self.drivers, **drivers})
         return replace(self, drivers=merged, agents=_with_driver_poses(base, merged))
 
-    def _with_new_drivers(
-        self, state: ScenarioState, base: Agents, surroundings: Surroundings
-    ) -> Traffic:
+    def _with_new_drivers(self, base: Agents, surroundings: Surroundings) -> Traffic:
         """With drivers for objects that have just appeared."""
-        drivers = dict(self.drivers)
+        drivers, drawn = dict(self.drivers), dict[str, float]()
         if self._assigns_drivers:
             for subject in base.objects:
                 if subject.object_id not in drivers:
-                    driver = self._driver_for(subject, surroundings)
+                    driver = self._driver_for(subject, surroundings, drawn)
                     if driver is not None:
                         drivers[subject.object_id] = driver
         frozen = MappingProxyType(drivers)
-        return replace(self, drivers=frozen, agents=_with_driver_poses(base, frozen))
+        placed = replace(self, drivers=frozen, agents=_with_driver_poses(base, frozen))
+        return placed._with_drawn(drawn)
+
+    def _with_comers_and_goers(self, base: Agents, before: Surroundings) -> Traffic:
+        """After spawned objects have left and others have appeared; ``before``: the step."""
+        assert self.spawner is not None
+        gone = self.spawner.gone(self.drivers, before)
+        kept = {i: d for i, d in self.drivers.items() if i not in gone}
+        traffic = self if not gone else replace(self, drivers=MappingProxyType({}))
+        traffic = traffic if not gone else traffic.with_drivers(kept, base)
+        spawner, added = self.spawner.advance(kept, traffic.agents, before)
+        return replace(traffic, spawner=spawner)._with_spawned(added, base)
+
+    def _with_spawned(self, added: Sequence[Idm], base: Agents) -> Traffic:
+        """With more spawned objects."""
+        if not added:
+            return self
+        assert self.spawner is not None
+        drivers, drawn = dict[str, AgentDriver](), dict[str, float]()
+        for driver in added:
+            drivers[driver.subject.object_id] = driver
+            drawn |= self.spawner.drawn(driver)
+        return self.with_drivers(drivers, base)._with_drawn(drawn)
+
+    def _with_drawn(self, drawn: Mapping[str, float]) -> Traffic:
+        if not drawn:
+            return self
+        return replace(self, drawn=MappingProxyType({**self.drawn, **drawn}))
 
     @property
     def _assigns_drivers(self) -> bool:
         """Whether objects that appear may get a driver."""
         return bool(self.spec.drivers) or self.spec.default != "log" or self.reacting
 
-    def _driver_for(self, subject: ObjectState, surroundings: Surroundings) -> AgentDriver | None:
+    def _driver_for(
+        self, subject: ObjectState, surroundings: Surroundings, drawn: dict[str, float]
+    ) -> AgentDriver | None:
+        """The driver of an object that has just appeared; its draws are added to ``drawn``."""
         spec = self.spec.drivers.get(subject.object_id)
         if spec is None:
             spec = self._default_for(subject)
         if spec is None:
             return None
+        if isinstance(spec, IdmDriver) and self.randomized is not None:
+            spec, named = self.randomized.driver_of(subject, spec)
+            drawn |= named
         return begin_driver(subject, spec, surroundings)
 
     def _default_for(self, subject: ObjectState) -> DriverSpec | None:

@@ -350,3 +350,18 @@ def test_two_planners_at_once_both_get_their_own_answers(site, join):
     for thread in threads:
         thread.join()
     assert not wrong
+
+
+def test_frames_say_where_the_vehicle_takes_itself_to_be(site, join):
+    planner = join(site.create())
+    cameras = [{"camera": "front", "codec": "raw"}, {"camera": "left", "codec": "jpeg"}]
+    exact = planner.reset(sensors=cameras, privileged=True)
+    noise = {"estimate": {"position": 0.5, "heading": 0.05}}
+    obs = planner.reset(sensors=cameras, privileged=True, randomization=noise)
+    turn = obs["ego"]["yaw"] - obs["ego_truth"]["yaw"]
+    for frame, true in zip(obs["frames"], exact["frames"], strict=True):
+        assert frame["data"] == true["data"]
+        (x, y), (tx, ty) = (f["T_world_sensor"][:2, 3] for f in (frame, true))
+        assert (x, y) != (tx, ty)
+        ahead, was = (np.arctan2(*f["T_world_sensor"][[1, 0], 2]) for f in (frame, true))
+        assert ahead - was == pytest.approx(turn, abs=1e-3)

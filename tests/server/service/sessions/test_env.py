@@ -32,6 +32,22 @@ def test_check_env_passes(env):
         check_env(env, skip_render_check=True)
 
 
+def test_the_seed_of_reset_draws_what_is_randomized(env):
+    ranges = {"randomization": {"start": {"lateral": 0.5, "speed": 2.0}}}
+    seen, infos = zip(*(env.reset(seed=s, options=ranges) for s in (1, 1, 2)), strict=True)
+    assert set(infos[0]["drawn"]) == {"start.lateral", "start.speed"}
+    assert infos[0]["drawn"] == infos[1]["drawn"] != infos[2]["drawn"]
+    assert seen[0]["state"][0] == seen[1]["state"][0] != seen[2]["state"][0]
+    unseeded = [env.reset(options=ranges)[1]["drawn"] for _ in range(2)]
+    assert unseeded[0] != unseeded[1]
+
+
+def test_seeds_change_nothing_where_nothing_is_randomized(env):
+    (first, info), (other, _) = env.reset(seed=1), env.reset(seed=2)
+    assert info["drawn"] == {}
+    assert all((first[k] == other[k]).all() for k in first)
+
+
 def test_an_episode_by_random_actions_ends(env):
     env.action_space.seed(0)
     obs, _ = env.reset(seed=1)

@@ -1,0 +1,113 @@
+"""A drive that outlasts its recording: reproducible to the bit, and resumed after a kill."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+import real2sim
+from real2sim.planners.idm import Idm
+from real2sim_server.demo.street import unpack_street
+from real2sim_server.demo.worker import WorkerProcess, worker_process
+
+pytestmark = pytest.mark.network
+
+DRIVE = {
+    "seed": 11,
+    "beyond_log": "loop",
+    "privileged": True,
+    "agents": {
+        "spawn": {"density": 30, "lanes": [{"offset": 0.0}, {"offset": 3.5, "oncoming": True}]}
+    },
+    "randomization": {
+        "start": {"longitudinal": 2.0, "lateral": 0.3, "speed": 1.0},
+        "estimate": {"position": 0.05, "heading": 0.005, "correlation": 5.0},
+        "latency_us": 30_000,
+    },
+}
+
+
+class Workers:
+    """One worker after another, on the demo's street and one store."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._folder, self._stack = folder, stack
+        self._runs: list[WorkerProcess] = []
+        unpack_street(folder / "scenes", "street")
+        self.client = self._another()
+
+    def kill(self) -> None:
+        """End the worker as it is; ``client`` is of the next one."""
+        self._runs[-1].process.kill()
+        self._runs[-1].process.wait()
+        self.client = self._another()
+
+    def _another(self) -> real2sim.Client:
+        folder = self._folder
+        log_file = folder / f"worker_{len(self._runs)}.log"
+        worker = worker_process(scenes=folder / "scenes", data=folder / "data", log_file=log_file)
+        self._runs.append(self._stack.enter_context(worker))
+        client = self._stack.enter_context(real2sim.connect(self._runs[-1].url, timeout=120))
+        client.wait_ready()
+        return client
+
+
+@pytest.fixture
+def workers(tmp_path: Path) -> Iterator[Workers]:
+    with ExitStack() as stack:
+        yield Workers(tmp_path, stack)
+
+
+def hashed(obs: real2sim.Observation) -> str:
+    """Of all that an observation shows."""
+    parts = [obs.step, obs.ego, obs.ego_truth, obs.agents, obs.events, obs.metrics, obs.drawn]
+    digest = hashlib.sha256(repr([*parts, obs.lap, obs.route.tolist()]).encode())
+    for camera in obs.frames:
+        digest.update(obs.image(camera).tobytes())
+    return digest.hexdigest()
+
+
+def drive(workers: Workers, options: dict, *, kills: tuple[int, ...]) -> tuple[list[str], dict]:
+    """Hashes of all observations of a drive whose worker is killed after some steps, and a few
+    facts about it."""
+    planner, session = Idm(speed=8.0), workers.client.session(scene="street").open()
+    sensors = [{"camera": "front", "width": 64, "codec": "raw", "period_us": 500_000}]
+    obs = session.reset(sensors=sensors, **options)
+    hashes, seen, collisions = [hashed(obs)], set[str](), 0
+    while not obs.over:
+        if obs.step in kills:
+            name, token = session.session_id, session.token
+            workers.kill()
+            session = workers.client.join(name, token=token).__enter__()
+        obs = session.step(planner.plan(obs))
+        hashes.append(hashed(obs))
+        seen |= {a.object_id for a in obs.agents if a.object_id.startswith("spawned:")}
+        collisions += sum(event.type == "collision" for event in obs.events)
+    facts = {"lap": obs.lap, "spawned": len(seen), "collisions": collisions, "reason": obs.reason}
+    session.close()
+    return hashes, facts
+
+
+def test_a_drive_beyond_the_log_is_the_same_after_a_kill(workers):
+    # From shortly before the seam of the loop to shortly after it.
+    options = DRIVE | {"start_us": 9_000_000, "horizon": 40}
+    whole, facts = drive(workers, options, kills=())
+    assert facts["lap"] == 1
+    assert facts["spawned"] > 1
+    assert drive(workers, options, kills=(25,)) == (whole, facts)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_drive_of_three_minutes_is_the_same_after_kills(workers):
+    options = DRIVE | {"horizon": 1800}
+    whole, facts = drive(workers, options, kills=())
+    assert facts["reason"] == "horizon"
+    assert facts["lap"] >= 12
+    assert facts["spawned"] > 40
+    assert facts["collisions"] == 0
+    assert drive(workers, options, kills=(600, 1201)) == (whole, facts)
