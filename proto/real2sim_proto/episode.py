@@ -28,6 +28,12 @@ class SensorSpec(Model):
         default=None, gt=0, description="time between frames; a multiple of dt_us; default: dt_us"
     )
 
+    detail: Literal["auto", "full"] = Field(
+        default="auto",
+        description="'auto': images of at most 16,384 pixels are drawn from merged Gaussians, "
+        "antialiased, in a fraction of the time; 'full': from all of them, as larger ones always",
+    )
+
     @model_validator(mode="after")
     def _modalities_differ(self) -> SensorSpec:
         if len(set(self.modalities)) != len(self.modalities):

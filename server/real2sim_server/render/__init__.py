@@ -4,7 +4,7 @@ from .backends import Backend, BackendStatus, describe_backends, select_backend
 from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
 from .frame import Frame, render_cameras, warm_up
 from .modalities import encode_image
-from .rasterize import rasterize
+from .rasterize import View, rasterize, rasterize_batch
 from .types import Instance, RasterOptions, RenderError, RenderOutput, ScreenStatistics
 
 __all__ = [
@@ -17,12 +17,14 @@ __all__ = [
     "RenderError",
     "RenderOutput",
     "ScreenStatistics",
+    "View",
     "describe_backends",
     "encode_depth",
     "encode_image",
     "encode_instance",
     "encode_rgb",
     "rasterize",
+    "rasterize_batch",
     "render_cameras",
     "select_backend",
     "warm_up",

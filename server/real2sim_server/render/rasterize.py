@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import torch
@@ -13,14 +15,33 @@ from torch import Tensor
 from ..geometry.rotation import is_rotation
 from ..geometry.transform import are_rigid
 from ..scene import GaussianCloud, TimeColour
-from .backends.base import Backend, RasterRequest
+from .backends.base import Backend, BatchBackend, RasterRequest, is_reduced
 from .backends.select import select_backend
-from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
+from .types import Detail, Instance, RasterOptions, RenderError, RenderOutput, Sky
 
 DEFAULT_OPTIONS = RasterOptions()
+SMALL_IMAGES = RasterOptions(depth=False, instance=False, detail="auto")
+DETAILS = get_args(Detail)
+UNSCALED = (1.0, 1.0, 1.0)
 RASTERIZE_MODES = ("classic", "antialiased")
 MAX_IMAGE_SIZE = 16_384
 MAX_INSTANCE_ID = 65_535
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One image of a batch.
+
+    Attributes:
+        instances: what is in its world.
+        viewmat: [4, 4] ``T_camera_world``.
+        K: [3, 3] intrinsics [px].
+    """
+
+    instances: Sequence[Instance]
+    viewmat: ArrayLike
+    K: ArrayLike
+
 
 _checked: weakref.WeakSet[GaussianCloud | TimeColour] = weakref.WeakSet()
 
@@ -74,13 +95,81 @@ def rasterize(
         options=options,
         between=between,
     )
+    _check_request(request, check_values=check_values)
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    return chosen.rasterize(request)
+
+
+def rasterize_batch(
+    views: Sequence[View],
+    width: int,
+    height: int,
+    *,
+    sky: Sky | None = None,
+    options: RasterOptions = SMALL_IMAGES,
+    backend: str | Backend = "auto",
+) -> RenderOutput:
+    """Draw the images of many worlds in one call: those of ``views`` in their order.
+
+    Small images are shared between cores, each drawn on one of them, where the backend can; what
+    an image shows depends on its own view alone, so each is the one that :func:`rasterize` gives,
+    bit for bit.
+
+    Args:
+        views: at least one; instances and camera of each image.
+        width, height: of all images [px].
+        sky: behind everything.
+        options: of all images; by default small ones are drawn from merged Gaussians.
+        backend: as in :func:`rasterize`.
+
+    Raises:
+        RenderError: as :func:`rasterize`, and for no views at all.
+    """
+    if not views:
+        raise RenderError("rasterize_batch() needs at least one view")
+    requests = [
+        RasterRequest(
+            instances=tuple(view.instances),
+            viewmats=_float64(np.asarray(view.viewmat)[None], "viewmat", (4, 4)),
+            Ks=_float64(np.asarray(view.K)[None], "K", (3, 3)),
+            width=width,
+            height=height,
+            sky=sky,
+            options=options,
+        )
+        for view in views
+    ]
+    for request in requests:
+        _check_request(request, check_values=True)
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    if isinstance(chosen, BatchBackend) and all(map(is_reduced, requests)):
+        return chosen.rasterize_batch(requests)
+    return _joined([chosen.rasterize(request) for request in requests])
+
+
+def _joined(outputs: Sequence[RenderOutput]) -> RenderOutput:
+    """Images of several calls as those of one."""
+    timing: dict[str, float] = {}
+    for output in outputs:
+        for stage, milliseconds in output.timing_ms.items():
+            timing[stage] = timing.get(stage, 0.0) + milliseconds
+    depths = [output.depth for output in outputs if output.depth is not None]
+    instances = [output.instance for output in outputs if output.instance is not None]
+    return RenderOutput(
+        rgb=torch.cat([output.rgb for output in outputs]),
+        alpha=torch.cat([output.alpha for output in outputs]),
+        depth=torch.cat(depths) if depths else None,
+        instance=torch.cat(instances) if instances else None,
+        timing_ms=timing,
+    )
+
+
+def _check_request(request: RasterRequest, *, check_values: bool) -> None:
     _check_cameras(request)
-    _check_options(options)
+    _check_options(request.options)
     _check_poses(request.instances)
     for index, instance in enumerate(request.instances):
         _check_instance(index, instance, check_values=check_values)
-    chosen = select_backend(backend) if isinstance(backend, str) else backend
-    return chosen.rasterize(request)
 
 
 def _float64(values: Tensor | ArrayLike, name: str, matrix: tuple[int, int]) -> Tensor:
@@ -137,6 +226,8 @@ def _check_poses(instances: Sequence[Instance]) -> None:
 
 
 def _check_options(options: RasterOptions) -> None:
+    if options.detail not in DETAILS:
+        raise RenderError(f"detail must be one of {list(DETAILS)}, not {options.detail!r}")
     if options.rasterize_mode not in RASTERIZE_MODES:
         raise RenderError(
             f"rasterize_mode must be one of {list(RASTERIZE_MODES)}, not {options.rasterize_mode!r}"
@@ -159,8 +250,7 @@ def _check_instance(index: int, instance: Instance, *, check_values: bool) -> No
         raise RenderError(
             f"{name}.instance_id must be 0 to {MAX_INSTANCE_ID}, not {instance.instance_id!r}"
         )
-    scale = np.asarray(instance.scale, dtype=np.float64)
-    if scale.shape != (3,) or not np.isfinite(scale).all() or (scale <= 0).any():
+    if instance.scale != UNSCALED and not _is_scale(instance.scale):
         raise RenderError(f"{name}.scale must be three positive numbers, not {instance.scale!r}")
     if instance.covars is not None:
         expected = (len(instance.cloud), 3, 3)
@@ -176,6 +266,11 @@ def _check_instance(index: int, instance: Instance, *, check_values: bool) -> No
         _checked.add(instance.cloud)
     if instance.colour is not None:
         _check_colour(instance.colour, len(instance.cloud), f"{name}.colour")
+
+
+def _is_scale(scale: tuple[float, float, float]) -> bool:
+    values = np.asarray(scale, dtype=np.float64)
+    return values.shape == (3,) and bool(np.isfinite(values).all() and (values > 0).all())
 
 
 def _check_cloud(cloud: GaussianCloud, name: str) -> None:

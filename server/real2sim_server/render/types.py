@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ..scene import GaussianCloud, Sky, TimeColour
+
+Detail = Literal["full", "auto"]
+SMALL_IMAGE_PIXELS = 128 * 128
+"""Images of at most so many pixels are small."""
 
 
 class RenderError(ValueError):
@@ -54,6 +59,11 @@ class RasterOptions:
         depth, instance: whether these images are made besides RGB and alpha.
         track_screen: whether ScreenStatistics are gathered, which densification reads; only in
             passes that carry gradients.
+        detail: ``full``: every Gaussian that an image shows is drawn; ``auto``: images of at most
+            SMALL_IMAGE_PIXELS are drawn from Gaussians merged to about two pixels, antialiased and
+            with the blur of a pixel alone, in a fraction of the time and nearer to a large image
+            scaled down; larger ones, and all on backends that merge nothing, as with ``full``,
+            bit for bit.
     """
 
     near_plane: float = 0.01
@@ -65,6 +75,7 @@ class RasterOptions:
     depth: bool = True
     instance: bool = True
     track_screen: bool = False
+    detail: Detail = "full"
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from ..types import Instance, RasterOptions, RenderOutput, Sky
+from ..types import SMALL_IMAGE_PIXELS, Instance, RasterOptions, RenderOutput, Sky
 
 ALPHA_MAX = 0.999
 """No single Gaussian covers a pixel more than this, so that transmittance stays above 0."""
@@ -62,6 +62,12 @@ def needs_gradients(request: RasterRequest) -> bool:
     return any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in tensors)
 
 
+def is_reduced(request: RasterRequest) -> bool:
+    """Whether a backend that can merge Gaussians does so for this request."""
+    small = request.width * request.height <= SMALL_IMAGE_PIXELS
+    return request.options.detail == "auto" and small and not needs_gradients(request)
+
+
 def with_colours(request: RasterRequest) -> RasterRequest:
     """The request with colours that change over time put into the clouds."""
     instances = tuple(
@@ -82,6 +88,16 @@ class Backend(Protocol):
 
     def warm_up(self) -> None:
         """Compile or load whatever the first call would otherwise wait for."""
+        ...
+
+
+@runtime_checkable
+class BatchBackend(Protocol):
+    """A Backend that draws the small images of many requests in one go."""
+
+    def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:
+        """All images of ``requests``, which are of one size, one sky and the same options, and for
+        each of which :func:`is_reduced` holds; the same bits as one by one."""
         ...
 
 

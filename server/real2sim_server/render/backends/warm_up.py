@@ -8,11 +8,18 @@ import numpy as np
 import torch
 
 from ...scene import GaussianCloud
-from ..types import Instance, RasterOptions, Sky
+from ..types import Detail, Instance, RasterOptions, Sky
 from .base import RasterRequest
 
 MANY = 5_000
 """More Gaussians than a backend treats as one block."""
+
+WARM_UPS: tuple[tuple[bool, bool, Detail], ...] = (
+    (False, False, "full"),
+    (True, True, "full"),
+    (True, True, "auto"),
+)
+"""Depth, instance and detail."""
 
 
 def warm_up_requests() -> Iterator[RasterRequest]:
@@ -27,7 +34,7 @@ def warm_up_requests() -> Iterator[RasterRequest]:
     many = cloud.select(torch.zeros(MANY, dtype=torch.int64))
     covars = (0.01 * torch.eye(3)).repeat(2, 1, 1)
     K = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], dtype=torch.float64)
-    for depth, instance in ((False, False), (True, True)):
+    for depth, instance, detail in WARM_UPS:
         yield RasterRequest(
             instances=(
                 Instance(cloud),
@@ -39,5 +46,5 @@ def warm_up_requests() -> Iterator[RasterRequest]:
             width=16,
             height=16,
             sky=Sky.uniform((0.5, 0.6, 0.7)),
-            options=RasterOptions(depth=depth, instance=instance),
+            options=RasterOptions(depth=depth, instance=instance, detail=detail),
         )

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar, get_args
 
@@ -188,7 +188,8 @@ def _passes(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, list[int]]:
     """Indices of the sensors by the pass that renders them."""
     passes: dict[RasterOptions, list[int]] = {}
     for i, sensor in enumerate(sensors):
-        passes.setdefault(options_for(sensor.modalities, DEFAULT_OPTIONS), []).append(i)
+        options = replace(DEFAULT_OPTIONS, detail=sensor.detail)
+        passes.setdefault(options_for(sensor.modalities, options), []).append(i)
     return passes
 
 

@@ -23,6 +23,7 @@ from ..base import (
     Placement,
     RasterRequest,
     direction_matrix,
+    is_reduced,
     needs_gradients,
     place_instances,
     with_colours,
@@ -30,6 +31,7 @@ from ..base import (
 from ..warm_up import warm_up_requests
 from .blend import blend_tiles
 from .cull import Chunks, seen_chunks
+from .detail.images import SmallImages
 from .gradients import TrainingPasses
 from .inputs import Workspace, array_of, project, timed, view_of
 from .records import TILE, Images, Records
@@ -54,9 +56,12 @@ class CpuBackend:
         self._lock = threading.RLock()
         self._idle_spaces: list[Workspace] = []
         self._training = TrainingPasses(self._lock)
+        self._small = SmallImages()
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw one camera after the other into shared output arrays."""
+        if is_reduced(request):
+            return self.rasterize_batch([request])
         if needs_gradients(request):
             return self._training.rasterize(with_colours(request))
         shape = (request.cameras, request.height, request.width)
@@ -82,6 +87,11 @@ class CpuBackend:
             timing_ms=timing,
             between=request.between,
         )
+
+    def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:
+        """Draw small images of many requests at once, see SmallImages."""
+        with self._lock:
+            return self._small.draw(requests)
 
     def warm_up(self) -> None:
         """Compile every kernel, or load it from the disk cache."""
