@@ -344,6 +344,9 @@ class Error(ServerEnvelope):
     retryable: bool = False
     fatal: bool = Field(default=False, description="the socket is closed after this")
     step: int | None = Field(default=None, description="step the session is at")
+    retry_after_s: int | None = Field(
+        default=None, description="of `retryable` ones: when it may be sent again"
+    )
 
 
 class Result(ServerEnvelope):

@@ -43,6 +43,10 @@ class ErrorCode(StrEnum):
     TOO_MANY_CONNECTIONS = "TOO_MANY_CONNECTIONS"
     FOREIGN_PAGE = "FOREIGN_PAGE"
     OVER_CAPACITY = "OVER_CAPACITY"
+    TOO_MANY_REQUESTS = "TOO_MANY_REQUESTS"
+    TOO_MANY_BYTES = "TOO_MANY_BYTES"
+    TOO_MUCH_ENGINE_TIME = "TOO_MUCH_ENGINE_TIME"
+    TOO_MANY_SESSIONS = "TOO_MANY_SESSIONS"
     QUEUE_FULL = "QUEUE_FULL"
     OUT_OF_MEMORY = "OUT_OF_MEMORY"
     QUOTA_EXCEEDED = "QUOTA_EXCEEDED"
@@ -96,6 +100,10 @@ HTTP_STATUS: dict[ErrorCode, int] = {
     ErrorCode.TOO_MANY_CONNECTIONS: 503,
     ErrorCode.FOREIGN_PAGE: 403,
     ErrorCode.OVER_CAPACITY: 429,
+    ErrorCode.TOO_MANY_REQUESTS: 429,
+    ErrorCode.TOO_MANY_BYTES: 429,
+    ErrorCode.TOO_MUCH_ENGINE_TIME: 429,
+    ErrorCode.TOO_MANY_SESSIONS: 429,
     ErrorCode.QUEUE_FULL: 503,
     ErrorCode.OUT_OF_MEMORY: 507,
     ErrorCode.QUOTA_EXCEEDED: 507,
@@ -120,6 +128,10 @@ HTTP_STATUS: dict[ErrorCode, int] = {
 RETRYABLE = frozenset(
     {
         ErrorCode.OVER_CAPACITY,
+        ErrorCode.TOO_MANY_REQUESTS,
+        ErrorCode.TOO_MANY_BYTES,
+        ErrorCode.TOO_MUCH_ENGINE_TIME,
+        ErrorCode.TOO_MANY_SESSIONS,
         ErrorCode.QUEUE_FULL,
         ErrorCode.DRAINING,
         ErrorCode.TIMEOUT,

@@ -49,6 +49,7 @@ class JobInfo(Reply):
     stage: str = Field(default="", description="what it is doing")
     event: int = Field(default=0, description="number of its newest event")
     who: str = Field(default="", description="who asked for it")
+    owner: str = Field(default="default", description="name of the token it was asked for with")
     request: dict[str, Any] = Field(default_factory=dict)
     result: dict[str, Any] | None = Field(default=None, description="once it has succeeded")
     files: list[JobFile] = Field(default_factory=list)

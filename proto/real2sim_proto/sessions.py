@@ -27,6 +27,7 @@ class SessionInfo(Reply):
     scenario_id: str | None = None
     ws_url: str = Field(description="drive socket")
     token: str = Field(description="authorises the drive socket and this session's REST calls")
+    owner: str = Field(default="default", description="name of the token it was made with")
     created_at: str
     step: int | None = None
     t_us: Microseconds | None = None

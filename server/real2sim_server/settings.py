@@ -27,6 +27,8 @@ class Settings(BaseSettings):
         host, port: where to listen; an address beyond loopback needs ``token``.
         token: bearer token that every request but ``/livez`` and ``/readyz`` must carry.
         token_file: file that holds the token, as an orchestrator mounts it.
+        tokens_file: named tokens with limits, which `real2sim token` makes; read again whenever it
+            changes.
         worker_id: first part of session ids, so that a proxy can find the worker again.
         data_dir: what the worker writes; the next five lie below it by default.
         scenes_dir: folder of scene bundles.
@@ -79,6 +81,7 @@ class Settings(BaseSettings):
     host: str = "127.0.0.1"
     port: int = Field(default=8600, ge=0, le=65535)
     token_file: Path | None = None
+    tokens_file: Path | None = None
     token: SecretStr | None = Field(default=None, min_length=8)
     worker_id: str = Field(default="w0", pattern=r"^w[0-9]{1,6}$")
     data_dir: Path = Field(default_factory=_default_data_dir)
@@ -132,6 +135,11 @@ class Settings(BaseSettings):
         if given.get("token") is not None:
             raise ValueError("token and token_file are both given; one of them is enough")
         return given | {"token": read_token(Path(file))}
+
+    @property
+    def wants_token(self) -> bool:
+        """Whether requests need a token."""
+        return self.token is not None or self.tokens_file is not None
 
     @property
     def scenes_path(self) -> Path:

@@ -20,6 +20,7 @@ from . import (  # noqa: I001 - the order of the help
     train_policy,
     replay,
     serve,
+    token,
     backup,
     demo,
     doctor,
@@ -27,6 +28,7 @@ from . import (  # noqa: I001 - the order of the help
 )
 from .command import app
 
+app.add_typer(token.app, name="token")
 app.add_typer(bench.app, name="bench")
 
 __all__ = [
@@ -47,6 +49,7 @@ __all__ = [
     "serve",
     "simulate",
     "synth",
+    "token",
     "track",
     "train_policy",
     "validate",

@@ -3,6 +3,7 @@
 Its parts, lowest first; each imports only those before it, and no file is part of a circle:
 
 - ``storage``: tables and rows of scenarios, sessions, jobs and stored answers; who owns them.
+- ``token_file``, ``accounts``: named tokens, and what their holders take.
 - ``preflight``: what is refused before anything heavy is loaded.
 - ``first_run``: a second process that compiles, begun before anything heavy is loaded.
 - ``warm_up``: kernels compiled or loaded before they are needed.

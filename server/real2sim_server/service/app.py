@@ -14,6 +14,7 @@ from starlette.types import Message
 from real2sim_proto import Problem
 
 from ..settings import Settings
+from .http.accounting import Accounting
 from .http.auth import require_token
 from .http.hosts import LoopbackOnly
 from .http.openapi import published
@@ -95,9 +96,10 @@ def create_app(settings: Settings) -> FastAPI:
     uploads = dict.fromkeys(upload_paths, settings.max_upload_bytes)
     install_problem_handlers(app)
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
-    if settings.token is None:
+    if not settings.wants_token:
         app.add_middleware(LoopbackOnly)
     app.add_middleware(OwnPagesOnly)
+    app.add_middleware(Accounting)
     app.add_middleware(RequestContext, metrics=worker.metrics)
     for router in OPEN:
         app.include_router(router)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import structlog
 
+from .accounts import PAYER, Account
 from .lanes import Lane, Lanes
 
 T = TypeVar("T")
@@ -106,6 +107,7 @@ class _EngineJob:
     run: Callable[[], Any]
     label: str
     future: Future[Any] | _LoopFuture
+    account: Account | None
     queued_at: float = field(default_factory=time.perf_counter)
 
 
@@ -140,6 +142,7 @@ class Engine:
         self._on_job = on_job
         self._jobs: Lanes[_EngineJob] = Lanes(queue_length)
         self._began = 0.0
+        self._account: Account | None = None
         self._changed = threading.Condition()
         self._accepting = False
         self._running: str | None = None
@@ -196,10 +199,14 @@ class Engine:
             on_result: called with the result on the event loop, before the awaiting task is woken.
 
         Raises:
+            OverLimitError: the account of the running task has had its time on the engine.
             QueueFullError: ``queue_length`` jobs of the lane wait already.
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
+        payer = PAYER.get()
+        if payer is not None and payer.account.limits.engine_seconds_per_minute is not None:
+            await payer.let_on_engine()
         awaited = _LoopFuture(on_result)
         job = self._submit(lambda: fn(*args, **kwargs), label, lane, awaited)
         try:
@@ -280,7 +287,8 @@ class Engine:
     def _submit(
         self, run: Callable[[], Any], label: str, lane: Lane, future: Future[Any] | _LoopFuture
     ) -> _EngineJob:
-        job = _EngineJob(run, label, future)
+        payer = PAYER.get()
+        job = _EngineJob(run, label, future, payer.account if payer is not None else None)
         with self._changed:
             if self._failure is not None:
                 raise DeviceLostError(f"the device was lost: {self._failure}")
@@ -335,11 +343,13 @@ class Engine:
     def _start(self, job: _EngineJob) -> None:
         """Run a job that is wanted still, and count its time."""
         self._began = time.perf_counter()
+        interrupted, self._account = self._account, job.account
         try:
             if job.future.set_running_or_notify_cancel():
                 self._run(job)
         finally:
             self._charge()
+            self._account = interrupted
             with self._changed:
                 self._jobs.end()
 
@@ -347,6 +357,8 @@ class Engine:
         now = time.perf_counter()
         with self._changed:
             self._jobs.charge(now - self._began)
+        if self._account is not None:
+            self._account.engine_seconds += now - self._began
         self._began = now
 
     def _run(self, job: _EngineJob) -> None:

@@ -61,7 +61,7 @@ def run(settings: Settings) -> int:
         StateFolderError: another worker is on the state folder, or it cannot be written to.
         StoreError: the store cannot be opened.
     """
-    check_bind(settings.host, _token(settings))
+    check_bind(settings.host, settings.wants_token)
     check_scenes(settings)
     configure_logging(level=settings.log_level, log_format=settings.log_format)
     listener = bind(settings.host, settings.port)
@@ -95,7 +95,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
         AddressError: the address is taken, or none of this machine.
         RuntimeError: it ended, or was not ready in time; with its reasons.
     """
-    check_bind(settings.host, _token(settings))
+    check_bind(settings.host, settings.wants_token)
     check_scenes(settings)
     listener = bind(settings.host, settings.port)
     app = create_app(settings)

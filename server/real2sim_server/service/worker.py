@@ -21,6 +21,7 @@ from real2sim_proto.scenes import DeviceInfo, Readiness
 from ..render import Backend, describe_backends, select_backend
 from ..scene.io import StagingLimits
 from ..settings import Settings
+from .accounts import Accounts
 from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.idempotency import Idempotency
@@ -63,6 +64,7 @@ class Worker:
     settings: Settings
     engine: Engine
     metrics: Metrics
+    accounts: Accounts
     connections: Connections
     store: Store
     scene_cache: SceneCache
@@ -87,8 +89,11 @@ class Worker:
 
         Raises:
             RenderError: the backend of the settings cannot be used here.
+            TokenFileError: the file of tokens cannot be used.
         """
         metrics = Metrics()
+        secret = settings.token.get_secret_value() if settings.token is not None else None
+        accounts = Accounts(token=secret, file=settings.tokens_file)
         backend = select_backend(settings.backend)
         engine = Engine(
             queue_length=settings.queue_length,
@@ -120,6 +125,7 @@ class Worker:
             settings=settings,
             engine=engine,
             metrics=metrics,
+            accounts=accounts,
             connections=Connections(_connection_limits(settings), metrics),
             store=store,
             scene_cache=scene_cache,
@@ -142,6 +148,7 @@ class Worker:
                 scene_cache=scene_cache,
                 scenarios=scenarios,
                 metrics=metrics,
+                accounts=accounts,
             ),
             backend=backend,
             device=_device_info(backend, settings),
@@ -177,6 +184,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.connections.watch()))
+            at_exit.push_async_callback(_cancel, asyncio.create_task(self.accounts.watch()))
             await at_exit.enter_async_context(self.sessions.running())
             await at_exit.enter_async_context(self.jobs.running())
             at_exit.push_async_callback(_cancel, asyncio.create_task(upkeep.run()))
@@ -271,6 +279,7 @@ class Worker:
         self.metrics.build.info(
             {"version": version("real2sim"), "backend": self.backend.name},
         )
+        self.metrics.watch_accounts(self.accounts, self.sessions.owned)
         self.metrics.session_limit.set(self.settings.max_sessions)
         self.metrics.watch(self.metrics.queue_depth, lambda: self.engine.queue_depth)
         self.metrics.watch(self.metrics.scene_bytes, lambda: self.scene_cache.resident_bytes)

@@ -33,3 +33,12 @@ def test_offsets_that_lead_out_of_the_file_are_not_followed(tmp_path):
     file.write_bytes(whole[:at] + struct.pack("<ii", 0, 1 << 30) + whole[at + 8 :])
     with pytest.raises(LogError, match=r"a\.feather: cannot be read as a Feather file"):
         read_feather(file, ["t"])
+
+
+def test_names_of_columns_that_are_no_text_are_an_error_of_the_file(tmp_path):
+    name = "a_name_that_can_be_found"
+    file = tmp_path / "a.feather"
+    feather.write_feather(pa.table({name: [1]}), file, compression="uncompressed")
+    file.write_bytes(file.read_bytes().replace(name.encode(), b"\x92" * len(name)))
+    with pytest.raises(LogError, match=r"a\.feather: cannot be read as a Feather file"):
+        read_feather(file, [name])

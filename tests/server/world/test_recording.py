@@ -201,6 +201,7 @@ def _row(key, value):
         ("context.msgpack", _put("route", np.array([[0.0, 0], [1e9, 0]]))),
         ("context.msgpack", _put("horizon", 3)),
         ("context.msgpack", _put("dt", "soon")),
+        ("context.msgpack", _put("ego_mass", 0.0)),
         ("context.msgpack", _put("lanes", [np.zeros((3, 1))])),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hmac
-import ipaddress
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
 
@@ -14,6 +13,9 @@ from starlette.requests import HTTPConnection
 
 from real2sim_proto import ErrorCode
 
+from ..accounts import Account
+from .accounting import begin_paying, usage_of
+from .hosts import is_loopback
 from .problems import ServiceError
 
 _bearer = HTTPBearer(auto_error=False, description="the worker's token; none where it has none")
@@ -23,8 +25,8 @@ class OpenBindError(ValueError):
     """An address that others can reach, without a token."""
 
 
-def check_bind(host: str, token: str | None) -> None:
-    """Refuse to listen beyond this machine without a token.
+def check_bind(host: str, token: object) -> None:
+    """Refuse to listen beyond this machine without a token, or a file of tokens.
 
     Raises:
         OpenBindError: saying what to do.
@@ -33,31 +35,14 @@ def check_bind(host: str, token: str | None) -> None:
         return
     raise OpenBindError(
         f"refusing to listen on {host!r} without a token: anyone who reaches it could drive and "
-        "edit. Set REAL2SIM_TOKEN (for example to the output of `openssl rand -hex 16`), or listen "
-        "on 127.0.0.1"
+        "edit. Set REAL2SIM_TOKEN (for example to the output of `openssl rand -hex 16`) or "
+        "REAL2SIM_TOKENS_FILE (see `real2sim token`), or listen on 127.0.0.1"
     )
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach ``host``."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def secrets_equal(given: str | None, expected: str) -> bool:
     """Compare in a time that does not depend on where the two differ."""
     return hmac.compare_digest((given or "").encode(), expected.encode())
-
-
-def matches_any_secret(given: str | None, *secrets: str | None) -> bool:
-    """Whether ``given`` is one of ``secrets``; None is no secret."""
-    # All are compared, so that the duration reveals nothing.
-    matches = [secrets_equal(given, secret) for secret in secrets if secret is not None]
-    return any(matches)
 
 
 async def require_token(
@@ -73,17 +58,23 @@ async def require_token(
 
 
 def check_token(connection: HTTPConnection) -> None:
-    """Raises ServiceError: UNAUTHORIZED, unless a request carries the worker's token."""
+    """Find the account that a request with a token of the worker is for, and let it in.
+
+    Raises:
+        ServiceError: UNAUTHORIZED.
+        OverLimitError: the account has had its requests or bytes.
+    """
+    if usage_of(connection.scope).account is not None:
+        return  # Its route has checked before anything was read.
     worker = connection.app.state.worker
-    secret = worker.settings.token
-    if secret is None:
-        return
     given = bearer_token(connection)
-    if not secrets_equal(given, secret.get_secret_value()):
+    account: Account | None = worker.accounts.of_token(given)
+    if account is None:
         worker.metrics.auth_failures.labels("http").inc()
         if given is None:
             raise unauthorized("this worker wants a bearer token")
         raise unauthorized("the bearer token is not this worker's")
+    begin_paying(connection, account)
 
 
 def bearer_token(connection: HTTPConnection) -> str | None:
@@ -115,6 +106,6 @@ def unauthorized(detail: str) -> ServiceError:
     return ServiceError(
         ErrorCode.UNAUTHORIZED,
         detail,
-        hint="send 'Authorization: Bearer <token>' with the worker's REAL2SIM_TOKEN",
+        hint="send 'Authorization: Bearer <token>' with a token of the worker's operator",
         headers={"WWW-Authenticate": "Bearer"},
     )

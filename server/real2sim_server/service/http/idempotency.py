@@ -18,6 +18,8 @@ from real2sim_proto import ErrorCode
 
 from ..storage.store import Store, StoredReply
 from ..storage.tokens import sealed, unsealed
+from ..token_file import DEFAULT_NAME
+from .accounting import usage_of
 from .problems import ServiceError
 
 REPLAY_HEADER = "Idempotent-Replayed"
@@ -96,7 +98,9 @@ class Idempotency:
         if key is None:
             yield IdempotentRequest()
             return
-        scoped = f"{request.method} {request.url.path} {key}"
+        account = usage_of(request.scope).account
+        holder = "" if account is None or account.name == DEFAULT_NAME else f"{account.name} "
+        scoped = f"{holder}{request.method} {request.url.path} {key}"
         full_key = hashlib.sha256(scoped.encode()).hexdigest()
         content = await request.body() if content is None else content
         fingerprint = _fingerprint(request, content)

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.metrics_core import Metric
+
+from ..accounts import Account
 
 FAST_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
 LOAD_BUCKETS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120)
@@ -165,6 +169,12 @@ class Metrics:
         """Let ``gauge`` call ``read`` whenever metrics are collected."""
         gauge.set_function(read)
 
+    def watch_accounts(
+        self, accounts: Iterable[Account], sessions: Callable[[], Mapping[str, int]]
+    ) -> None:
+        """Tell what was taken by the name of each token; ``sessions`` counts them by owner."""
+        self.registry.register(_AccountCollector(accounts, sessions))
+
     async def exposition(self) -> tuple[bytes, str]:
         """Body and media type of ``/metrics``, made on another thread, one at a time."""
         return await asyncio.to_thread(self._expose), CONTENT_TYPE_LATEST
@@ -172,3 +182,48 @@ class Metrics:
     def _expose(self) -> bytes:
         with self._exposing:
             return generate_latest(self.registry)
+
+
+class _AccountCollector:
+    """Figures of accounts, read when metrics are: what counts them knows no metric."""
+
+    def __init__(
+        self, accounts: Iterable[Account], sessions: Callable[[], Mapping[str, int]]
+    ) -> None:
+        self._accounts = accounts
+        self._sessions = sessions
+
+    def describe(self) -> Iterable[Metric]:
+        """The same without values."""
+        return [CounterMetricFamily(name, text, labels=["token"]) for name, text, _ in _FIGURES]
+
+    def collect(self) -> Iterator[Metric]:
+        """Every figure with a sample for each name."""
+        accounts = list(self._accounts)
+        for name, text, read in _FIGURES:
+            family = CounterMetricFamily(name, text, labels=["token"])
+            for account in accounts:
+                family.add_metric([account.name], read(account))
+            yield family
+        refused = CounterMetricFamily(
+            "real2sim_token_refusals", "refused by a limit of a token", labels=["token", "limit"]
+        )
+        for account in accounts:
+            for limit, count in account.refusals.items():
+                refused.add_metric([account.name, limit.value], count)
+        yield refused
+        owned = self._sessions()
+        present = GaugeMetricFamily(
+            "real2sim_token_sessions", "open sessions by token", labels=["token"]
+        )
+        for account in accounts:
+            present.add_metric([account.name], owned.get(account.name, 0))
+        yield present
+
+
+_FIGURES: tuple[tuple[str, str, Callable[[Account], float]], ...] = (
+    ("real2sim_token_requests", "requests and messages let in", lambda a: a.requests),
+    ("real2sim_token_received_bytes", "bodies and messages", lambda a: a.received_bytes),
+    ("real2sim_token_sent_bytes", "bodies and messages", lambda a: a.sent_bytes),
+    ("real2sim_token_engine_seconds", "time on the engine", lambda a: a.engine_seconds),
+)

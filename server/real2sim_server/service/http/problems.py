@@ -27,6 +27,7 @@ from ...physics.errors import PhysicsError
 from ...render import RenderError
 from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from ...world import WorldError
+from ..accounts import Limit, OverLimitError, RevokedError, seconds_to_wait
 from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
 from ..storage.errors import StoreFullError, StoreUnavailableError, is_full
 from .disconnects import ClientDisconnectedError
@@ -83,6 +84,7 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (StoreFullError, ErrorCode.STORAGE_FULL, "free space on the worker, and send it again"),
     (StoreUnavailableError, ErrorCode.STORAGE_UNAVAILABLE, _AGAIN),
     (EngineStoppedError, ErrorCode.DRAINING, None),
+    (RevokedError, ErrorCode.UNAUTHORIZED, "ask the operator for another token"),
     (TimeOutOfRangeError, ErrorCode.TIME_OUT_OF_RANGE, None),
     (UnknownObjectError, ErrorCode.UNKNOWN_OBJECT, None),
     (BundleError, ErrorCode.SCENE_BROKEN, None),
@@ -119,8 +121,31 @@ def _translated(error: Exception) -> ServiceError:
     return ServiceError(ErrorCode.INTERNAL, detail)
 
 
+CODE_OF_LIMIT = {
+    Limit.REQUESTS: ErrorCode.TOO_MANY_REQUESTS,
+    Limit.BYTES: ErrorCode.TOO_MANY_BYTES,
+    Limit.ENGINE: ErrorCode.TOO_MUCH_ENGINE_TIME,
+    Limit.SESSIONS: ErrorCode.TOO_MANY_SESSIONS,
+}
+
+
+def _of_limit(error: OverLimitError) -> ServiceError:
+    seconds = seconds_to_wait(error)
+    hint = f"send it again in {seconds} s"
+    if error.limit is Limit.SESSIONS:
+        hint = "end one of your sessions: DELETE /v1/sessions/{id}"
+    return ServiceError(
+        CODE_OF_LIMIT[error.limit],
+        str(error),
+        hint=hint,
+        headers={"Retry-After": str(seconds)},
+    )
+
+
 def _of_shortage(error: Exception) -> ServiceError | None:
-    """Of a want of space or memory."""
+    """Of a want of space, of memory, or of what an account has left."""
+    if isinstance(error, OverLimitError):
+        return _of_limit(error)
     if isinstance(error, OSError) and is_full(error):
         detail = "the worker has no space left for this"
         return ServiceError(ErrorCode.STORAGE_FULL, detail, hint="free space on the worker")

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from real2sim_proto import ErrorCode
 
+from .accounting import usage_of
 from .clients import CLIENT_HEADER
 from .problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
 from .security import secure
@@ -91,12 +92,14 @@ class RequestContext:
     def _note(self, scope: Scope, method: str, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", None) or "unmatched"
         self._metrics.observe_request(method, route, status, seconds)
+        account = usage_of(scope).account
         write = log.debug if scope["path"] in _QUIET else log.info
         write(
             "request",
             method=method,
             path=scope["path"],
             status=status,
+            **({"account": account.name} if account is not None else {}),
             ms=round(seconds * 1e3, 2),
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
 import secrets
 import shutil
 import threading
@@ -19,6 +20,7 @@ import structlog
 from real2sim_proto import ErrorCode, Problem
 from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
+from ..accounts import PAYER, Payer, owner_name
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, problem_of, service_error
 from ..library.quotas import Quota
@@ -193,6 +195,7 @@ class Jobs:
             state=JobState.QUEUED,
             event=1,
             who=new.who,
+            owner=owner_name(),
             request=dict(new.request),
             created_at=iso_time(now_us()),
         )
@@ -203,7 +206,9 @@ class Jobs:
         )
         await self._log.add(info, reply=reply)
         job = self._hold(info, work)
-        job.task = asyncio.create_task(self._run(job, light=new.light), name=info.job_id)
+        job.task = asyncio.create_task(
+            self._run(job, light=new.light), name=info.job_id, context=_waiting_context()
+        )
         return info
 
     async def cancel(self, job_id: str) -> JobInfo | None:
@@ -383,6 +388,15 @@ class Jobs:
 async def _notify_readers(job: _Job) -> None:
     async with job.changed:
         job.changed.notify_all()
+
+
+def _waiting_context() -> contextvars.Context:
+    """That of the caller, whose account the job waits for: nobody else can send it again."""
+    context = contextvars.copy_context()
+    payer = PAYER.get()
+    if payer is not None:
+        context.run(PAYER.set, Payer(payer.account, waits=True))
+    return context
 
 
 def accepted_headers(info: JobInfo) -> dict[str, str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
+from functools import partial
 
 import structlog
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
@@ -10,7 +12,9 @@ from structlog.contextvars import bound_contextvars
 
 from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
 
-from ..http.auth import secrets_equal, unauthorized
+from ..accounts import Account, RevokedError
+from ..http.accounting import begin_paying
+from ..http.auth import bearer_token, unauthorized
 from ..http.problems import REQUEST_ID_KEY, problem_response, service_error
 from ..sessions.connection import Connection
 from ..sessions.handshake import FatalError, close_with_error, receive_hello, with_progress
@@ -30,7 +34,7 @@ async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
     """Drive a session in lock step, or look on; see docs of the drive socket."""
     try:
         protocol = _common_protocol(socket)
-        authorised = _carries_worker_token(socket, worker)
+        account = _account_of_handshake(socket, worker)
         row = check_not_closed(await worker.sessions.row(session_id))
     except Exception as error:
         failure = service_error(error, log_unexpected=True)
@@ -41,7 +45,7 @@ async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
     await socket.accept(subprotocol=protocol)
     with worker.metrics.open_socket("drive"), bound_contextvars(session_id=row.session_id):
         try:
-            await _serve(socket, worker, row, authorised=authorised)
+            await _serve(socket, worker, row, account)
         except WebSocketDisconnect:
             log.info("drive socket left before its welcome")
         except FatalError as error:
@@ -51,17 +55,22 @@ async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
             await close_with_error(socket, error.error, message_id=error.message_id)
 
 
-async def _serve(socket: WebSocket, worker: Worker, row: SessionRow, *, authorised: bool) -> None:
+async def _serve(
+    socket: WebSocket, worker: Worker, row: SessionRow, account: Account | None
+) -> None:
     """Hello, the session, then its messages."""
-    secret = worker.settings.token
     hello = await receive_hello(
         socket,
         row,
-        authorised=authorised,
-        worker_token=secret.get_secret_value() if secret else None,
+        authorised=account is not None,
+        opens_worker=lambda token: _account_of_token(worker, token) is not None,
         resume_token=worker.sessions.resume_token(row),
     )
     try:
+        # Who has the session's token alone drives for whoever made it.
+        account = account or _account_of_token(worker, hello.token)
+        account = account or worker.accounts.of_owner(row.owner)
+        begin_paying(socket, account)
         session = await with_progress(
             socket, worker.sessions.find(row.session_id), hello, phase="loading the session"
         )
@@ -72,12 +81,17 @@ async def _serve(socket: WebSocket, worker: Worker, row: SessionRow, *, authoris
     started, first = time.perf_counter(), _steps(session)
     log.info("drive socket opened", role=hello.role)
     ws_base = str(socket.base_url).rstrip("/")
+    connection = Connection(socket, session, worker.sessions, ws_base=ws_base)
+    revoked = partial(_end, connection, account)
+    account.on_revoked.add(revoked)
     try:
-        await Connection(socket, session, worker.sessions, ws_base=ws_base).serve(hello)
+        await connection.serve(hello)
     finally:
+        account.on_revoked.discard(revoked)
         log.info(
             "drive socket closed",
             role=hello.role,
+            account=account.name,
             steps=max(0, _steps(session) - first),
             seconds=round(time.perf_counter() - started, 1),
             session_over=session.closed is not None,
@@ -96,17 +110,32 @@ def _common_protocol(socket: WebSocket) -> str:
     raise unsupported_protocol(offered)
 
 
-def _carries_worker_token(socket: WebSocket, worker: Worker) -> bool:
-    """Whether the handshake has the worker's token; hello may carry one instead.
+def _account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
+    """Whose token of the worker the handshake has; hello may carry one instead.
 
     Raises:
         ServiceError: UNAUTHORIZED for a wrong one.
     """
-    secret = worker.settings.token
-    scheme, _, given = socket.headers.get("Authorization", "").partition(" ")
-    if secret is None or scheme.lower() != "bearer":
-        return False
-    if not secrets_equal(given.strip(), secret.get_secret_value()):
+    given = bearer_token(socket)
+    if given is None or not worker.accounts.wants_token:
+        return None
+    account = worker.accounts.of_token(given)
+    if account is None:
         worker.metrics.auth_failures.labels("drive").inc()
         raise unauthorized("the bearer token is not this worker's")
-    return True
+    return account
+
+
+def _account_of_token(worker: Worker, token: str | None) -> Account | None:
+    """Whose token of the worker it is; None where the worker has none."""
+    return worker.accounts.of_token(token) if worker.accounts.wants_token else None
+
+
+def _end(connection: Connection, account: Account) -> None:
+    """Leave a client whose token is no more; not awaited, for it may be slow to read."""
+    ending = asyncio.ensure_future(connection.end(service_error(RevokedError(account.name))))
+    _ending.add(ending)
+    ending.add_done_callback(_ending.discard)
+
+
+_ending: set[asyncio.Future[None]] = set()

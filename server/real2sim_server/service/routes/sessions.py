@@ -21,14 +21,8 @@ from real2sim_proto.sessions import (
 )
 
 from ...world import Event, World
-from ..http.auth import (
-    TokenRoute,
-    bearer_token,
-    check_token,
-    require_token,
-    secrets_equal,
-    unauthorized,
-)
+from ..http.accounting import begin_paying
+from ..http.auth import TokenRoute, bearer_token, check_token, require_token, unauthorized
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
@@ -58,11 +52,12 @@ class SessionRoute(TokenRoute):
 
 async def _check_session_token(request: Request, session_id: str) -> None:
     worker: Worker = request.app.state.worker
-    given, secret = bearer_token(request), worker.settings.token
-    if secret is not None and secrets_equal(given, secret.get_secret_value()):
+    given, accounts = bearer_token(request), worker.accounts
+    if accounts.wants_token and (account := accounts.of_token(given)) is not None:
+        begin_paying(request, account)
         return
     row = None
-    if given is not None or secret is None:
+    if given is not None or not accounts.wants_token:
         # The row is enough: no session is rebuilt for those who may not use it.
         row = check_not_closed(await worker.sessions.row(session_id))
     if row is None or not opens_session(given, row):
@@ -70,6 +65,7 @@ async def _check_session_token(request: Request, session_id: str) -> None:
         error = unauthorized("this call wants the session's token or the worker's")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
         raise error
+    begin_paying(request, accounts.of_owner(row.owner))
 
 
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"], route_class=SessionRoute)

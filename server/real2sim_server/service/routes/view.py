@@ -12,7 +12,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from real2sim_proto import ErrorCode
 
-from ..http.auth import secrets_equal
+from ..accounts import Account
+from ..http.accounting import begin_paying
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import close_reason, receive_text
 from ..worker import Worker, WorkerOf
@@ -20,8 +21,14 @@ from .view_connection import ViewConnection
 
 HANDSHAKE_TIMEOUT_S = 10.0
 CLOSED_BAD_MESSAGE, CLOSED_UNAUTHORIZED, CLOSED_NOT_FOUND = 4400, 4401, 4404
-CLOSED_TIMEOUT, CLOSED_FAILED = 4408, 4500
+CLOSED_TIMEOUT, CLOSED_OVER_LIMIT, CLOSED_FAILED = 4408, 4429, 4500
 """Codes with which the socket is closed."""
+CLOSED_BY = {
+    ErrorCode.UNKNOWN_SCENARIO: CLOSED_NOT_FOUND,
+    ErrorCode.UNAUTHORIZED: CLOSED_UNAUTHORIZED,
+    ErrorCode.TOO_MANY_REQUESTS: CLOSED_OVER_LIMIT,
+    ErrorCode.TOO_MANY_BYTES: CLOSED_OVER_LIMIT,
+}
 
 # Not json.loads(): it follows nesting until the stack ends, and lets lone surrogates pass.
 _HELLO: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
@@ -50,10 +57,10 @@ async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
     await socket.accept()
     try:
         with worker.metrics.open_socket("view"):
-            await _check_hello(socket, worker)
+            account = await _check_hello(socket, worker)
             await worker.scenarios.view(scenario_id)
             await socket.send_text(json.dumps({"type": "welcome"}))
-            await _serve(socket, worker, scenario_id)
+            await _serve(socket, worker, scenario_id, account)
     except NoHelloError as error:
         log.info("view socket refused", code=error.code, reason=str(error))
         await socket.close(error.code, str(error))
@@ -61,23 +68,30 @@ async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
         return
     except Exception as error:
         failure = service_error(error, log_unexpected=True)
-        missing = failure.code is ErrorCode.UNKNOWN_SCENARIO
-        code = CLOSED_NOT_FOUND if missing else CLOSED_FAILED
+        code = CLOSED_BY.get(failure.code, CLOSED_FAILED)
         await socket.close(code, close_reason(failure.detail))
 
 
-async def _serve(socket: WebSocket, worker: Worker, scenario_id: str) -> None:
+async def _serve(socket: WebSocket, worker: Worker, scenario_id: str, account: Account) -> None:
     started = time.perf_counter()
     log.info("view socket opened", scenario_id=scenario_id)
+    connection = ViewConnection(socket, worker, scenario_id)
+    account.on_revoked.add(connection.end)
     try:
-        await ViewConnection(socket, worker, scenario_id).serve()
+        await connection.serve()
     finally:
+        account.on_revoked.discard(connection.end)
         seconds = round(time.perf_counter() - started, 1)
         log.info("view socket closed", scenario_id=scenario_id, seconds=seconds)
 
 
-async def _check_hello(socket: WebSocket, worker: Worker) -> None:
-    """Read `{"type": "hello", "token": ...}`. Raises NoHelloError where the token is not right."""
+async def _check_hello(socket: WebSocket, worker: Worker) -> Account:
+    """Read `{"type": "hello", "token": ...}`; whose token it is.
+
+    Raises:
+        NoHelloError: the token is not right.
+        OverLimitError: its holder has had their requests or bytes.
+    """
     try:
         async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
             hello = _HELLO.validate_json(await receive_text(socket))
@@ -86,9 +100,10 @@ async def _check_hello(socket: WebSocket, worker: Worker) -> None:
         raise NoHelloError(CLOSED_TIMEOUT, reason) from error
     except (ValidationError, ServiceError) as error:
         raise NoHelloError(CLOSED_BAD_MESSAGE, "the first message must be a hello") from error
-    secret, given = worker.settings.token, hello.get("token")
-    if secret is None:
-        return
-    if not isinstance(given, str) or not secrets_equal(given, secret.get_secret_value()):
+    given = hello.get("token")
+    account = worker.accounts.of_token(given if isinstance(given, str) else None)
+    if account is None:
         worker.metrics.auth_failures.labels("view").inc()
         raise NoHelloError(CLOSED_UNAUTHORIZED, "the token is not this worker's")
+    begin_paying(socket, account)
+    return account

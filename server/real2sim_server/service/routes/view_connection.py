@@ -20,6 +20,7 @@ from real2sim_proto.operations import Operation
 from ...edit import EditError, instances_at, replay_operations
 from ...render import Instance, RenderError
 from ...scene import Scene, SceneError
+from ..accounts import RevokedError, admit_message, owner_name
 from ..engine import QueueFullError
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import receive_text
@@ -72,12 +73,17 @@ class ViewConnection:
         self._pending: dict[str, ViewRequest] = {}
         self._request_received = asyncio.Event()
         self._sent_revision = -1
+        self._revoked = asyncio.Event()
+
+    def end(self) -> None:
+        """Leave the browser: its token is no more."""
+        self._revoked.set()
 
     async def serve(self) -> None:
-        """Answer until the browser leaves."""
+        """Answer until the browser leaves. Raises RevokedError: it has to."""
         reader = asyncio.create_task(self._read())
         answerer = asyncio.create_task(self._answer_requests())
-        tasks = {reader, answerer}
+        tasks = {reader, answerer, asyncio.create_task(self._until_revoked())}
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -89,6 +95,10 @@ class ViewConnection:
             error = None if task.cancelled() else task.exception()
             if error is not None and not isinstance(error, WebSocketDisconnect):
                 raise error
+
+    async def _until_revoked(self) -> None:
+        await self._revoked.wait()
+        raise RevokedError(owner_name())
 
     async def _read(self) -> None:
         while True:
@@ -122,6 +132,7 @@ class ViewConnection:
 
     async def _answer_one(self, request: ViewRequest) -> None:
         try:
+            admit_message()
             await self._answer_view(request)
         except WebSocketDisconnect:
             raise

@@ -30,6 +30,7 @@ from real2sim_proto.drive import (
     Snapshot,
 )
 
+from ..accounts import admit_message
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import send_parts, try_send_parts
@@ -143,6 +144,10 @@ class Connection:
             if session.controller is self:
                 session.controller = None
 
+    async def end(self, error: ServiceError) -> None:
+        """Tell the client why, and leave it."""
+        await self._close_with_error(error)
+
     async def yield_control(self) -> None:
         """Leave the session to the connection that has resumed it."""
         self._session.close_callbacks.discard(self._close_with_error)
@@ -202,6 +207,7 @@ class Connection:
         """The answer; None where it has been sent already."""
         try:
             _check_role(received.message, role)
+            admit_message()
             return await self._dispatch(received, role)
         except Exception as error:
             return self._error_message(service_error(error, log_unexpected=True))

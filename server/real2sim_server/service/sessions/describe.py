@@ -28,6 +28,7 @@ def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionI
         scenario_id=row.scenario_id,
         ws_url=f"{ws_base}/v1/sessions/{row.session_id}/drive",
         token=token,
+        owner=row.owner,
         created_at=created.isoformat(timespec="milliseconds"),
         step=world.steps if world else None,
         t_us=world.t_us if world else None,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -16,7 +16,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
 from real2sim_proto.drive import Hello
 
-from ..http.auth import matches_any_secret, secrets_equal, unauthorized
+from ..http.auth import secrets_equal, unauthorized
 from ..http.problems import ServiceError
 from ..http.websocket import send_parts
 from ..storage.store import SessionRow
@@ -54,7 +54,7 @@ async def receive_hello(
     row: SessionRow,
     *,
     authorised: bool,
-    worker_token: str | None,
+    opens_worker: Callable[[str | None], bool],
     resume_token: str,
 ) -> Hello:
     """The hello of a client that may use the session of a row.
@@ -63,7 +63,7 @@ async def receive_hello(
         socket: accepted with our subprotocol.
         row: of the session.
         authorised: whether the handshake carried the worker's token.
-        worker_token: opens every session; None where the worker has none.
+        opens_worker: whether a token is one of the worker's, which open every session.
         resume_token: of the session's controller.
 
     Raises:
@@ -83,8 +83,7 @@ async def receive_hello(
         raise FatalError(wrong_type, message_id=message.id)
     if not set(message.protocols) & set(SUPPORTED_SUBPROTOCOLS):
         raise FatalError(unsupported_protocol(message.protocols), message_id=message.id)
-    is_worker_token = matches_any_secret(message.token, worker_token)
-    has_token = opens_session(message.token, row) or is_worker_token
+    has_token = opens_session(message.token, row) or opens_worker(message.token)
     if not (authorised or has_token or is_resuming(message, resume_token)):
         no_token = unauthorized("hello carries neither the session's token nor the worker's")
         no_token.hint = "the answer to POST /v1/sessions has the session's token"
@@ -151,5 +150,6 @@ def error_message(
         "retryable": error.code in RETRYABLE,
         "fatal": fatal,
         "step": step,
+        "retry_after_s": int(error.headers.get("Retry-After", 0)) or None,
     }
     return pack_message("error", fields)

@@ -8,6 +8,7 @@ import hmac
 import re
 import secrets
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from ...scene import Scene
 from ...world import Score
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ...world.scoring import scores_of
+from ..accounts import Accounts, owner_name
 from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
@@ -75,6 +77,7 @@ class Sessions:
         scene_cache: keeps their scenes in memory.
         scenarios: what they may begin from.
         metrics: gets their number.
+        accounts: of those who make them, each with a limit of its own.
 
     Attributes:
         resume_key: what tokens of controllers that come back are made with.
@@ -90,6 +93,7 @@ class Sessions:
         scene_cache: SceneCache,
         scenarios: Scenarios,
         metrics: Metrics,
+        accounts: Accounts | None = None,
     ) -> None:
         self.pipeline = pipeline
         self.stepper = Stepper(pipeline, kernels, store)
@@ -101,7 +105,8 @@ class Sessions:
         self._scene_cache = scene_cache
         self._scenarios = scenarios
         self._open: dict[str, Session] = {}
-        self._in_creation = 0
+        self._accounts = accounts or Accounts(token=None, file=None)
+        self._in_creation: Counter[str] = Counter()
         self._rebuilding: dict[str, asyncio.Task[Session]] = {}
         self._closing: set[asyncio.Future[None]] = set()
         # Objects of a bare scene are the same for all sessions on it.
@@ -118,7 +123,11 @@ class Sessions:
     @property
     def full(self) -> bool:
         """Whether another session would be refused."""
-        return len(self._open) + self._in_creation >= self._limits.max_sessions
+        return len(self._open) + self._in_creation.total() >= self._limits.max_sessions
+
+    def owned(self) -> Counter[str]:
+        """How many there are by the name of their owner's token, those in creation included."""
+        return self._in_creation + Counter(s.row.owner for s in self._open.values())
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
@@ -164,7 +173,7 @@ class Sessions:
                 "given",
                 hint="name exactly one: POST /v1/sessions?scene=... or ?scenario=...",
             )
-        with self._reserved_slot():
+        with self._reserved_slot(owner_name()):
             token = secrets.token_urlsafe(TOKEN_BYTES)
             row, start = await self._start(scene, scenario, token)
             try:
@@ -228,13 +237,14 @@ class Sessions:
             ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET.
         """
         world = session.running_world()
-        with self._reserved_slot():
+        with self._reserved_slot(owner_name()):
             token = secrets.token_urlsafe(TOKEN_BYTES)
             row = replace(
                 session.row,
                 session_id=f"{self._limits.worker_id}.{secrets.token_hex(8)}",
                 token_hash=token_hash(token),
                 created_us=now_us(),
+                owner=owner_name(),
             )
             await self._scene_cache.pin(row.scene)
             try:
@@ -329,8 +339,14 @@ class Sessions:
     # --- inside -----------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _reserved_slot(self) -> Iterator[None]:
-        """Reserves a slot for a session in creation."""
+    def _reserved_slot(self, owner: str) -> Iterator[None]:
+        """Reserves a slot for a session in creation.
+
+        Raises:
+            ServiceError: DRAINING or OVER_CAPACITY.
+            OverLimitError: its owner has as many as they may.
+            RevokedError: its owner's token is no more.
+        """
         if self.draining:
             raise ServiceError(ErrorCode.DRAINING, "the worker is stopping")
         if self.full:
@@ -341,11 +357,12 @@ class Sessions:
                 "DELETE /v1/sessions/{id}",
                 headers={"Retry-After": str(RETRY_AFTER_S)},
             )
-        self._in_creation += 1
+        self._accounts.of_owner(owner).check_sessions(self.owned()[owner])
+        self._in_creation[owner] += 1
         try:
             yield
         finally:
-            self._in_creation -= 1
+            self._in_creation[owner] -= 1
 
     async def _rebuilt(self, row: SessionRow) -> Session:
         """The session of a row; concurrent requests wait for the same rebuild."""
@@ -357,7 +374,7 @@ class Sessions:
         return await asyncio.shield(task)
 
     async def _rebuild(self, row: SessionRow) -> Session:
-        with self._reserved_slot():
+        with self._reserved_slot(row.owner):
             pinned = await self._scene_cache.pin(row.scene)
             try:
                 summary = await self._scene_cache.summary(row.scene)
@@ -401,6 +418,7 @@ class Sessions:
             scenario_revision=view.revision if view is not None else None,
             token_hash=token_hash(token),
             created_us=now_us(),
+            owner=owner_name(),
         )
         return row, EpisodeStart(pinned, summary, state)
 

@@ -56,8 +56,16 @@ def _hash_tokens(connection: Connection) -> None:
         connection.execute(sa.text("DELETE FROM idempotent_replies WHERE key = :key"), telling)
 
 
+def _add_owners(connection: Connection) -> None:
+    """Sessions of before belong to the single token that there was."""
+    connection.exec_driver_sql(
+        "ALTER TABLE sessions ADD COLUMN owner VARCHAR(80) DEFAULT 'default' NOT NULL"
+    )
+
+
 MIGRATIONS: tuple[Migration, ...] = (
     Migration(2, "tokens of sessions are kept as hashes", _hash_tokens),
+    Migration(3, "sessions keep the name of the token they were made with", _add_owners),
 )
 
 OLDEST = MIGRATIONS[0].version - 1

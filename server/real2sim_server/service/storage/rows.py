@@ -41,6 +41,7 @@ class SessionRow:
         scenario_id, scenario_revision: what it began from; None for the bare scene.
         token_hash: of the token that opens it, as :func:`~.tokens.token_hash` makes it.
         closed_us, reason: None while it is open.
+        owner: name of the token that it was made with.
     """
 
     session_id: str
@@ -53,6 +54,7 @@ class SessionRow:
     created_us: int
     closed_us: int | None = None
     reason: str | None = None
+    owner: str = "default"
 
 
 @dataclass(frozen=True)

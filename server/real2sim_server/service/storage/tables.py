@@ -15,7 +15,7 @@ from sqlalchemy import (
     Text,
 )
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Raised with every change of a table, together with an entry in `migrations`."""
 
 metadata = MetaData()
@@ -77,6 +77,7 @@ sessions = Table(
     Column("created_us", BigInteger, nullable=False),
     Column("closed_us", BigInteger, nullable=True),
     Column("reason", Text, nullable=True),
+    Column("owner", String(80), nullable=False, server_default="default"),
 )
 Index("ix_sessions_open", sessions.c.worker_id, sessions.c.closed_us)
 

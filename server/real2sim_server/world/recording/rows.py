@@ -94,6 +94,8 @@ def read_context(fields: Mapping[str, Any]) -> ScoringContext:
     expert = _numbers(fields["expert_s"], (None,), "expert_s")
     if _integer(fields["horizon"]) + 1 != len(expert) or fields["dt"] <= 0:
         raise ValueError(f"horizon {fields['horizon']} does not fit {len(expert)} expert positions")
+    if fields["ego_mass"] <= 0:
+        raise ValueError(f"an ego_mass of {fields['ego_mass']} kg; it is above 0")
     _numbers(fields["ego_size"], (3,), "ego_size")
     _numbers([list(pair) for pair in fields["history"]] or np.zeros((0, 2)), (None, 2), "history")
     route = _way(fields["route"], "route")

@@ -196,7 +196,7 @@ def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
     connection.execute("UPDATE schema_version SET version = 99")
     connection.commit()
     connection.close()
-    with pytest.raises(StoreError, match="schema version 99, this worker reads 1 to 2"):
+    with pytest.raises(StoreError, match="schema version 99, this worker reads 1 to 3"):
         run(sqlite_url, nothing)
 
 

@@ -129,7 +129,7 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
             table = ipc.open_file(file).read_all()
         # The file's offsets are followed as they are, unless they are looked at before.
         table.validate(full=True)
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:  # names that are no text among them
         raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
     with _broken_named(f"{path}: the list of columns"):
         there = list(table.column_names)

@@ -1,0 +1,98 @@
+"""``real2sim token``: who may call a worker, and how much of it each may take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..console import CommandError, console, errors
+from .command import command
+
+if TYPE_CHECKING:
+    from ..service.token_file import NamedToken
+
+app = typer.Typer(no_args_is_help=True, help="Make, list and remove the named tokens of a worker.")
+
+Name = Annotated[str, typer.Argument(help="Of whoever holds it; metrics and logs tell it.")]
+TokensFile = Annotated[
+    Path | None, typer.Option(help="Default $REAL2SIM_TOKENS_FILE.", dir_okay=False)
+]
+
+
+@command("add", group=app)
+def add(
+    name: Name,
+    *,
+    file: TokensFile = None,
+    requests_per_second: Annotated[
+        float | None, typer.Option(help="Requests, and messages of sockets.")
+    ] = None,
+    bytes_per_day: Annotated[float | None, typer.Option(help="Sent and received.")] = None,
+    engine_seconds_per_minute: Annotated[
+        float | None, typer.Option(help="Of the thread that owns the device.")
+    ] = None,
+    sessions: Annotated[int | None, typer.Option(help="Open at a time.")] = None,
+) -> None:
+    """Make a token and print it, this once; the file keeps its hash."""
+    from pydantic import ValidationError
+
+    from ..service.token_file import TokenLimits, add_token
+
+    try:
+        limits = TokenLimits(
+            requests_per_second=requests_per_second,
+            bytes_per_day=bytes_per_day,
+            engine_seconds_per_minute=engine_seconds_per_minute,
+            sessions=sessions,
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = str(first["loc"][0]).replace("_", "-")
+        raise CommandError(f"--{option}: {first['msg']}, not {first['input']!r}") from None
+    path = _file(file)
+    token = add_token(path, name, limits)
+    errors.print(
+        f"token {name!r} is in {path}; a worker with REAL2SIM_TOKENS_FILE={path} takes it within "
+        "a second. It is shown this once:",
+        highlight=False,
+        soft_wrap=True,
+    )
+    # To stdout and alone, so that it can be piped to where it is kept.
+    print(token)
+
+
+@command("list", group=app)
+def list_(*, file: TokensFile = None) -> None:
+    """The names that there are, with their limits."""
+    from ..service.token_file import read_token_file
+
+    known = read_token_file(_file(file)).tokens
+    for token in known:
+        line = f"{token.name:20} {token.created_at:26} {_limits(token)}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+@command("remove", group=app)
+def remove(name: Name, *, file: TokensFile = None) -> None:
+    """Make a token invalid; who is connected with it is disconnected."""
+    from ..service.token_file import remove_token
+
+    path = _file(file)
+    remove_token(path, name)
+    console.print(f"token {name!r} is no longer in {path}", highlight=False, soft_wrap=True)
+
+
+def _limits(token: NamedToken) -> str:
+    given = token.limits.model_dump(exclude_none=True)
+    return ", ".join(f"{key.replace('_', ' ')}: {value:g}" for key, value in given.items()) or "-"
+
+
+def _file(given: Path | None) -> Path:
+    from ..settings import Settings
+
+    found = given or Settings().tokens_file
+    if found is None:
+        raise CommandError("which file? Give --file, or set REAL2SIM_TOKENS_FILE as for the worker")
+    return found.absolute()

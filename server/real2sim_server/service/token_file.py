@@ -1,0 +1,163 @@
+"""The file of named tokens: who may call a worker, and how much of it each may take.
+
+The file holds hashes. A token itself is shown once, when it is made.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from .._files import atomic_file
+from .storage.tokens import token_hash
+
+DEFAULT_NAME = "default"
+"""Of ``REAL2SIM_TOKEN``, and of everybody where a worker wants no token."""
+MAX_TOKENS = 1000
+TOKEN_BYTES = 24
+MAX_FILE_BYTES = 1 << 20
+
+Rate = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
+
+
+class TokenFileError(ValueError):
+    """A file of tokens that cannot be used; the message says why and what to do."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TokenLimits(_Strict):
+    """What the holder of a token may take; None is no limit.
+
+    Attributes:
+        requests_per_second: requests and messages of sockets; a second's worth at once.
+        bytes_per_day: sent and received together; a day's worth at once.
+        engine_seconds_per_minute: of the thread that owns the device; a minute's worth at once.
+        sessions: open at a time.
+    """
+
+    requests_per_second: Rate | None = None
+    bytes_per_day: Rate | None = None
+    engine_seconds_per_minute: Rate | None = None
+    sessions: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+
+
+class NamedToken(_Strict):
+    """One token.
+
+    Attributes:
+        name: of whoever holds it; metrics, logs, sessions and jobs name it so.
+        hash: of the token, as :func:`~.storage.tokens.token_hash` makes it.
+        created_at: UTC, ISO 8601.
+        limits: what its holder may take.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,39}$")]
+    hash: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    created_at: str = ""
+    limits: TokenLimits = TokenLimits()
+
+    @model_validator(mode="after")
+    def _is_free(self) -> NamedToken:
+        if self.name == DEFAULT_NAME:
+            raise ValueError(f"the name {DEFAULT_NAME!r} is that of REAL2SIM_TOKEN")
+        return self
+
+
+class TokenFile(_Strict):
+    """All named tokens of a worker."""
+
+    format: Literal["real2sim.tokens"] = "real2sim.tokens"
+    version: Literal[1] = 1
+    tokens: Annotated[tuple[NamedToken, ...], Field(max_length=MAX_TOKENS)] = ()
+
+    @model_validator(mode="after")
+    def _are_different(self) -> TokenFile:
+        for what in ("name", "hash"):
+            given = [getattr(token, what) for token in self.tokens]
+            if len(set(given)) < len(given):
+                raise ValueError(f"two tokens have the same {what}")
+        return self
+
+
+def read_token_file(path: Path) -> TokenFile:
+    """The tokens of a file.
+
+    Raises:
+        TokenFileError: it is missing, cannot be read, or says something else.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise TokenFileError(
+            f"the tokens cannot be read from {str(path)!r}: {error.strerror}; make a first one "
+            f"with `real2sim token add NAME --file {path}`"
+        ) from error
+    if len(text) > MAX_FILE_BYTES:
+        raise TokenFileError(f"{str(path)!r} has more than {MAX_FILE_BYTES} bytes")
+    try:
+        return TokenFile.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = "/".join(str(part) for part in first["loc"])
+        message = str(first["msg"]).removeprefix("Value error, ")
+        raise TokenFileError(
+            f"{str(path)!r} is no file of tokens: {f'{where}: ' * bool(where)}{message}; "
+            "`real2sim token` writes such files"
+        ) from error
+
+
+def add_token(path: Path, name: str, limits: TokenLimits) -> str:
+    """Make a token, and add its hash to a file, which is made where it is missing.
+
+    Returns:
+        The token, which is written nowhere.
+
+    Raises:
+        TokenFileError: the name is taken or none, or the file cannot be used.
+    """
+    present = read_token_file(path) if path.exists() else TokenFile()
+    if any(token.name == name for token in present.tokens):
+        raise TokenFileError(
+            f"there is a token {name!r} already; remove it first: `real2sim token remove {name}`"
+        )
+    token = secrets.token_urlsafe(TOKEN_BYTES)
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    try:
+        added = NamedToken(name=name, hash=token_hash(token), created_at=now, limits=limits)
+        changed = TokenFile(tokens=(*present.tokens, added))
+    except ValidationError as error:
+        message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        raise TokenFileError(f"{name!r} cannot be a token's name: {message}") from error
+    _write(path, changed)
+    return token
+
+
+def remove_token(path: Path, name: str) -> None:
+    """Take a token out of a file. Raises TokenFileError where there is none of that name."""
+    present = read_token_file(path)
+    left = tuple(token for token in present.tokens if token.name != name)
+    if len(left) == len(present.tokens):
+        known = ", ".join(token.name for token in present.tokens) or "none"
+        raise TokenFileError(f"there is no token {name!r} in {str(path)!r}; it has: {known}")
+    _write(path, TokenFile(tokens=left))
+
+
+def _write(path: Path, tokens: TokenFile) -> None:
+    text = tokens.model_dump_json(indent=1, exclude_none=True) + "\n"
+    try:
+        with atomic_file(path) as file:
+            os.fchmod(file.fileno(), 0o600)
+            file.write(text.encode())
+    except OSError as error:
+        raise TokenFileError(
+            f"{str(path)!r} cannot be written: {error.strerror or error}"
+        ) from error
