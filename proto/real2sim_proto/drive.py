@@ -108,9 +108,13 @@ class Score(ServerModel):
     value: float | None = Field(description="None where it is not defined, see `missing`")
     terms: dict[str, float] = Field(default_factory=dict, description="what it is made of")
     assumed: list[str] = Field(
-        default_factory=list, description="terms taken as 1 for want of inputs"
+        default_factory=list, description="what is taken for granted for want of inputs"
     )
     missing: list[str] = Field(default_factory=list, description="inputs it cannot do without")
+    cannot_see: str = Field(
+        default="",
+        description="one sentence: what it does not see in this episode, and what of that happened",
+    )
 
 
 # --- client to server -------------------------------------------------------------------------

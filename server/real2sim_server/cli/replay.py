@@ -115,3 +115,6 @@ def _print_scores(recording: Recording, figures: dict[str, object]) -> None:
     if "bit_identical" in figures:
         rows["bit-identical"] = "yes" if figures["bit_identical"] else "no"
     print_figures(f"{recording.scene}, {figures['steps']} steps", rows)
+    for score in recording.rescore():
+        if score.cannot_see:
+            console.print(f"[dim]{score.name}: {score.cannot_see}[/dim]")

@@ -47,6 +47,7 @@ def render_page(results: Sequence[EpisodeResult], *, title: str) -> str:
         parts += [
             f"<h2>{escape(case)}</h2>",
             _table([g for g in groups if g.case == case]),
+            *(_blind_spots(one) for one in shown),
             _image(plot_curves(mine, policies), "png", "speed, time to collision, error, progress"),
             _image(plot_paths(shown, policies), "png", "driven paths from above"),
             *(_strip(one) for one in shown if one.stills),
@@ -71,6 +72,19 @@ def _head(
         "computes them again. Curves show the first seed strong and the others faint, a cross a "
         "collision; maps and pictures show the first seed.</p>"
     )
+
+
+def _blind_spots(one: EpisodeResult) -> str:
+    """What the scores of an episode cannot see, to unfold."""
+    if one.error is not None:
+        return ""
+    items = "".join(
+        f"<li><b>{escape(name)}</b>: {escape(score['cannot_see'])}</li>"
+        for name, score in one.scores().items()
+        if score["cannot_see"]
+    )
+    summary = f"what the scores of {escape(one.policy)} cannot see, seed {one.seed}"
+    return f"<details><summary>{summary}</summary><ul>{items}</ul></details>"
 
 
 def _table(groups: Sequence[ScoreGroup]) -> str:

@@ -81,6 +81,9 @@ def scoring_context(
         route_end_s=expert[-1],
         expert_s=tuple(expert),
         history=_history(scene, spec, clock),
+        warmup_steps=spec.warmup_us // clock.dt_us,
+        background=spec.contact.background,
+        reactive=reactive(spec),
     )
 
 
@@ -100,6 +103,14 @@ def _expert_beyond_log(scene: Scene, spec: ResetSpec, times: NDArray[np.int64]) 
     laps, within = np.divmod(times - ego.start_us, ego.end_us - ego.start_us)
     found = laps * path.length + np.interp(within, ego.times_us - ego.start_us, places)
     return [float(s) for s in found]
+
+
+def reactive(spec: ResetSpec) -> bool:
+    """Whether any other road user may see the ego."""
+    agents = spec.agents
+    blind = {"log", "constant_velocity"}
+    kinds = {agents.default, *(driver.kind for driver in agents.drivers.values())}
+    return agents.ego_off_log != "replay" or not kinds <= blind
 
 
 def _history(scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> tuple[tuple[float, float], ...]:

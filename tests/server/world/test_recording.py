@@ -253,3 +253,39 @@ def test_without_action_the_ego_hits_what_stands_in_its_lane(make_scene, moving)
 def test_a_log_cannot_begin_without_a_reset(scene):
     with pytest.raises(ValueError, match="a reset comes first"):
         fresh(scene).apply(Entry("action", 0, action_payload(None)))
+
+
+def as_written_before(recording):
+    """The file of an older version: without what the scores took from the reset later."""
+    parts = {}
+    with zipfile.ZipFile(io.BytesIO(to_bytes(recording))) as archive:
+        for name in archive.namelist():
+            parts[name] = archive.read(name)
+    context = decode(parts["context.msgpack"])
+    for name in ("warmup_steps", "background", "reactive"):
+        del context[name]
+    about = json.loads(parts["episode.json"]) | {"metrics": "pdms@1"}
+    parts |= {"context.msgpack": encode(context), "episode.json": json.dumps(about).encode()}
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data)
+    return recording_module.recording_of_bytes(file.getvalue(), "old.r2e")
+
+
+def test_an_older_recording_is_scored_by_the_formulas_of_today(scene):
+    made = record(fresh(scene), entries(warmup_us=1_000_000), scene_hash="abc")
+    old = as_written_before(made)
+
+    assert old.context.warmup_steps == 10
+    assert [s.fields() for s in old.rescore()] == list(made.scores)
+
+
+def test_an_older_recording_is_compared_by_motion_for_its_scores_were_others(scene, recording):
+    old = as_written_before(recording)
+    assert first_difference(old, fresh(scene)) is None
+
+    third = old.instants[3]
+    moved = replace(third, ego=third.ego._replace(x=third.ego.x + 1e-9))
+    changed = replace(old, instants=(*old.instants[:3], moved, *old.instants[4:]))
+    assert first_difference(changed, fresh(scene)) == 3

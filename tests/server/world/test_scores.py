@@ -103,6 +103,7 @@ def test_the_recorded_drive_itself_is_perfect():
     assert found["alpasim"].value == 1.0
     assert found["kinematic_infeasibility"].value == 0.0
     assert found["delta_v"].value == 0.0
+    assert found["feasible"].value == 1.0
 
 
 def test_every_score_has_a_version_that_the_published_string_names():
@@ -129,9 +130,55 @@ def test_making_no_way_is_worth_nothing_to_nuplan():
     assert scores(drive([1.0] * 41), context(40))["nuplan_cls"].value == 0.0
 
 
-def test_ways_up_to_5_metres_are_no_measure_of_progress():
-    given = context(40, expert_s=tuple(0.1 * k for k in range(41)), route_end_s=4.0)
-    assert scores(drive([0.1] * 41), given)["pdms"].terms["EP"] == 1.0
+def slow(speed: float) -> ScoringContext:
+    """The recorded drive at another speed [m/s]."""
+    way = tuple(speed * DT * k for k in range(41))
+    return context(40, expert_s=way, route_end_s=way[-1])
+
+
+def test_a_short_recorded_drive_is_measured_all_the_same_and_the_scores_say_so():
+    found = scores(drive([0.0] * 41), slow(1.0))
+    assert found["pdms"].terms["EP"] == found["alpasim"].value == found["carla_ds"].value == 0.0
+    for name in ("pdms", "alpasim"):
+        assert "the recorded drive is short (4.0 m)" in " ".join(found[name].assumed)
+
+
+def test_where_the_recorded_drive_stands_standing_is_right_and_the_scores_say_so():
+    found = scores(drive([0.0] * 41), slow(0.1))
+    assert found["pdms"].value == found["alpasim"].value == 1.0
+    for name in ("pdms", "nuplan_cls", "hugsim_hd", "carla_ds", "alpasim"):
+        assert "the recorded drive stands still" in " ".join(found[name].assumed), name
+        assert "progress (the recorded drive stands still)" in found[name].cannot_see
+
+
+# --- the warm-up ------------------------------------------------------------------------------
+
+
+def test_steps_of_the_warm_up_do_not_count():
+    # Of 40 steps 20 are warm-up: with a hit and a stop that nobody likes, at half the way.
+    speeds = [10.0] * 10 + [0.0] * 11 + [10.0] * 20
+    rough = hit(drive(speeds), 15)
+    found = scores(rough, context(40, warmup_steps=20))
+    assert found["pdms"].terms["NC"] == 1.0
+    assert found["carla_ds"].terms["vehicle"] == 0.0
+    assert found["neuroncap"].missing == ()
+    assert found["kinematic_infeasibility"].value == 1.0  # from 0 to 10 m/s at its end
+    smooth = scores(hit(drive([10.0] * 41), 15), context(40, warmup_steps=20))
+    assert {n: smooth[n].value for n in ("pdms", "nuplan_cls", "alpasim", "feasible")} == {
+        "pdms": 1.0,
+        "nuplan_cls": 1.0,
+        "alpasim": 1.0,
+        "feasible": 1.0,
+    }
+    assert smooth["carla_ds"].value == pytest.approx(100.0)
+
+
+def test_progress_is_measured_from_the_end_of_the_warm_up():
+    # 5 m/s over the last 20 steps are half of the recorded way in the same time.
+    speeds = [10.0] * 21 + [9.0, 8.0, 7.0, 6.0] + [5.0] * 16
+    found = scores(drive(speeds), context(40, warmup_steps=20))
+    assert found["pdms"].terms["EP"] == pytest.approx(sum(speeds[21:]) * DT / 20.0)
+    assert found["carla_ds"].terms["RC"] == pytest.approx(sum(speeds[21:]) * DT / 20.0)
 
 
 def test_speeding_costs_by_how_much_for_how_long():
@@ -190,13 +237,22 @@ def test_hugsim_gives_nothing_for_steps_in_contact():
     assert found["hugsim_hd"].terms["mean"] == pytest.approx(39 / 40)
 
 
-def test_delta_v_is_impulse_by_mass_summed_over_steps():
-    instants = hit(drive([10.0] * 41), 20, impulse=(-6000.0, 0.0))
+def test_delta_v_is_the_change_of_velocity_by_an_impact():
+    # 4 m/s in one step, 1 m/s in the next: 7500 N s on 1500 kg.
+    instants = drive([10.0] * 20 + [6.0] + [5.0] * 20)
+    instants = hit(instants, 20, impulse=(-6000.0, 0.0))
     instants = hit(instants, 21, impulse=(-1500.0, 0.0), begun=False)
     found = scores(instants, context(40))["delta_v"]
     assert found.value == pytest.approx(5.0)
     assert found.terms["impulse"] == pytest.approx(7500.0)
-    assert found.terms["post_impact_displacement"] == pytest.approx(20.0)
+    assert found.terms["post_impact_displacement"] == pytest.approx(9.5 + 0.5)
+
+
+def test_an_engine_that_pushes_against_a_wall_adds_nothing_to_delta_v():
+    instants = hit(drive([10.0] * 20 + [0.0] * 21), 20, impulse=(-15_000.0, 0.0))
+    for step in range(21, 41):
+        instants = hit(instants, step, impulse=(-600.0, 0.0), begun=False)
+    assert scores(instants, context(40))["delta_v"].value == pytest.approx(10.4)
 
 
 HERE = (0.0, 0.0, 0.0, 4.6, 1.85)
@@ -215,6 +271,27 @@ HERE = (0.0, 0.0, 0.0, 4.6, 1.85)
 )
 def test_sides_of_a_contact_are_those_of_nuplan(box, ego_speed, speed, side):
     assert side_of_contact(HERE, ego_speed, box, speed, axle=1.35) == side
+
+
+def test_sides_are_those_of_navsim_for_overlaps_at_random():
+    # NAVSIM: behind is seen from the rear axle, not from the middle; speeds have both components.
+    rng = np.random.default_rng(5)
+    bumper = np.stack([np.full(4001, 2.3), np.linspace(-0.925, 0.925, 4001)], 1)
+    behind_middle = 0
+    for _ in range(3000):
+        x, y, yaw = rng.uniform(-4.5, 4.5), rng.uniform(-2.5, 2.5), rng.uniform(-3.2, 3.2)
+        box = (x, y, yaw, *rng.uniform((3.0, 1.4), (6.0, 2.2)))
+        bearing = abs(math.atan2(y, x + 1.35))
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        local = (bumper - [x, y]) @ np.array([[cos, -sin], [sin, cos]])
+        depth = (np.array(box[3:]) / 2 - np.abs(local)).min(axis=1).max()
+        if abs(bearing - math.radians(150)) < 1e-6 or abs(depth) < 1e-3:
+            continue
+        rear = bearing > math.radians(150)
+        expected = "rear" if rear else "front" if depth > 0 else "lateral"
+        behind_middle += rear != (abs(math.atan2(y, x)) > math.radians(150))
+        assert side_of_contact(HERE, 8.0, box, 6.0, axle=1.35) == expected
+    assert behind_middle > 50
 
 
 # --- time to collision ------------------------------------------------------------------------
@@ -309,6 +386,34 @@ def test_derivatives_are_exact_for_cubics():
     assert felt.yaw_acceleration == pytest.approx(0.2)
     assert felt.lat_acceleration == pytest.approx(8.0 * 0.3)
     assert felt.jerk == pytest.approx(math.hypot(0.4, 0.5 * 0.3 + 8.0 * 0.2))
+
+
+def test_comfort_recovers_in_hugsim_and_has_bounds_of_its_own():
+    # A jerk of 6 m/s^3 ahead is beyond the 4.13 of nuPlan, within the 8.37 of HUGSIM.
+    t = DT * np.arange(16)
+    rough = [10.0] * 20 + (10.0 + 3.0 * t**2)[:8].tolist() + [11.5] * 33
+    hasty = scores(drive(rough), context(60))
+    assert hasty["pdms"].terms["C"] == 0.0
+    braked = scores(drive([10.0] * 20 + [9.1, 8.2, 7.3, 6.4, 5.5] + [5.5] * 36), context(60))
+    assert braked["pdms"].terms["C"] == 0.0
+    # Only the steps whose window holds the braking lose 2 of 7.
+    lost = (1.0 - braked["hugsim_hd"].terms["mean"]) * 60 / (2 / 7)
+    assert 5 <= round(lost) <= 20
+    assert lost == pytest.approx(round(lost), abs=1e-6)
+
+
+def test_driving_beside_the_route_all_the_way_completes_nothing():
+    beside = scores(drive([10.0] * 41, y=2.9), context(40))
+    assert beside["carla_ds"].value == 0.0
+    assert beside["carla_ds"].terms["in_lanes"] == 0.0
+    assert "40 m beside all lanes that were driven" in beside["hugsim_hd"].cannot_see
+
+
+@pytest.mark.parametrize(("turn", "share"), [(1, 1.0), (-1, 0.0)])
+def test_a_lane_that_others_drove_the_same_way_is_a_lane(turn, share):
+    lane = np.stack([np.arange(0.0, 100.0)[::turn], np.full(100, 3.0)], axis=1)
+    found = scores(drive([10.0] * 41, y=2.9), context(40, lanes=(lane,)))["carla_ds"]
+    assert found.terms["in_lanes"] == pytest.approx(share)
 
 
 def test_a_stop_no_car_can_make_is_infeasible():

@@ -266,6 +266,21 @@ def test_driving_along_a_wall_is_no_contact(walled):
     assert drive(World(walled, ScenarioState.of(walled), spec)) == []
 
 
+def test_delta_v_at_a_wall_is_what_the_wall_takes_however_long_the_engine_pushes(walled):
+    contact = {"background": True, "dents": False}
+    spec = ResetSpec(action="control", on_collision="continue", contact=contact)
+    world = World(walled, ScenarioState.of(walled), spec)
+    fastest, impacts = 0.0, []
+    while not world.over:
+        world.step(Control(acceleration=4.0, steering=0.2))
+        fastest = max(fastest, world.motion.speed)
+        impacts += [impact.delta_v for impact in world.impacts]
+
+    found = {s.name: s for s in world.scores()}["delta_v"]
+    assert found.terms["impulse"] / world.context.ego_mass > fastest
+    assert found.value == pytest.approx(max(impacts), abs=0.6)
+
+
 # --- warm-up and recordings -------------------------------------------------------------------
 
 

@@ -35,6 +35,7 @@ from ...edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_st
 from ...scene import Scene
 from .. import scoring
 from ..errors import WorldError
+from ..evaluation import reactive
 from ..scoring import (
     Instant,
     MetricAccumulator,
@@ -43,7 +44,7 @@ from ..scoring import (
     metrics_version,
 )
 from ..world import World
-from .replay import KINDS, Entry, Replayer
+from .replay import KINDS, Entry, Replayer, recorded_spec
 from .rows import instant_row, read_context, read_instant
 
 FORMAT = "real2sim-episode"
@@ -289,6 +290,7 @@ def _of_parts(parts: Mapping[str, bytes]) -> Recording:
     rows = [read_instant(row) for row in instants["instants"]]
     if not rows:
         raise RecordingError("it holds no instant")
+    entries = tuple(_entry(*entry) for entry in log["entries"])
     frames = {name: data for name, data in parts.items() if name.startswith("frames/")}
     for name in frames:
         if not _FRAME.fullmatch(name):
@@ -298,8 +300,8 @@ def _of_parts(parts: Mapping[str, bytes]) -> Recording:
         scene_hash=_text(about, "scene_hash"),
         scenario_id=_text(about, "scenario_id") if about["scenario_id"] is not None else None,
         scenario_revision=about["scenario_revision"],
-        entries=tuple(_entry(*entry) for entry in log["entries"]),
-        context=read_context(context),
+        entries=entries,
+        context=read_context(_younger_context(entries) | context),
         instants=tuple(instant for instant, _ in rows),
         digests=tuple(found for _, found in rows),
         scores=tuple(dict(score) for score in about["scores"]),
@@ -308,6 +310,18 @@ def _of_parts(parts: Mapping[str, bytes]) -> Recording:
         frames=frames,
         drawn={str(k): float(v) for k, v in about.get("drawn", {}).items()},
     )
+
+
+def _younger_context(entries: Sequence[Entry]) -> dict[str, Any]:
+    """What the scores take from the reset today; old files hold it there alone."""
+    if not entries or entries[0].kind != "reset":
+        return {}
+    spec = recorded_spec(entries[0])
+    return {
+        "warmup_steps": spec.warmup_us // spec.dt_us,
+        "background": spec.contact.background,
+        "reactive": reactive(spec),
+    }
 
 
 def _entry(kind: Any, step: Any, payload: Any) -> Entry:

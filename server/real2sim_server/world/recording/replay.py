@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -113,7 +113,7 @@ class Replayer:
         """
         fields = decode(entry.payload)
         if entry.kind == "reset":
-            self.world = self.begin(_recorded_spec(fields))
+            self.world = self.begin(recorded_spec(entry))
             return self.world
         if self.world is None:
             raise ValueError(f"a log cannot begin with {entry.kind!r}; a reset comes first")
@@ -128,10 +128,10 @@ class Replayer:
         return self.world
 
 
-def _recorded_spec(fields: Mapping[str, Any]) -> ResetSpec:
+def recorded_spec(reset: Entry) -> ResetSpec:
     """How a recorded episode runs. All options are recorded, so one that is absent is younger than
     the episode, which ran as if it were off."""
-    spec = dict(fields["spec"])
+    spec = dict(decode(reset.payload)["spec"])
     spec["contact"] = YOUNGER_CONTACT | dict(spec.get("contact", {}))
     return ResetSpec.model_validate(spec)
 
@@ -173,7 +173,7 @@ def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:
         entries: of the episode, its reset first.
     """
     first, *rest = entries
-    spec = _recorded_spec(decode(first.payload))
+    spec = recorded_spec(first)
     steady = spec.model_copy(update={"on_collision": "terminate", "deadline_ms": None})
     world = replayer.begin(steady)
     requests: dict[int, list[Entry]] = {}

@@ -91,6 +91,11 @@ def read_context(fields: Mapping[str, Any]) -> ScoringContext:
     for name in ("speed_limit", "no_action_impact"):
         if fields.get(name) is not None:
             _number(fields[name], name)
+    if _integer(fields.get("warmup_steps", 0)) < 0:
+        raise ValueError(f"{fields['warmup_steps']} steps of warm-up")
+    for name in ("background", "reactive"):
+        if not isinstance(fields.get(name, False), bool):
+            raise ValueError(f"{name} is {str(fields[name])[:40]!r}, neither true nor false")
     expert = _numbers(fields["expert_s"], (None,), "expert_s")
     if _integer(fields["horizon"]) + 1 != len(expert) or fields["dt"] <= 0:
         raise ValueError(f"horizon {fields['horizon']} does not fit {len(expert)} expert positions")

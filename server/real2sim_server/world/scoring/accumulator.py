@@ -11,6 +11,7 @@ import numpy as np
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from .comfort import ComfortAccumulator
+from .feasibility import Feasibility
 from .hazard import NEVER
 from .instant import EgoSample
 
@@ -21,8 +22,10 @@ class MetricAccumulator:
     running episode and a recording.
 
     Attributes:
-        steps: made.
+        steps: made; those of the warm-up do not count, here and below.
+        start_s: along the route where the scores begin [m].
         distance: driven [m].
+        outside: part of it beside all lanes that go the ego's way [m].
         s, furthest: along the route: now and at most [m].
         offset: from the route now [m].
         at_fault: at-fault contacts of the ego, by kind: vehicle, vru, object.
@@ -39,10 +42,12 @@ class MetricAccumulator:
         plans_compared, plans_disagree: successive plans compared; whether any two differ.
         overspeed: integral of speed above the limit [m].
         hugsim: sum of HUGSIM's score of the steps.
-        infeasible: whether any step was out of reach for a car.
+        feasibility: whether a car could have moved so.
         first_impact: ego speed relative to what it hit first, there [m/s]; None without contact.
         impact_position: of the ego at the first contact.
-        impulses: impulse on the ego by object, summed [N s].
+        pushes: impulse of the steps of the last 0.2 s [N s], of contacts that go on, by name.
+        impulse: on the ego, lengths summed over objects and steps [N s].
+        delta_v: greatest change of the ego's velocity by one impact [m/s].
         secondary: contacts begun after the first, of the ego or between objects.
         hit: objects in contact so far.
         ego: at the newest instant.
@@ -50,7 +55,9 @@ class MetricAccumulator:
     """
 
     steps: int = 0
+    start_s: float = 0.0
     distance: float = 0.0
+    outside: float = 0.0
     s: float = 0.0
     furthest: float = 0.0
     offset: float = 0.0
@@ -71,10 +78,12 @@ class MetricAccumulator:
     plans_disagree: bool = False
     overspeed: float = 0.0
     hugsim: float = 0.0
-    infeasible: bool = False
+    feasibility: Feasibility = field(default_factory=Feasibility)
     first_impact: float | None = None
     impact_position: tuple[float, float] | None = None
-    impulses: dict[str, tuple[float, float]] = field(default_factory=dict)
+    pushes: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    impulse: float = 0.0
+    delta_v: float = 0.0
     secondary: int = 0
     hit: frozenset[str] = frozenset()
     ego: EgoSample | None = None

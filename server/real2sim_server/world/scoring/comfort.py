@@ -24,6 +24,9 @@ YAW_RATE = 0.95
 YAW_ACCELERATION = 1.93
 """Bounds of nuPlan and NAVSIM [m/s^2], [m/s^3], [rad/s], [rad/s^2]."""
 
+HUGSIM_LON_JERK = 8.37
+"""HUGSIM bounds the jerk ahead by this and no other; the rest as above [m/s^3]."""
+
 
 class ComfortSample(NamedTuple):
     """What passengers feel at one time: SI units, as the bounds."""
@@ -48,6 +51,18 @@ class ComfortSample(NamedTuple):
             and abs(self.yaw_acceleration) <= YAW_ACCELERATION
         )
 
+    @property
+    def comfortable_to_hugsim(self) -> bool:
+        """Whether HUGSIM's bounds hold."""
+        low, high = LON_ACCELERATION
+        return (
+            low <= self.lon_acceleration <= high
+            and abs(self.lat_acceleration) <= LAT_ACCELERATION
+            and abs(self.lon_jerk) <= HUGSIM_LON_JERK
+            and abs(self.yaw_rate) <= YAW_RATE
+            and abs(self.yaw_acceleration) <= YAW_ACCELERATION
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class ComfortAccumulator:
@@ -60,11 +75,17 @@ class ComfortAccumulator:
         samples: [n, 2] float64, speed [m/s] and continuous yaw [rad] of the last 1.5 s.
         comfortable: whether all bounds held so far.
         worst: greatest magnitudes so far, in the order of :class:`ComfortSample`.
+        newest: in the middle of the newest window; None before there is one.
     """
 
     samples: Float = field(default_factory=lambda: np.zeros((0, 2)))
     comfortable: bool = True
     worst: tuple[float, ...] = (0.0,) * 6
+    newest: ComfortSample | None = None
+
+    def begun_anew(self) -> ComfortAccumulator:
+        """With the same samples and no verdict yet."""
+        return ComfortAccumulator(self.samples)
 
     def updated(self, speed: float, yaw: float, dt: float) -> ComfortAccumulator:
         """After one more clock step."""
@@ -74,7 +95,8 @@ class ComfortAccumulator:
             return ComfortAccumulator(samples, self.comfortable, self.worst)
         sample = comfort_sample(samples, dt)
         worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, sample, strict=True))
-        return ComfortAccumulator(samples, self.comfortable and sample.comfortable, worst)
+        comfortable = self.comfortable and sample.comfortable
+        return ComfortAccumulator(samples, comfortable, worst, sample)
 
 
 def comfort_window(dt: float) -> int:

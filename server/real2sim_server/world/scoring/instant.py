@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from ..seam import Seam
-from .road_kernels import DENSITY, off_road
+from .road_kernels import DENSITY, in_lane, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
 """Side of the ego on which a contact began, after nuPlan's collision types."""
@@ -128,6 +128,9 @@ class ScoringContext:
         start_s, route_end_s: along the route at the start, and where the log is at the horizon.
         expert_s: where the log is along the route at each step [m]; ``horizon`` + 1 of them.
         history: (speed, yaw) of the log before the start, one a clock step, oldest first.
+        warmup_steps: steps in which the ego moved as recorded; they do not count.
+        background: whether walls and poles of the background can be hit.
+        reactive: whether any other road user sees the ego.
         no_action_impact: impact speed of a run in which the ego does not react [m/s]; None while
             it is not known, 0 where nothing is hit.
     """
@@ -146,6 +149,9 @@ class ScoringContext:
     route_end_s: float
     expert_s: tuple[float, ...]
     history: tuple[tuple[float, float], ...]
+    warmup_steps: int = 0
+    background: bool = False
+    reactive: bool = False
     no_action_impact: float | None = None
 
     @property
@@ -175,6 +181,15 @@ class ScoringContext:
             (self.corridor, self.lane),
         )
         return beyond, quarters
+
+    def in_lane(self, ego: EgoSample) -> bool:
+        """Whether the middle of the ego box is in its own lane, or in one that others drove in the
+        ego's direction."""
+        if abs(ego.offset) <= self.lane:
+            return True
+        ahead = self.centre_ahead
+        x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
+        return bool(in_lane((x, y, ego.path_yaw), self._lane_points, self.lane))
 
     def fields(self) -> dict[str, Any]:
         """Plain values, for a recording."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from .accumulator import MetricAccumulator
+from .blind_spots import Aspect, cannot_see
 from .instant import Instant, ScoringContext
 
 
@@ -19,6 +20,7 @@ class Score(NamedTuple):
     terms: dict[str, float]
     assumed: tuple[str, ...]
     missing: tuple[str, ...]
+    cannot_see: str = ""
 
     def fields(self) -> dict[str, Any]:
         """As a plain map."""
@@ -29,6 +31,7 @@ class Score(NamedTuple):
             "terms": dict(self.terms),
             "assumed": list(self.assumed),
             "missing": list(self.missing),
+            "cannot_see": self.cannot_see,
         }
 
 
@@ -62,8 +65,10 @@ class Metric:
         formula: of the accumulator; must not depend on anything else.
         streamed: whether its value is part of every observation.
         begin, update: where the accumulator lacks something: ``begin(instant, context)`` makes
-            state of the metric's own at step 0, ``update(state, instant, context)`` a new state
-            one step later; ``accumulator.states[name]`` has it. Both or neither.
+            state of the metric's own where the scores begin, ``update(state, instant, context)`` a
+            new state one step later; ``accumulator.states[name]`` has it. Both or neither.
+        sees: what it looks at beside contact, for the sentence that says what it cannot see; None
+            leaves that out.
     """
 
     name: str
@@ -72,12 +77,14 @@ class Metric:
     streamed: bool = False
     begin: Callable[[Instant, ScoringContext], Any] | None = None
     update: Callable[[Any, Instant, ScoringContext], Any] | None = None
+    sees: frozenset[Aspect] | None = None
 
     def score(self, accumulator: MetricAccumulator, context: ScoringContext) -> Score:
         """The score of an episode so far."""
         found = self.formula(accumulator, context)
+        blind = "" if self.sees is None else cannot_see(self.sees, accumulator, context)
         return Score(
-            self.name, self.version, found.value, found.terms, found.assumed, found.missing
+            self.name, self.version, found.value, found.terms, found.assumed, found.missing, blind
         )
 
 
@@ -92,6 +99,7 @@ def metric(
     streamed: bool = False,
     begin: Callable[[Instant, ScoringContext], Any] | None = None,
     update: Callable[[Any, Instant, ScoringContext], Any] | None = None,
+    sees: Iterable[Aspect] | None = None,
 ) -> Callable[[Formula], Formula]:
     """Register a formula as a metric; see :class:`Metric` for the arguments.
 
@@ -104,7 +112,8 @@ def metric(
     def register(formula: Formula) -> Formula:
         if name in METRICS:
             raise ValueError(f"there is a metric {name!r} already")
-        METRICS[name] = Metric(name, version, formula, streamed, begin, update)
+        seen = None if sees is None else frozenset(sees)
+        METRICS[name] = Metric(name, version, formula, streamed, begin, update, seen)
         return formula
 
     return register

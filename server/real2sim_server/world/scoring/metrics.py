@@ -5,16 +5,24 @@ from __future__ import annotations
 import math
 
 from .accumulator import MetricAccumulator
+from .blind_spots import Aspect
 from .fault import fault_class
 from .instant import ScoringContext
 from .metric import METRICS, MetricValue, metric
+from .progress import (
+    LEAST_ROUTE,
+    assumed_progress,
+    assumed_route,
+    expert_progress,
+    progress_along_route,
+    relative_progress,
+    route_completion,
+)
 
 TTC_BOUND = 0.95
 """nuPlan; NAVSIM's projections at 0, 0.3, 0.6, 0.9 s ask the same on a grid of 0.1 s [s]."""
 
-SHORT_ROUTE = 5.0
-"""Ways up to this are no measure of progress (NAVSIM) [m]."""
-
+NAVSIM_SEES: tuple[Aspect, ...] = ("progress", "comfort", "near_misses", "road", "fault")
 CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
 NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
@@ -43,29 +51,25 @@ def direction(accumulator: MetricAccumulator) -> float:
     return 1.0 if accumulator.oncoming < 2.0 else 0.5 if accumulator.oncoming < 6.0 else 0.0
 
 
-def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Way of the recorded drive along the route in the same time [m]."""
-    step = min(accumulator.steps, len(context.expert_s) - 1)
-    return context.expert_s[step] - context.start_s
-
-
-def progress_along_route(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Way along the route [m]."""
-    return max(accumulator.s - context.start_s, 0.0)
-
-
 def navsim_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """EP of NAVSIM with the recorded drive in place of PDM-Closed."""
-    way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
+    way, expert = progress_along_route(accumulator), expert_progress(accumulator, context)
+    if expert < LEAST_ROUTE:
+        return 1.0
     clear = no_collision(accumulator) * float(not accumulator.off_road)
-    most = max(way * clear, expert)
-    return 1.0 if most <= SHORT_ROUTE else min(way / most, 1.0)
+    return min(way / max(way * clear, expert), 1.0)
 
 
-def route_completion(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Fraction of the recorded way up to the horizon that was reached."""
-    whole = context.route_end_s - context.start_s
-    return 1.0 if whole <= 0 else min(max(accumulator.furthest - context.start_s, 0.0) / whole, 1.0)
+def feasible(accumulator: MetricAccumulator) -> float:
+    """1 while a car could have moved so, else 0; no score counts what no car can do."""
+    return float(not accumulator.feasibility.steps)
+
+
+def lane_share(accumulator: MetricAccumulator) -> float:
+    """Fraction of the way in lanes that were driven in the ego's direction (CARLA leaderboard)."""
+    if accumulator.distance <= 0:
+        return 1.0
+    return max(1 - accumulator.outside / accumulator.distance, 0.0)
 
 
 def ttc_within_bound(accumulator: MetricAccumulator) -> float:
@@ -76,10 +80,12 @@ def ttc_within_bound(accumulator: MetricAccumulator) -> float:
 # --- scores -----------------------------------------------------------------------------------
 
 
-@metric("pdms", version="2", streamed=True)
+@metric("pdms", version="3", streamed=True, sees=NAVSIM_SEES)
 def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven."""
+    """F NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven; F
+    is :func:`feasible`, as in all scores below."""
     terms = {
+        "feasible": feasible(accumulator),
         "NC": no_collision(accumulator),
         "DAC": float(not accumulator.off_road),
         "EP": navsim_progress(accumulator, context),
@@ -87,17 +93,18 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue
         "C": float(accumulator.comfort.comfortable),
     }
     weighted = 5 * terms["EP"] + 5 * terms["TTC"] + 2 * terms["C"]
-    value = terms["NC"] * terms["DAC"] * weighted / 12
-    return MetricValue(value, terms, assumed=(NO_MAP,))
+    value = terms["feasible"] * terms["NC"] * terms["DAC"] * weighted / 12
+    return MetricValue(value, terms, assumed=(NO_MAP, *assumed_progress(accumulator, context)))
 
 
-@metric("epdms", version="2")
+@metric("epdms", version="3", sees={*NAVSIM_SEES, "lane", "direction"})
 def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
+    """F NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
     without the penalty filter by the human drive."""
     if not accumulator.plans_compared:
         return MetricValue(None, {}, missing=("successive trajectory plans (EC)",))
     terms = {
+        "feasible": feasible(accumulator),
         "NC": no_collision(accumulator),
         "DAC": float(not accumulator.off_road),
         "DDC": direction(accumulator),
@@ -109,16 +116,18 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
         "EC": float(not accumulator.plans_disagree),
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 2 * (terms["LK"] + terms["HC"] + terms["EC"])
-    value = terms["NC"] * terms["DAC"] * terms["DDC"] * terms["TLC"] * weighted / 16
-    return MetricValue(value, terms, assumed=("TLC: no traffic lights", NO_MAP))
+    multipliers = (terms[name] for name in ("feasible", "NC", "DAC", "DDC", "TLC"))
+    assumed = ("TLC: no traffic lights", NO_MAP, *assumed_progress(accumulator, context))
+    return MetricValue(math.prod(multipliers) * weighted / 16, terms, assumed=assumed)
 
 
-@metric("nuplan_cls", version="2", streamed=True)
+@metric("nuplan_cls", version="3", streamed=True, sees={*NAVSIM_SEES, "direction", "speed_limit"})
 def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
-    way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
+    """F NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
+    way, expert = progress_along_route(accumulator), expert_progress(accumulator, context)
     limit, seconds = context.speed_limit, max(accumulator.steps * context.dt, context.dt)
     terms = {
+        "feasible": feasible(accumulator),
         "NC": nuplan_no_collision(accumulator),
         "DAC": float(not accumulator.far_off_road),
         "DDC": direction(accumulator),
@@ -129,84 +138,110 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 4 * terms["SL"] + 2 * terms["C"]
     makes_progress = float(terms["EP"] >= 0.2)
-    value = terms["NC"] * terms["DAC"] * terms["DDC"] * makes_progress * weighted / 16
+    multipliers = (terms[name] for name in ("feasible", "NC", "DAC", "DDC"))
+    value = math.prod(multipliers) * makes_progress * weighted / 16
     assumed = (NO_MAP,) if limit is not None else ("SL: no speed limit known", NO_MAP)
+    if expert < LEAST_ROUTE:
+        assumed = (*assumed, *assumed_progress(accumulator, context))
     return MetricValue(value, terms, assumed=assumed)
 
 
-@metric("hugsim_hd", version="2", streamed=True)
+@metric(
+    "hugsim_hd", version="3", streamed=True, sees=("progress", "comfort", "near_misses", "road")
+)
 def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
-    whole = context.route_end_s - context.start_s
-    reached = max(accumulator.furthest - context.start_s, 0.0)
-    route = 1.0 if whole <= 0 else min(reached / (0.9 * whole), 1.0)
+    """F RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
+    route = route_completion(accumulator, context, 0.9)
     mean = accumulator.hugsim / accumulator.steps if accumulator.steps else 1.0
-    return MetricValue(route * mean, {"RC": route, "mean": mean}, assumed=(NO_MAP,))
+    terms = {"feasible": feasible(accumulator), "RC": route, "mean": mean}
+    assumed = (NO_MAP, *assumed_route(accumulator, context))
+    return MetricValue(terms["feasible"] * route * mean, terms, assumed=assumed)
 
 
-@metric("neuroncap", version="1")
+@metric("neuroncap", version="2", sees=())
 def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """5 without collision, else 4 max(0, 1 - v_i/v_r) (Ljungbergh et al. 2024, NeuroNCAP).
+    """F times 5 without collision, else 4 max(0, 1 - v_i/v_r) (Ljungbergh et al. 2024, NeuroNCAP).
 
     v_i is the relative speed at first contact, v_r that of a run in which the ego keeps to the
     recorded drive whatever happens.
     """
+    possible = feasible(accumulator)
     if accumulator.first_impact is None:
-        return MetricValue(5.0, {})
+        return MetricValue(5.0 * possible, {"feasible": possible})
     reference = context.no_action_impact
     if reference is None:
         return MetricValue(None, {"v_i": accumulator.first_impact}, missing=("v_r",))
     ratio = accumulator.first_impact / reference if reference > 0 else math.inf
-    terms = {"v_i": accumulator.first_impact, "v_r": reference}
-    return MetricValue(4 * max(0.0, 1 - ratio), terms)
+    terms = {"feasible": possible, "v_i": accumulator.first_impact, "v_r": reference}
+    return MetricValue(4 * possible * max(0.0, 1 - ratio), terms)
 
 
-@metric("carla_ds", version="1", streamed=True)
+@metric("carla_ds", version="2", streamed=True, sees=("progress", "lane"))
 def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """Route completion in percent times the product of penalties (CARLA leaderboard), with those
-    infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65."""
+    """F times route completion in percent times the product of penalties (CARLA leaderboard), with
+    those infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65, and the share of
+    the way in lanes."""
     counts = {"vru": 0, "vehicle": 0, "object": 0}
     for category, n in accumulator.contacts.items():
         counts[fault_class(category)] += n
-    penalty = math.prod([CARLA_PENALTIES[kind] ** n for kind, n in counts.items()])
+    lanes, possible = lane_share(accumulator), feasible(accumulator)
+    penalty = lanes * math.prod([CARLA_PENALTIES[kind] ** n for kind, n in counts.items()])
     completion = route_completion(accumulator, context)
-    terms = {"RC": completion, "P": penalty} | {k: float(n) for k, n in counts.items()}
+    terms = {"feasible": possible, "RC": completion, "P": penalty, "in_lanes": lanes}
+    terms |= {k: float(n) for k, n in counts.items()}
     if accumulator.distance > 0:
         terms["infractions_per_km"] = sum(counts.values()) / (accumulator.distance * 1e-3)
-    assumed = ("no red lights, stop signs, yielding, timeouts",)
-    return MetricValue(100 * completion * penalty, terms, assumed=assumed)
+    assumed = (
+        "no red lights, stop signs, yielding, timeouts",
+        "lanes are those that were driven in the recording",
+        *assumed_route(accumulator, context),
+    )
+    return MetricValue(100 * possible * completion * penalty, terms, assumed=assumed)
 
 
-@metric("alpasim", version="2")
+@metric("alpasim", version="3", sees=("progress", "road", "fault"))
 def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """0 if at fault or off the road, else min(progress / 0.8, 1) (AlpaSim scene score)."""
-    way, expert = progress_along_route(accumulator, context), expert_progress(accumulator, context)
-    progress = 1.0 if expert < SHORT_ROUTE else min(way / expert, 1.0)
+    """0 if at fault, off the road or as no car moves, else min(progress / 0.8, 1) (AlpaSim scene
+    score)."""
+    progress, possible = relative_progress(accumulator, context), feasible(accumulator)
     clear = not accumulator.at_fault and not accumulator.off_road
-    value = min(progress / 0.8, 1.0) if clear else 0.0
-    return MetricValue(value, {"progress": progress}, assumed=(NO_MAP,))
+    value = possible * min(progress / 0.8, 1.0) if clear else 0.0
+    assumed = (NO_MAP, *assumed_progress(accumulator, context))
+    return MetricValue(value, {"feasible": possible, "progress": progress}, assumed=assumed)
 
 
-@metric("kinematic_infeasibility", version="1")
+@metric("feasible", version="1", streamed=True, sees=())
+def feasible_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
+    """1 if a car could have driven every step: acceleration and curvature as in Waymax, and the way
+    as its speed and heading say; else 0. Every other score is multiplied by it."""
+    found = accumulator.feasibility
+    terms = {"infeasible_steps": float(found.steps)}
+    if found.first is not None:
+        terms["first_s"] = found.first * context.dt
+    return MetricValue(feasible(accumulator), terms)
+
+
+@metric("kinematic_infeasibility", version="2", sees=())
 def kinematic_infeasibility(
     accumulator: MetricAccumulator, _context: ScoringContext
 ) -> MetricValue:
-    """1 if any step has |a| > 10.4 m/s^2 or |curvature| > 0.3 1/m, else 0 (Waymax)."""
-    return MetricValue(float(accumulator.infeasible), {})
+    """1 if any step has |a| > 10.4 m/s^2, |curvature| > 0.3 1/m (Waymax), or another way than its
+    speed and heading, else 0."""
+    return MetricValue(1.0 - feasible(accumulator), {})
 
 
-@metric("delta_v", version="1")
-def delta_v(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """Greatest change of the ego's velocity by one object [m/s], with what else physics says."""
-    strongest = max((math.hypot(*j) for j in accumulator.impulses.values()), default=0.0)
+@metric("delta_v", version="2", sees=())
+def delta_v(accumulator: MetricAccumulator, _context: ScoringContext) -> MetricValue:
+    """Greatest change of the ego's velocity by one impact [m/s], with what else physics says."""
     terms = {
-        "impulse": sum(math.hypot(*j) for j in accumulator.impulses.values()),
+        "feasible": feasible(accumulator),
+        "impulse": accumulator.impulse,
         "secondary_collisions": float(accumulator.secondary),
     }
     if accumulator.impact_position is not None and accumulator.ego is not None:
         x, y = accumulator.impact_position
         terms["post_impact_displacement"] = math.hypot(accumulator.ego.x - x, accumulator.ego.y - y)
-    return MetricValue(strongest / context.ego_mass, terms)
+    return MetricValue(accumulator.delta_v, terms)
 
 
 # --- streamed ---------------------------------------------------------------------------------
@@ -216,7 +251,7 @@ def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> 
     """What is streamed with every observation; all finite."""
     found = {
         "distance": accumulator.distance,
-        "route_progress": accumulator.s - context.start_s,
+        "route_progress": accumulator.s - accumulator.start_s,
         "lateral_offset": accumulator.offset,
         "collisions": float(accumulator.collisions),
         "at_fault_collisions": float(sum(accumulator.at_fault.values())),

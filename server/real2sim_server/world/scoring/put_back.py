@@ -9,6 +9,7 @@ import numpy as np
 from ..seam import Seam
 from .accumulator import MetricAccumulator
 from .comfort import ComfortAccumulator
+from .instant import EgoSample
 
 
 def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
@@ -18,16 +19,22 @@ def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
     the next one, for the route bends differently there.
     """
     assert accumulator.ego is not None
-    ego, position = accumulator.ego, accumulator.impact_position
-    x, y = seam.place(ego.x, ego.y)
+    position, found = accumulator.impact_position, accumulator.feasibility
+    samples = tuple((_moved(ego, seam), way) for ego, way in found.samples)
     return replace(
         accumulator,
-        ego=ego._replace(x=x, y=y, yaw=ego.yaw + seam.turn, path_yaw=ego.path_yaw + seam.turn),
+        ego=_moved(accumulator.ego, seam),
         impact_position=None if position is None else seam.place(*position),
         comfort=_turned(accumulator.comfort, seam),
         comfort_with_history=_turned(accumulator.comfort_with_history, seam),
+        feasibility=replace(found, samples=samples),
         plan=None,
     )
+
+
+def _moved(ego: EgoSample, seam: Seam) -> EgoSample:
+    x, y = seam.place(ego.x, ego.y)
+    return ego._replace(x=x, y=y, yaw=ego.yaw + seam.turn, path_yaw=ego.path_yaw + seam.turn)
 
 
 def _turned(comfort: ComfortAccumulator, seam: Seam) -> ComfortAccumulator:

@@ -52,6 +52,30 @@ def off_road(middle, size, route, lanes, half_widths):
 
 
 @kernel
+def in_lane(place, lines, half_width):
+    """Whether a place lies within half a width [m] of a line that goes on in its direction.
+
+    Args:
+        place: x, y [m], yaw [rad].
+        lines: as in :func:`off_road`; there may be none.
+        half_width: of each lane [m].
+    """
+    points, ends = lines
+    x, y, yaw = place
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    begin = 0
+    for end in ends:
+        for k in range(begin, end - 1):
+            dx, dy = points[k, 0] - x, points[k, 1] - y
+            if dx * dx + dy * dy <= half_width * half_width:
+                on_x, on_y = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+                if on_x * cos + on_y * sin > 0.0:
+                    return True
+        begin = end
+    return False
+
+
+@kernel
 def _narrow(beyond, places, lines, half_width):
     """Lower ``beyond`` [P] [m] to how far places [P, 2] [m] are off the strips along lines."""
     distance = math.inf

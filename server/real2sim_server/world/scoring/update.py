@@ -12,6 +12,7 @@ from .accumulator import MetricAccumulator
 from .comfort import ComfortAccumulator, plans_agree
 from .comfort_kernels import windowed_sum
 from .fault import ego_at_fault, fault_class
+from .feasibility import Feasibility
 from .hazard import time_to_collision
 from .instant import EgoSample, Instant, ScoringContext
 from .metric import METRICS
@@ -20,16 +21,12 @@ from .put_back import put_back
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
 ONCOMING_WINDOW_S = 1.0
 LANE_OFFSET, LANE_SECONDS = 0.5, 2.0
+CRASH_S = 0.2
+"""Crashes change velocities within this time (crash pulses of cars last 0.1 to 0.15 s) [s]."""
 HUGSIM_TTC = 1.0
 """Longest shift of the plan in HUGSIM's time to collision [s]."""
 HUGSIM_REACHED = 3.0
 """Distance from the route within which a point of it counts as reached [m]."""
-
-MAX_ACCELERATION, MAX_CURVATURE = 10.4, 0.3
-"""Waymax, kinematic infeasibility [m/s^2], [1/m]."""
-
-SLOWEST_CURVATURE = 0.5
-"""Below this speed curvature is noise [m/s]."""
 
 
 def begin_accumulator(instant: Instant, context: ScoringContext) -> MetricAccumulator:
@@ -38,29 +35,42 @@ def begin_accumulator(instant: Instant, context: ScoringContext) -> MetricAccumu
     turns = round((instant.ego.yaw - context.history[-1][1]) / math.tau) if context.history else 0
     for speed, yaw in context.history:
         with_history = with_history.updated(speed, yaw + turns * math.tau, context.dt)
+    return _begun(instant, context, with_history)
+
+
+def _begun(
+    instant: Instant, context: ScoringContext, with_history: ComfortAccumulator
+) -> MetricAccumulator:
+    """The accumulator at the instant from which on steps count."""
     ego = instant.ego
-    accumulator = MetricAccumulator(s=ego.s, furthest=ego.s, offset=ego.offset, ego=ego)
-    return replace(
-        accumulator,
+    return MetricAccumulator(
+        start_s=ego.s,
+        s=ego.s,
+        furthest=ego.s,
+        offset=ego.offset,
+        ego=ego,
         states={m.name: m.begin(instant, context) for m in METRICS.values() if m.begin},
         comfort=ComfortAccumulator().updated(ego.speed, ego.yaw, context.dt),
         comfort_with_history=with_history.updated(ego.speed, ego.yaw, context.dt),
+        feasibility=Feasibility(samples=((ego, 0.0),)),
     )
 
 
 def update_accumulator(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> MetricAccumulator:
-    """The accumulator one step later."""
+    """The accumulator one step later; steps of the warm-up leave nothing but comfort's history."""
     if instant.seam is not None:
         accumulator = put_back(accumulator, instant.seam)
+    if instant.step <= context.warmup_steps:
+        return _begun(instant, context, accumulator.comfort_with_history.begun_anew())
     ego, dt = instant.ego, context.dt
     assert accumulator.ego is not None
     before = accumulator.ego
     beyond, quarters = context.off_road(ego)
     off_road = beyond > 0
     off_lane = off_road or bool(_in_several_lanes(ego, context))
-    accumulator = _with_contacts(accumulator, instant, off_lane)
+    accumulator = _with_contacts(_with_pushes(accumulator, instant, context), instant, off_lane)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=accumulator.hit)
     comfort = accumulator.comfort.updated(ego.speed, ego.yaw, dt)
     backward, oncoming = windowed_sum(
@@ -68,11 +78,14 @@ def update_accumulator(
     )
     lane_run = accumulator.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
     limit = context.speed_limit
+    way = math.hypot(ego.x - before.x, ego.y - before.y)
+    distance = accumulator.distance + way
     return replace(
         accumulator,
         **_compared_plans(accumulator, instant.plan),
         steps=accumulator.steps + 1,
-        distance=accumulator.distance + math.hypot(ego.x - before.x, ego.y - before.y),
+        distance=distance,
+        outside=accumulator.outside + (0.0 if context.in_lane(ego) else way),
         s=ego.s,
         furthest=max(accumulator.furthest, ego.s)
         if abs(ego.offset) < HUGSIM_REACHED
@@ -90,7 +103,7 @@ def update_accumulator(
         left_lane=accumulator.left_lane or lane_run >= LANE_SECONDS - 1e-9,
         overspeed=accumulator.overspeed + (max(ego.speed - limit, 0.0) * dt if limit else 0.0),
         hugsim=accumulator.hugsim + _hugsim_step(instant, quarters / 4, ttc, comfort),
-        infeasible=accumulator.infeasible or _infeasible(before, ego, dt),
+        feasibility=accumulator.feasibility.updated(instant, distance, context),
         ego=ego,
         states=_updated_states(accumulator, instant, context),
     )
@@ -123,12 +136,10 @@ def _with_contacts(
             else replace(accumulator, secondary=secondary)
         )
     at_fault, contacts = dict(accumulator.at_fault), dict(accumulator.contacts)
-    impulses, hit = dict(accumulator.impulses), set(accumulator.hit)
+    hit = set(accumulator.hit)
     first, position = accumulator.first_impact, accumulator.impact_position
     for record in instant.contacts:
         name = record.object_id or record.category
-        jx, jy = impulses.get(name, (0.0, 0.0))
-        impulses[name] = (jx + record.impulse[0], jy + record.impulse[1])
         if not record.begun:
             continue
         if first is None:
@@ -145,12 +156,32 @@ def _with_contacts(
         accumulator,
         at_fault=at_fault,
         contacts=contacts,
-        impulses=impulses,
         hit=frozenset(hit),
         first_impact=first,
         impact_position=position,
         secondary=secondary,
     )
+
+
+def _with_pushes(
+    accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
+) -> MetricAccumulator:
+    """With what impacts do to the ego's velocity: impulse by mass, within the time of a crash. A
+    contact that lasts, in which an engine may push against a wall, adds no more."""
+    pushing = [c for c in instant.contacts if c.impulse != (0.0, 0.0)]
+    if not pushing:
+        return replace(accumulator, pushes={}) if accumulator.pushes else accumulator
+    kept = max(round(CRASH_S / context.dt), 1)
+    pushes: dict[str, tuple[tuple[float, float], ...]] = {}
+    impulse, delta_v = accumulator.impulse, accumulator.delta_v
+    for record in pushing:
+        name = record.object_id or record.category
+        earlier = () if record.begun else accumulator.pushes.get(name, ())
+        pushes[name] = (*earlier, record.impulse)[-kept:]
+        strength = math.hypot(sum(x for x, _ in pushes[name]), sum(y for _, y in pushes[name]))
+        delta_v = max(delta_v, strength / context.ego_mass)
+        impulse += math.hypot(*record.impulse)
+    return replace(accumulator, pushes=pushes, impulse=impulse, delta_v=delta_v)
 
 
 def _compared_plans(
@@ -174,13 +205,5 @@ def _hugsim_step(
         return 0.0
     drivable = 0.0 if on_road < 0.3 else 0.5 if on_road < 0.5 else 1.0
     safe = float(ttc > HUGSIM_TTC + 1e-9)
-    return drivable * (5 * safe + 2 * float(comfort.comfortable)) / 7
-
-
-def _infeasible(before: EgoSample, ego: EgoSample, dt: float) -> bool:
-    """Waymax: acceleration or curvature that no car has."""
-    acceleration = (ego.speed - before.speed) / dt
-    speed = max(abs(ego.speed), abs(before.speed))
-    turn = math.remainder(ego.yaw - before.yaw, math.tau)
-    curved = speed > SLOWEST_CURVATURE and abs(turn) > MAX_CURVATURE * speed * dt
-    return abs(acceleration) > MAX_ACCELERATION or curved
+    soft = comfort.newest is None or comfort.newest.comfortable_to_hugsim
+    return drivable * (5 * safe + 2 * float(soft)) / 7
