@@ -40,3 +40,17 @@ def quaternion_of(R: Matrix) -> tuple[float, float, float, float]:
     x, y, z, w = np.linalg.eigh(K)[1][:, -1].tolist()
     sign = -1.0 if w < 0 else 1.0
     return (sign * w, sign * x, sign * y, sign * z)
+
+
+def pose_between(before: Matrix, after: Matrix, fraction: float) -> Matrix:
+    """[4, 4] between two poses: positions linear, rotations along the shortest arc."""
+    p, q = np.array(quaternion_of(before[:3, :3])), np.array(quaternion_of(after[:3, :3]))
+    cosine = float(p @ q)
+    q, cosine = (q, cosine) if cosine >= 0 else (-q, -cosine)
+    angle = float(np.arccos(min(cosine, 1.0)))
+    if angle < 1e-6:
+        mixed = p + fraction * (q - p)
+    else:
+        mixed = np.sin((1 - fraction) * angle) * p + np.sin(fraction * angle) * q
+    position = (1 - fraction) * before[:3, 3] + fraction * after[:3, 3]
+    return pose_matrix(position.tolist(), (mixed / np.linalg.norm(mixed)).tolist())

@@ -33,6 +33,7 @@ from real2sim_proto.sessions import (
     SessionState,
     StepRequest,
 )
+from real2sim_proto.views import SceneView
 
 from ._call import (
     Call,
@@ -97,6 +98,18 @@ def upload_scene(path: Path, scene: str | None) -> Call[SceneInfo]:
 
 def render_scene(scene: str, view: ViewRequest) -> Call[Image]:
     return image(f"/v1/scenes/{segment(scene)}/render", view)
+
+
+def view_scene(scene: str, body: SceneView) -> Call[View]:
+    """Changes nothing, so it may be sent again."""
+    request = Request(
+        "POST",
+        f"/v1/scenes/{segment(scene)}/render",
+        headers={"Content-Type": "application/json", "Accept": MSGPACK},
+        body=json_of(body),
+        long_timeout=True,
+    )
+    return Call(request, parse_view)
 
 
 # --- scenarios --------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from . import assets, drive, errors, jobs, operations, scenarios, scenes, sessions
+from . import assets, drive, errors, jobs, operations, scenarios, scenes, sessions, views
 
 MODELS: dict[str, type[BaseModel]] = {
     model.__name__: model
@@ -44,6 +44,7 @@ MODELS: dict[str, type[BaseModel]] = {
         scenes.SceneInfo,
         scenes.SceneList,
         scenes.SceneImport,
+        views.SceneView,
         assets.AssetCut,
         assets.AssetInfo,
         assets.AssetList,

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
+from real2sim_proto.base import Pose
 from real2sim_proto.scenes import SceneInfo, SceneState
+from real2sim_proto.views import FreeCamera, SceneView
 
 from .. import _requests
-from .._call import ViewRequest
+from .._call import ViewRequest, checked
 from .._references import SceneRef, scene_name
 from ..errors import Real2SimError, ReplyTimeoutError
 from ..images import Image
+from ..observation import View
 from .concurrency import sleep
 from .transport import AsyncTransport
 
@@ -139,6 +143,44 @@ class AsyncScenes:
         codec = self._transport.target.image_codec(codec, modality)
         view = ViewRequest(camera, t_us, width, modality, codec)
         return await self._transport.send(_requests.render_scene(scene_name(scene), view))
+
+    async def view(
+        self,
+        scene: SceneRef,
+        cameras: Sequence[FreeCamera | Mapping[str, Any]],
+        *,
+        t_us: int | None = None,
+        objects: Mapping[str, Pose | Mapping[str, Any]] | None = None,
+        others: Literal["recorded", "parked", "none"] = "recorded",
+    ) -> View:
+        """One instant from cameras anywhere, with objects anywhere; nothing is kept of it.
+
+        Args:
+            scene: a scene or its name.
+            cameras: models of ``real2sim_proto.views.FreeCamera``, or their fields.
+            t_us: instant for the objects that are not posed; default: the start of the recording.
+            objects: poses of box centres in the world by object id.
+            others: objects that are not posed: ``recorded`` as at ``t_us``, only those that are
+                ``parked``, or ``none``.
+
+        Raises:
+            NotFoundError: no such scene or object.
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> street = await client.scenes.get("street")
+            >>> behind = {"position": (-8.0, 0.0, 2.0), "quaternion": (0.5, -0.5, 0.5, -0.5)}
+            >>> camera = {"name": "behind", "width": 96, "height": 64, "pose": behind}
+            >>> there = {"position": (14.0, 0.0, 0.8), "quaternion": (1.0, 0.0, 0.0, 0.0)}
+            >>> view = await client.scenes.view(
+            ...     "street", [camera | {"K": street.cameras[0].K}], objects={"car_red": there}
+            ... )
+            >>> view.image("behind").shape
+            (64, 96, 3)
+        """
+        posed = [{"object_id": name, "pose": pose} for name, pose in (objects or {}).items()]
+        body = checked(SceneView, cameras=list(cameras), t_us=t_us, objects=posed, others=others)
+        return await self._transport.send(_requests.view_scene(scene_name(scene), body))
 
 
 def _is_resident(info: SceneInfo) -> bool:

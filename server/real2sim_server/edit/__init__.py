@@ -4,6 +4,7 @@ from .apply import EditOutcome, apply_operations, replay_operations
 from .compose import cloud_of, compose, instances_at
 from .errors import EditError
 from .ground_inpainting import vacated_parking
+from .posed import posed_instances
 from .scenario import LogEntry, PlannedEntry, Scenario
 from .snapshot import pack_state, unpack_state
 from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
@@ -26,6 +27,7 @@ __all__ = [
     "compose",
     "instances_at",
     "pack_state",
+    "posed_instances",
     "replay_operations",
     "unpack_state",
     "vacated_parking",

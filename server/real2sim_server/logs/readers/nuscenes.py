@@ -108,6 +108,7 @@ class NuScenesReader:
                 "licence": "CC BY-NC-SA 4.0 (Caesar et al. 2020)",
                 "reader": self.name,
                 "track_ids": keys,
+                "T_world_dataset": ego.to_log.tolist(),
                 "frames_without_all_images": len(front) - len(times_us),
             },
             image_times_us=matched.times_us,

@@ -61,6 +61,19 @@ BODIES: dict[str, Any] = {
     "SessionCreate": {"reset": {"seed": 0, "dt_us": 100_000}},
     "ResetSpec": {"seed": 0, "dt_us": 100_000},
     "StepRequest": {"n": 10},
+    "SceneView": {
+        "t_us": 1_000_000,
+        "cameras": [
+            {
+                "name": "above",
+                "width": 640,
+                "height": 360,
+                "K": [[400, 0, 320], [0, 400, 180], [0, 0, 1]],
+                "pose": {"position": [0, 0, 20], "quaternion": [0.271, -0.653, 0.653, -0.271]},
+            }
+        ],
+        "objects": [{"object_id": "car_6", "pose": {"position": [25, 0, 0.8]}}],
+    },
     "SessionRender": {"sensors": [{"camera": "front", "width": 640, "codec": "jpeg"}]},
 }
 """An example of each JSON body, by the name of its schema."""

@@ -48,6 +48,7 @@ class RenderRequest:
         T_world_vehicle: [4, 4] float64, where the rig stands.
         t_us: instant, noted in the frames [us].
         sensors: cameras, modalities, sizes and codecs.
+        rig: whose cameras these are; default: the scene's.
     """
 
     scene: Scene
@@ -55,6 +56,7 @@ class RenderRequest:
     T_world_vehicle: NDArray[np.float64]
     t_us: int
     sensors: Sequence[SensorSpec]
+    rig: CameraRig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,8 @@ class Renderer:
             ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
             QueueFullError, RenderError: as the engine and the rasterizer do.
         """
-        cameras = check_sensors(request.scene.rig, request.sensors, max_pixels=self._max_pixels)
+        rig = request.rig or request.scene.rig
+        cameras = check_sensors(rig, request.sensors, max_pixels=self._max_pixels)
         submitted = time.perf_counter()
         lane = _lane(cameras, stream)
         images, render_ms = await self._engine.call(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fastapi import Response
@@ -43,6 +44,26 @@ def choose_media_type(accept: str | None, modality: Modality) -> str:
     return choose_among(offered, accept, of=f"modality {modality!r}")
 
 
+MSGPACK = "application/msgpack"
+
+
+def choose_frames_type(accept: str | None, modalities: Sequence[Modality]) -> str:
+    """The same for images of these modalities: msgpack, or, for one image, any of its forms."""
+    if len(modalities) == 1:
+        return choose_media_type(accept, modalities[0])
+    return choose_among([MSGPACK], accept, of="more than one image")
+
+
+def frames_response(rendered: RenderedFrames, media_type: str, *, t_us: int) -> Response:
+    """The answer that carries all frames of one instant; one alone also as an image file."""
+    if media_type != MSGPACK:
+        return frame_response(rendered, media_type)
+    view = {"t_us": t_us, "frames": [frame.fields for frame in rendered.frames]}
+    view["timing"] = rendered.timing_ms
+    headers = {"Vary": "Accept", "Cache-Control": "no-store"}
+    return Response(encode_message(view), media_type=MSGPACK, headers=headers)
+
+
 def frame_response(
     rendered: RenderedFrames, media_type: str, *, revision: int | None = None
 ) -> Response:
@@ -53,7 +74,7 @@ def frame_response(
     """
     frame = rendered.frames[0]
     content: bytes = bytes(frame.data)
-    if media_type == "application/msgpack":
+    if media_type == MSGPACK:
         content = encode_message(frame.fields)
     timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in rendered.timing_ms.items())
     headers = {"Server-Timing": timing, "Vary": "Accept", "Cache-Control": "no-store"}

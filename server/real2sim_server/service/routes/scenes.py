@@ -11,6 +11,7 @@ from fastapi import APIRouter, Header, Request, Response
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo
 from real2sim_proto.scenes import SceneInfo, SceneList, SceneState
+from real2sim_proto.views import SceneView
 
 from ...edit import ScenarioState
 from ..http.auth import TokenRoute
@@ -20,10 +21,17 @@ from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
 from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
 from ..library.views import scene_info
-from ..rendering.responses import FRAME_RESPONSES, frame_response
+from ..rendering.responses import (
+    FRAME_RESPONSES,
+    choose_frames_type,
+    frame_response,
+    frames_response,
+)
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
+from .free_view import free_view_request
 
+FREE_VIEW = "application/msgpack with all frames, each in its codec; or one frame as image file"
 WAIT_S = 2.0
 MAX_WAIT_S = 600.0
 
@@ -113,6 +121,30 @@ async def render(
     )
     rendered = await cancel_on_disconnect(request, worker.renderer.render(render_request))
     return frame_response(rendered, media_type)
+
+
+@router.post(
+    "/scenes/{scene}/render",
+    responses={200: FRAME_RESPONSES[200] | {"description": FREE_VIEW}},
+    response_class=Response,
+)
+async def view(
+    worker: WorkerOf,
+    scene: Identifier,
+    body: SceneView,
+    request: Request,
+    accept: Annotated[str | None, Header()] = None,
+) -> Response:
+    """One instant of the scene from cameras anywhere, with objects where the request has them.
+
+    Nothing is kept of it: for other programs that drive and want pictures.
+    """
+    modalities = [name for camera in body.cameras for name in camera.modalities]
+    media_type = choose_frames_type(accept, modalities)
+    resident = await worker.scene_cache.get(scene)
+    render_request = await asyncio.to_thread(free_view_request, resident, body, media_type)
+    rendered = await cancel_on_disconnect(request, worker.renderer.render(render_request))
+    return frames_response(rendered, media_type, t_us=render_request.t_us)
 
 
 def _wait_seconds(prefer: str | None) -> float:
