@@ -28,7 +28,7 @@ def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDA
         rgb: of any number of images.
         between: called between pieces of the work.
     """
-    if rgb.is_cuda:
+    if rgb.device.type != "cpu":
         rounded = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
         return rounded.cpu().numpy()
     values = np.ascontiguousarray(rgb.detach().numpy())
@@ -44,7 +44,7 @@ def solid_depth(
 ) -> NDArray[np.float32]:
     """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA; ``between`` is called
     between pieces of the work."""
-    if depth.is_cuda:
+    if depth.device.type != "cpu":
         return depth.where(alpha >= SOLID_ALPHA, 0.0).cpu().numpy()
     values = np.ascontiguousarray(depth.detach().numpy())
     kept = np.empty_like(values)

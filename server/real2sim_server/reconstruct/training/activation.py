@@ -82,7 +82,7 @@ def activated_plain(
     background, objects = torch.split(sh[:, :functions], [counts[0], len(sh) - counts[0]])
     if tones.shape[1]:
         many = torch.tensor(counts[1:], device=tones.device)
-        weights = torch.repeat_interleave(tones, many, dim=0)
+        weights = torch.repeat_interleave(tones, many, dim=0, output_size=len(fourier))
         change = (fourier * weights[..., None]).sum(1)
         objects = torch.cat([objects[:, :1] + change[:, None], objects[:, 1:]], dim=1)
     sizes = list(counts)

@@ -63,7 +63,7 @@ def write_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     state = {k: v for k, v in vars(checkpoint).items() if k != "tensors"}
     state |= {"format": FORMAT, "version": VERSION}
     with atomic_folder(folder) as new:
-        tensors = {k: t.detach().contiguous() for k, t in checkpoint.tensors.items()}
+        tensors = {k: t.detach().cpu().contiguous() for k, t in checkpoint.tensors.items()}
         save_file(tensors, new / TENSOR_FILE)
         (new / STATE_FILE).write_text(json.dumps(state) + "\n", encoding="ascii")
 

@@ -101,12 +101,21 @@ class TrainingViews:
         log: with cameras.
         frames: indices into ``log``.
         options: of training.
+        device: where views are given. On another device than the CPU they stay there, as bytes and
+            within ``options.image_bytes`` too, so that later epochs copy nothing.
 
     Raises:
         ReconstructError: nothing to see.
     """
 
-    def __init__(self, log: DrivingLog, frames: list[int], options: TrainOptions) -> None:
+    def __init__(
+        self,
+        log: DrivingLog,
+        frames: list[int],
+        options: TrainOptions,
+        *,
+        device: torch.device | str = "cpu",
+    ) -> None:
         if not frames or len(log.rig) == 0:
             raise ReconstructError(f"log {log.name!r} has no image to train on")
         self._log, self._options = log, options
@@ -115,6 +124,9 @@ class TrainingViews:
         self._keys = [(name, frame) for frame in frames for name in names]
         self._cache: OrderedDict[int, _CachedImage] = OrderedDict()
         self._nbytes = 0
+        self._device = torch.device(device)
+        self._resident: OrderedDict[tuple[int, int], TrainingView] = OrderedDict()
+        self._resident_bytes = 0
         self._pending: dict[int, Future[_CachedImage]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="views")
 
@@ -157,12 +169,35 @@ class TrainingViews:
         Raises:
             LogError: its image or sweep cannot be read.
         """
+        if self._device.type != "cpu":
+            return self._on_device(index, divisor)
+        return self._as_floats(self._bytes(index, divisor))
+
+    def _on_device(self, index: int, divisor: int) -> TrainingView:
+        """The view on its device, copied there when it is first asked for."""
+        key = (index, divisor)
+        kept = self._resident.pop(key, None)
+        if kept is None:
+            held = self._bytes(index, divisor)
+            parts = {name: getattr(held, name) for name in ("image", "pixels", "depths")}
+            kept = replace(held, **{k: part.to(self._device) for k, part in parts.items()})
+            self._resident_bytes += _nbytes(kept)
+        self._resident[key] = kept
+        while self._resident_bytes > self._options.image_bytes and len(self._resident) > 1:
+            self._resident_bytes -= _nbytes(self._resident.popitem(last=False)[1])
+        return self._as_floats(kept)
+
+    def _as_floats(self, view: TrainingView) -> TrainingView:
+        return replace(view, image=view.image.float() / 255)
+
+    def _bytes(self, index: int, divisor: int) -> TrainingView:
+        """The view with an image of bytes, on the CPU."""
         stored = self._stored(index)
         name, frame = self._keys[index]
         width = self._width(self._log.rig[name])
         camera = self._log.rig[name].resized(max(16, width // divisor))
         pixels, depths = _pixels(stored.points, camera)
-        image = resized(stored.image, camera).astype(np.float32) / 255
+        image = np.ascontiguousarray(resized(stored.image, camera))
         return TrainingView(
             camera=camera,
             frame=frame,
@@ -213,6 +248,11 @@ class TrainingViews:
         # Points come sorted by angle; a stride that is prime to the beams spreads what is kept.
         step = max(1, len(chosen) // self._options.depth_points) | 1
         return points[chosen[::step]].astype(np.float32)
+
+
+def _nbytes(view: TrainingView) -> int:
+    parts = (view.image, view.pixels, view.depths)
+    return sum(part.numel() * part.element_size() for part in parts)
 
 
 def image_time(log: DrivingLog, camera: str, frame: int) -> int:

@@ -100,9 +100,9 @@ class ScreenSums:
     views: Tensor
 
     @classmethod
-    def zeros(cls, count: int) -> ScreenSums:
+    def zeros(cls, count: int, device: torch.device | str = "cpu") -> ScreenSums:
         """For ``count`` Gaussians that were not visible yet."""
-        return cls(torch.zeros(count, 2), torch.zeros(count))
+        return cls(torch.zeros(count, 2, device=device), torch.zeros(count, device=device))
 
     def add(self, rows: list[slice], screen: ScreenStatistics) -> None:
         """Add one image; ``rows`` are those of each drawn instance."""
@@ -136,7 +136,7 @@ class Strategy:
 
     Args:
         options: see there.
-        half_sizes: [I, 3] half the sizes of the objects' boxes [m].
+        half_sizes: [I, 3] half the sizes of the objects' boxes [m], where the Gaussians are.
         seed: of all noise, together with the iteration.
         iterations: of the whole training.
     """
@@ -145,7 +145,7 @@ class Strategy:
         self, options: DensifyOptions, half_sizes: Tensor, *, seed: int, iterations: int
     ) -> None:
         self.options = options
-        self.state = ScreenSums.zeros(0)
+        self.state = ScreenSums.zeros(0, half_sizes.device)
         self._half_sizes = half_sizes
         self._seed = seed
         self._first = round(options.start * iterations)
@@ -153,7 +153,7 @@ class Strategy:
 
     def initialize_state(self, count: int) -> None:
         """Begin anew for ``count`` Gaussians, after something else changed the set."""
-        self.state = ScreenSums.zeros(count)
+        self.state = ScreenSums.zeros(count, self._half_sizes.device)
 
     def step_pre_backward(self, output: RenderOutput) -> None:
         """After the image of a step is drawn, before the loss is differentiated.
@@ -186,7 +186,10 @@ class Strategy:
         dead[:background] |= gaussians.log_scales[:background].amax(-1).exp() > options.max_scale
         if len(gaussians) > background:
             half = torch.repeat_interleave(
-                self._half_sizes, torch.tensor(gaussians.counts[1:]), dim=0
+                self._half_sizes,
+                torch.tensor(gaussians.counts[1:], device=self._half_sizes.device),
+                dim=0,
+                output_size=len(gaussians) - background,
             )
             outside = gaussians.means[background:].abs() > half * BOX_MARGIN + 0.1
             dead[background:] |= outside.any(-1)
@@ -231,7 +234,7 @@ class GradientStrategy(Strategy):
         """[N] bool: the strongest gradients above the threshold, as many as the budget allows."""
         options, background = self.options, gaussians.counts[0]
         mean = self.state.gradients / self.state.views.clamp(min=1)[:, None]
-        excess = torch.empty(len(gaussians))
+        excess = mean.new_empty(len(gaussians))
         excess[:background] = mean[:background, 1] / options.background_gradient
         excess[background:] = mean[background:, 0] / options.object_gradient
         excess[dead] = 0

@@ -49,7 +49,12 @@ class Gaussians:
     @property
     def owners(self) -> Tensor:
         """[N] int64: 0 for the background, then 1 + position of the object."""
-        return torch.repeat_interleave(torch.arange(len(self.counts)), torch.tensor(self.counts))
+        device = self.means.device
+        return torch.repeat_interleave(
+            torch.arange(len(self.counts), device=device),
+            torch.tensor(self.counts, device=device),
+            output_size=len(self),
+        )
 
     def tensors(self) -> dict[str, Tensor]:
         """Parameters by name."""
@@ -112,6 +117,7 @@ def concatenate(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]
     pairs = list(zip(first.counts, second.counts, strict=True))
     counts = torch.tensor([n for pair in pairs for n in pair])
     of_second = torch.tensor([False, True] * len(pairs)).repeat_interleave(counts)
+    of_second = of_second.to(first.means.device)
     return Gaussians(**fields, counts=tuple(a + b for a, b in pairs)), of_second
 
 
@@ -132,7 +138,12 @@ MIRROR_SIGNS = (1.0, -1, 1, 1, -1, -1, 1, 1, 1, -1, -1, -1, 1, 1, 1, 1)
 
 
 def from_scene(
-    scene: Scene, *, sh_degree: int, harmonics: int, initial_opacity: float
+    scene: Scene,
+    *,
+    sh_degree: int,
+    harmonics: int,
+    initial_opacity: float,
+    device: torch.device | str = "cpu",
 ) -> Gaussians:
     """Raw parameters of a scene.
 
@@ -140,6 +151,7 @@ def from_scene(
         sh_degree: of the spherical harmonics.
         harmonics: F, basis functions of time-varying colours.
         initial_opacity: upper bound, so that all opacities can still learn.
+        device: where they are kept.
     """
     clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
     clouds = [c.with_sh_degree(sh_degree) for c in clouds]
@@ -147,12 +159,12 @@ def from_scene(
     counts = tuple(len(c) for c in clouds)
     opacities = concatenate.opacities.clamp(0.01, initial_opacity)
     return Gaussians(
-        means=leaf(concatenate.means),
-        log_scales=leaf(concatenate.scales.log()),
-        quats=leaf(concatenate.quats),
-        logits=leaf(torch.logit(opacities)),
-        sh=leaf(concatenate.sh),
-        fourier=leaf(_fourier(scene, sum(counts) - counts[0], harmonics)),
+        means=leaf(concatenate.means, device),
+        log_scales=leaf(concatenate.scales.log(), device),
+        quats=leaf(concatenate.quats, device),
+        logits=leaf(torch.logit(opacities), device),
+        sh=leaf(concatenate.sh, device),
+        fourier=leaf(_fourier(scene, sum(counts) - counts[0], harmonics), device),
         counts=counts,
     )
 
@@ -170,6 +182,7 @@ def _fourier(scene: Scene, rows: int, harmonics: int) -> Tensor:
     return fourier
 
 
-def leaf(tensor: Tensor) -> Tensor:
-    """A contiguous float32 copy that requires gradients."""
-    return tensor.detach().float().clone().contiguous().requires_grad_()
+def leaf(tensor: Tensor, device: torch.device | str | None = None) -> Tensor:
+    """A contiguous float32 copy that requires gradients, on ``device`` or where it was."""
+    placed = tensor.detach() if device is None else tensor.detach().to(device)
+    return placed.float().clone().contiguous().requires_grad_()

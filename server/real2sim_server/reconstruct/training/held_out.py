@@ -53,13 +53,14 @@ def score_held_out(
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).round().astype(int)]
     if not frames:
         return HeldOutScore(float("nan"), float("nan"), float("nan"), 0)
-    views = TrainingViews(log, frames, options)
+    views = TrainingViews(log, frames, options, device=model.device)
     moving = [k for k, o in model.scene.objects.items() if o.trajectory.moves]
     scores = []
     for index in range(len(views)):
         view = views.view(index)
         image = model.render(view.camera, view.t_us).rgb.clamp(0, 1)
-        mask = torch.from_numpy(box_mask(model.scene, view.camera, view.t_us, only=moving))
+        inside = box_mask(model.scene, view.camera, view.t_us, only=moving)
+        mask = torch.from_numpy(inside).to(image.device)
         scores.append(_score(image, view.image, mask))
     views.close()
     psnr, ssim, psnr_objects = np.array(scores).T

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...render import Instance, RasterOptions, RenderOutput, rasterize
-from ...render.backends import Backend
+from ...render.backends import Backend, device_of, select_backend
 from ...scene import Camera, GaussianCloud, Scene, Sky, TimeColour
 from . import gaussians as packing
 from .gaussians import Gaussians
@@ -42,6 +42,7 @@ class SceneModel:
     """Trainable parameters of a scene.
 
     Attributes:
+        device: where parameters lie: that of the renderer, so that no step moves them.
         mirrored: by object, whether training shows its other side now and then.
         priors: Gaussians that are drawn too but do not learn; None for none.
 
@@ -62,23 +63,26 @@ class SceneModel:
     ) -> None:
         self.scene = scene
         self.options = options
-        self.backend = backend
+        self.backend = select_backend(backend) if isinstance(backend, str) else backend
+        self.device = device_of(self.backend)
         self.gaussians = packing.from_scene(
             scene,
             sh_degree=options.sh_degree,
             harmonics=options.harmonics,
             initial_opacity=options.initial_opacity,
+            device=self.device,
         )
         self.priors: Gaussians | None = None
-        self.poses = ObjectPoses(scene, key_times_us if options.refine_poses else None)
-        self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution))
+        refined = key_times_us if options.refine_poses else None
+        self.poses = ObjectPoses(scene, refined, device=self.device)
+        self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution), self.device)
         cameras = len(scene.rig)
-        self.exposure = packing.leaf(torch.eye(3, 4).expand(cameras, 3, 4))
-        self.cameras = torch.zeros(cameras, 6, requires_grad=True)
+        self.exposure = packing.leaf(torch.eye(3, 4).expand(cameras, 3, 4), self.device)
+        self.cameras = torch.zeros(cameras, 6, device=self.device, requires_grad=True)
         vehicles = [o.category in SYMMETRIC_CATEGORIES for o in scene.objects.values()]
         self.mirrored = tuple(options.mirror > 0 and vehicle for vehicle in vehicles)
         half = [np.array(o.size) / 2 for o in scene.objects.values()]
-        self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float()
+        self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float().to(self.device)
 
     def parameters(self) -> dict[str, Tensor]:
         """Every trainable tensor by name."""
@@ -93,13 +97,13 @@ class SceneModel:
 
     def load(self, tensors: Mapping[str, Tensor], counts: tuple[int, ...]) -> None:
         """Take over parameters as :meth:`parameters` gave them."""
-        fields = {name: packing.leaf(tensors[name]) for name in packing.FIELDS}
+        fields = {name: packing.leaf(tensors[name], self.device) for name in packing.FIELDS}
         self.gaussians = Gaussians(**fields, counts=counts)
-        self.sky = packing.leaf(tensors["sky"])
-        self.poses.shifts = packing.leaf(tensors["pose_translation"])
-        self.poses.yaws = packing.leaf(tensors["pose_yaw"])
-        self.exposure = packing.leaf(tensors["exposure"])
-        self.cameras = packing.leaf(tensors["camera"])
+        self.sky = packing.leaf(tensors["sky"], self.device)
+        self.poses.shifts = packing.leaf(tensors["pose_translation"], self.device)
+        self.poses.yaws = packing.leaf(tensors["pose_yaw"], self.device)
+        self.exposure = packing.leaf(tensors["exposure"], self.device)
+        self.cameras = packing.leaf(tensors["camera"], self.device)
 
     def render(
         self,
@@ -173,9 +177,8 @@ class SceneModel:
         if count == 0 or not self.scene.objects:
             return None
         empty = torch.zeros(0, count, 3)
-        return torch.stack(
-            [self._colour(i, empty).tones(t_us) for i in range(len(self.poses.keys))]
-        )
+        tones = [self._colour(i, empty).tones(t_us) for i in range(len(self.poses.keys))]
+        return torch.stack(tones).to(self.device)
 
     def _colour(self, index: int, coefficients: Tensor) -> TimeColour:
         times = self.poses.keys[index].times_us
@@ -188,7 +191,7 @@ class SceneModel:
         if self.options.learning_rates.camera <= 0:
             return viewmat
         change = self.cameras[self.scene.rig.names.index(camera.name)].double()
-        return _small_motion(change) @ viewmat
+        return _small_motion(change) @ viewmat.to(self.device)
 
     def export(self, **provenance: Any) -> Scene:
         """The scene as it is now with its priors, immutable, on its own memory."""
@@ -198,7 +201,7 @@ class SceneModel:
         with torch.no_grad():
             clouds = gaussians.clouds(degree=self.options.sh_degree)
         clouds = [_own(cloud) for cloud in clouds]
-        parts = torch.split(gaussians.fourier.detach(), list(gaussians.counts[1:]))
+        parts = torch.split(gaussians.fourier.detach().cpu(), list(gaussians.counts[1:]))
         objects = {}
         for index, (name, item) in enumerate(self.scene.objects.items()):
             varies = parts[index].numel() > 0
@@ -217,7 +220,7 @@ class SceneModel:
             background=clouds[0],
             objects=objects,
             rig=rig,
-            sky=Sky(self.sky.detach().clamp(0, 1).clone()),
+            sky=Sky(self.sky.detach().clamp(0, 1).cpu().clone()),
             provenance={**self.scene.provenance, "reconstruction": provenance},
             content_hash="",
         )
@@ -225,12 +228,12 @@ class SceneModel:
     def _refined(self, camera: Camera, index: int) -> Camera:
         if self.options.learning_rates.camera <= 0:
             return camera
-        change = _small_motion(self.cameras[index].detach().double()).numpy()
+        change = _small_motion(self.cameras[index].detach().cpu().double()).numpy()
         return replace(camera, T_vehicle_camera=camera.T_vehicle_camera @ np.linalg.inv(change))
 
 
 def _own(cloud: GaussianCloud) -> GaussianCloud:
-    copies = {name: tensor.detach().clone() for name, tensor in vars(cloud).items()}
+    copies = {name: tensor.detach().cpu().clone() for name, tensor in vars(cloud).items()}
     copies["quats"] = torch.nn.functional.normalize(copies["quats"], dim=-1)
     return GaussianCloud(**copies)
 
@@ -252,5 +255,5 @@ def _small_motion(change: Tensor) -> Tensor:
         [torch.stack([zero, -z, y]), torch.stack([z, zero, -x]), torch.stack([-y, x, zero])]
     )
     top = torch.cat([torch.linalg.matrix_exp(skew), change[:3, None]], dim=1)
-    last = torch.tensor([[0.0, 0, 0, 1]], dtype=change.dtype)
+    last = torch.tensor([[0.0, 0, 0, 1]], dtype=change.dtype, device=change.device)
     return torch.cat([top, last])

@@ -48,8 +48,8 @@ def refine(
     kept = (~prune & ~split).nonzero()[:, 0]
     copies, halves = duplicate.nonzero()[:, 0], split.nonzero()[:, 0].repeat(2)
     source = torch.cat([kept, copies, halves])
-    is_new = torch.arange(len(source)) >= len(kept)
-    is_half = torch.arange(len(source)) >= len(kept) + len(copies)
+    place = torch.arange(len(source), device=source.device)
+    is_new, is_half = place >= len(kept), place >= len(kept) + len(copies)
     order = torch.argsort(gaussians.owners[source], stable=True)
     refined = select_rows(gaussians, optimizer, source[order], is_new[order])
     _scatter(refined, is_half[order].nonzero()[:, 0], rng)
@@ -60,7 +60,7 @@ def _scatter(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> 
     """Draw the places of ``halves`` from the Gaussians they came from, and shrink them."""
     scales = gaussians.log_scales[halves].exp()
     noise = rng.standard_normal((len(halves), 3), dtype=np.float32)
-    offset = torch.from_numpy(noise) * scales
+    offset = torch.from_numpy(noise).to(scales.device) * scales
     rotated = torch.einsum("nij,nj->ni", rotation_matrices(gaussians.quats[halves]), offset)
     gaussians.means[halves] += rotated
     gaussians.log_scales[halves] -= float(np.log(SPLIT_SHRINK))
@@ -70,7 +70,7 @@ def _scatter(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> 
 def prune(gaussians: Gaussians, optimizer: SelectiveAdam, mask: Tensor) -> Gaussians:
     """Without the Gaussians of ``mask`` [N] bool."""
     kept = (~mask).nonzero()[:, 0]
-    return select_rows(gaussians, optimizer, kept, torch.zeros(len(kept), dtype=torch.bool))
+    return select_rows(gaussians, optimizer, kept, torch.zeros_like(kept, dtype=torch.bool))
 
 
 @torch.no_grad()
@@ -113,9 +113,9 @@ def relocate(
 
 def sample_by_weight(weights: Tensor, count: int, rng: np.random.Generator) -> Tensor:
     """``count`` indices [count] int64 drawn with probability proportional to ``weights`` [N]."""
-    sums = np.cumsum(weights.double().numpy())
+    sums = np.cumsum(weights.double().cpu().numpy())
     chosen = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
-    return torch.from_numpy(np.minimum(chosen, len(sums) - 1))
+    return torch.from_numpy(np.minimum(chosen, len(sums) - 1)).to(weights.device)
 
 
 def compute_relocation(
@@ -156,7 +156,8 @@ def inject_noise(
         strength: of the noise, relative to that.
         min_opacity: about which the noise ceases.
     """
-    noise = torch.from_numpy(rng.standard_normal((len(gaussians), 3), dtype=np.float32))
+    drawn = rng.standard_normal((len(gaussians), 3), dtype=np.float32)
+    noise = torch.from_numpy(drawn).to(gaussians.means.device)
     opacity = gaussians.logits.sigmoid()
     freedom = torch.sigmoid(-100 * (opacity - min_opacity))
     rotations = rotation_matrices(gaussians.quats)

@@ -112,8 +112,10 @@ class SelectiveAdam:
 
 def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction: float) -> None:
     values, gradient, first, second = views
-    g = gradient[seen]
-    m = 0.9 * first[seen] + 0.1 * g
-    v = 0.999 * second[seen] + 0.001 * g * g
-    first[seen], second[seen] = m, v
-    values[seen] -= columns * m / (v.sqrt() * correction + EPSILON)
+    # Chosen by where, not by index: an index of unknown length would be waited for.
+    rows = seen[:, None]
+    m = torch.where(rows, 0.9 * first + 0.1 * gradient, first)
+    v = torch.where(rows, 0.999 * second + 0.001 * gradient * gradient, second)
+    first.copy_(m)
+    second.copy_(v)
+    values.sub_(torch.where(rows, columns * m / (v.sqrt() * correction + EPSILON), 0.0))

@@ -60,9 +60,16 @@ class ObjectPoses:
         key_times_us: [K] times of training frames: only there do images correct a pose, so
             other times between the first and last pose of a track lean on their neighbours.
             None keeps every pose of the trajectories as it is.
+        device: where corrections lie, and poses with them.
     """
 
-    def __init__(self, scene: Scene, key_times_us: NDArray[np.int64] | None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        key_times_us: NDArray[np.int64] | None,
+        *,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.keys: list[KeyPoses] = []
         row = 0
         for item in scene.objects.values():
@@ -73,26 +80,28 @@ class ObjectPoses:
             self.keys.append(key)
             row += len(times)
         self._given = [Trajectory(k.times_us, k.positions, k.quaternions) for k in self.keys]
-        self.shifts = torch.zeros(row, 3, requires_grad=True)
-        self.yaws = torch.zeros(row, 1, requires_grad=True)
+        self.shifts = torch.zeros(row, 3, device=device, requires_grad=True)
+        self.yaws = torch.zeros(row, 1, device=device, requires_grad=True)
 
     def at(self, t_us: int) -> tuple[list[int], Tensor]:
         """Indices of the objects that exist at ``t_us``, K of them, and their ``T_world_object``
         [K, 4, 4] float64, which carry gradients."""
         present = [index for index, key in enumerate(self.keys) if key.covers(t_us)]
         if not present:
-            return [], torch.zeros(0, 4, 4, dtype=torch.float64)
+            return [], torch.zeros(0, 4, 4, dtype=torch.float64, device=self.shifts.device)
         keys = [self.keys[index] for index in present]
         before, after, fractions = zip(*(key.bracket(t_us) for key in keys), strict=True)
         first = np.array([key.first_row for key in keys])
-        rows = torch.from_numpy(first + before), torch.from_numpy(first + after)
-        later = torch.tensor(fractions, dtype=torch.float64)[:, None]
+        device = self.shifts.device
+        rows = [torch.from_numpy(first + key).to(device) for key in (before, after)]
+        later = torch.tensor(fractions, dtype=torch.float64, device=device)[:, None]
         weights = (1 - later).float(), later.float()
         shift = self.shifts[rows[0]] * weights[0] + self.shifts[rows[1]] * weights[1]
         yaw = self.yaws[rows[0]] * weights[0] + self.yaws[rows[1]] * weights[1]
         poses = [self._given[index].pose(t_us) for index in present]
         given = transform_from(*(np.array(part) for part in zip(*poses, strict=True)))
-        return present, torch.from_numpy(given) @ _corrections(shift.double(), yaw[:, 0].double())
+        corrections = _corrections(shift.double(), yaw[:, 0].double())
+        return present, torch.from_numpy(given).to(device) @ corrections
 
     def roughness(self) -> Tensor:
         """Mean squared second differences of all refined trajectories [m, rad] at 10 Hz."""
@@ -107,18 +116,21 @@ class ObjectPoses:
 
     def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor]:
         """World positions [T, 3] about their mean and unwrapped yaws [T, 1], float32."""
-        rotations = torch.from_numpy(quaternion_to_matrix(key.quaternions)).float()
-        base = torch.from_numpy(key.positions - key.positions.mean(0)).float()
-        positions = base + torch.einsum("tij,tj->ti", rotations, self.shifts[key.rows])
-        heading = np.unwrap(np.arctan2(rotations[:, 1, 0].numpy(), rotations[:, 0, 0].numpy()))
-        yaws = torch.from_numpy(heading.astype(np.float32))[:, None] + self.yaws[key.rows]
+        device = self.shifts.device
+        rotations = quaternion_to_matrix(key.quaternions).astype(np.float32)
+        turns = torch.from_numpy(rotations).to(device)
+        base = torch.from_numpy(key.positions - key.positions.mean(0)).float().to(device)
+        positions = base + torch.einsum("tij,tj->ti", turns, self.shifts[key.rows])
+        heading = np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
+        given = torch.from_numpy(heading.astype(np.float32)).to(device)
+        yaws = given[:, None] + self.yaws[key.rows]
         return positions, yaws
 
     def trajectory(self, index: int) -> Trajectory:
         """The refined trajectory of object ``index``."""
         key = self.keys[index]
-        shift = self.shifts.detach()[key.rows].double().numpy()
-        yaw = self.yaws.detach()[key.rows, 0].double().numpy()
+        shift = self.shifts.detach()[key.rows].cpu().double().numpy()
+        yaw = self.yaws.detach()[key.rows, 0].cpu().double().numpy()
         rotations = quaternion_to_matrix(key.quaternions)
         positions = key.positions + np.einsum("tij,tj->ti", rotations, shift)
         quaternions = multiply_quaternions(key.quaternions, yaw_quaternion(yaw))

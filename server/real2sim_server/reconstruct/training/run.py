@@ -161,7 +161,7 @@ def _previewer(
             view = views.view(index)
             with torch.no_grad():
                 image = model.render(view.camera, view.t_us).rgb.clamp(0, 1)
-            columns.append(np.concatenate([view.image.numpy(), image.numpy()]))
+            columns.append(np.concatenate([view.image.numpy(), image.cpu().numpy()]))
         height = max(column.shape[0] for column in columns)
         padded = [np.pad(c, ((0, height - c.shape[0]), (0, 0), (0, 0))) for c in columns]
         picture = (np.concatenate(padded, axis=1) * 255).round().astype(np.uint8)

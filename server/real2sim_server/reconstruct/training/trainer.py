@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -57,10 +58,10 @@ class Trainer:
         self.log, self.options, self.folder = log, options, folder
         held_out = set(held_out_frames(log.frame_count, options.hold_out))
         frames = [f for f in range(log.frame_count) if f not in held_out]
-        self.views = TrainingViews(log, frames, options)
         keys = {image_time(log, name, f) for f in frames for name in log.rig.names}
         key_times = np.array(sorted(keys), dtype=np.int64)
         self.model = SceneModel(scene, options, key_times, backend=backend)
+        self.views = TrainingViews(log, frames, options, device=self.model.device)
         self.optimizer = SelectiveAdam(self.model.parameters())
         self.strategy = STRATEGIES[options.densify.method](
             options.densify,
@@ -120,10 +121,9 @@ class Trainer:
         with timed("loss"):
             terms, squared = self._loss_terms(view, rendered)
             total = torch.stack(list(terms.values())).sum()
-        if not bool(torch.isfinite(total)):
-            raise ReconstructError(
-                f"the loss is {float(total)} at iteration {i}; lower the learning rates"
-            )
+        loss, squared_error, *values = _on_host(total, squared, *terms.values())
+        if not math.isfinite(loss):
+            raise ReconstructError(f"the loss is {loss} at iteration {i}; lower the learning rates")
         self.strategy.step_pre_backward(rendered.output)
         with timed("backward"):
             torch.autograd.backward(total)
@@ -131,9 +131,9 @@ class Trainer:
             taken = self._update(rendered)
         with timed("densify"):
             self._densify(taken)
-        self.running.add(float(total.detach()), float(squared))
+        self.running.add(loss, squared_error)
         self.iteration += 1
-        return {name: float(value.detach()) for name, value in terms.items()}
+        return dict(zip(terms, values, strict=True))
 
     def _flips(self, i: int) -> tuple[bool, ...]:
         """Which vehicles show their other side in this step."""
@@ -178,19 +178,20 @@ class Trainer:
                 gaussians.log_scales, weights.needle_ratio
             )
         if weights.box > 0 and objects:
-            counts = torch.tensor(gaussians.counts[1:])
-            half = torch.repeat_interleave(model.half_sizes, counts, dim=0)
             means = gaussians.means[gaussians.counts[0] :]
+            counts = torch.tensor(gaussians.counts[1:], device=means.device)
+            half = torch.repeat_interleave(model.half_sizes, counts, dim=0, output_size=len(means))
             terms["box"] = weights.box * losses.outside_box(means, half)
         if weights.smooth > 0 and objects and self.options.refine_poses:
             terms["smooth"] = weights.smooth * model.poses.roughness()
         if weights.exposure > 0 and self.options.learning_rates.exposure > 0:
-            change = model.exposure - torch.eye(3, 4)
+            change = model.exposure - torch.eye(3, 4, device=model.device)
             terms["exposure"] = weights.exposure * change.square().sum()
         late = self.iteration >= self.options.densify.stop * self.options.iterations
         if weights.object_entropy > 0 and objects and late:
             inside = torch.from_numpy(box_mask(model.scene, view.camera, view.t_us))
             alpha = model.objects_alpha(view.camera, view.t_us)
+            inside = inside.to(alpha.device)
             entropy = losses.object_accumulation(alpha, inside)
             terms["object_entropy"] = weights.object_entropy * entropy
         return terms
@@ -202,7 +203,7 @@ class Trainer:
         rows = self._rows(rendered.drawn)
         assert rendered.output.screen is not None
         screen = rendered.output.screen.first(len(rows))
-        visible = torch.zeros(len(gaussians), dtype=torch.bool)
+        visible = torch.zeros(len(gaussians), dtype=torch.bool, device=self.model.device)
         for part, radii in zip(rows, screen.radii, strict=True):
             visible[part] = (radii > 0).any(0)
         masks = {name: visible for name in FIELDS if name not in OBJECT_FIELDS}
@@ -294,7 +295,7 @@ class Trainer:
         parts: dict[str, dict[str, Tensor]] = {"model": {}, "priors": {}, "adam": {}, "sums": {}}
         for name, tensor in held.tensors.items():
             group, key = name.split(".", 1)
-            parts[group][key] = tensor
+            parts[group][key] = tensor.to(self.model.device)
         self.model.load(parts["model"], held.counts)
         if held.prior_counts:
             self.model.priors = Gaussians(**parts["priors"], counts=held.prior_counts)
@@ -308,6 +309,12 @@ class Trainer:
         )
         if self.metrics is not None:
             self.metrics.cut(held.iteration)
+
+
+def _on_host(*values: Tensor) -> list[float]:
+    """All values in one copy, so that a step waits for its device once."""
+    numbers: list[float] = torch.stack([v.detach().double() for v in values]).tolist()
+    return numbers
 
 
 def _is_due(done: int, every: int) -> bool:

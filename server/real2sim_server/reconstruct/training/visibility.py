@@ -77,7 +77,9 @@ def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> GaussianVi
     """
     gaussians = model.gaussians
     starts = gaussians.starts
-    visible, unoccluded, depth_sums = (torch.zeros(len(gaussians)) for _ in range(3))
+    visible, unoccluded, depth_sums = (
+        torch.zeros(len(gaussians), device=model.device) for _ in range(3)
+    )
     flips = [(), model.mirrored] if any(model.mirrored) else [()]
     sides = [gaussians.clouds(degree=0, mirrored=mirrored) for mirrored in flips]
     for (camera, t_us), clouds in itertools.product(viewpoints, sides):
@@ -107,7 +109,7 @@ def blending_weights(
     """
     colours, coloured = [], []
     for item in instances:
-        colour = torch.zeros(len(item.cloud), 1, 3, requires_grad=True)
+        colour = torch.zeros(len(item.cloud), 1, 3, device=model.device, requires_grad=True)
         colours.append(colour)
         coloured.append(replace(item, cloud=replace(item.cloud, sh=colour)))
     with torch.enable_grad():
@@ -124,9 +126,7 @@ def blending_weights(
         depth = output.depth.detach()
         inverse = torch.where(depth > NEAR, 1 / depth, 0)
         torch.autograd.backward(output.rgb[..., 0].sum() + (output.rgb[..., 1] * inverse).sum())
-    sums = [
-        torch.zeros(len(c), 3) if c.grad is None else c.grad[:, 0].cpu() / SH_C0 for c in colours
-    ]
+    sums = [torch.zeros_like(c[:, 0]) if c.grad is None else c.grad[:, 0] / SH_C0 for c in colours]
     return [(s[:, 0], s[:, 1]) for s in sums]
 
 
@@ -187,10 +187,11 @@ def _depths(instance: Instance, viewmat: Tensor) -> Tensor:
 
 def _to_camera(instance: Instance, viewmat: Tensor) -> Tensor:
     """``T_camera_object`` [4, 4] float32."""
-    pose = torch.eye(4, dtype=torch.float64)
+    device = instance.cloud.device
+    pose = torch.eye(4, dtype=torch.float64, device=device)
     if instance.T_world_object is not None:
-        pose = torch.as_tensor(instance.T_world_object, dtype=torch.float64).detach()
-    return (viewmat.double() @ pose).float()
+        pose = torch.as_tensor(instance.T_world_object, dtype=torch.float64, device=device).detach()
+    return (viewmat.to(device).double() @ pose).float()
 
 
 def prune_hidden(

@@ -1,6 +1,6 @@
 """Ways to rasterize, one module each, behind one Protocol."""
 
-from .base import Backend, RasterRequest
+from .base import Backend, RasterRequest, device_of
 from .select import (
     BackendStatus,
     RegisteredBackend,
@@ -15,6 +15,7 @@ __all__ = [
     "RasterRequest",
     "RegisteredBackend",
     "describe_backends",
+    "device_of",
     "register_backend",
     "select_backend",
 ]

@@ -101,6 +101,12 @@ class BatchBackend(Protocol):
         ...
 
 
+def device_of(backend: Backend) -> torch.device:
+    """Where the images of ``backend`` lie, and where its inputs are best kept."""
+    device: torch.device = getattr(backend, "device", torch.device("cpu"))
+    return device
+
+
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Where I instances stand before C cameras; float64, so that only the result is rounded.

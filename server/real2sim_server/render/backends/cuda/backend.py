@@ -6,10 +6,7 @@ evaluated in their own frames before gsplat blends them. Imported only where CUD
 
 from __future__ import annotations
 
-import time
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +20,7 @@ from ..base import Placement, RasterRequest, needs_gradients, pixel_directions, 
 from ..warm_up import warm_up_requests
 from .instance import instance_image
 from .screen import track_screen
+from .stage_times import StageTimes
 
 
 class CudaBackend:
@@ -41,30 +39,29 @@ class CudaBackend:
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw all cameras in one call of gsplat.rasterization."""
-        timing: dict[str, float] = {}
-        options = request.options
+        options, differentiable = request.options, needs_gradients(request)
+        times = StageTimes(self.device, waits=not differentiable)
         on_device = _moved(request, self.device)
-        with self._timed(timing, "project"):
+        with times.stage("project"):
             world = self._world(on_device)
-        with self._timed(timing, "blend"):
+        with times.stage("blend"):
             rgb, alpha, depth, meta = _blend(on_device, world)
         screen = None
-        if options.track_screen and needs_gradients(request):
+        if options.track_screen and differentiable:
             screen = track_screen(on_device, meta, self.device)
         instance = None
         if options.instance:
-            with self._timed(timing, "instance"):
+            with times.stage("instance"):
                 shape = (request.cameras, request.height, request.width)
                 instance = instance_image(meta, world.instance_ids, shape)
-        with self._timed(timing, "sky"):
-            behind = _behind(on_device)
-            rgb = rgb + (1 - alpha)[..., None] * behind
+        with times.stage("sky"):
+            rgb = rgb + (1 - alpha)[..., None] * _behind(on_device)
         return RenderOutput(
             rgb=rgb,
             alpha=alpha,
             depth=depth if options.depth else None,
             instance=instance,
-            timing_ms=timing,
+            timing_ms=times.read(),
             screen=screen,
         )
 
@@ -132,13 +129,6 @@ class CudaBackend:
             cloud.quats, cloud.scales, compute_covar=True, compute_preci=False, triu=False
         )
         return covars
-
-    @contextmanager
-    def _timed(self, timing: dict[str, float], stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        torch.cuda.synchronize(self.device)
-        timing[stage] = (time.perf_counter() - start) * 1e3
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,34 @@
+"""The pretended device as a fixture, and the CUDA backend on it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from real2sim_server.render.backends import Backend
+
+from . import gsplat_stand_in, pretended
+
+
+@pytest.fixture
+def device_counts() -> Iterator[pretended.Counts]:
+    """The device is there; counts launches, copies and waits."""
+    with pretended.pretending() as counts:
+        yield counts
+
+
+@pytest.fixture
+def cuda_backend(
+    device_counts: pretended.Counts, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Backend]:
+    """The CUDA backend on the pretended device, gsplat by a stand-in."""
+    name = "real2sim_server.render.backends.cuda.backend"
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in.module())
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    from real2sim_server.render.backends.cuda import backend
+
+    monkeypatch.setattr(backend, "instance_image", gsplat_stand_in.instance_image)
+    yield backend.CudaBackend(pretended.DEVICE)
+    sys.modules.pop(name, None)
