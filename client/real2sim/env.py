@@ -3,14 +3,16 @@
 ::
 
     env = real2sim.make_env(scene="street", sensors=["front"])
+    env = gymnasium.make("real2sim.env:real2sim/Drive-v0", scene="street", sensors=["front"])
     obs, info = env.reset(seed=0)
     obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -30,9 +32,23 @@ Obs = dict[str, NDArray[Any]]
 ACCELERATION, BRAKING, STEERING = 4.0, 8.0, 0.6
 """What an action of 1, -1 and, sideways, 1 stands for [m/s^2], [rad]."""
 
+ENV_ID = "real2sim/Drive-v0"
+"""For ``gymnasium.make``, once this module is imported."""
+
 WAYPOINTS = 20
 FAR = 1e4
 """Bound of positions in observations [m]."""
+
+AGENTS = 16
+"""Road users that a vehicle without cameras is told of."""
+AGENT_FIELDS = 9
+
+FORMS: dict[str, tuple[float, type[np.generic]]] = {
+    "rgb": (255, np.uint8),
+    "depth": (FAR, np.float32),
+    "instance": (65535, np.uint16),
+}
+"""Largest value and dtype of images by modality."""
 
 
 class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
@@ -42,8 +58,11 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     angle (1 is 0.6 rad to the left).
 
     Observation: ``state`` [5] float32 (speed, lateral speed, acceleration, steering, yaw rate; SI),
-    ``route`` [20, 2] float32 in the vehicle frame [m], and each camera's image under its name,
-    uint8 [H, W, 3].
+    ``route`` [20, 2] float32 in the vehicle frame [m], each camera's image under its name, uint8
+    [H, W, 3], and what else a sensor shows: ``front/depth`` [H, W] float32 [m], ``front/instance``
+    [H, W] uint16. ``agents`` [N, 9] float32 are the N road users nearest to the vehicle, in its
+    frame: 1, x, y [m], cosine and sine of the heading, velocity along x and y [m/s], length, width
+    [m]; rows of zeros where there are fewer.
 
     Reward: metres of way along the route, less 10 for a contact that the ego is to blame for, less
     0.1 for a step off the road. ``info`` has ``metrics``, ``events`` and what the seed has
@@ -55,8 +74,10 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     Args:
         url, token: of the worker; defaults as of :func:`real2sim.connect`.
         scene, scenario: exactly one of them, or its name or id.
-        sensors: camera names or specs; all rgb.
-        options: of ``DriveSession.reset``; ``seed`` and ``action`` are the environment's.
+        sensors: camera names or specs; a spec says which modalities.
+        agents: how many road users are shown; default: 16 without sensors, else none.
+        options: of ``DriveSession.reset``; ``seed`` and ``action`` are the environment's, and
+            ``privileged`` where it shows agents.
 
     Examples:
         >>> env = real2sim.make_env(scene="street", sensors=["front"], render_mode="rgb_array")
@@ -72,6 +93,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         scene: SceneRef | None = None,
         scenario: ScenarioRef | None = None,
         sensors: Sequence[Sensor] = (),
+        agents: int | None = None,
         render_mode: str | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
@@ -81,15 +103,21 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             raise ValueError("render_mode 'rgb_array' shows the first camera; name one in sensors")
         self.render_mode = render_mode
         self._sensors = list(sensors)
-        self._options = dict(options or {}) | {"action": "control"}
-        self._client = connect(url, token=token)
-        try:
-            self._session = self._client.session(scene=scene, scenario=scenario).open()
-        except BaseException:
-            self._client.close()
-            raise
+        self._agents = agents if agents is not None else 0 if sensors else AGENTS
+        if self._agents < 0:
+            raise ValueError(f"agents is {agents!r}; give how many road users are shown, 0 or more")
+        self._options = dict(options or {})
+        self._fixed = {"action": "control"} | ({"privileged": True} if self._agents else {})
         self._images: dict[str, NDArray[Any]] = {}
-        self._last = self._begin(0)
+        with contextlib.ExitStack() as opened:
+            self._client = connect(url, token=token)
+            opened.callback(self._client.close)
+            self._session = self._client.session(scene=scene, scenario=scenario).open()
+            opened.callback(self._session.close)
+            self._last = self._begin(0)
+            if render_mode is not None and not any("rgb" in m for m in self._last.frames.values()):
+                raise ValueError("render_mode 'rgb_array' shows a camera, and no sensor shows rgb")
+            opened.pop_all()
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space: spaces.Space[Obs] = self._space(self._last)
 
@@ -129,7 +157,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         return self._seen(last), reward, last.terminated, last.truncated, self._info(last)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The newest image of the first camera, uint8 [H, W, 3].
+        """The newest colour image of the first camera, uint8 [H, W, 3].
 
         Examples:
             >>> env.render().shape
@@ -138,7 +166,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         """
         if self.render_mode is None:
             return None
-        return self._last.image(next(iter(self._last.frames)))
+        # Of a slower camera, the last one that was due.
+        shown = self._images or dict(_images_in(self._last))
+        return next(image for name, image in shown.items() if "/" not in name)
 
     @property
     def last(self) -> Observation:
@@ -155,7 +185,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         self._client.close()
 
     def _begin(self, seed: int, options: Mapping[str, Any] | None = None) -> Observation:
-        chosen: Any = self._options | dict(options or {}) | {"seed": seed, "action": "control"}
+        chosen: Any = self._options | dict(options or {}) | {"seed": seed} | self._fixed
         return self._session.reset(sensors=self._sensors, **chosen)
 
     def _space(self, obs: Observation) -> Any:
@@ -163,8 +193,11 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             "state": spaces.Box(-FAR, FAR, (5,), np.float32),
             "route": spaces.Box(-FAR, FAR, (WAYPOINTS, 2), np.float32),
         }
-        for camera in obs.frames:
-            parts[camera] = spaces.Box(0, 255, obs.image(camera).shape, np.uint8)
+        for name, image in _images_in(obs):
+            most, dtype = FORMS[name.partition("/")[2] or "rgb"]
+            parts[name] = spaces.Box(0, most, image.shape, dtype)
+        if self._agents:
+            parts["agents"] = spaces.Box(-FAR, FAR, (self._agents, AGENT_FIELDS), np.float32)
         return spaces.Dict(parts)
 
     def _seen(self, obs: Observation) -> Obs:
@@ -174,9 +207,12 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             "state": np.clip(np.array(state, dtype=np.float32), -FAR, FAR),
             "route": np.clip(obs.route, -FAR, FAR).astype(np.float32),
         }
+        if self._agents:
+            seen["agents"] = _nearest_agents(obs, self._agents)
         # A slower camera keeps its last image until the next one is due.
-        for camera in obs.frames:
-            self._images[camera] = np.array(obs.image(camera))
+        for name, image in _images_in(obs):
+            most, dtype = FORMS[name.partition("/")[2] or "rgb"]
+            self._images[name] = np.minimum(image, most).astype(dtype)
         return seen | self._images
 
     @staticmethod
@@ -188,6 +224,43 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         }
 
 
+def _images_in(obs: Observation) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Images by the names that they have in observations: rgb by its camera alone."""
+    for camera, modalities in obs.frames.items():
+        for modality in modalities:
+            name = camera if modality == "rgb" else f"{camera}/{modality}"
+            yield name, obs.image(camera, modality)
+
+
+def _nearest_agents(obs: Observation, count: int) -> NDArray[np.float32]:
+    """[count, 9] in the vehicle frame; see :class:`DriveEnv`."""
+    rows = np.zeros((count, AGENT_FIELDS), np.float32)
+    if not obs.agents:
+        return rows
+    ahead, left = math.cos(obs.ego.yaw), math.sin(obs.ego.yaw)
+    turn = np.array([[ahead, left], [-left, ahead]])
+    positions = np.array([agent.position[:2] for agent in obs.agents]) - obs.ego.position[:2]
+    velocities = np.array([agent.velocity[:2] for agent in obs.agents])
+    # Of two that are as far, the one with the lower id, whatever order they come in.
+    distances = np.linalg.norm(positions, axis=1)
+    ids = np.array([agent.object_id for agent in obs.agents])
+    nearest = np.lexsort((ids, distances))[:count]
+    w, x, y, z = np.array([obs.agents[k].quaternion for k in nearest]).T
+    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - obs.ego.yaw
+    found = np.column_stack(
+        [
+            np.ones(len(nearest)),
+            positions[nearest] @ turn.T,
+            np.cos(heading),
+            np.sin(heading),
+            velocities[nearest] @ turn.T,
+            [obs.agents[k].size[:2] for k in nearest],
+        ]
+    )
+    rows[: len(nearest)] = np.clip(found, -FAR, FAR)
+    return rows
+
+
 def _reward(before: Observation, now: Observation) -> float:
     def gained(name: str) -> float:
         return now.metrics.get(name, 0.0) - before.metrics.get(name, 0.0)
@@ -195,3 +268,6 @@ def _reward(before: Observation, now: Observation) -> float:
     off_road = 1.0 - now.metrics.get("on_road", 1.0)
     reward = gained("route_progress") - 10.0 * gained("at_fault_collisions") - 0.1 * off_road
     return reward if math.isfinite(reward) else 0.0
+
+
+gymnasium.register(id=ENV_ID, entry_point="real2sim.env:DriveEnv")

@@ -7,6 +7,8 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal
 
+import numpy as np
+
 from real2sim_proto.base import Pose
 
 from ..render.types import Instance
@@ -48,7 +50,11 @@ def posed_instances(
 
 
 def _posed(subject: ObjectState, pose: Pose, t_us: int) -> ObjectState:
-    there = Trajectory(times_us=[t_us], positions=[pose.position], quaternions=[pose.quaternion])
+    there = Trajectory(
+        times_us=np.array([t_us], dtype=np.int64),
+        positions=np.array([pose.position]),
+        quaternions=np.array([pose.quaternion]),
+    )
     return replace(subject, trajectory=there, edited=True)
 
 

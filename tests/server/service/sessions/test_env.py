@@ -69,6 +69,100 @@ def test_the_way_made_is_the_reward(env):
     assert reward == pytest.approx(0.5, abs=0.01)
 
 
+@pytest.fixture
+def made(site):
+    """Environments of the tiny scene that end with the test."""
+    opened = []
+
+    def make(**options):
+        opened.append(real2sim.make_env(url=site.url, scene="tiny", **options))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
+
+
+def test_depth_and_instances_have_keys_of_their_own(made):
+    sensor = {"camera": "front", "modalities": ["rgb", "depth", "instance"], "width": 48}
+    env = made(sensors=[sensor, {"camera": "left", "modalities": ["depth"]}])
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    images = {name: (obs[name].shape, obs[name].dtype.name) for name in obs if "/" in name}
+    assert images == {
+        "front/depth": ((32, 48), "float32"),
+        "front/instance": ((32, 48), "uint16"),
+        "left/depth": ((64, 96), "float32"),
+    }
+    assert obs["front"].shape == (32, 48, 3)
+    assert "left" not in obs
+    assert obs["front/depth"].max() > 5.0
+
+
+def test_without_cameras_the_nearest_agents_are_shown(made, tiny_scene):
+    env = made()
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    assert obs["agents"].shape == (16, 9)
+    seen = obs["agents"][obs["agents"][:, 0] == 1]
+    assert len(seen) == 3
+    blue, *_ = seen
+    velocity = tiny_scene.objects["car_blue"].trajectory
+    speed = (velocity.positions[-1] - velocity.positions[0])[0] / 2.0
+    assert blue == pytest.approx([1, 8, 0, 1, 0, speed, 0, 4.2, 1.8], abs=1e-3)
+    assert not obs["agents"][3:].any()
+
+
+def test_agents_turn_with_the_vehicle(made):
+    env = made(agents=2, options={"ego": {"max_steer": 0.6}})
+    env.reset(seed=0)
+    for _ in range(10):
+        obs, *_ = env.step(np.array([0.0, 1.0], np.float32))
+    yaw = env.last.ego.yaw
+    assert yaw > 0.1
+    x, y = obs["agents"][0, 1:3]
+    back = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ (x, y)
+    positions = [agent.position[:2] for agent in env.last.agents]
+    offsets = np.array(positions) - env.last.ego.position[:2]
+    assert np.linalg.norm(offsets - back, axis=1).min() < 1e-4
+    assert np.linalg.norm((x, y)) == pytest.approx(np.linalg.norm(offsets, axis=1).min(), abs=1e-4)
+
+
+def test_agents_are_not_shown_beside_cameras_unless_asked_for(made):
+    assert "agents" not in made(sensors=["front"]).observation_space.spaces
+    assert made(sensors=["front"], agents=4).observation_space["agents"].shape == (4, 9)
+
+
+def test_the_registered_environment_passes_check_env(site):
+    from gymnasium.utils.env_checker import check_env
+
+    env = gymnasium.make("real2sim.env:real2sim/Drive-v0", url=site.url, scene="tiny")
+    assert env.spec.id == "real2sim/Drive-v0"
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(unwrapped|render modes|infinity).*")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"agents": -1}, "agents is -1"),
+        (
+            {
+                "render_mode": "rgb_array",
+                "sensors": [{"camera": "front", "modalities": ["depth"]}],
+            },
+            "no sensor shows rgb",
+        ),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_and_leaves_no_session(site, made, options, said):
+    with pytest.raises(ValueError, match=said):
+        made(**options)
+    assert len(site.worker.sessions) == 0
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_ppo_of_stable_baselines3_runs_2000_steps_without_changes(env):
