@@ -18,7 +18,15 @@ from .accounting import begin_paying, usage_of
 from .hosts import is_loopback
 from .problems import ServiceError
 
-_bearer = HTTPBearer(auto_error=False, description="the worker's token; none where it has none")
+WORKER_SCHEME, SESSION_SCHEME = "WorkerToken", "SessionToken"
+"""Names of the security schemes in the OpenAPI document."""
+
+_bearer = HTTPBearer(
+    auto_error=False,
+    scheme_name=WORKER_SCHEME,
+    description="`Authorization: Bearer` with the worker's token, `REAL2SIM_TOKEN` of its settings; "
+    "a worker that has none asks for none. It opens every session, too.",
+)
 
 
 class OpenBindError(ValueError):

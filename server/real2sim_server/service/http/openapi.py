@@ -13,6 +13,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
+from .auth import SESSION_SCHEME, WORKER_SCHEME
 from .documented_errors import document_errors
 
 METHODS = ("get", "put", "post", "delete", "patch")
@@ -78,6 +79,12 @@ BODIES: dict[str, Any] = {
 }
 """An example of each JSON body, by the name of its schema."""
 
+SAMPLE_QUERY: dict[str, tuple[str, ...]] = {"sessions-create": ("scene",)}
+"""Query parameters of a call's sample, by operation, though none of them alone is required."""
+
+TOKEN_OF = {WORKER_SCHEME: "$REAL2SIM_TOKEN", SESSION_SCHEME: "$SESSION_TOKEN"}
+"""Variable of the shell that holds the token of a security scheme."""
+
 _published: dict[str, Any] = {}
 
 
@@ -97,6 +104,7 @@ def document(app: FastAPI) -> dict[str, Any]:
     for path, method, operation in operations(made):
         document_errors(operation)
         _add_examples(operation)
+        _add_worker_token(operation)
         operation["x-codeSamples"] = [{"lang": "Shell", "source": curl(path, method, operation)}]
     schemas = made["components"]["schemas"]
     for unused in ("HTTPValidationError", "ValidationError"):
@@ -113,16 +121,22 @@ def operations(made: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]
 
 
 def curl(path: str, method: str, operation: dict[str, Any]) -> str:
-    """A call of the operation for a shell, with ``$WORKER`` as its address."""
-    query = []
+    """A call of the operation for a shell, with ``$WORKER`` as its address, and with the token
+    that it wants in a variable of :data:`TOKEN_OF`."""
+    query, in_sample = [], SAMPLE_QUERY.get(operation["operationId"], ())
     for parameter in operation.get("parameters", ()):
         given = parameter.get("example")
         if parameter["in"] == "path":
             path = path.replace(f"{{{parameter['name']}}}", str(given))
-        elif parameter["in"] == "query" and parameter.get("required"):
+        elif parameter["in"] == "query" and (
+            parameter.get("required") or parameter["name"] in in_sample
+        ):
             query.append(f"{parameter['name']}={given}")
     address = f'"$WORKER{path}{"?" + "&".join(query) if query else ""}"'
     words = ["curl", *([] if method == "get" else ["-X", method.upper()]), address]
+    if schemes := operation.get("security"):
+        token = TOKEN_OF[next(iter(schemes[0]))]
+        words += ["-H", f'"Authorization: Bearer {token}"']
     content = operation.get("requestBody", {}).get("content", {})
     example = content.get("application/json", {}).get("example")
     if example is not None:
@@ -139,6 +153,13 @@ def _add_examples(operation: dict[str, Any]) -> None:
         name = _schema_name(body["schema"])
         if name in BODIES:
             body["example"] = BODIES[name]
+
+
+def _add_worker_token(operation: dict[str, Any]) -> None:
+    """The worker's token opens sessions, too: either will do."""
+    schemes = operation.get("security", [])
+    if {SESSION_SCHEME: []} in schemes and {WORKER_SCHEME: []} not in schemes:
+        schemes.append({WORKER_SCHEME: []})
 
 
 def _schema_name(schema: dict[str, Any]) -> str:

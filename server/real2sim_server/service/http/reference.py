@@ -32,8 +32,9 @@ def reference_page(made: dict[str, Any]) -> str:
             f'<link rel="stylesheet" href="{STYLE}"></head><body>',
             f"<h1>{escape(info['title'])} <small>{escape(info['version'])}</small></h1>",
             '<p>The same for programs: <a href="/openapi.json">openapi.json</a>. In the examples '
-            "<code>$WORKER</code> is the address of this worker; where it has a token, add "
-            "<code>-H &quot;Authorization: Bearer $REAL2SIM_TOKEN&quot;</code>.</p>",
+            "<code>$WORKER</code> is the address of this worker, <code>$REAL2SIM_TOKEN</code> its "
+            "token, if it has one, and <code>$SESSION_TOKEN</code> the <code>token</code> in the "
+            "answer that made the session.</p>",
             "<nav>",
             *(f'<a href="#{escape(tag)}">{escape(tag)}</a>' for tag, _ in tags),
             "</nav>",

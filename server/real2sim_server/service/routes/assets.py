@@ -37,7 +37,7 @@ _BODY: dict[str, Any] = {
         "content": {
             "application/json": {
                 "schema": AssetCut.model_json_schema(),
-                "example": {"scene": "street", "object_id": "car_3", "asset_id": "red_car"},
+                "example": {"scene": "demo_street", "object_id": "car_3", "asset_id": "red_car"},
             },
             "multipart/form-data": {
                 "schema": _UPLOAD_SCHEMA

@@ -22,7 +22,14 @@ from real2sim_proto.sessions import (
 
 from ...world import Event, World
 from ..http.accounting import begin_paying
-from ..http.auth import TokenRoute, bearer_token, check_token, require_token, unauthorized
+from ..http.auth import (
+    SESSION_SCHEME,
+    TokenRoute,
+    bearer_token,
+    check_token,
+    require_token,
+    unauthorized,
+)
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
@@ -35,7 +42,16 @@ from ..sessions.views import view_response
 from ..storage.store import StoredReply
 from ..worker import Worker, WorkerOf
 
-_bearer = HTTPBearer(auto_error=False, description="the session's token, or the worker's")
+_bearer = HTTPBearer(
+    auto_error=False,
+    scheme_name=SESSION_SCHEME,
+    description="`Authorization: Bearer` with the token of one session: `token` in the answer that "
+    "made it (`POST /v1/sessions`, or `.../fork`), which is told only then. Calls of a session "
+    "need it also where the worker has no token of its own; where it has one, that does as well.",
+)
+
+
+EXACTLY_ONE = "that the session runs on; give exactly one of `scene` and `scenario`"
 
 
 class SessionRoute(TokenRoute):
@@ -94,11 +110,13 @@ async def create(  # noqa: PLR0917, one parameter for each part of the request
     worker: WorkerOf,
     request: Request,
     body: SessionCreate | None = None,
-    scene: Annotated[Identifier | None, Query()] = None,
-    scenario: Annotated[Identifier | None, Query()] = None,
+    scene: Annotated[Identifier | None, Query(description=EXACTLY_ONE)] = None,
+    scenario: Annotated[Identifier | None, Query(description=EXACTLY_ONE)] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new session on a scene or a scenario; with a body its first episode begins at once."""
+    """A new session on a scene or a scenario, exactly one of them; with a body its first episode
+    begins at once. The answer holds the session's token, which its other calls and its drive
+    socket want, and which is told only here."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
