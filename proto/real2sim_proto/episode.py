@@ -118,9 +118,14 @@ class ConstantVelocityDriver(Model):
 
 
 class IdmDriver(Model):
-    """Follows its recorded path behind whoever is ahead (Treiber et al. 2000)."""
+    """Follows a path behind whoever is ahead (Treiber et al. 2000)."""
 
     kind: Literal["idm"] = "idm"
+    path: Literal["recorded", "route"] = Field(
+        default="recorded",
+        description="'recorded': its own, as recorded or edited; 'route': the lane beside the "
+        "ego's route in which it is, the way it faces",
+    )
     desired_speed: Speed | None = Field(
         default=None, description="[m/s]; default: its highest recorded speed"
     )

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter, field_validator, model_validator
 
 from .base import Identifier, Metres, Microseconds, Model, Pose, Quaternion, Track, Vector3
+from .episode import AgentDriver, IdmDriver
 
 Frame = Literal["world", "object"]
 
@@ -169,6 +170,56 @@ class Insert(Model):
         return self
 
 
+class RoutePlace(Model):
+    """A place beside the ego's route, in a session that runs."""
+
+    ahead: Annotated[float, Field(ge=-500, le=500)] = Field(
+        description="of the ego's rear axle along the route [m]"
+    )
+    offset: Annotated[float, Field(ge=-50, le=50)] = Field(
+        default=0.0, description="from the route, positive on its left [m]"
+    )
+    oncoming: bool = Field(default=False, description="heading against the route")
+
+
+class Spawn(Model):
+    """Add a road user that drives, with the look of an asset or of an object of the scene.
+
+    Its own track goes straight on at `speed`; `driver` moves it in sessions. `delete` removes it.
+    """
+
+    op: Literal["spawn"] = "spawn"
+    object_id: Identifier | None = Field(default=None, description="default: spawned_<n>")
+    asset_id: Identifier | None = Field(default=None, description="from the asset library")
+    recorded_id: Identifier | None = Field(
+        default=None, description="instead of an asset: the look of this object of the scene"
+    )
+    pose: Pose | None = Field(default=None, description="of the box centre, world; or `place`")
+    place: RoutePlace | None = Field(
+        default=None, description="beside the ego's route instead; in sessions only"
+    )
+    speed: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=0.0, description="along its heading when it appears [m/s]"
+    )
+    start_us: Microseconds | None = Field(
+        default=None,
+        description="when it appears; default: now in a session, else at the beginning",
+    )
+    driver: AgentDriver = Field(
+        default=IdmDriver(path="route"),
+        description="in sessions; `agents.drivers` of a reset goes first",
+    )
+    snap: Snap = True
+
+    @model_validator(mode="after")
+    def _names_one_look_and_place(self) -> Spawn:
+        if (self.asset_id is None) == (self.recorded_id is None):
+            raise ValueError("a spawn needs either asset_id or recorded_id, not both")
+        if (self.pose is None) == (self.place is None):
+            raise ValueError("a spawn needs either a pose or a place, not both")
+        return self
+
+
 class Replace(Model):
     """Give an object another look, fitted into its box: an asset's, or a recorded object's."""
 
@@ -294,6 +345,7 @@ Operation = Annotated[
     | Delete
     | Restore
     | Insert
+    | Spawn
     | Replace
     | EraseRegion
     | SetPhysics

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.operations import Delete, Duplicate, Insert, Replace, Restore
+from real2sim_proto.operations import Delete, Duplicate, Insert, Replace, Restore, Spawn
 
 from ..scene.scene import MAX_OBJECTS
 from .errors import EditError
-from .motion import rescaled, shifted, snap_to_ground, stationary_track
+from .motion import rescaled, shifted, snap_to_ground, stationary_track, straight_on
 from .operation import (
     AppliedOperation,
     invalid_operation,
@@ -66,6 +66,35 @@ def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
     )
     if operation.size is not None:
         added = rescaled(added, _fitting(operation.size, asset.size), keep_bottom=False)
+    if operation.snap:
+        on_ground = snap_to_ground(added.trajectory, added.scaled_size, state.ground)
+        added = replace(added, trajectory=on_ground)
+    return _added(state, added)
+
+
+@operation(Spawn)
+def spawn(state: ScenarioState, operation: Spawn) -> AppliedOperation:
+    """Add a road user that drives; its own track goes straight on."""
+    _require_free_instance_id(state)
+    appearance = _appearance(state, operation)
+    if operation.pose is None:
+        raise invalid_operation(
+            "a place beside the ego's route is known in a running session only",
+            hint="give the pose of the box centre",
+        )
+    start_us = state.clock[0] if operation.start_us is None else operation.start_us
+    added = ObjectState(
+        object_id=new_id(state, operation.object_id, "spawned_"),
+        source_id=appearance.source_id,
+        category=appearance.category,
+        size=appearance.size,
+        scale=(1.0, 1.0, 1.0),
+        trajectory=straight_on(operation.pose, operation.speed, start_us, state.time_range[1]),
+        instance_id=state.next_instance_id,
+        asset=appearance.asset,
+        edited=True,
+        driver=operation.driver,
+    )
     if operation.snap:
         on_ground = snap_to_ground(added.trajectory, added.scaled_size, state.ground)
         added = replace(added, trajectory=on_ground)
@@ -164,7 +193,7 @@ class _Appearance:
     asset: AssetSource | None = None
 
 
-def _appearance(state: ScenarioState, operation: Replace) -> _Appearance:
+def _appearance(state: ScenarioState, operation: Replace | Spawn) -> _Appearance:
     if operation.asset_id is not None:
         asset = _asset(state, operation.asset_id)
         return _Appearance("", asset.category, asset.size, asset)

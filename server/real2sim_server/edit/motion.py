@@ -138,6 +138,16 @@ def stationary_track(pose: Pose, time_range: tuple[int, int]) -> Track:
     )
 
 
+def straight_on(pose: Pose, speed: float, start_us: int, end_us: int) -> Trajectory:
+    """The trajectory that goes from a pose along its heading at ``speed`` [m/s], up to ``end_us``
+    or for a second."""
+    times = np.array([start_us, max(end_us, start_us + 1_000_000)], np.int64)
+    ahead = transform_from(pose.position, pose.quaternion)[:3, 0]
+    way = speed * (times - start_us)[:, None] * 1e-6
+    positions = np.asarray(pose.position) + way * ahead
+    return Trajectory(times, positions, np.tile(pose.quaternion, (2, 1)))
+
+
 def snap_to_ground(
     trajectory: Trajectory, size: tuple[float, float, float], ground: Ground
 ) -> Trajectory:

@@ -6,7 +6,10 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from real2sim_proto import CodecError, ErrorCode, decode, encode
+from real2sim_proto.episode import AgentDriver
 from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
 
 from ..scene import Trajectory
@@ -14,6 +17,7 @@ from .errors import EditError
 from .state import AssetLookup, ObjectState, ScenarioState
 
 MAX_BYTES = 256 * 1024 * 1024
+_DRIVER: TypeAdapter[AgentDriver] = TypeAdapter(AgentDriver)
 
 
 def pack_state(state: ScenarioState) -> bytes:
@@ -67,7 +71,8 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
 
 
 def _packed_object(subject: ObjectState) -> dict[str, Any]:
-    return {
+    driver = {"driver": subject.driver.model_dump(mode="json")} if subject.driver else {}
+    return driver | {
         "object_id": subject.object_id,
         "source_id": subject.source_id,
         "category": subject.category,
@@ -110,4 +115,5 @@ def _unpacked_object(packed: dict[str, Any], assets: AssetLookup | None) -> Obje
         physics=SetPhysics.model_validate(physics) if physics else None,
         velocity=SetVelocity.model_validate(velocity) if velocity else None,
         edited=packed["placed"],
+        driver=_DRIVER.validate_python(packed["driver"]) if "driver" in packed else None,
     )

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from real2sim_proto.episode import AgentDriver
 from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
 
 from ..scene import GaussianCloud, Ground, Scene, Trajectory
@@ -79,6 +80,7 @@ class ObjectState:
         physics: what it is for the physics; None for defaults throughout.
         velocity: with which it enters the physics; None for that of its trajectory.
         edited: whether an edit gave it its trajectory or its appearance.
+        driver: that moves it in sessions; None where those say who does.
     """
 
     object_id: str
@@ -93,6 +95,7 @@ class ObjectState:
     physics: SetPhysics | None = None
     velocity: SetVelocity | None = None
     edited: bool = False
+    driver: AgentDriver | None = None
 
     @property
     def scaled_size(self) -> tuple[float, float, float]:

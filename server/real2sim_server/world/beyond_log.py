@@ -146,12 +146,17 @@ def tracks_beyond_log(
     start_us = state.clock[0]
     return PackedTracks(
         tuple(
-            replace(o, trajectory=_prolonged(o.trajectory, start_us, until_us))
+            replace(o, trajectory=_prolonged(o.trajectory, _from_us(o, start_us), until_us))
             if o.object_id in kept
             else o
             for o in visible
         )
     )
+
+
+def _from_us(subject: ObjectState, start_us: int) -> int:
+    """What an edit has put there is there from when it says."""
+    return subject.trajectory.start_us if subject.edited else start_us
 
 
 def _without_doubles(standing: list[ObjectState]) -> set[str]:

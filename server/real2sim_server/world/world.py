@@ -6,10 +6,12 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.base import Pose
 from real2sim_proto.episode import ResetSpec, SensorSpec
-from real2sim_proto.operations import Operation
+from real2sim_proto.operations import Operation, Spawn
 
 from ..edit import (
     EditError,
@@ -20,6 +22,7 @@ from ..edit import (
     compose,
 )
 from ..edit.tracks import PackedTracks
+from ..geometry.rotation import yaw_quaternion
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
@@ -266,7 +269,8 @@ class World:
     ) -> EditOutcome:
         """Edit the objects at this instant, all operations or none; time does not move.
 
-        An object put onto the ego is a collision of the next step. Objects whose trajectory is
+        An object put onto the ego is a collision of the next step. A spawn without a time appears
+        now, and one with a place beside the route where that is now. Objects whose trajectory is
         edited begin to follow it anew, also those that physics had taken over.
 
         Args:
@@ -282,7 +286,7 @@ class World:
                 f"made for revision {base_revision}; the session is at {self.revision}",
                 hint="look at the objects again and send the edit for the present revision",
             )
-        outcome = apply_operations(self.state, operations)
+        outcome = apply_operations(self.state, [self._placed(o) for o in operations])
         self.state, self._tracks = outcome.state, self._tracks_of(outcome.state)
         self.traffic = self.traffic.edited(
             self._tracks, self._surroundings(self._tracks.at(self.t_us))
@@ -348,6 +352,21 @@ class World:
     def fork(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""
         return copy.copy(self)
+
+    def _placed(self, operation: Operation) -> Operation:
+        """The operation with what is known here only: now, and where the ego is on its route."""
+        if not isinstance(operation, Spawn):
+            return operation
+        known: dict[str, Any] = {}
+        if operation.start_us is None:
+            known["start_us"] = self.t_us
+        if (place := operation.place) is not None:
+            x, y, _, yaw = self._path.at(self._path_point.s + place.ahead)
+            x, y = x - place.offset * math.sin(yaw), y + place.offset * math.cos(yaw)
+            w, qx, qy, qz = yaw_quaternion(yaw + math.pi if place.oncoming else yaw).tolist()
+            pose = Pose(position=(x, y, self.ground.height(x, y)), quaternion=(w, qx, qy, qz))
+            known |= {"pose": pose, "place": None}
+        return operation.model_copy(update=known)
 
     # --- phases of a step -------------------------------------------------------------------
 

@@ -24,8 +24,8 @@ WORKER_SCHEME, SESSION_SCHEME = "WorkerToken", "SessionToken"
 _bearer = HTTPBearer(
     auto_error=False,
     scheme_name=WORKER_SCHEME,
-    description="`Authorization: Bearer` with the worker's token, `REAL2SIM_TOKEN` of its settings; "
-    "a worker that has none asks for none. It opens every session, too.",
+    description="`Authorization: Bearer` with the worker's token, `REAL2SIM_TOKEN` of its "
+    "settings; a worker that has none asks for none. It opens every session, too.",
 )
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, overload
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.operations import OPERATIONS, Insert, Operation, Replace
+from real2sim_proto.operations import OPERATIONS, Insert, Operation, Replace, Spawn
 from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 
 from ...edit import AssetLookup, LogEntry, PlannedEntry, Scenario, ScenarioState
@@ -127,7 +127,7 @@ def asset_hashes(entries: Iterable[LogEntry], assets: AssetLookup | None) -> dic
         operation.asset_id
         for entry in entries
         for operation in entry.operations
-        if isinstance(operation, Insert | Replace) and operation.asset_id is not None
+        if isinstance(operation, Insert | Replace | Spawn) and operation.asset_id is not None
     }
     found = {name: assets(name) if assets else None for name in sorted(named)}
     return {name: getattr(asset, "content_hash", "") for name, asset in found.items() if asset}

@@ -14,6 +14,7 @@ from ...edit import ObjectState
 from ...scene import Ground, Trajectory
 from ..path import LoggedPath
 from .driver import AgentPose, Surroundings, pose_on_path, pose_put_back
+from .lane import lane_of
 from .leader import Leader, leading_agent
 from .replay import recorded_pose
 
@@ -59,9 +60,11 @@ class Idm:
     @classmethod
     def begin(cls, subject: ObjectState, spec: IdmDriver, surroundings: Surroundings) -> Idm:
         """From where and how the object moves now."""
-        path = LoggedPath(subject.trajectory)
         now = recorded_pose(subject, surroundings.t_us)
-        return cls.from_pose(subject, now, spec, path)
+        if spec.path == "recorded":
+            return cls.from_pose(subject, now, spec, LoggedPath(subject.trajectory))
+        lane = lane_of(surroundings.route, now.position[0], now.position[1], now.yaw)
+        return replace(cls.from_pose(subject, now, spec, lane), along_route=True)
 
     @classmethod
     def from_pose(

@@ -22,6 +22,7 @@ from ..errors import WorldError
 from ..path import LoggedPath
 from .driver import AgentDriver, Surroundings, level_quaternion
 from .idm import Idm, highest_speed
+from .lane import lane_beside
 
 PREFIX = "spawned:"
 """Of the ids of spawned objects; no id on the wire may hold a colon, so none is taken."""
@@ -31,9 +32,6 @@ LOOKS = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle"})
 
 SIDE = 0.3
 """Clearance beside a box that counts as in the way [m]."""
-
-BACK = 600.0
-"""Lanes begin so far before the recorded drive, straight on [m]."""
 
 SLOWEST = 3.0
 """Desired speed where the recorded drive hardly moved [m/s]."""
@@ -247,19 +245,6 @@ def begin_spawner(
     if spec.spawn is None:
         return None
     return Spawner.begin(spec.spawn, state, draws, route=route, ego=ego)
-
-
-def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> LoggedPath:
-    """The lane ``offset`` metres to the left of a route, which begins long before it."""
-    x, y, z = route.positions[0].tolist()
-    yaw = float(route.yaws[0])
-    start = [x - BACK * math.cos(yaw), y - BACK * math.sin(yaw), z]
-    longer = LoggedPath.through(
-        np.vstack([start, route.positions]),
-        np.concatenate([[yaw], route.yaws]),
-        np.vstack([route.ups[:1], route.ups]),
-    )
-    return longer.beside(offset, reverse=oncoming)
 
 
 def _lane(spec: LaneSpec, route: LoggedPath, looks: tuple[ObjectState, ...]) -> Lane:

@@ -61,6 +61,7 @@ class Traffic:
         spawner: lets objects appear and leave; None where nobody does.
         randomized: draws parameters of drivers; None where nothing is drawn.
         drawn: all that has been drawn for objects so far, by name.
+        edits_drive: whether an edit has said who drives an object.
     """
 
     spec: AgentsSpec
@@ -70,6 +71,7 @@ class Traffic:
     spawner: Spawner | None = None
     randomized: RandomizedDrivers | None = None
     drawn: Mapping[str, float] = field(default_factory=lambda: NOTHING_DRAWN)
+    edits_drive: bool = False
 
     @classmethod
     def begin(
@@ -101,7 +103,14 @@ class Traffic:
                 hint="insert or duplicate it first; GET /v1/scenes/{scene} lists the objects",
             )
         none: Mapping[str, AgentDriver] = MappingProxyType({})
-        begun = cls(spec, none, surroundings.others, spawner=spawner, randomized=randomized)
+        begun = cls(
+            spec,
+            none,
+            surroundings.others,
+            spawner=spawner,
+            randomized=randomized,
+            edits_drive=_edits_drive(tracks),
+        )
         begun = begun._with_new_drivers(surroundings.others, surroundings)
         if spawner is None:
             return begun
@@ -145,7 +154,8 @@ class Traffic:
             )
         }
         base = tracks.at(surroundings.t_us)
-        return replace(self, drivers=MappingProxyType(kept))._with_new_drivers(base, surroundings)
+        anew = replace(self, drivers=MappingProxyType(kept), edits_drive=_edits_drive(tracks))
+        return anew._with_new_drivers(base, surroundings)
 
     def with_reacting_agents(
         self, tracks: PackedTracks[ObjectState], surroundings: Surroundings
@@ -266,13 +276,14 @@ class Traffic:
     @property
     def _assigns_drivers(self) -> bool:
         """Whether objects that appear may get a driver."""
-        return bool(self.spec.drivers) or self.spec.default != "log" or self.reacting
+        named = bool(self.spec.drivers) or self.edits_drive
+        return named or self.spec.default != "log" or self.reacting
 
     def _driver_for(
         self, subject: ObjectState, surroundings: Surroundings, drawn: dict[str, float]
     ) -> AgentDriver | None:
         """The driver of an object that has just appeared; its draws are added to ``drawn``."""
-        spec = self.spec.drivers.get(subject.object_id)
+        spec = self.spec.drivers.get(subject.object_id, subject.driver)
         if spec is None:
             spec = self._default_for(subject)
         if spec is None:
@@ -287,6 +298,10 @@ class Traffic:
         if kind == "log" or subject.category not in DRIVEN or not _moves(subject):
             return None
         return IdmDriver() if kind == "idm" else ConstantVelocityDriver()
+
+
+def _edits_drive(tracks: PackedTracks[ObjectState]) -> bool:
+    return any(subject.driver is not None for subject in tracks.objects)
 
 
 def _moves(subject: ObjectState) -> bool:

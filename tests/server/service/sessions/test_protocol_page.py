@@ -1,0 +1,153 @@
+"""The page of the wire contract says what a client in another language has to know."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from real2sim_proto import HTTP_STATUS, ErrorCode
+from real2sim_proto.drive import EgoState, Event, Hello, Obs, Resume
+from real2sim_server.service.http.websocket import CLOSED_NO_UTF8
+from real2sim_server.service.sessions.connection import NORMAL_CLOSURE
+from real2sim_server.service.sessions.handshake import POLICY_VIOLATION
+from real2sim_server.world.events import EventType
+from real2sim_server.world.scoring import METRICS
+
+pytestmark = pytest.mark.network
+
+ROOT = Path(__file__).resolve().parents[4]
+PAGE = (ROOT / "docs" / "protocol.md").read_text("utf-8")
+SERVER = ROOT / "server" / "real2sim_server"
+QUOTED = set(re.findall(r"`([^`\n]+)`", PAGE))
+
+
+def section(title: str) -> str:
+    """Text under a heading, up to the next one of the same depth."""
+    found = re.search(rf"^(#+) {title}\n(.*?)(?=^#|\Z)", PAGE, re.M | re.S)
+    assert found, title
+    return found.group(2)
+
+
+def first_cells(text: str) -> set[str]:
+    """What stands in backquotes, or as numbers, in the first column of tables."""
+    cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("|")]
+    return {word for cell in cells for word in re.findall(r"[a-z_0-9]+", cell)}
+
+
+@pytest.fixture
+def observed(site, join) -> dict[str, Any]:
+    """An observation with an image, after a collision with the car that is ahead."""
+    planner = join(site.create())
+    sensors = [{"camera": "front", "codec": "raw"}]
+    contact = {"on_collision": "continue", "contact": {"dents": False}}
+    obs = planner.reset(sensors=sensors, privileged=True, **contact)
+    while not obs["events"] or obs["step"] < 5:
+        obs = planner.act(obs["step"], acceleration=20.0)
+        if obs["truncated"]:
+            break
+    return obs
+
+
+def test_every_close_code_is_on_the_page():
+    rows = first_cells(section("Closing"))
+    ours = {NORMAL_CLOSURE, POLICY_VIOLATION, CLOSED_NO_UTF8}
+    # Of libraries: too large, an error or no pong, stopping, restarting.
+    theirs = {1009, 1011, 1001, 1012}
+    assert {str(code) for code in ours | theirs} <= rows
+
+
+def test_every_code_that_ends_a_connection_is_on_the_page():
+    fatal = set()
+    for file in ("handshake.py", "connection.py", "registry.py", "messages.py"):
+        text = (SERVER / "service/sessions" / file).read_text("utf-8")
+        fatal |= set(re.findall(r"FatalError\(\s*ServiceError\(ErrorCode\.(\w+)", text))
+    fatal |= {"UNAUTHORIZED", "BAD_MESSAGE", "UNSUPPORTED_PROTOCOL", "CONTROLLER_TAKEN"}
+    fatal |= {"SESSION_CLOSED"}
+    text = section("Closing")
+    assert [code for code in sorted(fatal) if f"`{code}`" not in text] == []
+
+
+def test_statuses_of_a_refused_handshake_are_those_of_their_codes():
+    text = section("Closing").partition("A handshake that fails")[2]
+    named = re.findall(r"(\d{3}) \(`(\w+)`", text)
+    assert len(named) == 4
+    assert all(HTTP_STATUS[ErrorCode(code)] == int(status) for status, code in named)
+
+
+def test_every_reason_is_on_the_page():
+    world = (SERVER / "world/world.py").read_text("utf-8")
+    timer = (SERVER / "service/sessions/deadline_timer.py").read_text("utf-8")
+    reasons = set(re.findall(r"self\.reason = (?:True, |self\.reason or )?\"(\w+)\"", world))
+    reasons |= set(re.findall(r"self\.reason = True, \"(\w+)\"", world))
+    reasons |= set(re.findall(r"stop\(session, \"(\w+)\"\)", timer))
+    assert {"deadline", "wall_clock", "horizon"} <= reasons
+    paragraph = section("Observations").partition("`reason` is")[2].partition("\n\n")[0]
+    assert reasons | {"collision"} == set(re.findall(r"`(\w+)`", paragraph)) - {
+        "terminated",
+        "truncated",
+        "on_timeout",
+        "fail",
+        "wall_clock_s",
+        "result",
+        "bye",
+    }
+
+
+def test_every_event_and_its_data_are_on_the_page(observed):
+    text = section("Observations")
+    assert set(get_args(EventType)) <= first_cells(text)
+    assert set(get_args(Event.model_fields["type"].annotation)) == set(get_args(EventType))
+    for event in observed["events"]:
+        lacking = [name for name in event["data"] if f"`{name}`" not in text]
+        assert lacking == [], event["type"]
+
+
+def test_every_metric_is_on_the_page(observed):
+    rows = first_cells(section("Observations"))
+    assert set(observed["metrics"]) <= rows
+    assert {name for name, metric in METRICS.items() if metric.streamed} <= rows
+    assert "ttc" in rows
+
+
+def test_every_field_of_an_observation_is_on_the_page():
+    text = section("Observations")
+    fields = (set(Obs.model_fields) | set(EgoState.model_fields)) - {"v", "type", "id"}
+    assert [name for name in sorted(fields) if f"`{name}`" not in text] == []
+
+
+def test_arrays_have_the_shapes_of_the_page(observed):
+    frame = observed["frames"][0]
+    arrays = {"route": observed["route"], "K": frame["K"]}
+    arrays["T_world_sensor"] = frame["T_world_sensor"]
+    text = re.sub(r"\s+", " ", PAGE)
+    for name, array in arrays.items():
+        assert isinstance(array, np.ndarray)
+        said = re.search(rf"`{name}`(?: \|)?,? (\w+) (\[[\d, ]+\])", text)
+        assert said, name
+        assert said.groups() == (array.dtype.name, str(list(array.shape)))
+
+
+def test_what_a_returning_controller_says_is_on_the_page():
+    text = section("Resuming")
+    assert all(re.search(rf"\b{name}\b", text) for name in Resume.model_fields)
+    assert "resume" in Hello.model_fields
+    assert "`id` 0" in text
+
+
+def test_a_session_wants_its_token_where_the_worker_has_none(site):
+    info = site.create()
+    url = f"/v1/sessions/{info['session_id']}"
+    refused = site.http.get(url)
+    assert (refused.status_code, refused.json()["code"]) == (401, "UNAUTHORIZED")
+    assert site.call("GET", info).status_code == 200
+    assert "also on a worker that has none of its own" in section("Tokens")
+
+
+def test_unasked_messages_have_id_0_and_the_page_says_which():
+    text = section("Rules")
+    assert all(name in text for name in ("`obs`", "`progress`", "`error`", "`deadline_missed`"))
+    assert "`id` 0" in text
