@@ -24,8 +24,9 @@ WORKER_SCHEME, SESSION_SCHEME = "WorkerToken", "SessionToken"
 _bearer = HTTPBearer(
     auto_error=False,
     scheme_name=WORKER_SCHEME,
-    description="`Authorization: Bearer` with the worker's token, `REAL2SIM_TOKEN` of its "
-    "settings; a worker that has none asks for none. It opens every session, too.",
+    description="`Authorization: Bearer` with a token of the worker: `REAL2SIM_TOKEN` of its "
+    "settings, or a named one of `REAL2SIM_TOKENS_FILE`; a worker without asks for none. It opens "
+    "every session, too.",
 )
 
 
