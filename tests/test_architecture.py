@@ -41,6 +41,7 @@ LAYERS = (
     "service",
     "demo",
     "policies",
+    "learning",
     "benchmarks",
     "cli",
 )

@@ -75,6 +75,12 @@ class PackedTracks(Generic[T]):
         quaternions = self._knots[:, 3:7]
         self._knots[:-1, 10] = (quaternions[1:] != quaternions[:-1]).any(axis=1)
 
+    @property
+    def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
+        """Ends, times [us] and knots of all trajectories, as :func:`.track_kernels.poses_at` takes
+        them."""
+        return self._ends, self._times, self._knots
+
     def at(self, t_us: int) -> PlacedObjects[T]:
         """Objects whose trajectory covers ``t_us``; poses and velocities as Trajectory has them."""
         known, positions, quaternions, velocities, transforms = poses_at(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -113,7 +113,7 @@ def rasterize_batch(
 
     Small images are shared between cores, each drawn on one of them, where the backend can; what
     an image shows depends on its own view alone, so each is the one that :func:`rasterize` gives,
-    bit for bit.
+    bit for bit. Images carry no gradients.
 
     Args:
         views: at least one; instances and camera of each image.
@@ -127,24 +127,32 @@ def rasterize_batch(
     """
     if not views:
         raise RenderError("rasterize_batch() needs at least one view")
+    viewmats = _float64(np.stack([view.viewmat for view in views]), "viewmats", (4, 4))
+    Ks = _float64(np.stack([view.K for view in views]), "Ks", (3, 3))
+    everything = RasterRequest(
+        instances=tuple(instance for view in views for instance in view.instances),
+        viewmats=viewmats,
+        Ks=Ks,
+        width=width,
+        height=height,
+        sky=sky,
+        options=options,
+    )
+    _check_request(everything, check_values=True)
     requests = [
-        RasterRequest(
+        replace(
+            everything,
             instances=tuple(view.instances),
-            viewmats=_float64(np.asarray(view.viewmat)[None], "viewmat", (4, 4)),
-            Ks=_float64(np.asarray(view.K)[None], "K", (3, 3)),
-            width=width,
-            height=height,
-            sky=sky,
-            options=options,
+            viewmats=viewmats[k : k + 1],
+            Ks=Ks[k : k + 1],
         )
-        for view in views
+        for k, view in enumerate(views)
     ]
-    for request in requests:
-        _check_request(request, check_values=True)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
-    if isinstance(chosen, BatchBackend) and all(map(is_reduced, requests)):
-        return chosen.rasterize_batch(requests)
-    return _joined([chosen.rasterize(request) for request in requests])
+    with torch.no_grad():
+        if isinstance(chosen, BatchBackend) and is_reduced(everything):
+            return chosen.rasterize_batch(requests)
+        return _joined([chosen.rasterize(request) for request in requests])
 
 
 def _joined(outputs: Sequence[RenderOutput]) -> RenderOutput:
@@ -189,9 +197,11 @@ def _check_cameras(request: RasterRequest) -> None:
     for name, size in (("width", request.width), ("height", request.height)):
         if not 1 <= size <= MAX_IMAGE_SIZE:
             raise RenderError(f"{name} must be 1 to {MAX_IMAGE_SIZE} px, not {size!r}")
-    for index in range(request.cameras):
-        _check_rigid(request.viewmats[index].detach().cpu().numpy(), f"viewmats[{index}]")
-        K = request.Ks[index].detach().cpu().numpy()
+    poses, Ks = (given.detach().cpu().numpy() for given in (request.viewmats, request.Ks))
+    if not are_rigid(poses).all():
+        for index, pose in enumerate(poses):
+            _check_rigid(pose, f"viewmats[{index}]")
+    for index, K in enumerate(Ks):
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise RenderError(f"Ks[{index}] must have positive focal lengths, not {K.tolist()}")
         if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], (0, 0, 1)):

@@ -69,17 +69,17 @@ class Ground:
 
     def height_at(self, points: ArrayLike) -> Float:
         """z [S] float64 [m] below ``points`` [S, 2] [m] of the world."""
-        found: Float = heights_at(*self._grid, np.ascontiguousarray(points, dtype=np.float64))
+        found: Float = heights_at(*self.grid, np.ascontiguousarray(points, dtype=np.float64))
         return found
 
     def height(self, x: float, y: float) -> float:
         """z [m] at one place [m]: the same for one, in about a microsecond."""
-        found: float = height_at(*self._grid, x, y)
+        found: float = height_at(*self.grid, x, y)
         return found
 
     def normal_at(self, points: ArrayLike) -> Float:
         """Unit normals [S, 3] float64 below ``points`` [S, 2], over the size of a vehicle."""
-        found: Float = normals_at(*self._grid, np.ascontiguousarray(points, dtype=np.float64))
+        found: Float = normals_at(*self.grid, np.ascontiguousarray(points, dtype=np.float64))
         return found
 
     def pose_on(self, x: float, y: float, yaw: float) -> Float:
@@ -88,7 +88,7 @@ class Ground:
         Its x axis seen from above has heading ``yaw`` [rad]; its z axis is normal to the ground
         between its wheels.
         """
-        found: Float = pose_at(*self._grid, x, y, yaw)
+        found: Float = pose_at(*self.grid, x, y, yaw)
         return found
 
     def covers(self, points: Float) -> NDArray[np.bool_]:
@@ -115,7 +115,7 @@ class Ground:
         return self.heights.nbytes + self.is_ground.nbytes
 
     @cached_property
-    def _grid(self) -> tuple[NDArray[np.float32], Float]:
+    def grid(self) -> tuple[NDArray[np.float32], Float]:
         """What kernels take: the heights, and where and how large their cells are."""
         return self.heights, np.append(self.first_centre, self.cell)
 

@@ -160,6 +160,21 @@ class World:
         return self.traffic.agents
 
     @property
+    def route(self) -> LoggedPath:
+        """The way that everything is measured along."""
+        return self._path
+
+    @property
+    def path_point(self) -> PathPoint:
+        """Where the ego is along the route."""
+        return self._path_point
+
+    @property
+    def contacts(self) -> ContactState:
+        """What is in contact now."""
+        return self._contacts
+
+    @property
     def warming_up(self) -> bool:
         """Whether the ego still moves as recorded."""
         return self.t_us < self._clock.start_us + self.spec.warmup_us

@@ -168,6 +168,11 @@ class ScoringContext:
     def _lane_points(self) -> Lines:
         return _lines([line for line in self.lanes if len(line) > 1])
 
+    @property
+    def road_lines(self) -> tuple[Lines, Lines]:
+        """Points of the route and of the lanes, as :func:`.road_kernels.off_road` takes them."""
+        return self._route_points, self._lane_points
+
     def off_road(self, ego: EgoSample) -> tuple[float, int]:
         """How far the worst corner of the ego box is off the road [m], 0 and less on it; and how
         many of its quarters, 0 to 4, have their middle on the road."""

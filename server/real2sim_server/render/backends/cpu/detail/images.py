@@ -124,8 +124,9 @@ def _draws(requests: Sequence[RasterRequest]) -> _Draws:
     cameras: list[NDArray[np.float64]] = []
     views, sky_matrices = [], []
     gaussians = 1
+    options = _filtered(requests[0].options)
     for given in requests:
-        request = replace(given, options=_filtered(given.options))
+        request = replace(given, options=options)
         viewmats = request.viewmats.detach().cpu().numpy()
         Ks = request.Ks.detach().cpu().numpy()
         for c in range(request.cameras):

@@ -1,0 +1,360 @@
+"""Worlds of one scene side by side, as a structure of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import Control, TrajectoryPlan
+
+from ...edit import ObjectState, ScenarioState, compose
+from ...geometry.transform import transform_from
+from ...render.types import Instance
+from ...scene import Scene
+from ..agents import Agents
+from ..collision.contact_state import ContactState
+from ..collision.overlaps import EgoContacts
+from ..collision.sweep import StepStart
+from ..driving import HOLD, KINDS, vehicle_parameters
+from ..ego.controller import EgoController
+from ..ego.motion import Motion
+from ..ego.route import WAYPOINT_SPACING, WAYPOINTS
+from ..path import Float
+from ..scoring.fault import ego_at_fault
+from ..traffic.idm import Idm
+from ..world import World
+from .step_kernels import (
+    BEYOND,
+    OFFSET,
+    PATH_X,
+    PATH_YAW,
+    PLACES,
+    STATE,
+    S,
+    routes_ahead,
+    step_worlds,
+)
+from .subset import check_batchable
+from .tables import road_of, tracks_of
+from .traffic_kernels import DRIVES, LEFT
+
+Flags = NDArray[np.bool_]
+Longs = NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class _Instant:
+    """All worlds at one instant; arguments of step_worlds."""
+
+    motions: Float
+    poses: Float
+    places: Float
+    objects: Float
+    present: Flags
+    drivers: NDArray[np.int8]
+    driving: Float
+
+    @classmethod
+    def of(cls, worlds: int, objects: int) -> _Instant:
+        return cls(
+            motions=np.zeros((worlds, STATE)),
+            poses=np.tile(np.eye(4), (worlds, 1, 1)),
+            places=np.zeros((worlds, PLACES)),
+            objects=np.zeros((worlds, objects, 10)),
+            present=np.zeros((worlds, objects), np.bool_),
+            drivers=np.zeros((worlds, objects), np.int8),
+            driving=np.zeros((worlds, objects, 3)),
+        )
+
+    @property
+    def arrays(self) -> tuple[NDArray[np.generic], ...]:
+        return tuple(vars(self).values())
+
+
+@dataclass(frozen=True, eq=False)
+class BatchStep:
+    """What a step has brought, by world.
+
+    Attributes:
+        progress: [W] float64, way along the route in this step [m].
+        at_fault: [W] int64, contacts begun that the ego is to blame for.
+        contacts: [W] int64, contacts begun.
+    """
+
+    progress: Float
+    at_fault: Longs
+    contacts: Longs
+
+
+class BatchWorld:
+    """W worlds of one scene and one reset; each place runs an episode of its own.
+
+    What a world of the batch does is what a :class:`..world.World` does, see :mod:`.subset` for
+    the part of it that is known here: same motions, objects, contacts, ends. Worlds know nothing
+    of each other, and no result depends on the number of threads.
+
+    Attributes:
+        scene: shared, immutable.
+        state: objects of all worlds.
+        spec: of all episodes but their start.
+        worlds: W.
+        start_us, steps: [W] int64, where each episode began [us], and its steps since.
+        horizons: [W] int64, steps after which each is cut off.
+        terminated, truncated: [W] bool, how each has ended.
+        off_road: [W] bool, whether each was off the road in its episode.
+        touching: names of what each ego is in contact with.
+    """
+
+    def __init__(
+        self, scene: Scene, spec: ResetSpec, worlds: int, *, state: ScenarioState | None = None
+    ) -> None:
+        """All worlds at the start of an episode.
+
+        Args:
+            scene: that is driven in.
+            spec: of the episodes.
+            worlds: how many, at least 1.
+            state: objects; by default those of the scene.
+
+        Raises:
+            WorldError: INVALID_REQUEST for what batches do not know; and as ``World`` does.
+            ValueError: fewer than one world.
+        """
+        if worlds < 1:
+            raise ValueError(f"a batch needs at least one world, not {worlds}")
+        check_batchable(spec)
+        self.scene, self.spec, self.worlds = scene, spec, worlds
+        self.state = ScenarioState.of(scene) if state is None else state
+        self._begun: dict[int, World] = {}
+        first = self._begin(spec.start_us)
+        self.objects, self._tracks = tracks_of(self.state, spec)
+        self._rows = {o.object_id: k for k, o in enumerate(self.objects)}
+        self._road = road_of(scene.ground, first.route, first.context)
+        self._vehicle = tuple(vehicle_parameters(spec.ego))
+        ego = spec.ego
+        hardest = max(ego.max_acceleration, ego.max_braking)
+        self._limits = (hardest, ego.max_steer_rate, ego.max_steer, ego.wheelbase)
+        self._law = HOLD if spec.action == "control" else KINDS[ego.tracker]
+        self._now = _Instant.of(worlds, len(self.objects))
+        self._next = _Instant.of(worlds, len(self.objects))
+        self.start_us, self.steps, self.horizons = (np.zeros(worlds, np.int64) for _ in range(3))
+        self.terminated, self.truncated, self.off_road = (
+            np.zeros(worlds, np.bool_) for _ in range(3)
+        )
+        self.touching: list[frozenset[str]] = [frozenset()] * worlds
+        self._near = np.zeros(worlds, np.bool_)
+        self.reset()
+
+    @property
+    def times_us(self) -> Longs:
+        """[W] now [us]."""
+        return self.start_us + self.steps * self.spec.dt_us
+
+    @property
+    def over(self) -> Flags:
+        """[W] which episodes have ended; these worlds stand still until they are reset."""
+        return self.terminated | self.truncated
+
+    @property
+    def motions(self) -> Float:
+        """[W, 9] float64, states of the egos in the order of ``driving.PlanarState``; a view."""
+        return self._now.motions
+
+    @property
+    def poses(self) -> Float:
+        """[W, 4, 4] float64, ``T_world_vehicle``; a view."""
+        return self._now.poses
+
+    @property
+    def route_s(self) -> Float:
+        """[W] float64, where the egos are along the route [m]; a view."""
+        return self._now.places[:, S]
+
+    @property
+    def route_offset(self) -> Float:
+        """[W] float64, how far beside the route, positive on the left [m]; a view."""
+        return self._now.places[:, OFFSET]
+
+    def reset(
+        self, where: ArrayLike | None = None, *, start_us: Sequence[int | None] | None = None
+    ) -> None:
+        """Begin new episodes.
+
+        Args:
+            where: [W] bool or indices of worlds; all by default.
+            start_us: where each of them begins, None for that of the spec [us].
+
+        Raises:
+            WorldError: TIME_OUT_OF_RANGE for a start that does not fit the log; then nothing has
+                changed.
+        """
+        chosen = np.arange(self.worlds)[slice(None) if where is None else np.asarray(where)]
+        starts = [self.spec.start_us] * len(chosen) if start_us is None else list(start_us)
+        begun = [self._begin(start) for start in starts]
+        for w, world in zip(chosen.tolist(), begun, strict=True):
+            self._place(w, world)
+
+    def step(self, actions: ArrayLike, *, plan_us: ArrayLike | None = None) -> BatchStep:
+        """Move every world that is not over by one clock step.
+
+        Args:
+            actions: [W, 2] acceleration [m/s^2] and road-wheel angle [rad] where the action of the
+                spec is ``control``; else [W, N, 3] poses x, y [m], yaw [rad] in the frame of each
+                vehicle.
+            plan_us: [N] times of those poses after now, increasing [us].
+
+        Raises:
+            ValueError: actions of another shape or not finite, or times that do not increase.
+        """
+        given, after_us = self._checked(actions, plan_us)
+        going, before, after = ~self.over, self._now, self._next
+        times_us = self.times_us
+        step_worlds(
+            *(going, times_us, self.spec.dt_us, self._law, given, after_us, True),
+            *(self._vehicle, self._limits, self._tracks, self._road),
+            *before.arrays,
+            *after.arrays,
+            self._near,
+        )
+        self._now, self._next = after, before
+        self.steps[going] += 1
+        self.off_road |= going & (after.places[:, BEYOND] > 0)
+        at_fault, contacts = (np.zeros(self.worlds, np.int64) for _ in range(2))
+        for w in np.flatnonzero(going).tolist():
+            if self._near[w]:
+                at_fault[w], contacts[w] = self._meet(w, int(times_us[w]), given[w], after_us)
+            elif self.touching[w]:
+                self.touching[w] = frozenset()
+        self.terminated |= contacts > 0
+        self.truncated |= going & (self.steps >= self.horizons)
+        progress = np.where(going, after.places[:, S] - before.places[:, S], 0.0)
+        return BatchStep(progress, at_fault, contacts)
+
+    def routes(self) -> NDArray[np.float32]:
+        """Waypoints [W, 20, 2] float32 along the route ahead, in the frame of each vehicle [m]."""
+        found = np.empty((self.worlds, WAYPOINTS, 2), np.float32)
+        routes_ahead(self._road.route, self._now.motions, self._now.places, WAYPOINT_SPACING, found)
+        return found
+
+    def agents(self, w: int) -> Agents:
+        """Objects of one world now."""
+        return self._agents(self._now, w)
+
+    def instances(self, w: int) -> list[Instance]:
+        """What the renderer draws of one world now; nothing is copied."""
+        shown_us = min(int(self.times_us[w]), self.scene.end_us)
+        return compose(self.scene, self.state, self.agents(w), shown_us)
+
+    def _begin(self, start_us: int | None) -> World:
+        """The world at the start of an episode, kept for the next one from there."""
+        start = self.scene.start_us if start_us is None else int(start_us)
+        if start not in self._begun:
+            spec = self.spec.model_copy(update={"start_us": start, "sensors": []})
+            self._begun[start] = World(self.scene, self.state, spec)
+        return self._begun[start]
+
+    def _place(self, w: int, world: World) -> None:
+        now, near = self._now, world.path_point
+        now.motions[w] = world.motion.numbers
+        now.poses[w] = world.T_world_vehicle
+        now.places[w, S], now.places[w, OFFSET], now.places[w, PATH_YAW] = (
+            near[0],
+            near[1],
+            near.yaw,
+        )
+        now.places[w, PATH_X : PATH_X + 3] = near.position
+        now.present[w], now.drivers[w] = False, 0
+        agents = world.agents
+        for i, subject in enumerate(agents.objects):
+            k = self._rows[subject.object_id]
+            now.present[w, k] = True
+            now.objects[w, k, :3] = agents.positions[i]
+            now.objects[w, k, 3:7] = agents.quaternions[i]
+            now.objects[w, k, 7:] = agents.velocities[i]
+        for object_id, driver in world.traffic.drivers.items():
+            k, idm = self._rows[object_id], cast(Idm, driver)
+            now.drivers[w, k] = DRIVES if idm.present else LEFT
+            now.driving[w, k] = idm.s, idm.offset, idm.speed
+        self.start_us[w], self.steps[w], self.horizons[w] = world.t_us, 0, world.horizon
+        self.terminated[w] = self.truncated[w] = self.off_road[w] = False
+        self.touching[w] = world.contacts.touching
+
+    def _checked(self, actions: ArrayLike, plan_us: ArrayLike | None) -> tuple[Float, Longs]:
+        given = np.ascontiguousarray(actions, dtype=np.float64)
+        if self._law == HOLD:
+            if given.shape != (self.worlds, 2) or plan_us is not None:
+                raise ValueError(
+                    f"actions of {self.worlds} worlds that take commands must be "
+                    f"[{self.worlds}, 2] without plan_us, not {list(given.shape)}"
+                )
+            given = np.concatenate([given, np.zeros((self.worlds, 1))], axis=1)[:, None]
+            after_us = np.zeros(0, np.int64)
+        else:
+            after_us = np.ascontiguousarray([] if plan_us is None else plan_us, np.int64)
+            if after_us.ndim != 1 or given.shape != (self.worlds, len(after_us), 3):
+                raise ValueError(
+                    f"actions of {self.worlds} worlds that take trajectories must be "
+                    f"[{self.worlds}, N, 3] with N plan_us, not {list(given.shape)} with "
+                    f"{list(after_us.shape)}"
+                )
+            if not len(after_us) or (np.diff(after_us, prepend=0) <= 0).any():
+                raise ValueError(f"plan_us must increase from above 0, not {after_us.tolist()}")
+        if not np.isfinite(given).all():
+            raise ValueError("actions hold values that are not finite")
+        return given, after_us
+
+    def _meet(self, w: int, t_us: int, action: Float, plan_us: Longs) -> tuple[int, int]:
+        """Contacts of one world in a step in which it may have met something: those that the ego is
+        to blame for, and all that began."""
+        found = self._contacts(w, t_us, action, plan_us)
+        self.touching[w] = found.touching
+        place = self._now.places[w]
+        aside = abs(place[OFFSET]) + self._road.ego_size[1] / 2 > self._road.half_widths[1]
+        off_lane = bool(place[BEYOND] > 0 or aside)
+        at_fault = sum(ego_at_fault(record, off_lane) for record in found.records)
+        return at_fault, len(found.begun)
+
+    def _contacts(self, w: int, t_us: int, action: Float, plan_us: Longs) -> EgoContacts:
+        """By the same functions as a single world."""
+        before, after = self._next, self._now
+        motion = Motion._make((*before.motions[w].tolist(), ()))
+        controller = EgoController(self.spec, self.scene.ego).with_plan(
+            self._plan(t_us, action, plan_us), motion, t_us, t_us
+        )
+        start = StepStart(
+            motion,
+            before.poses[w],
+            self._agents(before, w),
+            t_us,
+            self.spec.dt_us,
+            lambda since_us: controller.advance(motion, t_us, since_us)[1],
+        )
+        contacts = ContactState(self.spec, self.scene.ego_size, None, self.touching[w])
+        moved = Motion._make((*after.motions[w].tolist(), ()))
+        return contacts.ego_contacts(start, after.poses[w], moved, self._agents(after, w))
+
+    def _plan(self, t_us: int, action: Float, plan_us: Longs) -> Control | TrajectoryPlan:
+        if self._law == HOLD:
+            return Control(acceleration=action[0, 0], steering=action[0, 1])
+        times = (t_us + plan_us).tolist()
+        poses = [tuple(pose) for pose in action.tolist()]
+        return TrajectoryPlan(times_us=times, poses=poses, frame="vehicle")
+
+    def _agents(self, instant: _Instant, w: int) -> Agents:
+        there = np.flatnonzero(instant.present[w])
+        rows = instant.objects[w, there]
+        objects: tuple[ObjectState, ...] = tuple(self.objects[k] for k in there.tolist())
+        positions, quaternions = rows[:, :3].copy(), rows[:, 3:7].copy()
+        return Agents(
+            objects=objects,
+            sizes=self._tracks.sizes[there],
+            positions=positions,
+            quaternions=quaternions,
+            velocities=rows[:, 7:].copy(),
+            transforms=transform_from(positions, quaternions),
+        )

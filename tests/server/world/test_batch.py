@@ -1,0 +1,200 @@
+"""Worlds in batches are single worlds: same motions, objects, contacts, ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import Control, TrajectoryPlan
+from real2sim_server.demo.street import SHIPPED
+from real2sim_server.edit import ScenarioState
+from real2sim_server.scene import Scene
+from real2sim_server.scene.io import read_packed
+from real2sim_server.world import World
+from real2sim_server.world.batch import BatchWorld
+from real2sim_server.world.errors import WorldError
+
+CLOSE = 1e-9
+PLAN_US = np.arange(1, 11) * 200_000
+
+
+@pytest.fixture(scope="module")
+def street() -> Scene:
+    return read_packed(SHIPPED)
+
+
+def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
+    """Raise where a world of the batch is not the single one."""
+    assert np.array(world.motion.numbers) == pytest.approx(batch.motions[w], abs=CLOSE)
+    assert world.T_world_vehicle == pytest.approx(batch.poses[w], abs=CLOSE)
+    assert world.path_point.s == pytest.approx(batch.route_s[w], abs=CLOSE)
+    assert world.path_point.offset == pytest.approx(batch.route_offset[w], abs=CLOSE)
+    assert world.observe().route == pytest.approx(batch.routes()[w], abs=1e-4)
+    ours, theirs = batch.agents(w), world.agents
+    rows = {o.object_id: k for k, o in enumerate(ours.objects)}
+    assert set(rows) == {o.object_id for o in theirs.objects}
+    order = [rows[o.object_id] for o in theirs.objects]
+    for name in ("positions", "quaternions", "velocities", "sizes", "transforms"):
+        assert getattr(ours, name)[order] == pytest.approx(getattr(theirs, name), abs=CLOSE)
+    assert (world.terminated, world.truncated) == (batch.terminated[w], batch.truncated[w])
+    assert world.accumulator.off_road == batch.off_road[w]
+    assert world.contacts.touching == batch.touching[w]
+    assert sum(world.accumulator.at_fault.values()) == at_fault
+
+
+def drive_beside(scene: Scene, fields: dict[str, Any], worlds: int, steps: int) -> BatchWorld:
+    """A batch, step by step beside as many single worlds with the same actions."""
+    spec, state = ResetSpec(**fields), ScenarioState.of(scene)
+    batch = BatchWorld(scene, spec, worlds, state=state)
+    single = [World(scene, state, spec) for _ in range(worlds)]
+    random = np.random.default_rng(4)
+    bias = random.uniform(-0.03, 0.03, worlds)
+    for _ in range(steps):
+        running = ~batch.over
+        speeds = random.uniform(2.0, 14.0, worlds)
+        if spec.action == "control":
+            push = random.uniform(-1.0, 3.0, worlds)
+            actions = np.stack([push, bias + random.uniform(-0.05, 0.05, worlds)], axis=1)
+            plans: list[Any] = [Control(acceleration=a, steering=b) for a, b in actions.tolist()]
+            done = batch.step(actions)
+        else:
+            way = speeds[:, None] * PLAN_US * 1e-6
+            actions = np.stack([way, bias[:, None] * way, 0 * way + bias[:, None]], axis=2)
+            now = batch.times_us
+            plans = [
+                TrajectoryPlan(
+                    times_us=(now[w] + PLAN_US).tolist(), poses=actions[w].tolist(), frame="vehicle"
+                )
+                for w in range(worlds)
+            ]
+            done = batch.step(actions, plan_us=PLAN_US)
+        for w in np.flatnonzero(running).tolist():
+            single[w].step(plans[w])
+            compare(batch, w, single[w], int(done.at_fault[w]))
+    return batch
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"action": "control"},
+        {"action": "control", "agents": {"default": "idm"}},
+        {"action": "control", "ego": {"dynamics": "dynamic_bicycle"}, "dt_us": 40_000},
+        {"action": "control", "dt_us": 500_000},
+        {"action": "trajectory", "ego": {"tracker": "lqr"}},
+        {"action": "trajectory", "ego": {"tracker": "pursuit", "dynamics": "dynamic_bicycle"}},
+    ],
+)
+def test_worlds_of_a_batch_are_single_worlds(street: Scene, fields: dict[str, Any]) -> None:
+    drive_beside(street, fields, worlds=5, steps=30)
+
+
+def test_contacts_end_episodes_as_in_single_worlds(street: Scene) -> None:
+    batch = drive_beside(street, {"action": "control"}, worlds=8, steps=45)
+    assert batch.terminated.any()
+    assert batch.off_road.any()
+
+
+def test_objects_come_and_go_as_in_single_worlds(
+    make_scene: Callable[..., Scene], moving: Callable[..., Any]
+) -> None:
+    def during(trajectory: Any, first: int, last: int) -> Any:
+        part = slice(first, last)
+        parts = (trajectory.times_us, trajectory.positions, trajectory.quaternions)
+        return type(trajectory)(*(values[part] for values in parts))
+
+    scene = make_scene(
+        ahead=moving(14, speed=8.0),
+        comes=during(moving(30, 4, speed=5.0), 8, 60),
+        goes=during(moving(-20, -4, speed=9.0), 0, 12),
+    )
+    for default in ("log", "idm"):
+        fields = {"action": "control", "agents": {"default": default}, "horizon": 40}
+        drive_beside(scene, fields, worlds=3, steps=40)
+
+
+def test_a_reset_begins_some_episodes_anew(street: Scene) -> None:
+    spec = ResetSpec(action="control", horizon=3)
+    batch = BatchWorld(street, spec, 4)
+    first = batch.motions.copy()
+    for _ in range(3):
+        batch.step(np.tile([2.0, 0.0], (4, 1)))
+    assert batch.truncated.all()
+    later = street.start_us + 2_000_000
+    batch.reset(np.array([1, 3]), start_us=[None, later])
+    assert batch.over.tolist() == [True, False, True, False]
+    assert np.array_equal(batch.motions[1], first[1])
+    assert batch.times_us[3] == later
+    world = World(street, ScenarioState.of(street), spec.model_copy(update={"start_us": later}))
+    batch.step(np.tile([2.0, 0.0], (4, 1)))
+    world.step(Control(acceleration=2.0, steering=0.0))
+    compare(batch, 3, world, 0)
+
+
+def test_worlds_that_are_over_stand_still(street: Scene) -> None:
+    batch = BatchWorld(street, ResetSpec(action="control", horizon=1), 2)
+    batch.step(np.zeros((2, 2)))
+    before = batch.motions.copy(), batch.times_us.copy()
+    done = batch.step(np.ones((2, 2)))
+    assert np.array_equal(batch.motions, before[0])
+    assert np.array_equal(batch.times_us, before[1])
+    assert done.progress.tolist() == [0.0, 0.0]
+
+
+def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
+    threads, found = numba.get_num_threads(), []
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            batch = BatchWorld(street, ResetSpec(action="control"), 7)
+            for k in range(15):
+                batch.step(np.tile([1.0, 0.01 * k], (7, 1)))
+            found.append(batch.motions.copy())
+    finally:
+        numba.set_num_threads(threads)
+    assert np.array_equal(found[0], found[-1])
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"action": "pose"}, "action"),
+        ({"on_collision": "continue"}, "on_collision"),
+        ({"ego": {"tracker": "ilqr"}}, "ego.tracker"),
+        ({"ego": {"tracker": "perfect"}}, "ego.tracker"),
+        ({"ego": {"actuators": {"drive_delay_us": 50_000}}}, "ego.actuators"),
+        ({"agents": {"default": "constant_velocity"}}, "agents.default"),
+        ({"agents": {"drivers": {"car_0": {"kind": "idm"}}}}, "agents"),
+        ({"warmup_us": 100_000}, "warmup_us"),
+        ({"latency": {"model": "fixed", "fixed_us": 1}}, "latency"),
+        ({"contact": {"background": True}}, "contact.background"),
+        ({"beyond_log": "extend"}, "beyond_log"),
+    ],
+)
+def test_what_batches_do_not_know_is_refused(
+    street: Scene, fields: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(WorldError, match=named):
+        BatchWorld(street, ResetSpec(**fields), 2)
+
+
+@pytest.mark.parametrize(
+    ("action", "actions", "plan_us"),
+    [
+        ("control", np.zeros((3, 2)), None),
+        ("control", np.full((2, 2), np.nan), None),
+        ("trajectory", np.zeros((2, 2, 3)), [100_000, 100_000]),
+        ("trajectory", np.zeros((2, 2, 3)), None),
+    ],
+)
+def test_bad_actions_are_refused(
+    street: Scene, action: str, actions: np.ndarray, plan_us: list[int] | None
+) -> None:
+    batch = BatchWorld(street, ResetSpec(action=action), 2)
+    with pytest.raises(ValueError, match=r"actions|plan_us"):
+        batch.step(actions, plan_us=plan_us)
