@@ -71,15 +71,23 @@ class VehicleSpec(Model):
 
 
 class ActuatorSpec(Model):
-    """What lies between a command and the wheels; all zero by default."""
+    """What lies between a command and the wheels.
+
+    The default lags are those of nuPlan's kinematic bicycle.
+    """
 
     steering_delay_us: int = Field(default=0, ge=0, le=1_000_000, description="dead time")
     steering_lag: Annotated[float, Field(ge=0, le=2)] = Field(
-        default=0.0, description="time constant of the first order [s]"
+        default=0.05, description="time constant of the first order [s]"
     )
     drive_delay_us: int = Field(default=0, ge=0, le=1_000_000, description="dead time")
     drive_lag: Annotated[float, Field(ge=0, le=2)] = Field(
-        default=0.0, description="time constant of the first order [s]"
+        default=0.2, description="time constant of the first order [s]"
+    )
+    foreseen: bool = Field(
+        default=True,
+        description="trackers of trajectories know these figures and act in time; false: they "
+        "steer as if there were neither lag nor dead time",
     )
 
 

@@ -39,7 +39,8 @@ from real2sim_server.world.driving.lqr import HEADWAY, TIME
 from real2sim_server.world.driving.tyres import integrate
 from real2sim_server.world.ego.motion import Motion
 
-VEHICLE = vehicle_parameters(EgoSpec())
+IDEAL = {"steering_lag": 0.0, "drive_lag": 0.0}
+VEHICLE = vehicle_parameters(EgoSpec(actuators=IDEAL))
 SLIPPING = vehicle_parameters(EgoSpec(dynamics="dynamic_bicycle"))
 SECOND = 1_000_000
 NOTHING = np.empty((0, 2))
@@ -211,14 +212,14 @@ def test_pursuit_steers_the_arc_through_a_place_of_the_plan(offset, ahead):
 def cost_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> float:
     """What iLQR minimises, by a rollout of the kinematic bicycle."""
     x, y, yaw, speed, steering = start.x, start.y, start.yaw, start.speed, start.steering
-    errors = [np.array([x, y, yaw, speed, steering]) - wanted[0]]
+    errors = [np.array([x, y, yaw, speed, steering, 0.0]) - wanted[0]]
     for (a, rate), aim in zip(inputs.reshape(STEPS, 2), wanted[1:], strict=True):
         end, later = steering + rate * STEP, speed + a * STEP
         way = (speed + later) / 2 * STEP
         turn = way * math.tan((steering + end) / 2) / VEHICLE.wheelbase
         x, y = x + way * math.cos(yaw + turn / 2), y + way * math.sin(yaw + turn / 2)
         yaw, speed, steering = yaw + turn, later, end
-        errors.append(np.array([x, y, yaw, speed, steering]) - aim)
+        errors.append(np.array([x, y, yaw, speed, steering, 0.0]) - aim)
     commands = inputs.reshape(STEPS, 2)
     return float((np.array(errors) ** 2 @ STATE_COST).sum() + (commands**2 @ INPUT_COST).sum())
 
@@ -227,8 +228,8 @@ def cost_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> float
 def test_ilqr_finds_the_commands_that_a_general_optimiser_finds(y, speed):
     start = state_of(x=3.0, y=y, speed=speed)
     knots, turn_rate = straight_plan(10.0)
-    states, inputs = solve_schedule(start, PlanCurve(knots, turn_rate), 0.3, VEHICLE)
-    wanted = np.zeros((STEPS + 1, 5))
+    states, inputs = solve_schedule(start, PlanCurve(knots, turn_rate, 0.0), 0.3, VEHICLE)
+    wanted = np.zeros((STEPS + 1, 6))
     wanted[:, 0], wanted[:, 3] = 10.0 * (0.3 + STEP * np.arange(STEPS + 1)), 10.0
 
     best = minimize(
@@ -253,14 +254,17 @@ def some_drives() -> list[list[float]]:
     found = []
     for kind in (PURSUIT, LQR, ILQR):
         for dynamics in ("kinematic_bicycle", "dynamic_bicycle"):
-            for actuators in ({}, delays):
+            for actuators in ({}, delays, {**delays, "foreseen": False}):
                 spec = EgoSpec(dynamics=dynamics, actuators=actuators)
                 vehicle = tuple(vehicle_parameters(spec))
                 state, pending = tuple(state_of(speed=8.0, y=0.5)), NOTHING
                 curve = plan_curve(state, *_at_zero(some_plan(rng, 10)), vehicle)
                 for k in range(5):
                     driver = (kind, *curve, 0.1 * k, (0.0, 0.0), NO_SCHEDULE)
-                    driver = (*driver[:-1], prepare_schedule(state, driver, vehicle))
+                    driver = (
+                        *driver[:-1],
+                        prepare_schedule(state, pending, driver, vehicle, 100_000),
+                    )
                     state, pending = advance_vehicle(state, pending, driver, vehicle, 100_000)
                 found.append([*state, *pending.ravel().tolist()])
     return found

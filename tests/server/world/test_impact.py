@@ -267,6 +267,7 @@ def test_a_wall_of_the_background_is_hit(make_scene, on_collision):
     scene = wall_scene(make_scene, 25.0)
     spec = ResetSpec(
         action="control",
+        ego={"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}},
         on_collision=on_collision,
         contact={"background": True, "restitution": 0.2},
     )

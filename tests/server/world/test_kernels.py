@@ -24,6 +24,7 @@ from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.reference import PlannedTrajectory
 from real2sim_server.world.scoring import comfort_kernels, hazard_kernels, road_kernels
 from real2sim_server.world.scoring.comfort import plans_agree
+from real2sim_server.world.warm_up import warm_up_planning
 
 NOW, SECOND = 4_000_000, 1_000_000
 SIZE = (4.6, 1.85, 1.6)
@@ -368,6 +369,8 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
     make_world, moving, action, ego, on_collision, default
 ):
     warm_up()
+    if ego.get("tracker") == "ilqr":
+        warm_up_planning()
     modules = (
         entries,
         box_kernels,

@@ -17,7 +17,7 @@ from real2sim_server.world.ego.motion import (
     teleported,
 )
 
-SPEC = EgoSpec()
+SPEC = EgoSpec(actuators={"steering_lag": 0.0, "drive_lag": 0.0})
 
 
 def hold(acceleration: float = 0.0, steering: float = 0.0):

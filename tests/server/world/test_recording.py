@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from real2sim_proto import decode, encode
-from real2sim_proto.episode import ResetSpec
+from real2sim_proto.episode import ActuatorSpec, ResetSpec
 from real2sim_proto.operations import Delete, Translate
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import ScenarioState
@@ -38,6 +38,7 @@ from real2sim_server.world.recording.replay import (
     reset_payload,
     stop_payload,
 )
+from real2sim_server.world.recording.stored_spec import stored_spec
 
 DRIVERS = {"car": {"kind": "external"}, "other": {"kind": "idm"}}
 
@@ -234,6 +235,44 @@ def test_an_entry_that_cannot_be_applied_is_named(recording, scene):
     broken = replace(recording, entries=(*recording.entries[:2], Entry("edit", 1, b"\x80")))
     with pytest.raises(RecordingError, match=r"entry 2 \(edit, step 1\) is damaged"):
         first_difference(broken, Replayer.on(scene, ScenarioState.of(scene)))
+
+
+def earlier_spec(**ego) -> dict:
+    """A spec as it was written before trackers knew of lags, in full."""
+    fields = decode(reset_payload(ResetSpec(ego=ego)))["spec"]
+    del fields["ego"]["actuators"]["foreseen"]
+    return fields
+
+
+def test_an_old_log_keeps_its_actuators_and_trackers_that_do_not_know_them():
+    lagging = {"steering_lag": 0.1, "drive_lag": 0.0}
+    spec = stored_spec(earlier_spec(actuators=lagging))
+
+    assert spec.ego.actuators == ActuatorSpec(**lagging, foreseen=False)
+
+
+@pytest.mark.parametrize("fields", [{}, {"ego": {}}, {"ego": {"actuators": {}}}])
+def test_a_log_without_actuators_has_ideal_ones(fields):
+    assert stored_spec(fields).ego.actuators == ActuatorSpec(
+        steering_lag=0.0, drive_lag=0.0, foreseen=False
+    )
+
+
+def test_a_log_of_today_means_what_it_says():
+    spec = ResetSpec(ego={"actuators": {"steering_lag": 0.3}})
+
+    assert stored_spec(decode(reset_payload(spec))["spec"]) == spec
+
+
+def test_an_old_log_is_replayed_as_it_was_driven(scene):
+    ideal = {"tracker": "ilqr", "actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
+    resets = encode({"spec": earlier_spec(**ideal)}), reset_payload(ResetSpec(ego=ideal))
+    logs = [[Entry("reset", 0, reset), *entries(10)[1:5]] for reset in resets]
+    then, now = (
+        record(Replayer.on(scene, ScenarioState.of(scene)), log, scene_hash="x") for log in logs
+    )
+
+    assert then.digests == now.digests
 
 
 def test_the_last_episode_begins_at_the_last_reset():

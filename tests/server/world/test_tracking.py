@@ -15,6 +15,7 @@ from real2sim_server.scene import Trajectory
 from real2sim_server.world import World
 
 START_US = 5_000_000
+IDEAL = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
 
 
 def s_curve(*, speed: float, curvature: float) -> Trajectory:
@@ -65,9 +66,17 @@ def test_a_curved_drive_is_followed_within_30_cm(make_world, frame, poses, spaci
 @pytest.mark.parametrize(("speed", "curvature"), [(9.0, 0.05), (14.0, 0.04), (20.0, 0.012)])
 def test_single_pose_plans_are_followed_within_5_cm(make_world, tracker, speed, curvature):
     ego = s_curve(speed=speed, curvature=curvature)
-    world = make_world(ego, spec={"ego": {"tracker": tracker}})
+    world = make_world(ego, spec={"ego": {"tracker": tracker, **IDEAL}})
 
     assert errors(world, poses=1, spacing_us=100_000, frame="vehicle").max() < 0.05
+
+
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
+def test_single_pose_plans_are_followed_within_20_cm_by_lagging_actuators(make_world, tracker):
+    ego = s_curve(speed=14.0, curvature=0.04)
+    world = make_world(ego, spec={"ego": {"tracker": tracker}})
+
+    assert errors(world, poses=1, spacing_us=100_000, frame="vehicle").max() < 0.2
 
 
 def test_without_a_plan_the_log_is_followed(make_world):
@@ -113,7 +122,7 @@ def test_a_vehicle_beside_its_plan_comes_back_to_it(make_world):
 
 
 def test_after_its_end_a_plan_ends_in_a_gentle_stop(make_world):
-    world = make_world()
+    world = make_world(spec={"ego": IDEAL})
     plan = TrajectoryPlan(times_us=[world.t_us + 500_000], poses=[(5.0, 0.0, 0.0)])
     world.step(plan)
     braking = []
@@ -127,7 +136,7 @@ def test_after_its_end_a_plan_ends_in_a_gentle_stop(make_world):
 
 
 def test_a_plan_that_stands_still_close_ahead_is_an_emergency_stop(make_world):
-    world = make_world()
+    world = make_world(spec={"ego": IDEAL})
     stop = TrajectoryPlan(
         times_us=[world.t_us + 500_000 * i for i in range(1, 9)],
         poses=[(2.0, 0.0, 0.0)] * 8,

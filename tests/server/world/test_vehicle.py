@@ -6,15 +6,20 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_are
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.world.driving import GRAVITY, Command, vehicle_parameters
+from real2sim_server.world.driving.lqr import lagging_gains
 from real2sim_server.world.driving.tyres import axle_forces, fiala
 from real2sim_server.world.ego.motion import Motion, advance_motion, constant_law
 from real2sim_server.world.ego.reference import PlannedTrajectory, ReferenceTrajectory
 from real2sim_server.world.ego.trackers import make_tracker
 
+IDEAL = {"steering_lag": 0.0, "drive_lag": 0.0}
+NUPLAN = {"steering_lag": 0.05, "drive_lag": 0.2}
+DELAYED = {"steering_delay_us": 100_000, "drive_delay_us": 100_000}
 DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
 
 
@@ -89,7 +94,7 @@ def test_lateral_acceleration_ends_at_the_friction_limit():
 
 @pytest.mark.parametrize(("friction", "expected"), [(0.9, 8.0), (0.5, 0.5 * GRAVITY)])
 def test_braking_distance_is_that_of_brakes_or_of_friction(friction, expected):
-    spec = EgoSpec(dynamics="dynamic_bicycle", vehicle={"friction": friction})
+    spec = EgoSpec(dynamics="dynamic_bicycle", vehicle={"friction": friction}, actuators=IDEAL)
     motions = driven(spec, Motion(0, 0, 0, 20.0), 6.0, lambda _m: Command(-50.0, 0.0))
 
     assert motions[-1].speed == 0.0
@@ -135,7 +140,7 @@ def test_braking_in_a_bend_takes_cornering_force():
 
 
 def test_a_delayed_brake_acts_after_its_dead_time():
-    spec = EgoSpec(actuators={"drive_delay_us": 250_000})
+    spec = EgoSpec(actuators={**IDEAL, "drive_delay_us": 250_000})
     motions = driven(spec, Motion(0, 0, 0, 10.0), 1.0, lambda _m: Command(-4.0, 0.0))
 
     assert [m.speed for m in motions[:2]] == [10.0, 10.0]
@@ -183,14 +188,101 @@ def worst_offset(spec: EgoSpec, speed: float) -> float:
     return max(errors)
 
 
-@pytest.mark.parametrize("dynamics", ["kinematic_bicycle", "dynamic_bicycle"])
+MODELS = ["kinematic_bicycle", "dynamic_bicycle"]
+TRACKERS = ["pursuit", "lqr", "ilqr"]
+
+
+@pytest.mark.parametrize("dynamics", MODELS)
+@pytest.mark.parametrize("actuators", [IDEAL, NUPLAN, NUPLAN | DELAYED, {"steering_lag": 0.1}])
 @pytest.mark.parametrize(
-    ("tracker", "tolerance"), [("pursuit", 0.25), ("lqr", 0.2), ("ilqr", 0.2), ("perfect", 1e-3)]
+    ("tracker", "tolerance"), [*((t, 0.2) for t in TRACKERS), ("perfect", 1e-3)]
 )
-def test_a_lane_change_at_15_metres_a_second_is_tracked(dynamics, tracker, tolerance):
-    spec = EgoSpec(dynamics=dynamics, tracker=tracker)
+def test_a_lane_change_at_15_metres_a_second_is_tracked(dynamics, tracker, actuators, tolerance):
+    spec = EgoSpec(dynamics=dynamics, tracker=tracker, actuators=actuators)
 
     assert worst_offset(spec, 15.0) < tolerance
+
+
+def test_actuators_lag_like_nuplans_unless_told_otherwise():
+    # KinematicBicycleModel: accel_time_constant 0.2 s, steering_angle_time_constant 0.05 s.
+    assert EgoSpec() == EgoSpec(actuators=NUPLAN)
+
+
+@pytest.mark.parametrize("dynamics", MODELS)
+@pytest.mark.parametrize("tracker", TRACKERS)
+@pytest.mark.parametrize(
+    "actuators",
+    [
+        {"steering_lag": 0.1},
+        DELAYED | IDEAL,
+        NUPLAN | DELAYED,
+        {"steering_lag": 0.3, "drive_lag": 0.5},
+        {**NUPLAN, "steering_delay_us": 200_000, "drive_delay_us": 50_000},
+    ],
+)
+@pytest.mark.parametrize("radius", [math.inf, 60.0])
+def test_slow_actuators_leave_trackers_stable(dynamics, tracker, actuators, radius):
+    spec = EgoSpec(dynamics=dynamics, tracker=tracker, actuators=actuators)
+    speed, times = 12.0, [k * 100_000 for k in range(1, 101)]
+    turns = [speed * t * 1e-6 / radius for t in times]
+    poses = [(radius * math.sin(a), radius * (1 - math.cos(a)), a) for a in turns]
+    if math.isinf(radius):
+        poses = [(speed * t * 1e-6, 0.0, 0.0) for t in times]
+    motion, offsets = Motion(0, 0.5, 0, speed), []
+    for k in range(80):
+        reference = ReferenceTrajectory(
+            motion,
+            start_us=k * 100_000,
+            trajectory=PlannedTrajectory.of(times[k:], poses[k:]),
+            spec=spec,
+        )
+        motion = make_tracker(reference, spec).advance(motion, 0.0, 100_000)
+        x, y, yaw = poses[k]
+        offsets.append(abs((motion.y - y) * math.cos(yaw) - (motion.x - x) * math.sin(yaw)))
+
+    assert max(offsets) < 0.8
+    assert max(offsets[-20:]) < 0.13
+
+
+def test_trackers_that_do_not_foresee_drive_as_if_actuators_were_ideal():
+    slow = {**NUPLAN, **DELAYED, "foreseen": False}
+    motion, commands = Motion(0, 0.5, 0, 12.0), []
+    for actuators in (slow, IDEAL):
+        spec = EgoSpec(tracker="lqr", actuators=actuators)
+        plan = PlannedTrajectory.of([1_000_000, 2_000_000], [(12.0, 0.0, 0.0), (24.0, 0.0, 0.0)])
+        reference = ReferenceTrajectory(motion, start_us=0, trajectory=plan, spec=spec)
+        commands.append(make_tracker(reference, spec).command(motion, 0.2))
+
+    assert commands[0] == commands[1]
+
+
+def test_a_plan_is_not_over_while_its_last_commands_are_on_their_way():
+    # A single pose, a dead time ahead: without that the vehicle would brake all the time.
+    spec = EgoSpec(tracker="lqr", actuators={**IDEAL, **DELAYED})
+    motion = Motion(0, 0, 0, 10.0)
+    for k in range(30):
+        trajectory = PlannedTrajectory.of([100_000 * (k + 1)], [(motion.x + 1.0, 0.0, 0.0)])
+        reference = ReferenceTrajectory(
+            motion, start_us=k * 100_000, trajectory=trajectory, spec=spec
+        )
+        motion = make_tracker(reference, spec).advance(motion, 0.0, 100_000)
+
+    assert motion.speed == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize("lag", [0.01, 0.1, 0.333, 1.0, 3.6])
+def test_gains_of_a_lagging_regulator_are_those_of_the_riccati_equation(lag):
+    A = np.array([[0.0, 1, 0], [0, 0, 1], [0, 0, -1 / lag]])
+    B = np.array([[0.0], [0], [1 / lag]])
+    P = solve_continuous_are(A, B, np.diag([1.0, 0, 0]), np.eye(1))
+    expected = (B.T @ P)[0]
+
+    np.testing.assert_allclose((1.0, *lagging_gains(lag)), expected, rtol=1e-6)
+
+
+def test_without_a_lag_the_gains_are_those_of_two_integrators():
+    assert lagging_gains(0.0) == (math.sqrt(2.0), 0.0)
+    np.testing.assert_allclose(lagging_gains(1e-6), (math.sqrt(2.0), 0.0), atol=1e-5)
 
 
 @pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr", "perfect"])

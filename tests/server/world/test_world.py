@@ -65,7 +65,8 @@ def test_the_ego_quaternion_is_its_pose(make_world, moving, yaw):
 
 
 def test_control_is_direct_actuation(make_world):
-    world = make_world(spec=CONTROL)
+    ideal = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
+    world = make_world(spec={**CONTROL, "ego": ideal})
     for _ in range(10):
         world.step(Control(acceleration=-2.0, steering=0.1))
 

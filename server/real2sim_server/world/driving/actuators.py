@@ -22,9 +22,7 @@ def delay_line(pending, vehicle, h):
     Returns:
         Line [D + 1, 2] float64 for delays of D substeps, and how many of its rows are in use.
     """
-    longest = max(
-        _delay_substeps(vehicle.drive_delay, h), _delay_substeps(vehicle.steering_delay, h)
-    )
+    longest = max(delay_substeps(vehicle.drive_delay, h), delay_substeps(vehicle.steering_delay, h))
     line = np.empty((longest + 1, 2))
     waiting = min(len(pending), longest)
     for k in range(waiting):
@@ -58,16 +56,25 @@ def push_command(line, waiting, command):
 
 
 @func
-def actuator_outputs(line, waiting, state, vehicle, h):
-    """What engine, brakes and steering gear aim at in this substep of ``h`` seconds.
+def actuator_outputs(queue, state, vehicle, h, ahead):
+    """What engine, brakes and steering gear aim at in a substep of ``h`` seconds.
 
     Until the first command arrives they keep what they do.
+
+    Args:
+        queue: line of commands and how many of its rows are in use.
+        state: of the vehicle when the substep begins.
+        vehicle: constants.
+        h: [s].
+        ahead: substeps after that in which the newest command was given; commands that are not
+            given yet are taken to be like the newest.
     """
+    line, waiting = queue
     drive, steering = state.drive, state.steering
-    k = _delay_substeps(vehicle.drive_delay, h)
+    k = max(delay_substeps(vehicle.drive_delay, h) - ahead, 0)
     if k < waiting:
         drive = clamped(line[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
-    k = _delay_substeps(vehicle.steering_delay, h)
+    k = max(delay_substeps(vehicle.steering_delay, h) - ahead, 0)
     if k < waiting:
         steering = line[k, 1]
     return Command(
@@ -77,8 +84,18 @@ def actuator_outputs(line, waiting, state, vehicle, h):
 
 
 @func
-def _delay_substeps(delay, h):
+def delay_substeps(delay, h):
+    """A dead time [s] in whole substeps of ``h`` seconds."""
     return math.floor(delay / h + 0.5)
+
+
+@func
+def leading(value, wanted, h, lag):
+    """What to ask of a first-order lag at ``value`` so that it is at ``wanted`` ``h`` seconds
+    later."""
+    if lag == 0.0:
+        return wanted
+    return value - (wanted - value) / math.expm1(-h / lag)
 
 
 @func

@@ -36,10 +36,13 @@ class PlanCurve(NamedTuple):
     Attributes:
         knots: see above.
         turn_rate: at the last pose, and from there on [rad/s].
+        early: how long before it takes effect a command is given [s]; the plan counts as over once
+            one that is given after its end would take effect.
     """
 
     knots: np.ndarray
     turn_rate: float
+    early: float
 
 
 @func
@@ -63,13 +66,19 @@ def curve_through(state, seconds, poses, vehicle):
     for i in range(1, last + 1):
         slope = _slope(knots, i) if last > 1 else _arrival(knots, state.speed, vehicle)
         knots[i, VX], knots[i, VY] = _along_heading(slope, knots[i, YAW])
-    return PlanCurve(knots, _last_turn_rate(knots, state, vehicle))
+    return PlanCurve(knots, _last_turn_rate(knots, state, vehicle), 0.0)
 
 
 @func
 def end_of(curve):
     """Time of the last pose [s]."""
     return curve.knots[len(curve.knots) - 1, T]
+
+
+@func
+def is_over(curve, t):
+    """Whether a command that takes effect at time ``t`` [s] was given after the plan's end."""
+    return t >= end_of(curve) + curve.early
 
 
 @func

@@ -7,8 +7,15 @@ import math
 import numpy as np
 
 from ..._numba import func, kernel
-from .actuators import actuator_outputs, delay_line, delayed_commands, push_command
+from .actuators import (
+    actuator_outputs,
+    delay_line,
+    delay_substeps,
+    delayed_commands,
+    push_command,
+)
 from .curve import PlanCurve, at, curve_through, heading
+from .foresight import foreseen_state
 from .state import Command, PlanarState
 from .trackers import HOLD, tracker_command, tracker_schedule
 from .vehicle import VehicleParameters
@@ -16,7 +23,8 @@ from .vehicle_models import step_vehicle
 
 SUBSTEP_US = 10_000
 
-NO_SCHEDULE = np.empty((0, 0)), np.empty((0, 0))
+_NOTHING = np.empty((0, 0))
+NO_SCHEDULE = _NOTHING, _NOTHING, _NOTHING, _NOTHING
 """Of trackers that do not plan ahead."""
 
 
@@ -50,7 +58,7 @@ def plan_curve(state, times_us, start_us, poses, vehicle):
         times_us: [N] int64, increasing, after ``start_us`` [us].
         start_us: when the vehicle is in that state [us].
         poses: [N, 3] float64, x, y [m], yaw [rad], world.
-        vehicle: the members of a :class:`.vehicle.Vehicle`.
+        vehicle: the members of a :class:`.vehicle.VehicleParameters`.
 
     Returns:
         Knots [N + 1, 6] float64 and the turn rate at the end [rad/s].
@@ -63,13 +71,13 @@ def plan_curve(state, times_us, start_us, poses, vehicle):
 @kernel
 def curve_at(curve, t):
     """x, y [m], velocity x, y [m/s] and planned heading [rad], ``t`` seconds after the start."""
-    named = PlanCurve(*curve)
+    named = PlanCurve(*curve, 0.0)
     x, y, vx, vy = at(named, t)
     return x, y, vx, vy, heading(named, t)
 
 
 @kernel
-def prepare_schedule(state, law, vehicle):
+def prepare_schedule(state, pending, law, vehicle, dt_us):
     """The schedule of a tracker that plans ahead, from a state on; arguments as in
     :func:`advance_vehicle`.
 
@@ -77,13 +85,24 @@ def prepare_schedule(state, law, vehicle):
     and few drives plan ahead.
 
     Returns:
-        Two float64 arrays of two dimensions, see :class:`.trackers.Tracker`.
+        Four float64 arrays of two dimensions: the schedule (see :class:`.trackers.Tracker`) by
+        which engine and brakes go, then the one of the steering gear. Each begins when a command
+        given now arrives there.
     """
     kind, knots, turn_rate, since, _, _ = law
-    curve = PlanCurve(knots, turn_rate)
-    return tracker_schedule(
-        kind - 1, PlanarState(*state), curve, since, VehicleParameters(*vehicle)
-    )
+    parameters = VehicleParameters(*vehicle)
+    _, h = _substeps(dt_us)
+    queue = delay_line(pending, parameters, h)
+    drive, steering = _arrivals(parameters, h)
+    curve = PlanCurve(knots, turn_rate, drive * h)
+    start = foreseen_state(PlanarState(*state), queue, parameters, h, drive)
+    schedule = tracker_schedule(kind - 1, start, curve, since + drive * h, parameters)
+    first = schedule
+    if steering != drive:
+        curve = PlanCurve(knots, turn_rate, steering * h)
+        start = foreseen_state(PlanarState(*state), queue, parameters, h, steering)
+        schedule = tracker_schedule(kind - 1, start, curve, since + steering * h, parameters)
+    return first[0], first[1], schedule[0], schedule[1]
 
 
 @kernel
@@ -99,23 +118,23 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
         state: nine floats of a :class:`.state.PlanarState`.
         pending: [W, 2] float64, commands on their way to the wheels, newest first.
         law: kind, knots and turn rate of its plan, seconds since that began, the command to hold,
-            which trackers ignore, and the schedule: of :func:`prepare_schedule` for trackers that
-            plan ahead, else :data:`NO_SCHEDULE`.
-        vehicle: the members of a :class:`.vehicle.Vehicle`.
+            which trackers ignore, and the schedules: of :func:`prepare_schedule` for trackers
+            that plan ahead, else :data:`NO_SCHEDULE`.
+        vehicle: the members of a :class:`.vehicle.VehicleParameters`.
 
     Returns:
         State and commands on their way, in the form in which they came.
     """
-    since, schedule = law[3], law[5]
-    substeps = -(-dt_us // SUBSTEP_US)
-    h = dt_us * 1e-6 / substeps
+    since = law[3]
+    substeps, h = _substeps(dt_us)
     start, parameters = PlanarState(*state), VehicleParameters(*vehicle)
     line, waiting = delay_line(pending, parameters, h)
     now = start
     for k in range(substeps):
-        command = _command(law, now, since + k * h, parameters, (*schedule, k * h))
+        timing = since + k * h, k * h, h
+        command = _timely_command(law, now, (line, waiting), parameters, timing)
         waiting = push_command(line, waiting, command)
-        outputs = actuator_outputs(line, waiting, now, parameters, h)
+        outputs = actuator_outputs((line, waiting), now, parameters, h, 0)
         now = step_vehicle(parameters.model, now, outputs, parameters, h)
     return _numbers(now, start.speed, substeps * h), delayed_commands(line, waiting)
 
@@ -124,18 +143,61 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
 def driver_command(state, law, vehicle):
     """The command of a law: acceleration [m/s^2] and road-wheel angle [rad]; arguments as in
     :func:`advance_vehicle`. Trackers that plan ahead do here what the plain LQR would."""
-    schedule = np.empty((0, 0)), np.empty((0, 0)), 0.0
-    command = _command(law, PlanarState(*state), law[3], VehicleParameters(*vehicle), schedule)
+    kind, knots, turn_rate, since, hold, _ = law
+    if kind == HOLD:
+        return hold
+    curve, schedule = PlanCurve(knots, turn_rate, 0.0), (np.empty((0, 0)), np.empty((0, 0)), 0.0)
+    command = tracker_command(
+        kind - 1, PlanarState(*state), curve, since, VehicleParameters(*vehicle), schedule
+    )
     return command.acceleration, command.steering
 
 
 @func
-def _command(law, state, t, vehicle, schedule):
-    kind, knots, turn_rate, _, (acceleration, steering), _ = law
-    if kind == HOLD:
-        return Command(acceleration, steering)
-    curve = PlanCurve(knots, turn_rate)
-    return tracker_command(kind - 1, state, curve, t, vehicle, schedule)
+def _substeps(dt_us):
+    """How many substeps a step has, and their length [s]."""
+    count = -(-dt_us // SUBSTEP_US)
+    return count, dt_us * 1e-6 / count
+
+
+@func
+def _arrivals(vehicle, h):
+    """Substeps until a command is known to reach engine and brakes, and the steering gear."""
+    return (
+        delay_substeps(vehicle.known_drive_delay, h),
+        delay_substeps(vehicle.known_steering_delay, h),
+    )
+
+
+@func
+def _timely_command(law, now, queue, vehicle, timing):
+    """The command of a law for a substep, each part of it for the time at which it arrives.
+
+    Args:
+        law, vehicle: as in :func:`advance_vehicle`.
+        now: state of the vehicle.
+        queue: commands on their way, and how many.
+        timing: seconds since the plan began, seconds since the step began, length of the substep.
+    """
+    if law[0] == HOLD:
+        return Command(*law[4])
+    drive, steering = _arrivals(vehicle, timing[2])
+    schedules = law[5]
+    command = _command_after(drive, (law, schedules[:2]), (now, queue), vehicle, timing)
+    if steering == drive:
+        return command
+    later = _command_after(steering, (law, schedules[2:]), (now, queue), vehicle, timing)
+    return Command(command.acceleration, later.steering)
+
+
+@func
+def _command_after(substeps, driver, moving, vehicle, timing):
+    """The command of a law and its schedule for the state after some substeps."""
+    (law, schedule), (now, queue), (t, elapsed, h) = driver, moving, timing
+    curve = PlanCurve(law[1], law[2], substeps * h)
+    there = foreseen_state(now, queue, vehicle, h, substeps)
+    t += curve.early
+    return tracker_command(law[0] - 1, there, curve, t, vehicle, (*schedule, elapsed))
 
 
 @func

@@ -1,21 +1,27 @@
 """Iterative LQR: the commands that follow the plan best over the next seconds, within limits.
 
 Gauss-Newton (Li & Todorov 2004) with the kinematic bicycle over 1.5 s in steps of 0.1 s, on the
-state (x, y, yaw, speed, road-wheel angle) and the inputs (acceleration, steering rate). Limits are
-held in the rollout of each iteration. A schedule is one state a row, [STEPS + 1, 5], and one pair
-of inputs a row, [STEPS, 2].
+state (x, y, yaw, speed, road-wheel angle, acceleration) and the inputs (acceleration asked for,
+steering rate). Limits are held in the rollout of each iteration. A schedule is one state a row,
+[STEPS + 1, 6], and one pair of inputs a row, [STEPS, 2].
+
+The acceleration follows what is asked for with the lag that is known of engine and brakes. The lag
+of the steering gear needs no state: angle and rate of the wheels say what to ask of it.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from ..._numba import func
-from .curve import end_of
+from .actuators import leading
+from .curve import is_over
 from .lqr import point_at, regulate
 from .state import Command, clamped, wrapped
+from .vehicle import VehicleParameters
 from .vehicle_models import steady_steering
 
 STEP = 0.1
@@ -27,18 +33,32 @@ GAINS = (1.0, 0.5, 0.2, 0.05)
 ENOUGH = 1e-4
 """Iterations end where one gains less than this fraction of the cost."""
 
-STATE_COST = np.array([4.0, 4.0, 10.0, 1.0, 0.0])
-"""Per squared error of x, y [m], yaw [rad], speed [m/s], road-wheel angle [rad]."""
+STATE_COST = np.array([4.0, 4.0, 10.0, 1.0, 0.0, 0.0])
+"""Per squared error of x, y [m], yaw [rad], speed [m/s], road-wheel angle [rad], acceleration."""
 INPUT_COST = np.array([0.05, 0.5])
 """Per squared acceleration [m/s^2] and steering rate [rad/s]."""
 
-NX, NU = 5, 2
+NX, NU = 6, 2
+
+
+class Model(NamedTuple):
+    """The vehicle as it is planned with.
+
+    Attributes:
+        vehicle: its constants.
+        kept: share of the acceleration before a step that is left after it.
+        held: share of it in the mean over the step.
+    """
+
+    vehicle: VehicleParameters
+    kept: float
+    held: float
 
 
 @func
 def prepare(state, curve, since, vehicle):
     """The schedule of a vehicle that is ``since`` seconds into its plan; empty after its end."""
-    if since >= end_of(curve):
+    if is_over(curve, since):
         return np.empty((0, 0)), np.empty((0, 0))
     return solve_schedule(state, curve, since, vehicle)
 
@@ -56,6 +76,10 @@ def follow_schedule(state, curve, t, vehicle, schedule):
     rolling = steering + 0.01 * inputs[k, 1]
     curvature = math.tan(rolling) / vehicle.wheelbase
     ahead = steady_steering(vehicle.model, rolling, curvature, state.speed, vehicle)
+    if vehicle.known_steering_lag > 0.0:
+        most = vehicle.max_steer_rate * 0.01
+        ahead = state.steering + clamped(ahead - state.steering, -most, most)
+        ahead = leading(state.steering, ahead, 0.01, vehicle.known_steering_lag)
     return Command(inputs[k, 0], ahead)
 
 
@@ -63,20 +87,21 @@ def follow_schedule(state, curve, t, vehicle, schedule):
 def solve_schedule(state, curve, since, vehicle):
     """The schedule of a vehicle that is ``since`` seconds into its plan."""
     wanted = _reference_states(state, curve, since)
+    model = _model_of(vehicle)
     states, inputs = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
     tried = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
     for first in (states[0], tried[0][0]):
         first[0], first[1], first[2] = state.x, state.y, state.yaw
-        first[3], first[4] = state.speed, state.steering
+        first[3], first[4], first[5] = state.speed, state.steering, state.drive
     for k in range(STEPS):
         inputs[k, 0], inputs[k, 1] = (wanted[k + 1, 3] - wanted[k, 3]) / STEP, 0.0
-        _step(states, inputs, k, vehicle)
+        _step(states, inputs, k, model)
     cost = _cost((states, inputs), wanted)
     for _ in range(ITERATIONS):
-        forward, feedback = _backward(states, inputs, wanted, vehicle.wheelbase)
+        forward, feedback = _backward(states, inputs, wanted, model)
         gained = -1.0
         for gain in GAINS:
-            _rollout(tried, (states, inputs), (gain, forward, feedback), vehicle)
+            _rollout(tried, (states, inputs), (gain, forward, feedback), model)
             gained = cost - _cost(tried, wanted)
             if gained > 0.0:
                 break
@@ -90,8 +115,17 @@ def solve_schedule(state, curve, since, vehicle):
 
 
 @func
+def _model_of(vehicle):
+    lag = vehicle.known_drive_lag
+    if lag == 0.0:
+        return Model(vehicle, 0.0, 0.0)
+    kept = math.exp(-STEP / lag)
+    return Model(vehicle, kept, lag / STEP * (1 - kept))
+
+
+@func
 def _reference_states(state, curve, since):
-    """Wanted states [STEPS + 1, 5]; yaws continuous from the vehicle's."""
+    """Wanted states [STEPS + 1, 6]; yaws continuous from the vehicle's."""
     wanted = np.zeros((STEPS + 1, NX))
     yaw = state.yaw
     for k in range(STEPS + 1):
@@ -103,7 +137,7 @@ def _reference_states(state, curve, since):
 
 
 @func
-def _rollout(tried, schedule, change, vehicle):
+def _rollout(tried, schedule, change, model):
     """Writes to ``tried`` the schedule that a fraction of the change of the inputs leads to, within
     limits."""
     (tried_states, tried_inputs), (states, inputs) = tried, schedule
@@ -114,23 +148,24 @@ def _rollout(tried, schedule, change, vehicle):
             for j in range(NX):
                 command += feedback[k, i, j] * (tried_states[k, j] - states[k, j])
             tried_inputs[k, i] = command
-        _step(tried_states, tried_inputs, k, vehicle)
+        _step(tried_states, tried_inputs, k, model)
 
 
 @func
-def _step(states, inputs, k, vehicle):
+def _step(states, inputs, k, model):
     """Holds the limits of a row of inputs and writes the state that it leads to."""
-    before, after = states[k], states[k + 1]
+    before, after, vehicle = states[k], states[k + 1], model.vehicle
     x, y, yaw, speed, steering = before[0], before[1], before[2], before[3], before[4]
     a = clamped(inputs[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
     rate = clamped(inputs[k, 1], -vehicle.max_steer_rate, vehicle.max_steer_rate)
     end = clamped(steering + rate * STEP, -vehicle.max_steer, vehicle.max_steer)
-    later = max(speed + a * STEP, 0.0)
+    later = max(speed + (a + model.held * (before[5] - a)) * STEP, 0.0)
     way = (speed + later) / 2 * STEP
     turn = way * math.tan((steering + end) / 2) / vehicle.wheelbase
     middle = yaw + turn / 2
     after[0], after[1] = x + way * math.cos(middle), y + way * math.sin(middle)
     after[2], after[3], after[4] = yaw + turn, later, end
+    after[5] = a + model.kept * (before[5] - a)
     inputs[k, 0], inputs[k, 1] = a, (end - steering) / STEP
 
 
@@ -148,22 +183,23 @@ def _cost(schedule, wanted):
 
 
 @func
-def _backward(states, inputs, wanted, wheelbase):
-    """Changes of the inputs [STEPS, 2] and feedback gains [STEPS, 2, 5]."""
+def _backward(states, inputs, wanted, model):
+    """Changes of the inputs [STEPS, 2] and feedback gains [STEPS, 2, 6]."""
     forward, feedback = np.empty((STEPS, NU)), np.empty((STEPS, NU, NX))
-    V, v = np.zeros((NX, NX)), np.empty(NX)
+    A, B, V, v = np.zeros((NX, NX)), np.zeros((NX, NU)), np.zeros((NX, NX)), np.empty(NX)
+    VA, VB = np.empty((NX, NX)), np.empty((NX, NU))
+    Hxx, Hux, Huu = np.empty((NX, NX)), np.empty((NU, NX)), np.empty((NU, NU))
+    hx, hu = np.empty(NX), np.empty(NU)
     for i in range(NX):
         V[i, i] = STATE_COST[i]
         v[i] = STATE_COST[i] * (states[STEPS, i] - wanted[STEPS, i])
     for k in range(STEPS - 1, -1, -1):
-        A, B = _linearised(states[k], states[k + 1], wheelbase)
-        VA, VB = _product(V, A), _product(V, B)
-        Hxx, Hux, Huu = (
-            _transposed(A, VA),
-            _transposed(B, VA),
-            _transposed(B, VB),
-        )
-        hx, hu = np.empty(NX), np.empty(NU)
+        _linearise(A, B, (states[k], states[k + 1]), model)
+        _product(VA, V, A)
+        _product(VB, V, B)
+        _transposed(Hxx, A, VA)
+        _transposed(Hux, B, VA)
+        _transposed(Huu, B, VB)
         for i in range(NX):
             Hxx[i, i] += STATE_COST[i]
             hx[i] = STATE_COST[i] * (states[k, i] - wanted[k, i])
@@ -192,15 +228,16 @@ def _backward(states, inputs, wanted, wheelbase):
 
 
 @func
-def _linearised(state, after, wheelbase):
-    """Derivatives of the next state by state [5, 5] and by input [5, 2]."""
+def _linearise(A, B, along, model):
+    """Writes the derivatives of the next state by state [6, 6], above its diagonal, and by input
+    [6, 2]; what they leave out is 0."""
+    state, after = along
     way = (state[3] + after[3]) / 2 * STEP
     middle = (state[2] + after[2]) / 2
     cos, sin, tan = math.cos(middle), math.sin(middle), math.tan((state[4] + after[4]) / 2)
-    by_steering = way * (1 + tan * tan) / wheelbase
-    by_speed = STEP * tan / wheelbase
-    A, B = np.zeros((NX, NX)), np.zeros((NX, NU))
-    for i in range(NX):
+    by_steering = way * (1 + tan * tan) / model.vehicle.wheelbase
+    by_speed = STEP * tan / model.vehicle.wheelbase
+    for i in range(5):
         A[i, i] = 1.0
     A[0, 2], A[1, 2] = -way * sin, way * cos
     A[0, 3] = STEP * cos - way * sin * by_speed / 2
@@ -209,30 +246,32 @@ def _linearised(state, after, wheelbase):
     A[0, 4] = -way * sin * by_steering / 2
     A[1, 4] = way * cos * by_steering / 2
     A[2, 4] = by_steering
-    # An input acts over the step: on average it has changed speed and angle by half of itself.
+    # An input acts over the step: on average it has changed speed and angle by half of itself. So
+    # has the acceleration before it, as far as that is held.
     for i in range(3):
-        B[i, 0], B[i, 1] = A[i, 3] * STEP / 2, A[i, 4] * STEP / 2
-    B[3, 0] = B[4, 1] = STEP
-    return A, B
+        A[i, 5] = A[i, 3] * STEP / 2 * model.held
+        B[i, 0], B[i, 1] = A[i, 3] * STEP / 2 * (1 - model.held), A[i, 4] * STEP / 2
+    A[3, 5], A[5, 5] = STEP * model.held, model.kept
+    B[3, 0], B[4, 1], B[5, 0] = STEP * (1 - model.held), STEP, 1 - model.kept
 
 
 @func
-def _product(M, N):
-    """M N."""
-    result = np.zeros((M.shape[0], N.shape[1]))
+def _product(result, M, N):
+    """Writes M N."""
     for i in range(M.shape[0]):
         for j in range(N.shape[1]):
-            for k in range(M.shape[1]):
-                result[i, j] += M[i, k] * N[k, j]
-    return result
+            total = 0.0
+            for k in range(NX):
+                total += M[i, k] * N[k, j]
+            result[i, j] = total
 
 
 @func
-def _transposed(M, N):
-    """M^T N."""
-    result = np.zeros((M.shape[1], N.shape[1]))
+def _transposed(result, M, N):
+    """Writes M^T N."""
     for i in range(M.shape[1]):
         for j in range(N.shape[1]):
-            for k in range(M.shape[0]):
-                result[i, j] += M[k, i] * N[k, j]
-    return result
+            total = 0.0
+            for k in range(NX):
+                total += M[k, i] * N[k, j]
+            result[i, j] = total

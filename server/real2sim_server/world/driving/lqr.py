@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from ..._numba import func
-from .curve import MOVING, YAW, X, Y, end_of, heading, planned_at
+from .curve import MOVING, YAW, X, Y, heading, is_over, planned_at
 from .state import GENTLE_BRAKING, Command, wrapped
 from .vehicle_models import steady_steering
 
@@ -18,6 +18,10 @@ HEADWAY, SHORTEST = 0.55, 2.0
 
 DIFFERENCE = 0.05
 """Acceleration and curvature of the plan are taken over this time [s]."""
+
+
+NEWTON_STEPS = 8
+"""From the start that is taken, the gains are then exact for lags of up to ten times the scale."""
 
 
 class PlanPoint(NamedTuple):
@@ -39,19 +43,52 @@ def regulate(state, curve, t, vehicle, _schedule):
     the plan the error obeys e'' = a - a_ref in time; across it e'' = k - k_ref in path length,
     for small heading errors. Both are double integrators, whose Riccati equation for the cost
     q e^2 + r u^2 has the solution u = -(e/l^2 + sqrt(2) e'/l) with l = (r/q)^(1/4) (Anderson &
-    Moore 1990, Optimal Control, ch. 3).
+    Moore 1990, Optimal Control, ch. 3). Lags that are known are part of both, see
+    :func:`lagging_gains`; what the plan itself needs is fed forward by as much earlier.
     """
-    if t >= end_of(curve):
+    if is_over(curve, t):
         last = curve.knots[len(curve.knots) - 1]
         point = PlanPoint(last[X], last[Y], last[YAW], 0.0, 0.0, 0.0)
-        return Command(-GENTLE_BRAKING, _steering_onto(point, state, vehicle))
+        return Command(-GENTLE_BRAKING, _steering_onto(point, 0.0, state, vehicle))
     point = point_at(curve, t)
     along = (point.x - state.x) * math.cos(point.yaw) + (point.y - state.y) * math.sin(point.yaw)
     speed = state.speed * math.cos(state.yaw - point.yaw)
-    acceleration = (
-        point.acceleration + along / TIME**2 + math.sqrt(2.0) * (point.speed - speed) / TIME
-    )
-    return Command(acceleration, _steering_onto(point, state, vehicle))
+    by_speed, by_drive = lagging_gains(vehicle.known_drive_lag / TIME)
+    acceleration = point.acceleration + along / TIME**2 + by_speed * (point.speed - speed) / TIME
+    if vehicle.known_drive_lag > 0.0:
+        later = point_at(curve, t + vehicle.known_drive_lag)
+        acceleration += later.acceleration - point.acceleration
+        acceleration -= by_drive * (state.drive - point.acceleration)
+    coming = point.curvature
+    if vehicle.known_steering_lag > 0.0:
+        coming = point_at(curve, t + vehicle.known_steering_lag).curvature
+    return Command(acceleration, _steering_onto(point, coming, state, vehicle))
+
+
+@func
+def lagging_gains(lag):
+    """Gains of the regulator of a double integrator behind a lag of the first order.
+
+    For e'' = a and lag a' = u - a with the cost e^2 + u^2 the optimal u is -(e + b e' + c a). The
+    squares z of the closed loop's poles solve lag^2 z^3 = z^2 + 1 (symmetric root locus); its real
+    root is w / lag^2 with w^3 = w^2 + lag^4.
+
+    Args:
+        lag: in units of the regulator's scale.
+
+    Returns:
+        b and c; sqrt(2) and 0 without a lag.
+    """
+    if lag == 0.0:
+        return math.sqrt(2.0), 0.0
+    fourth = lag**4
+    w = 1.0 + min(fourth, fourth ** (1 / 3))
+    for _ in range(NEWTON_STEPS):
+        w -= (w * w * (w - 1.0) - fourth) / (w * (3.0 * w - 2.0))
+    root = math.sqrt(w)
+    # The other two poles are those of s^2 + b s + 1/sqrt(w), and the first is at -sqrt(w)/lag.
+    pair = math.sqrt(2.0 / root - (lag / w) ** 2)
+    return lag / root + pair * root, lag * pair + root - 1.0
 
 
 @func
@@ -69,14 +106,28 @@ def point_at(curve, t):
 
 
 @func
-def _steering_onto(point, state, vehicle):
-    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``."""
+def _steering_onto(point, coming, state, vehicle):
+    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``, whose
+    curvature is ``coming`` [1/m] once the steering gear has followed."""
     dx, dy = state.x - point.x, state.y - point.y
     across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
     # Where the vehicle really goes: with slipping tyres not quite where it points.
     direction = state.yaw + math.atan2(state.lateral_speed, max(state.speed, 1.0))
     off = wrapped(direction - point.yaw)
     scale = max(HEADWAY * state.speed, SHORTEST)
-    curvature = point.curvature - across / scale**2 - math.sqrt(2.0) * off / scale
+    lag = vehicle.known_steering_lag * state.speed / scale
+    by_heading, by_steering = lagging_gains(lag)
+    curvature = coming - across / scale**2 - by_heading * off / scale
+    steering = _steering_of(curvature, state.speed, vehicle)
+    if lag > 0.0:
+        steering -= by_steering * (
+            state.steering - _steering_of(point.curvature, state.speed, vehicle)
+        )
+    return steering
+
+
+@func
+def _steering_of(curvature, speed, vehicle):
+    """Road-wheel angle [rad] that keeps a curvature [1/m]."""
     rolling = math.atan(vehicle.wheelbase * curvature)
-    return steady_steering(vehicle.model, rolling, curvature, state.speed, vehicle)
+    return steady_steering(vehicle.model, rolling, curvature, speed, vehicle)

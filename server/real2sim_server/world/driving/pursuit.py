@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from ..._numba import func
-from .curve import YAW, X, Y, at, end_of, heading
-from .state import GENTLE_BRAKING, Command, clamped
+from .curve import MOVING, YAW, X, Y, at, end_of, heading, is_over
+from .state import GENTLE_BRAKING, Command, PlanarState, clamped
 from .vehicle_models import steady_steering
 
 LOOKAHEAD = 0.4
@@ -27,17 +27,48 @@ def pursue(state, curve, t, vehicle, _schedule):
     Steering is pure pursuit (Coulter 1992, CMU-RI-TR-92-01): the arc that ends at the aim. The
     aim lies on the plan, so the arc carries the plan's curvature. Acceleration is what brings the
     vehicle to where the plan is after the look-ahead time T, from s = v T + a T^2 / 2; with its
-    two gains 2 / T^2 and 2 / T the lag behind a moving plan decays with damping 0.7.
+    two gains 2 / T^2 and 2 / T the lag behind a moving plan decays with damping 0.7. Lags that are
+    known count as dead times: each command is for where the vehicle will be after its lag.
     """
-    if t >= end_of(curve):
+    if is_over(curve, t):
         last = curve.knots[len(curve.knots) - 1]
         x, y = _straight_on(state, last[X], last[Y], last[YAW])
         return Command(-GENTLE_BRAKING, _steering(state, x, y, vehicle))
-    x, y, vx, vy = at(curve, t + LOOKAHEAD)
-    acceleration = _acceleration(state, x - state.x, y - state.y, vx, vy)
-    if math.hypot(x - state.x, y - state.y) < MIN_AIM:
-        x, y = _farther_aim(state, curve, t + LOOKAHEAD)
-    return Command(acceleration, _steering(state, x, y, vehicle))
+    after = t + LOOKAHEAD + vehicle.known_drive_lag
+    x, y, vx, vy = at(curve, after)
+    there = _coasted(state, vehicle.known_drive_lag)
+    acceleration = _acceleration(there, x - there.x, y - there.y, vx, vy)
+    if vehicle.known_steering_lag != vehicle.known_drive_lag:
+        after = t + LOOKAHEAD + vehicle.known_steering_lag
+        x, y, _, _ = at(curve, after)
+        there = _coasted(state, vehicle.known_steering_lag)
+    if math.hypot(x - there.x, y - there.y) < MIN_AIM:
+        x, y = _farther_aim(there, curve, after)
+    return Command(acceleration, _steering(there, x, y, vehicle))
+
+
+@func
+def _coasted(state, seconds):
+    """The vehicle some time later, were its drive and its turn rate per way to stay as they are."""
+    if seconds == 0.0:
+        return state
+    speed = max(state.speed + state.drive * seconds, 0.0)
+    way = (state.speed + speed) / 2 * seconds
+    turn = state.yaw_rate * way / state.speed if state.speed > MOVING else 0.0
+    heading_there = state.yaw + turn / 2
+    sideways = state.lateral_speed * seconds
+    cos, sin = math.cos(heading_there), math.sin(heading_there)
+    return PlanarState(
+        state.x + way * cos - sideways * sin,
+        state.y + way * sin + sideways * cos,
+        state.yaw + turn,
+        speed,
+        state.acceleration,
+        state.steering,
+        state.yaw_rate,
+        state.lateral_speed,
+        state.drive,
+    )
 
 
 @func

@@ -24,7 +24,9 @@ class Tracker(NamedTuple):
     Attributes:
         command: ``command(state, curve, t, vehicle, schedule)``, the :class:`.state.Command` of a
             substep, ``t`` seconds after the plan began; ``schedule`` is what was prepared (it may
-            be empty) and the seconds since then.
+            be empty) and the seconds since then. State and time are those at which the command
+            reaches the wheels; lags that it has to allow for are ``vehicle.known_steering_lag``
+            and ``vehicle.known_drive_lag``.
         prepare: ``prepare(state, curve, since, vehicle)``, once a clock step, ``since`` seconds
             after the plan began: a schedule, two float64 arrays of two dimensions. None for
             trackers that do not plan ahead.

@@ -27,6 +27,8 @@ class VehicleParameters(NamedTuple):
         max_speed: [m/s].
         steering_delay, drive_delay: dead times of commands [s].
         steering_lag, drive_lag: time constants of the first order [s].
+        known_steering_delay, known_steering_lag, known_drive_delay, known_drive_lag: what trackers
+            take these four to be [s]: the same, or 0 where they know nothing of them.
     """
 
     model: int
@@ -49,3 +51,7 @@ class VehicleParameters(NamedTuple):
     steering_lag: float
     drive_delay: float
     drive_lag: float
+    known_steering_delay: float
+    known_steering_lag: float
+    known_drive_delay: float
+    known_drive_lag: float

@@ -52,6 +52,13 @@ def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
     rear = figures.front_load * spec.wheelbase
     # k^2 / (a b) is close to 1 for passenger cars (Heydinger et al. 1999, SAE 1999-01-1336).
     inertia = figures.yaw_inertia or figures.mass * front * rear
+    lags = {
+        "steering_delay": actuators.steering_delay_us * 1e-6,
+        "steering_lag": actuators.steering_lag,
+        "drive_delay": actuators.drive_delay_us * 1e-6,
+        "drive_lag": actuators.drive_lag,
+    }
+    known = {f"known_{name}": value * actuators.foreseen for name, value in lags.items()}
     return VehicleParameters(
         model=list(VEHICLE_MODELS).index(spec.dynamics),
         wheelbase=spec.wheelbase,
@@ -69,8 +76,6 @@ def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
         max_acceleration=spec.max_acceleration,
         max_braking=spec.max_braking,
         max_speed=spec.max_speed,
-        steering_delay=actuators.steering_delay_us * 1e-6,
-        steering_lag=actuators.steering_lag,
-        drive_delay=actuators.drive_delay_us * 1e-6,
-        drive_lag=actuators.drive_lag,
+        **lags,
+        **known,
     )

@@ -26,6 +26,9 @@ from ..path import Float
 SLOW = 0.1
 """Below this speed the steering angle cannot be derived from the motion [m/s]."""
 
+Schedules = tuple[Float, Float, Float, Float]
+"""See :func:`.driving.prepare_schedule`."""
+
 NO_PLAN = np.empty((0, 6))
 NOTHING_PENDING = np.empty((0, 2))
 
@@ -80,8 +83,8 @@ class ControlLaw(NamedTuple):
     hold: tuple[float, float] = (0.0, 0.0)
 
     def arguments(
-        self, since: float, schedule: tuple[Float, Float] = NO_SCHEDULE
-    ) -> tuple[int, Float, float, float, tuple[float, float], tuple[Float, Float]]:
+        self, since: float, schedule: Schedules = NO_SCHEDULE
+    ) -> tuple[int, Float, float, float, tuple[float, float], Schedules]:
         """The law ``since`` seconds after its plan began, as :mod:`.driving` takes it."""
         return self.kind, self.knots, self.turn_rate, since, self.hold, schedule
 
@@ -107,7 +110,8 @@ def advance_motion(
     vehicle = tuple(vehicle_parameters(spec))
     numbers, arguments = motion.numbers, law.arguments(since)
     if law.kind in PLANNING_AHEAD:
-        arguments = law.arguments(since, prepare_schedule(numbers, arguments, vehicle))
+        schedule = prepare_schedule(numbers, pending, arguments, vehicle, dt_us)
+        arguments = law.arguments(since, schedule)
     state, waiting = advance_vehicle(numbers, pending, arguments, vehicle, dt_us)
     delayed = tuple(Command(*row) for row in waiting.tolist())
     return Motion._make((*state, delayed))

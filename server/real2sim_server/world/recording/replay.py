@@ -16,10 +16,9 @@ from real2sim_proto.plans import PLAN, Plan
 from ...edit import ScenarioState
 from ...scene import Scene
 from ..world import World
+from .stored_spec import stored_spec
 
 KINDS = ("reset", "action", "edit", "agent", "snapshot", "restore", "stop")
-YOUNGER_CONTACT = {"swept": False}
-"""Options of contact that old episodes lack, and what they ran with."""
 _OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 
 
@@ -129,11 +128,8 @@ class Replayer:
 
 
 def recorded_spec(reset: Entry) -> ResetSpec:
-    """How a recorded episode runs. All options are recorded, so one that is absent is younger than
-    the episode, which ran as if it were off."""
-    spec = dict(decode(reset.payload)["spec"])
-    spec["contact"] = YOUNGER_CONTACT | dict(spec.get("contact", {}))
-    return ResetSpec.model_validate(spec)
+    """How a recorded episode runs, see :func:`~.stored_spec.stored_spec`."""
+    return stored_spec(decode(reset.payload)["spec"])
 
 
 def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:

@@ -76,7 +76,8 @@ def test_a_late_planner_can_be_braked_for(client):
         begun = session.reset(action="control", on_timeout="brake", **SOON)
         time.sleep(0.3)
         late = session.step(PLAN)
-    assert late.ego.acceleration == pytest.approx(-6.0)
+    # On the way to -6 m/s^2 behind the lag of the brakes.
+    assert -6.0 <= late.ego.acceleration < -1.0
     assert late.ego.speed < begun.ego.speed
 
 
@@ -137,7 +138,7 @@ def test_measured_latency_is_on_record_and_delays_the_plan(site, join):
     # A quarter of a second is more than a step: meanwhile the recorded drive goes on.
     late, prompt = (planner.act(step, acceleration=-8.0)["ego"]["speed"] for step in (0, 1))
     assert late == pytest.approx(5.0, abs=0.05)
-    assert prompt < 4.6
+    assert prompt < 4.9
 
 
 @pytest.mark.parametrize(
