@@ -64,6 +64,8 @@ MODELS: dict[str, type[BaseModel]] = {
         sessions.SessionInfo,
         sessions.SessionList,
         sessions.StepRequest,
+        sessions.SessionEdit,
+        sessions.SessionEdited,
         sessions.SessionState,
         sessions.SessionRender,
     )

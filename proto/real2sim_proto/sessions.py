@@ -7,7 +7,9 @@ from pydantic import Field
 from .base import Microseconds, Model
 from .drive import AgentState, EgoState, Event
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
+from .operations import Operation
 from .plans import Plan
+from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import Reply
 
 MAX_STEPS_PER_REQUEST = 1000
@@ -49,6 +51,26 @@ class StepRequest(Model):
     plan: Plan | None = Field(
         default=None, description="default: the last one, else follow the log"
     )
+
+
+class SessionEdit(Model):
+    """Body of `POST /v1/sessions/{id}/operations`: edits of the running world, before its next
+    step; all of them apply, or none."""
+
+    operations: list[Operation] = Field(min_length=1, max_length=MAX_OPERATIONS_PER_REQUEST)
+    base_rev: int | None = Field(
+        default=None, description="`revision` they were made for; refused when it is another now"
+    )
+
+
+class SessionEdited(Reply):
+    """Answer to edits of a running world."""
+
+    session_id: str
+    step: int = Field(description="they take effect before the step that follows it")
+    revision: int
+    created: list[str] = Field(default_factory=list, description="ids of new objects")
+    warnings: list[EditWarning] = Field(default_factory=list)
 
 
 class SessionState(Reply):

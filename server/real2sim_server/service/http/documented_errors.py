@@ -95,6 +95,7 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
         C.OVER_CAPACITY,
         C.TOO_MANY_SESSIONS,
     ),
+    "sessions-edit": (*_OF_EDITS, C.NOT_RESET, C.STALE_REVISION),
     "sessions-fork": _OF_EPISODES,
     "sessions-recording": _OF_EPISODES,
     "sessions-render": (*_OF_EPISODES, C.UNKNOWN_CAMERA, C.NOT_ACCEPTABLE),

@@ -61,6 +61,11 @@ BODIES: dict[str, Any] = {
     "ExportRequest": {"scenario": "sc_0123456789abcdef", "camera": "front", "fps": 10},
     "SessionCreate": {"reset": {"seed": 0, "dt_us": 100_000}},
     "ResetSpec": {"seed": 0, "dt_us": 100_000},
+    "SessionEdit": {
+        "operations": [
+            {"op": "spawn", "recorded_id": "van_0", "place": {"ahead": 40.0}, "speed": 8.0}
+        ]
+    },
     "StepRequest": {"n": 10},
     "SceneView": {
         "t_us": 1_000_000,

@@ -13,6 +13,8 @@ from real2sim_proto.base import Identifier
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.sessions import (
     SessionCreate,
+    SessionEdit,
+    SessionEdited,
     SessionInfo,
     SessionList,
     SessionRender,
@@ -20,6 +22,7 @@ from real2sim_proto.sessions import (
     StepRequest,
 )
 
+from ...edit import EditOutcome
 from ...world import Event, World
 from ..http.accounting import begin_paying
 from ..http.auth import (
@@ -33,7 +36,7 @@ from ..http.auth import (
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
-from ..sessions.describe import session_info, session_state
+from ..sessions.describe import session_edited, session_info, session_state
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import check_not_closed, created_headers
 from ..sessions.session import Session, opens_session
@@ -196,6 +199,35 @@ async def step(
             await worker.sessions.stepper.step(session, body.n, body.plan, reply=reply)
             world, events = session.running_world(), session.take_events()
     return await large_response(lambda: session_state(session.session_id, world, events))
+
+
+@router.post("/{session_id}/operations", response_model=SessionEdited)
+async def edit(
+    worker: WorkerOf,
+    session: SessionOf,
+    request: Request,
+    body: SessionEdit,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """Edit the running world before its next step: put road users there (`spawn`) and take them
+    away (`delete`), move objects. A controller may be driving meanwhile; the next observation has
+    the event `edited`."""
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+
+        def stored(world: World, outcome: EditOutcome) -> StoredReply | None:
+            if idempotent.key is None:
+                return None
+            return idempotent.reply(session_edited(session.session_id, world, outcome), status=200)
+
+        async with session.lock:
+            session.check_open()
+            outcome = await worker.sessions.stepper.edit(
+                session, body.operations, base_rev=body.base_rev, reply=stored
+            )
+            made = session_edited(session.session_id, session.running_world(), outcome)
+    return info_response(made)
 
 
 @router.get("/{session_id}/state", response_model=SessionState)

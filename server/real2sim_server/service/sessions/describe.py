@@ -11,8 +11,9 @@ from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
-from real2sim_proto.sessions import SessionInfo, SessionState
+from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
 
+from ...edit import EditOutcome
 from ...world import Event, World, agent_fields, ego_fields, metrics_version
 from ..library.views import camera_infos, edited_objects
 from .session import Session
@@ -56,6 +57,17 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
             "lap": world.lap,
             "drawn": world.drawn,
         }
+    )
+
+
+def session_edited(session_id: str, world: World, outcome: EditOutcome) -> SessionEdited:
+    """What an edit of a running world led to."""
+    return SessionEdited(
+        session_id=session_id,
+        step=world.steps,
+        revision=world.revision,
+        created=list(outcome.created),
+        warnings=list(outcome.warnings),
     )
 
 

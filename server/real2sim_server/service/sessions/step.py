@@ -42,6 +42,9 @@ LogRecord = tuple[str, int, bytes]
 MakeReply = Callable[[World, Sequence[Event]], StoredReply | None]
 """Makes what is stored under a request's key of the world it led to and the events on the way."""
 
+MakeEditReply = Callable[[World, EditOutcome], StoredReply | None]
+"""The same of an edited world and what the edit led to."""
+
 MAX_SNAPSHOTS = 32
 
 STEPS_AT_ONCE = 20
@@ -197,9 +200,18 @@ class Stepper:
         session.lockstep.skip(world.steps - now.steps, over=world.over)
 
     async def edit(
-        self, session: Session, operations: Sequence[Operation], *, base_rev: int | None
+        self,
+        session: Session,
+        operations: Sequence[Operation],
+        *,
+        base_rev: int | None,
+        reply: MakeEditReply | None = None,
     ) -> EditOutcome:
-        """Edit the world before its next step. Raises EditError; then nothing has changed."""
+        """Edit the world before its next step; ``reply`` makes the answer that is stored with it.
+
+        Raises:
+            EditError: nothing has changed.
+        """
         now = session.running_world()
 
         def edited() -> tuple[World, EditOutcome]:
@@ -207,7 +219,8 @@ class Stepper:
             return world, world.apply(operations, base_revision=base_rev)
 
         world, outcome = await self._pipeline.on_world_thread(edited)
-        await self._record(session, [("edit", now.steps, edit_payload(operations))])
+        stored = reply(world, outcome) if reply is not None else None
+        await self._record(session, [("edit", now.steps, edit_payload(operations))], reply=stored)
         session.world = world
         return outcome
 

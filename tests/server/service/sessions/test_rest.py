@@ -9,7 +9,9 @@ import pytest
 
 from real2sim_proto import decode
 from real2sim_proto.drive import SERVER_MESSAGE
-from real2sim_proto.sessions import SessionInfo, SessionState
+from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
+from real2sim_server.world.recording.recording import first_difference, recording_of_bytes
+from real2sim_server.world.recording.replay import Replayer
 
 pytestmark = pytest.mark.network
 
@@ -262,3 +264,68 @@ def test_images_that_cannot_be_are_refused(site, info, sensor, expected):
 
 
 MSGPACK = {"Accept": "application/msgpack"}
+
+
+# --- edits ------------------------------------------------------------------------------------
+
+KEEP = {"op": "restore", "object_id": "post"}
+SPAWN = {"op": "spawn", "recorded_id": "car_red", "place": {"ahead": 12.0}, "speed": 4.0}
+
+
+def ids(answer) -> set[str]:
+    return {a["object_id"] for a in answer.json()["agents"]}
+
+
+def test_an_author_spawns_a_car_beside_a_controller_and_takes_it_away(site, join):
+    info = site.create()
+    planner = join(info)
+    planner.reset(privileged=True)
+    answer = site.call("POST", info, "/operations", json={"operations": [SPAWN]})
+    made = SessionEdited.model_validate_json(answer.content)
+    assert (made.step, made.revision, made.created) == (0, 1, ["spawned_1"])
+    obs = planner.act(0)
+    assert "spawned_1" in {a["object_id"] for a in obs["agents"]}
+    assert "edited" in {e["type"] for e in obs["events"]}
+    gone = {"operations": [{"op": "delete", "object_id": "spawned_1"}]}
+    assert site.call("POST", info, "/operations", json=gone).json()["revision"] == 2
+    assert "spawned_1" not in {a["object_id"] for a in planner.act(1)["agents"]}
+
+
+def test_an_edit_of_a_running_world_takes_effect_once(site, info):
+    key = {"Idempotency-Key": "one"}
+    body = {"operations": [SPAWN]}
+    answers = [site.call("POST", info, "/operations", json=body, headers=key) for _ in range(2)]
+    assert answers[1].headers["Idempotent-Replayed"] == "true"
+    assert answers[0].json() == answers[1].json()
+    assert len(ids(site.call("GET", info, "/state"))) == 4
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ({"operations": [SPAWN | {"recorded_id": "ghost"}]}, (404, "UNKNOWN_OBJECT")),
+        ({"operations": [SPAWN | {"recorded_id": None}]}, (422, "INVALID_REQUEST")),
+        ({"operations": [SPAWN], "base_rev": 7}, (412, "STALE_REVISION")),
+        (
+            {"operations": [SPAWN, {"op": "restore", "object_id": "post"}]},
+            (422, "INVALID_OPERATION"),
+        ),
+    ],
+)
+def test_a_refused_edit_of_a_running_world_changes_nothing(site, info, body, expected):
+    assert problem(site.call("POST", info, "/operations", json=body)) == expected
+    state = site.call("GET", info, "/state").json()
+    assert (state["revision"], len(state["agents"])) == (0, 3)
+
+
+def test_a_recording_holds_what_was_spawned(site, info):
+    site.call("POST", info, "/operations", json={"operations": [SPAWN]})
+    for _ in range(3):
+        site.call("POST", info, "/step", json={"plan": CONTROL})
+    recording = recording_of_bytes(site.call("GET", info, "/recording").content, "it")
+    assert [e.kind for e in recording.entries] == ["reset", "edit", *["action"] * 3]
+    assert "spawned_1" in recording.instants[-1].others.ids
+    session = site.session(info)
+    assert (
+        first_difference(recording, Replayer.on(session.start.scene, session.start.state)) is None
+    )
