@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import base64
+import importlib
 import io
 import json
 import math
+import os
+import sys
 import threading
+import types
+import warnings
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -106,6 +112,54 @@ def test_it_is_told_what_neuroncap_tells(peer, planner):
     assert pose[:3, 3].tolist() == [100.0, 50.0, 2.0]
     assert len(told["canbus"]) == 16
     assert told["canbus"][13] == 6.0
+
+
+def form(value):
+    """Keys, lengths and kinds of a JSON value."""
+    if isinstance(value, dict):
+        return {key: form(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [form(part) for part in value]
+    return "number" if isinstance(value, int | float) else type(value).__name__
+
+
+def test_what_it_is_told_has_the_form_that_neuroncap_itself_sends(peer, planner):
+    """By NeuroNCAP's own code, out of a checkout of atonderski/neuro-ncap (MIT)."""
+    checkout = os.environ.get("REAL2SIM_NEURONCAP")
+    if not checkout:
+        pytest.skip("REAL2SIM_NEURONCAP names no checkout of atonderski/neuro-ncap")
+    for needed in ("httpx", "shapely"):
+        pytest.importorskip(needed)
+    planner.plan(rig.seen())
+    told = peer.asked[-1][1]
+    # Its package imports nuScenes' toolkit and more, which this module does not use.
+    for name in ("neuro_ncap", "neuro_ncap.components"):
+        package = types.ModuleType(name)
+        package.__path__ = [str(Path(checkout, *name.split(".")))]
+        sys.modules[name] = package
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            theirs = importlib.import_module("neuro_ncap.components.model_api")
+    finally:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "neuro_ncap"]:
+            del sys.modules[name]
+    names = list(told["images"])
+    calibration = theirs.Calibration(
+        camera2image={name: torch.eye(3) for name in names},
+        camera2ego={name: torch.eye(4) for name in names},
+        lidar2ego=torch.eye(4),
+    )
+    sent = theirs.ModelInput(
+        images=dict.fromkeys(names, ""),
+        ego2world=torch.eye(4),
+        canbus=torch.zeros(16),
+        timestamp=0,
+        command=theirs.Command.STRAIGHT,
+        calibration=calibration,
+    ).to_json_dict()
+    assert form(told) == form(sent)
+    assert told["command"] == theirs.Command.STRAIGHT
 
 
 def test_cameras_get_the_names_that_the_planner_knows(peer, planner):

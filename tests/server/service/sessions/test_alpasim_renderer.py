@@ -10,6 +10,7 @@ import importlib
 import os
 import shutil
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -225,6 +226,18 @@ def test_an_aggregate_has_every_image(runtime):
     requests = [asked(m, stub, t_us=t_us) for t_us in (0, 100_000)]
     answer = stub.render_aggregated(m.AggregatedRenderRequest(rgb_requests=requests))
     assert len(answer.rgb_returns) == 2
+
+
+def test_rollouts_at_once_get_their_own_pictures(ours):
+    m, stub = ours
+    requests = [
+        asked(m, stub, objects=[("car_red", placed(10.0 + 2 * k, 1.0, 0.75))]) for k in range(4)
+    ]
+    alone = [stub.render_rgb(request).image_bytes for request in requests]
+    assert len(set(alone)) == 4
+    with ThreadPoolExecutor(4) as pool:
+        together = pool.map(lambda request: stub.render_rgb(request).image_bytes, requests * 3)
+        assert list(together) == alone * 3
 
 
 def test_scenes_are_listed_and_those_in_memory_told(runtime):
