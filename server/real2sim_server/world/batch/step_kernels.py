@@ -103,7 +103,8 @@ def step_world(
 def advanced(state, t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle):
     """State of a vehicle ``dt_us`` after it got an action."""
     pending = np.empty((0, 2))
-    schedule = np.empty((0, 0)), np.empty((0, 0))
+    nothing = np.empty((0, 0))
+    schedule = nothing, nothing, nothing, nothing
     if law == HOLD:
         held = (action[0, 0], action[0, 1])
         arguments = (law, np.empty((0, 6)), 0.0, 0.0, held, schedule)
