@@ -55,15 +55,16 @@ class Embedding:
         weights /= weights.sum(axis=1, keepdims=True)
         self._index: NDArray[np.int64] = index
         self._weights = weights
-        centre = np.einsum("gk,gki->gi", weights, rest[index])
+        # Products of stacks of small matrices: einsum takes several times as long.
+        centre = (weights[:, None] @ rest[index])[:, 0]
         r = rest[index] - centre[:, None]
-        second = np.einsum("gk,gki,gkj->gij", weights, r, r)
+        weighted = weights[:, :, None] * r
+        second = r.transpose(0, 2, 1) @ weighted
         value, axes = np.linalg.eigh(second)
         solid = value > FLAT * spacing**2
-        inverse = np.einsum(
-            "gij,gj,gkj->gik", axes, np.where(solid, 1 / np.maximum(value, 1e-12), 0), axes
-        )
-        self._slopes = np.einsum("gk,gki,gij->gkj", weights, r, inverse)
+        inverted = np.where(solid, 1 / np.maximum(value, 1e-12), 0)
+        inverse = (axes * inverted[:, None]) @ axes.transpose(0, 2, 1)
+        self._slopes = weighted @ inverse
         self._centre = centre
         self._offset = points - centre
         # Far from all particles only rotation is trusted.
@@ -73,14 +74,14 @@ class Embedding:
     def follow(self, displacements: Float) -> Deformed:
         """Where the points are when particles are displaced by ``displacements`` [N, 3] [m]."""
         u = np.asarray(displacements, dtype=np.float64)[self._index]
-        F = np.eye(3) + np.einsum("gki,gkj->gij", u, self._slopes)
+        F = np.eye(3) + u.transpose(0, 2, 1) @ self._slopes
         left, stretch, right = np.linalg.svd(F)
         left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
         rotations = left @ right
         clamped = (left * np.clip(stretch, *STRETCH_LIMITS)[:, None, :]) @ right
         F = self._trust * clamped + (1 - self._trust) * rotations
-        mean = np.einsum("gk,gki->gi", self._weights, u)
-        moved = self._centre + mean + np.einsum("gij,gj->gi", F, self._offset)
+        mean = (self._weights[:, None] @ u)[:, 0]
+        moved = self._centre + mean + (F @ self._offset[:, :, None])[:, :, 0]
         return Deformed(moved, F, rotations)
 
 
@@ -100,6 +101,18 @@ def deform_cloud(cloud: GaussianCloud, deformed: Deformed) -> GaussianCloud:
         opacities=cloud.opacities,
         sh=_turned(cloud, deformed.rotations),
     )
+
+
+def replaced_rows(cloud: GaussianCloud, rows: torch.Tensor, part: GaussianCloud) -> GaussianCloud:
+    """The cloud with other Gaussians ``part`` in ``rows`` [P] int64; opacities stay."""
+
+    def replaced(name: str) -> torch.Tensor:
+        values: torch.Tensor = getattr(cloud, name).detach().clone()
+        values[rows] = getattr(part, name)
+        return values
+
+    means, quats, scales, sh = (replaced(name) for name in ("means", "quats", "scales", "sh"))
+    return GaussianCloud(means, quats, scales, cloud.opacities, sh)
 
 
 def stretched(cloud: GaussianCloud, factors: tuple[float, float, float]) -> GaussianCloud:
@@ -126,13 +139,13 @@ def _turned(cloud: GaussianCloud, rotations: Float) -> torch.Tensor:
     directions = _directions()
     # The turned function at R d is the old one at d: fit through fixed directions.
     before = sh_basis(directions, degree)
-    turned_basis = sh_basis(np.einsum("nij,dj->ndi", rotations[index], directions), degree)
+    turned_basis = sh_basis(directions @ rotations[index].transpose(0, 2, 1), degree)
     for band in range(1, degree + 1):
         part = slice(band * band, (band + 1) ** 2)
         after = turned_basis[..., part]
-        own = np.einsum("dk,nkc->ndc", before[:, part], sh[index][:, part])
-        gram = np.einsum("ndj,ndk->njk", after, after)
-        sh[index, part] = np.linalg.solve(gram, np.einsum("ndj,ndc->njc", after, own))
+        own = before[:, part] @ sh[index][:, part]
+        across = after.transpose(0, 2, 1)
+        sh[index, part] = np.linalg.solve(across @ after, across @ own)
     return torch.from_numpy(sh.astype(np.float32)).to(cloud.device)
 
 

@@ -115,6 +115,53 @@ def test_a_dent_grows_for_a_tenth_of_a_second_and_then_stays(crash_scene, moving
     assert len(set(kept[-5:])) == 1
 
 
+def test_what_is_drawn_does_not_depend_on_what_was_drawn_before(crash_scene, moving):
+    world = world_of(crash_scene(car=moving(20, 0.4, z=0.75)), dt_us=20_000, horizon=400)
+    while not world.impacts:
+        world.step(COAST)
+    unseen = world_of(crash_scene(car=moving(20, 0.4, z=0.75)), dt_us=20_000, horizon=400)
+    while unseen.steps < world.steps:
+        unseen.step(COAST)
+    drawn = []
+    for _ in range(6):
+        world.step(COAST)
+        unseen.step(COAST)
+        world.deformation.solve(world.t_us)
+        drawn.append(bits(cloud_of(world)))
+    assert bits(cloud_of(unseen)) == drawn[-1]
+    assert len(set(drawn)) > 3
+
+
+def test_an_image_solves_no_more_of_a_crash_than_it_shows(crash_scene, moving, monkeypatch):
+    world = world_of(crash_scene(car=moving(20, 0, z=0.75)), dt_us=20_000, horizon=400)
+    while not world.impacts:
+        world.step(COAST)
+    solved: list[float] = []
+    step = crash.Solver.step
+    monkeypatch.setattr(crash.Solver, "step", lambda s, t: (solved.append(t), step(s, t))[1])
+    spans = []
+    for _ in range(15):
+        world.step(COAST)
+        before = len(solved)
+        world.deformation.solve(world.t_us)
+        spans.append(sum(solved[before:]))
+    # Of each 20 ms what they hold, and what fills its last frame; nothing once it is over.
+    assert sum(spans) > 0.1
+    assert max(spans) < 0.05
+    assert spans[-3:] == [0, 0, 0]
+
+
+def test_what_the_crash_does_not_reach_stays_as_it_was(crash_scene, moving):
+    world = world_of(crash_scene(car=moving(20, 0, z=0.75)))
+    drive_until_contact(world)
+    for _ in range(5):
+        world.step(COAST)
+    before, after = world.scene.objects["car"].cloud, cloud_of(world)
+    same = (after.means == before.means).all(dim=1)
+    assert 0.2 < same.double().mean() < 0.9
+    assert torch.equal(after.quats[same], before.quats[same])
+
+
 def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_scene, moving):
     scene, spec = crash_scene(car=moving(20, 0.4, z=0.75)), ResetSpec(**GO_ON)
     entries = [Entry("reset", 0, reset_payload(spec))]

@@ -218,7 +218,7 @@ class StepPipeline:
     ) -> Sequence[RenderedImage]:
         """Images of a world, its objects deformed first."""
         if world.deformation is not None:
-            world.deformation.solve()
+            world.deformation.solve(world.t_us)
             timer.stage("physics")
         images = self._images(world, sensors, cameras)
         timer.stage("render")

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from ...edit import ObjectState
 from ...edit.compose import cloud_of
@@ -25,9 +27,11 @@ from ...physics.errors import PhysicsError
 from ...render.types import Instance
 from ...scene import GaussianCloud, Scene
 from ...simulation import impact as crash
-from ...simulation.embedding import Embedding, deform_cloud, stretched
+from ...simulation.embedding import Deformed, Embedding, deform_cloud, replaced_rows, stretched
 from .impact import Impact, ImpactParticipant
 from .rigid_body import BodyState
+
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +47,15 @@ NEVER_DEFORMED = frozenset({"pedestrian", "person", "cyclist", "motorcyclist", "
 FRICTION = 0.4
 """Of bodywork on bodywork."""
 
+LEAST_MOVED = 5e-3
+"""Particles that have moved less than this leave Gaussians where they are [m]."""
+
+REACH = 2.5
+"""Gaussians follow particles no farther away than this many spacings."""
+
+PARTS = np.array([8, 1, 1])
+"""Parts of an object along its length, width and height that follow their particles apart."""
+
 WALL = (1.0, 2.0, 2.0)
 """Size of the part of the background that an object runs into: depth, width, height [m]."""
 
@@ -57,8 +70,8 @@ class Deformation(Protocol):
     def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
         """After an impact; ``subjects``: all objects by id."""
 
-    def solve(self) -> None:
-        """Find the shapes that are not known yet, before they are drawn."""
+    def solve(self, t_us: int) -> None:
+        """Find the shapes at an instant that are not known yet, before they are drawn."""
 
     def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
         """What is drawn of an object; the given instance where it is not deformed."""
@@ -91,10 +104,10 @@ class DeformationTracker:
                 deformed[name] = _DeformedObject(old.origin, old.impacts + 1, old, collision, role)
         return replace(self, deformed=deformed)
 
-    def solve(self) -> None:
-        """Solve the deformations of all impacts that are not solved yet."""
+    def solve(self, t_us: int) -> None:
+        """Solve all impacts as far as their shapes at an instant need it."""
         for deformed in self.deformed.values():
-            deformed.outcome()
+            deformed.displacements(t_us)
 
     def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
         """The object as it is at ``t_us``, in the colours that it had before its first impact."""
@@ -136,7 +149,7 @@ class _UndeformedObject:
         self._scene, self._mass, self._t_us = scene, mass, t_us
         self._cloud: GaussianCloud | None = None
         self._body: crash.CrashBody | None = None
-        self._embedding: Embedding | None = None
+        self._pieces: list[_Piece] | None = None
 
     @property
     def cloud(self) -> GaussianCloud:
@@ -159,16 +172,55 @@ class _UndeformedObject:
             )
         return self._body
 
-    def deformed(self, displacements: Float, *, last: bool) -> GaussianCloud:
-        """Its Gaussians moved with the particles around them; ``last``: the last frame."""
-        if self._embedding is None:
+    def deformed(self, displacements: Float) -> GaussianCloud:
+        """Its Gaussians moved with the particles around them, where those have moved."""
+        if self._pieces is None:
             means = self.cloud.means.detach().cpu().numpy().astype(np.float64)
-            rest = self.body.rest.positions
-            self._embedding = Embedding(rest, means, spacing=self.body.spacing)
-        cloud = deform_cloud(self.cloud, self._embedding.follow(displacements))
-        if last:
-            self._embedding = None
-        return cloud
+            self._pieces = _pieces(means, self.body.rest.positions)
+        moved = np.linalg.norm(displacements, axis=1) > LEAST_MOVED
+        near = [p for p in self._pieces if p.touches(self.body, moved)]
+        if not near:
+            return self.cloud
+        followed = [p.follow(self.body, displacements) for p in near]
+        rows = torch.from_numpy(np.concatenate([p.rows for p in near])).to(self.cloud.device)
+        deformed = Deformed(
+            np.concatenate([f.positions for f in followed]),
+            np.concatenate([f.F for f in followed]),
+            np.concatenate([f.rotations for f in followed]),
+        )
+        return replaced_rows(self.cloud, rows, deform_cloud(self.cloud.select(rows), deformed))
+
+
+class _Piece:
+    """Gaussians of one part of an object; each part follows its particles by itself, so that what
+    is drawn of it does not depend on the others."""
+
+    def __init__(self, rows: NDArray[np.int64], points: Float) -> None:
+        self.rows = rows
+        self._points = points
+        self._low, self._high = points.min(axis=0), points.max(axis=0)
+        self._embedding: Embedding | None = None
+
+    def touches(self, body: crash.CrashBody, moved: NDArray[np.bool_]) -> bool:
+        """Whether any particle that has moved, [N] bool, is near."""
+        places, reach = body.rest.positions[moved], REACH * body.spacing
+        return bool(((places > self._low - reach) & (places < self._high + reach)).all(1).any())
+
+    def follow(self, body: crash.CrashBody, displacements: Float) -> Deformed:
+        """Where they are when particles are displaced [N, 3] [m]."""
+        if self._embedding is None:
+            self._embedding = Embedding(body.rest.positions, self._points, spacing=body.spacing)
+        return self._embedding.follow(displacements)
+
+
+def _pieces(points: Float, rest: Float) -> list[_Piece]:
+    """Points [G, 3] of an object in even parts between the ends of its particles [N, 3]."""
+    low, high = rest.min(axis=0), rest.max(axis=0)
+    inner = np.clip((points - low) / np.maximum(high - low, 1e-6), 0, 1 - 1e-9)
+    cells = (inner * PARTS).astype(np.int64) @ [PARTS[1] * PARTS[2], PARTS[2], 1]
+    order = np.argsort(cells, kind="stable")
+    bounds = np.flatnonzero(np.diff(cells[order])) + 1
+    return [_Piece(rows, points[rows]) for rows in np.split(order, bounds) if len(rows)]
 
 
 @dataclass(eq=False)
@@ -199,25 +251,25 @@ class _DeformedObject:
             return self.before.body if self.before is not None else self.origin.body
 
     def outcome(self) -> crash.ImpactResult | None:
-        """What the latest impact did; None where it left no trace."""
+        """What the latest impact did in the end; None where it left no trace."""
         return None if self.collision is None else self.collision.outcomes()[self.role]
+
+    def displacements(self, t_us: int) -> list[Float]:
+        """Of its particles by the latest impact, frame by frame until an instant; see
+        :class:`~real2sim_server.simulation.impact.ImpactResult`."""
+        if self.collision is None:
+            return []
+        age_s = (t_us - self.collision.impact.began_us) * 1e-6
+        return self.collision.displacements(self.role, max(int(age_s / crash.FRAME_S), 0))
 
     def cloud(self, t_us: int) -> GaussianCloud | None:
         """Its Gaussians at an instant; None while they are as they were."""
-        if self.collision is None:
-            return None
-        outcome = self.outcome()
-        age_s = (t_us - self.collision.impact.began_us) * 1e-6
-        frame = -1
-        if outcome is not None:
-            frame = min(int(age_s / crash.FRAME_S), len(outcome.displacements)) - 1
-        if outcome is None or frame < 0:
+        frames = self.displacements(t_us)
+        if not frames:
             return self.before.cloud(t_us) if self.before is not None else None
         with self.origin.lock:
-            if self._shown is None or self._shown[0] != frame:
-                moved = outcome.displacements[frame].astype(np.float64)
-                last = frame == len(outcome.displacements) - 1
-                self._shown = frame, self.origin.deformed(moved, last=last)
+            if self._shown is None or self._shown[0] != len(frames):
+                self._shown = len(frames), self.origin.deformed(frames[-1])
             return self._shown[1]
 
 
@@ -230,13 +282,23 @@ class _ImpactSolution:
         self.impact = impact
         self._before_impact = before_impact
         self._lock = threading.Lock()
+        self._simulation: crash.ImpactSimulation | None = None
+        self._failed = False
         self._outcomes: tuple[crash.ImpactResult | None, crash.ImpactResult | None] | None = None
+
+    def displacements(self, role: int, count: int) -> list[Float]:
+        """The first ``count`` frames of one of its bodies; fewer where it is over before."""
+        with self._lock:
+            if self._before_impact[role] is None:
+                return []
+            return self._attempt(lambda simulation: simulation.displacements(role, count), [])
 
     def outcomes(self) -> tuple[crash.ImpactResult | None, crash.ImpactResult | None]:
         """Of the ego or first object, and of the object."""
         with self._lock:
             if self._outcomes is None:
-                found = self._solve()
+                results = self._attempt(lambda simulation: simulation.results(), None)
+                found = results or (None, None)
                 kept = [
                     outcome if old is not None else None
                     for outcome, old in zip(found, self._before_impact, strict=True)
@@ -244,24 +306,33 @@ class _ImpactSolution:
                 self._outcomes = kept[0], kept[1]
             return self._outcomes
 
-    def _solve(self) -> tuple[crash.ImpactResult | None, crash.ImpactResult | None]:
-        assert self.impact.participants is not None
-        first, second = self.impact.participants
-        floor = first.low if second is None else min(first.low, second.low)
+    def _attempt(self, ask: Callable[[crash.ImpactSimulation], T], nothing: T) -> T:
+        """What the simulation answers; ``nothing`` where the solver fails."""
+        if self._failed:
+            return nothing
         try:
-            one = self._impact_body(first, self._before_impact[0], floor)
-            other = (
-                self._wall()
-                if second is None
-                else self._impact_body(second, self._before_impact[1], floor)
-            )
-            return crash.simulate_impact(one, other) or (None, None)
+            if self._simulation is None:
+                self._simulation = self._begin()
+            return ask(self._simulation)
         except PhysicsError as error:
             # A picture without the deformation serves an episode better than its end.
+            self._failed = True
             _log.warning(
                 "no deformation after the impact at %s us: %s", self.impact.began_us, error
             )
-            return None, None
+            return nothing
+
+    def _begin(self) -> crash.ImpactSimulation:
+        assert self.impact.participants is not None
+        first, second = self.impact.participants
+        floor = first.low if second is None else min(first.low, second.low)
+        one = self._impact_body(first, self._before_impact[0], floor)
+        other = (
+            self._wall()
+            if second is None
+            else self._impact_body(second, self._before_impact[1], floor)
+        )
+        return crash.ImpactSimulation(one, other)
 
     def _impact_body(
         self, participant: ImpactParticipant, old: _DeformedObject | None, floor: float
