@@ -11,15 +11,19 @@ from .episode import MAX_SENSORS
 
 MAX_POSED = 4096
 
-Row = tuple[float, float, float]
+SHORTEST_FOCAL = 0.1
+"""[px]."""
+
+Pixels = Annotated[float, Field(ge=-1e6, le=1e6)]
+Row = tuple[Pixels, Pixels, Pixels]
 
 
 def _intrinsics(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
-    (fx, _, _), (below, fy, _), last = K
-    if fx <= 0 or fy <= 0 or below != 0 or last != (0.0, 0.0, 1.0):
+    (fx, skew, _), (below, fy, _), last = K
+    if min(fx, fy) < SHORTEST_FOCAL or skew != 0 or below != 0 or last != (0.0, 0.0, 1.0):
         raise ValueError(
             f"K {K!r} is not that of a pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "
-            "fx and fy above 0"
+            f"fx and fy {SHORTEST_FOCAL} pixels or more"
         )
     return K
 

@@ -118,6 +118,9 @@ def test_what_cannot_be_drawn_is_refused(client, tiny_scene, body, code):
     [
         {"K": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"K": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]},
+        {"K": [[1, 1, 0], [0, 1, 0], [0, 0, 1]]},
+        {"K": [[1e300, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"K": [[1e-300, 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"width": 8},
         {"pose": {"position": [0, 0, 0], "quaternion": [1, 1, 0, 0]}},
     ],
@@ -125,6 +128,24 @@ def test_what_cannot_be_drawn_is_refused(client, tiny_scene, body, code):
 def test_what_is_no_camera_is_refused(client, tiny_scene, wrong):
     response = client.post(VIEW, json={"cameras": [camera(tiny_scene, **wrong)]})
     assert response.status_code == 422
+
+
+@pytest.mark.parametrize(
+    "extreme",
+    [
+        {"cameras": {"K": [[1e6, 0, -1e6], [0, 0.1, 1e6], [0, 0, 1]]}},
+        {"cameras": {"pose": {"position": [1e6, -1e6, 1e6], "quaternion": UPRIGHT}}},
+        {"t_us": 2**62, "objects": {"position": [0, 0, 0], "quaternion": UPRIGHT}},
+        {"t_us": -(2**62), "objects": {"position": [1e6, 1e6, -1e6], "quaternion": UPRIGHT}},
+    ],
+)
+def test_what_is_allowed_at_its_extremes_is_drawn(client, tiny_scene, extreme):
+    wanted = camera(tiny_scene, **extreme.pop("cameras", {}))
+    pose = extreme.pop("objects", None)
+    objects = [{"object_id": "car_blue", "pose": pose}] if pose else []
+    body = {"cameras": [wanted], "objects": objects} | extreme
+    response = client.post(VIEW, json=body)
+    assert response.status_code == 200, response.text
 
 
 def test_a_name_given_twice_is_refused(client, tiny_scene):
