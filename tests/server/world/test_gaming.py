@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
+from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.scene import Trajectory
 
 STEPS = 60
@@ -211,6 +212,21 @@ def test_what_a_vehicle_model_drives_is_what_a_car_can_do(make_world, moving, dy
         wild = (-8.0 if step % 20 < 5 else 4.0), 0.15 * math.sin(step / 4)
         world.step(Control(acceleration=wild[0], steering=wild[1]))
 
+    assert world.metrics()["feasible"] == 1.0
+
+
+def test_being_put_back_to_the_start_of_a_loop_is_no_jump(make_world):
+    times = np.arange(121) * 100_000
+    angle, radius = times * 1e-6 * 10.0 / 120.0, 120.0
+    places = [radius * np.sin(angle), radius * (1 - np.cos(angle)), np.zeros(121)]
+    headings = np.stack([yaw_quaternion(a) for a in angle])
+    bend = Trajectory(times, np.stack(places, axis=1), headings)
+    spec = {"action": "control", "beyond_log": "loop", "horizon": 300}
+    world = make_world(bend, spec=spec)
+    while not world.over:
+        world.step(Control(acceleration=0.0, steering=math.atan(2.8 / radius)))
+
+    assert world.lap >= 2
     assert world.metrics()["feasible"] == 1.0
 
 

@@ -218,6 +218,15 @@ def test_a_lateral_hit_across_the_lane_line_is_the_egos_fault():
     assert found["pdms"].value == 0.0
 
 
+@pytest.mark.parametrize(("since", "nc"), [(0.1, 1.0), (0.9, 0.0)])
+def test_fault_is_that_of_the_moment_of_contact(since, nc):
+    # Within one long step the ego goes over the lane line, at 0.825 m.
+    instants = drive([10.0] * 41)
+    shifted = [replace(i, ego=i.ego._replace(y=1.5, offset=1.5)) for i in instants[20:]]
+    changing = hit([*instants[:20], *shifted], 20, side="lateral", since=since)
+    assert scores(changing, context(40))["pdms"].terms["NC"] == nc
+
+
 def test_an_object_counts_once_however_often_it_is_touched():
     twice = hit(hit(drive([10.0] * 41), 20, category="pole"), 30, category="pole")
     found = scores(twice, context(40))

@@ -41,6 +41,7 @@ class Impact:
         side: of the ego on which the contact began.
         speeds: of the first body and of the object when it began [m/s].
         began_us: when it began in this step [us].
+        since: the same as a fraction of the step.
         participants: the ego (or ``other_id``) and the object when it began; None for the
             background.
     """
@@ -59,6 +60,7 @@ class Impact:
     side: Side = "lateral"
     speeds: tuple[float, float] = (0.0, 0.0)
     began_us: int = 0
+    since: float = 1.0
     participants: tuple[ImpactParticipant, ImpactParticipant | None] | None = None
 
     @property

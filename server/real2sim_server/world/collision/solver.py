@@ -419,6 +419,7 @@ def _impacts(state: _SolverState) -> tuple[Impact, ...]:
                 side=exchanged.side,
                 speeds=exchanged.speeds,
                 began_us=exchanged.began_us,
+                since=(exchanged.began_us - state.step.t_us) / state.step.dt_us,
                 participants=exchanged.participants,
             )
         )

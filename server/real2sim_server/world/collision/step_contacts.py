@@ -68,6 +68,7 @@ def _ego_records(
             object_speed=impact.speeds[1],
             impulse=impact.impulse,
             begun=(impact.object_id or BACKGROUND) not in touching,
+            since=impact.since,
         )
         for impact in impacts
         if impact.other_id is None

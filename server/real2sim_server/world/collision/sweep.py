@@ -179,7 +179,9 @@ class _Sweep:
         ego_speed = math.hypot(motion.speed, motion.lateral_speed)
         t_us = self._start.t_us + contact.fraction * self._start.dt_us
         if contact.row is None:
-            record = ContactRecord(None, BACKGROUND, "stopped_track", ego_speed, ego_speed, 0.0)
+            record = ContactRecord(
+                None, BACKGROUND, "stopped_track", ego_speed, ego_speed, 0.0, since=contact.fraction
+            )
             return OverlapContact(None, ego_speed, t_us, contact.place), record
         subject = self._agents.objects[contact.row]
         other, (wx, wy) = self._object_at(contact.row, contact.fraction)
@@ -191,6 +193,7 @@ class _Sweep:
             relative_speed=relative,
             ego_speed=ego_speed,
             object_speed=object_speed,
+            since=contact.fraction,
         )
         return OverlapContact(subject.object_id, relative, t_us, _place(box, other)), record
 

@@ -122,6 +122,7 @@ def _contact(fields: Mapping[str, Any]) -> ContactRecord:
     x, y = _numbers(fields["impulse"], (2,), "impulse").tolist()
     for name in ("relative_speed", "ego_speed", "object_speed"):
         _number(fields[name], name)
+    _number(fields.get("since", 1.0), "since")
     if fields["object_id"] is not None:
         _text(fields["object_id"])
     if fields["side"] not in get_args(Side) or not isinstance(fields["begun"], bool):

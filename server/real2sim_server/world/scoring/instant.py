@@ -74,6 +74,7 @@ class ContactRecord:
         relative_speed, ego_speed, object_speed: when the contact began [m/s].
         impulse: on the ego [N s]; zeros where no momentum is exchanged.
         begun: whether the contact began in this step.
+        since: when it did, as a fraction of the step.
     """
 
     object_id: str | None
@@ -84,6 +85,7 @@ class ContactRecord:
     object_speed: float
     impulse: tuple[float, float] = (0.0, 0.0)
     begun: bool = True
+    since: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from .comfort_kernels import windowed_sum
 from .fault import ego_at_fault, fault_class
 from .feasibility import Feasibility
 from .hazard import time_to_collision
-from .instant import EgoSample, Instant, ScoringContext
+from .instant import ContactRecord, EgoSample, Instant, ScoringContext
 from .metric import METRICS
 from .put_back import put_back
 
@@ -70,7 +70,7 @@ def update_accumulator(
     beyond, quarters = context.off_road(ego)
     off_road = beyond > 0
     off_lane = off_road or bool(_in_several_lanes(ego, context))
-    accumulator = _with_contacts(_with_pushes(accumulator, instant, context), instant, off_lane)
+    accumulator = _with_contacts(_with_pushes(accumulator, instant, context), instant, context)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=accumulator.hit)
     comfort = accumulator.comfort.updated(ego.speed, ego.yaw, dt)
     backward, oncoming = windowed_sum(
@@ -126,7 +126,7 @@ def _in_several_lanes(ego: EgoSample, context: ScoringContext) -> bool:
 
 
 def _with_contacts(
-    accumulator: MetricAccumulator, instant: Instant, off_lane: bool
+    accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> MetricAccumulator:
     secondary = accumulator.secondary + instant.secondary
     if not instant.contacts:
@@ -148,7 +148,9 @@ def _with_contacts(
             secondary += 1
         contacts[record.category] = contacts.get(record.category, 0) + 1
         # Each object counts once, however often it is touched (nuPlan).
-        if name not in hit and ego_at_fault(record, off_lane):
+        if name not in hit and ego_at_fault(
+            record, _was_off_lane(accumulator, instant, record, context)
+        ):
             kind = fault_class(record.category)
             at_fault[kind] = at_fault.get(kind, 0) + 1
         hit.add(name)
@@ -161,6 +163,23 @@ def _with_contacts(
         impact_position=position,
         secondary=secondary,
     )
+
+
+def _was_off_lane(
+    accumulator: MetricAccumulator, instant: Instant, record: ContactRecord, context: ScoringContext
+) -> bool:
+    """Whether the ego was in several lanes or off the road when a contact began."""
+    now, part = instant.ego, record.since
+    if part < 1.0 and accumulator.ego is not None:
+        before = accumulator.ego
+        turned = before.yaw + part * math.remainder(now.yaw - before.yaw, math.tau)
+        now = now._replace(
+            x=before.x + part * (now.x - before.x),
+            y=before.y + part * (now.y - before.y),
+            offset=before.offset + part * (now.offset - before.offset),
+            yaw=turned,
+        )
+    return context.off_road(now)[0] > 0 or _in_several_lanes(now, context)
 
 
 def _with_pushes(
