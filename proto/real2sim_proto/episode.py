@@ -91,6 +91,34 @@ class ActuatorSpec(Model):
     )
 
 
+class SuspensionSpec(Model):
+    """Springs and dampers between wheels and body.
+
+    The defaults are those of a mid-size car: it pitches by about 1.4 degrees per g of braking and
+    rolls by about 3.9 degrees per g in bends. Ride frequencies and damping: Gillespie 1992,
+    Fundamentals of Vehicle Dynamics, ch. 5.
+    """
+
+    front_frequency: Annotated[float, Field(ge=0.5, le=10)] = Field(
+        default=1.3, description="ride frequency of the front axle [Hz]"
+    )
+    rear_frequency: Annotated[float, Field(ge=0.5, le=10)] = Field(
+        default=1.5, description="ride frequency of the rear axle [Hz]"
+    )
+    damping: Annotated[float, Field(ge=0.05, le=0.95)] = Field(
+        default=0.3, description="of the critical one"
+    )
+    track: Annotated[float, Field(ge=0.3, le=5)] = Field(
+        default=1.58, description="between left and right wheels [m]"
+    )
+    pitch_resistance: Annotated[float, Field(ge=0, le=0.95)] = Field(
+        default=0.3, description="share of the load transfer that links carry past the springs"
+    )
+    roll_resistance: Annotated[float, Field(ge=0, le=0.95)] = Field(
+        default=0.4, description="share of the load transfer that anti-roll bars carry"
+    )
+
+
 class EgoSpec(Model):
     """How the controlled vehicle moves."""
 
@@ -108,6 +136,10 @@ class EgoSpec(Model):
     max_speed: Annotated[float, Field(gt=0, le=150)] = Field(default=60.0, description="[m/s]")
     vehicle: VehicleSpec = VehicleSpec()
     actuators: ActuatorSpec = ActuatorSpec()
+    suspension: SuspensionSpec | None = Field(
+        default=None,
+        description="body and cameras pitch under drive and brakes and roll in bends; None: rigid",
+    )
 
 
 # --- other road users -------------------------------------------------------------------------

@@ -55,7 +55,7 @@ def film_episode(
             (frame,) = render_cameras(
                 world.instances(),
                 [chosen],
-                world.T_world_vehicle,
+                world.T_world_body,
                 sky=scene.sky,
                 options=RasterOptions(),
                 backend=backend,

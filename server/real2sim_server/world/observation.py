@@ -21,7 +21,7 @@ class Observation:
     Attributes:
         step, t_us, revision: instant, and number of edits so far.
         motion: planar state of the ego.
-        T_world_vehicle: [4, 4] float64, standing on the ground.
+        T_world_vehicle: [4, 4] float64, its body, which carries the cameras.
         ego_size: (length, width, height) of the ego box [m].
         command: which way the recorded drive turns next.
         route: [20, 2] float64, the recorded way ahead in the vehicle frame [m].

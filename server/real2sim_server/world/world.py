@@ -41,6 +41,7 @@ from .ego.controller import EgoController, Plan, emergency_brake
 from .ego.motion import Motion, logged_motion
 from .ego.reference import PlannedTrajectory
 from .ego.route import command_ahead, route_ahead
+from .ego.suspension import LEVEL, sprung, tilted
 from .episode import episode_clock, takes_effect_us
 from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
@@ -75,7 +76,8 @@ class World:
         steps: clock steps done since the reset; ``step`` of the observation.
         revision: edits of this session so far.
         motion: planar state of the ego.
-        T_world_vehicle: [4, 4] float64, the ego standing on the ground.
+        T_world_vehicle: [4, 4] float64, the ego standing level on the ground; that touches others.
+        T_world_body: [4, 4] float64, its body on its springs, which carries the cameras.
         traffic: drivers and poses of the other objects.
         ground: of the scene.
         accumulator: what the scores are made of.
@@ -121,6 +123,7 @@ class World:
         self.motion, drawn = self._first_motion()
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
+        self._attitude, self.T_world_body = LEVEL, self.T_world_vehicle
         self._estimate_error = estimate_error(spec.randomization.estimate, self._draws, 0)
         self._controller = EgoController(spec, scene.ego)
         self.traffic = self._first_traffic()
@@ -186,12 +189,13 @@ class World:
 
     @property
     def T_world_estimate(self) -> Float:
-        """[4, 4] float64, the ego where it takes itself to be; ``T_world_vehicle`` where its
+        """[4, 4] float64, the body where the ego takes itself to be; ``T_world_body`` where its
         estimate has no errors."""
         if self._estimate_error is None:
-            return self.T_world_vehicle
+            return self.T_world_body
         estimate = self._estimate_error.applied(self.motion)
-        return self.ground.pose_on(estimate.x, estimate.y, estimate.yaw)
+        standing = self.ground.pose_on(estimate.x, estimate.y, estimate.yaw)
+        return tilted(standing, self._attitude, self.spec.ego)
 
     @property
     def context(self) -> scoring.ScoringContext:
@@ -315,7 +319,7 @@ class World:
         """What the policy gets at this instant, apart from images."""
         motion, s, truth = self.motion, self._path_point.s, None
         if self._estimate_error is not None:
-            truth = (motion, self.T_world_vehicle) if self.spec.privileged else None
+            truth = (motion, self.T_world_body) if self.spec.privileged else None
             motion = self._estimate_error.applied(motion)
             s = self._path.nearest(motion.x, motion.y, near_s=s).s
         return Observation(
@@ -424,6 +428,7 @@ class World:
         self.motion = at_start_again(before, near, self._path, near.s - way)
         self._path_point = self._path.nearest(self.motion.x, self.motion.y, near_s=near.s - way)
         self.T_world_vehicle = self._ego_pose()
+        self.T_world_body = tilted(self.T_world_vehicle, self._attitude, self.spec.ego)
         self.lap += laps
         self._tracks = self._tracks_of(self.state)
         self.traffic = self.traffic.put_back(self._tracks, surroundings, way)
@@ -465,11 +470,19 @@ class World:
         self.steps += 1
         self._controller, self.traffic = moved.controller, moved.traffic
         self._contacts, self.impacts = moved.contacts, moved.impacts or ()
+        before = self.motion
         self.motion = moved.motion._replace(acceleration=acceleration)
         self._path_point = self._path.nearest(
             self.motion.x, self.motion.y, near_s=self._path_point.s
         )
         self.T_world_vehicle = self._ego_pose()
+        if self.spec.ego.suspension is not None and self.spec.action != "pose":
+            recorded = self.t_us <= self._clock.start_us + self.spec.warmup_us
+            ego = self.spec.ego
+            self._attitude = (
+                LEVEL if recorded else sprung(self._attitude, before, self.motion, seconds, ego)
+            )
+        self.T_world_body = tilted(self.T_world_vehicle, self._attitude, self.spec.ego)
         if self._estimate_error is not None:
             self._estimate_error = estimate_error(
                 self.spec.randomization.estimate,

@@ -327,15 +327,15 @@ class StepPipeline:
         request = RenderRequest(
             scene=world.scene,
             instances=world.instances(),
-            T_world_vehicle=world.T_world_vehicle,
+            T_world_vehicle=world.T_world_body,
             t_us=world.t_us,
             sensors=sensors,
         )
         images, _ = self._renderer.render_images(request, cameras, between=between)
-        if world.T_world_estimate is world.T_world_vehicle:
+        if world.T_world_estimate is world.T_world_body:
             return images
         # Images are of where the ego is; what they say of it is its own estimate.
-        believed = world.T_world_estimate @ invert_transform(world.T_world_vehicle)
+        believed = world.T_world_estimate @ invert_transform(world.T_world_body)
         return [replace(i, T_world_sensor=believed @ i.T_world_sensor) for i in images]
 
     async def _finish(

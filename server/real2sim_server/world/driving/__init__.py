@@ -16,7 +16,7 @@ from .entries import (
 )
 from .state import Command, PlanarState
 from .trackers import HOLD, ILQR, KINDS, LQR, PLANNING_AHEAD, PURSUIT
-from .vehicle import GRAVITY, VehicleParameters
+from .vehicle import GRAVITY, VehicleParameters, wheel_load
 from .vehicle_models import VEHICLE_MODELS, VehicleModel, vehicle_parameters
 
 __all__ = [
@@ -40,5 +40,6 @@ __all__ = [
     "plan_curve",
     "prepare_schedule",
     "vehicle_parameters",
+    "wheel_load",
     "world_poses",
 ]

@@ -6,7 +6,9 @@ import math
 
 from ..._numba import func
 from .state import clamped
-from .vehicle import GRAVITY
+from .vehicle import GRAVITY, wheel_load
+
+_wheel_load = func(wheel_load)
 
 SLOWEST, FASTER = 2.0, 4.0
 """Below the first speed slip angles mean nothing and the kinematic bicycle holds; between the two
@@ -80,9 +82,9 @@ def axle_forces(vehicle, moving, steering, acceleration):
         acceleration: by engine or brakes, at most friction times gravity [m/s^2].
     """
     vx, vy, turn = moving
-    shift = acceleration * vehicle.height
-    load_f = max(vehicle.mass * (GRAVITY * vehicle.rear - shift) / vehicle.wheelbase, 0.0)
-    load_r = max(vehicle.mass * (GRAVITY * vehicle.front + shift) / vehicle.wheelbase, 0.0)
+    mass, height, wheelbase = vehicle.mass, vehicle.height, vehicle.wheelbase
+    load_f = _wheel_load(mass, height, wheelbase, vehicle.rear, acceleration)
+    load_r = _wheel_load(mass, height, wheelbase, vehicle.front, -acceleration)
     used = acceleration / GRAVITY
     left = math.sqrt(max(vehicle.friction**2 - used * used, 0.0))
     slip_f = steering - math.atan2(vy + vehicle.front * turn, vx)

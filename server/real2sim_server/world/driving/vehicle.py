@@ -7,6 +7,22 @@ from typing import NamedTuple
 GRAVITY = 9.81
 
 
+def wheel_load(mass: float, height: float, base: float, arm: float, acceleration: float) -> float:
+    """Load [N] on the wheels at one end of a base, of a mass that accelerates towards that end.
+
+    The one formula of load transfer: of tyres along the vehicle, of the suspension along and
+    across it. Compiled code takes it through :func:`real2sim_server._numba.func`.
+
+    Args:
+        mass: [kg].
+        height: of the centre of mass [m].
+        base: between the two ends [m].
+        arm: from the other end to the centre of mass [m].
+        acceleration: [m/s^2].
+    """
+    return max(mass * (GRAVITY * arm - acceleration * height) / base, 0.0)
+
+
 class VehicleParameters(NamedTuple):
     """A car as two axles that carry a mass, with the limits of what moves and steers it.
 

@@ -8,7 +8,10 @@ from typing import Any
 from real2sim_proto.episode import ResetSpec
 
 BEFORE: Mapping[str, Any] = {
-    "ego": {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0, "foreseen": False}},
+    "ego": {
+        "actuators": {"steering_lag": 0.0, "drive_lag": 0.0, "foreseen": False},
+        "suspension": None,
+    },
     "contact": {"swept": False},
 }
 """How episodes ran before members had their present defaults, or before there were such members.
