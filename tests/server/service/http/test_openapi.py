@@ -157,3 +157,55 @@ def test_any_request_gets_a_documented_answer_by_all_checks_and_none_breaks_the_
                 examples(most)(given(case=operation.as_strategy())(ask))()
         assert httpx2.get(f"{worker.url}/livez", trust_env=False).status_code == 200
     assert asked > 100
+
+
+@pytest.mark.network
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("opened_by", "most"),
+    [
+        ("session", 3),
+        pytest.param("worker", 20, marks=[pytest.mark.slow, pytest.mark.timeout(1800)]),
+    ],
+)
+def test_any_request_to_what_is_there_gets_a_documented_answer(
+    make_settings, made, opened_by, most
+):
+    """Where ids are those of a running session and of a scenario, by either token."""
+    schemathesis = pytest.importorskip(
+        "schemathesis", reason="not installed: pip install 'real2sim[dev]'"
+    )
+    from schemathesis.checks import load_all_checks
+
+    load_all_checks()
+    config = {"checks": {"positive_data_acceptance": VALID}}
+    schema = schemathesis.openapi.from_dict(made, config=schemathesis.Config.from_dict(config))
+    statuses = set()
+    with running_worker(make_settings(token=TOKEN)) as worker:
+        there = {"scene": "tiny", "camera": "front"}
+        with httpx2.Client(base_url=worker.url, headers=BEARER, trust_env=False) as client:
+            session = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": {}})
+            there["session_id"] = session.json()["session_id"]
+            scenario = client.post("/v1/scenarios", json={"scene": "tiny"})
+            there["scenario_id"] = scenario.json()["scenario_id"]
+        given_token = {"worker": TOKEN, "session": session.json()["token"]}[opened_by]
+        headers = {"Authorization": f"Bearer {given_token}"}
+
+        def ask(case) -> None:
+            known = {k: v for k, v in there.items() if k in case.path_parameters}
+            case.path_parameters = {**case.path_parameters, **known}
+            response = case.call(base_url=worker.url, headers=headers, timeout=30)
+            statuses.add(response.status_code)
+            documented = case.operation.definition.raw["responses"]
+            assert str(response.status_code) in documented, response.text
+            if response.status_code < 400:
+                case.validate_response(response, headers=headers)
+
+        for found in schema.get_all_operations():
+            operation = found.ok()
+            named = [name for name in there if f"{{{name}}}" in operation.path]
+            wanted = "session_id" in named or (opened_by == "worker" and named)
+            if wanted and operation.method != "delete":
+                examples(most)(given(case=operation.as_strategy())(ask))()
+    assert {200, 422} <= statuses
+    assert opened_by == "worker" or 401 not in statuses
