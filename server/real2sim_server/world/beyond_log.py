@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -123,12 +122,13 @@ def at_start_again(motion: Motion, near: PathPoint, route: LoggedPath, s: float)
 
 # --- objects --------------------------------------------------------------------------------------
 
-_standing: WeakKeyDictionary[Trajectory, tuple[int, int, Trajectory]] = WeakKeyDictionary()
-"""Trajectories of standing objects, prolonged to a time range."""
+Prolonged = dict[Trajectory, Trajectory]
+"""Trajectories of standing objects by what they were before they were prolonged, so that one is
+the same object as long as an episode lasts: drivers begin anew with another."""
 
 
 def tracks_beyond_log(
-    state: ScenarioState, until_us: int, *, left: Iterable[str] = ()
+    state: ScenarioState, until_us: int, prolonged: Prolonged, *, left: Iterable[str] = ()
 ) -> PackedTracks[ObjectState]:
     """Where the objects are, up to ``until_us`` [us]: what stands is there all the time.
 
@@ -138,17 +138,19 @@ def tracks_beyond_log(
     Args:
         state: objects after all edits.
         until_us: end of the episode [us].
+        prolonged: of the episode; it is added to.
         left: ids of those that have left.
     """
     gone = frozenset(left)
     visible = [o for o in state.visible if o.object_id not in gone]
     kept = _without_doubles([o for o in visible if o.trajectory.extent < STANDING])
-    start_us = state.clock[0]
+    for subject in visible:
+        if subject.object_id in kept and subject.trajectory not in prolonged:
+            span = (_from_us(subject, state.clock[0]), until_us)
+            prolonged.setdefault(subject.trajectory, _prolonged(subject.trajectory, *span))
     return PackedTracks(
         tuple(
-            replace(o, trajectory=_prolonged(o.trajectory, _from_us(o, start_us), until_us))
-            if o.object_id in kept
-            else o
+            replace(o, trajectory=prolonged[o.trajectory]) if o.object_id in kept else o
             for o in visible
         )
     )
@@ -176,11 +178,7 @@ def _without_doubles(standing: list[ObjectState]) -> set[str]:
 
 
 def _prolonged(trajectory: Trajectory, start_us: int, end_us: int) -> Trajectory:
-    """The trajectory with its first pose from ``start_us`` on and its last one up to ``end_us``;
-    the same object for the same trajectory, for drivers begin anew with another."""
-    found = _standing.get(trajectory)
-    if found is not None and found[:2] == (start_us, end_us):
-        return found[2]
+    """The trajectory with its first pose from ``start_us`` on and its last one up to ``end_us``."""
     p, q, times = trajectory.positions, trajectory.quaternions, trajectory.times_us
     if start_us < times[0]:
         p, q = np.vstack([p[:1], p]), np.vstack([q[:1], q])
@@ -188,6 +186,4 @@ def _prolonged(trajectory: Trajectory, start_us: int, end_us: int) -> Trajectory
     if end_us > times[-1]:
         p, q = np.vstack([p, p[-1:]]), np.vstack([q, q[-1:]])
         times = np.concatenate([times, [end_us]])
-    prolonged = Trajectory(times, p, q)
-    _standing[trajectory] = (start_us, end_us, prolonged)
-    return prolonged
+    return Trajectory(times, p, q)

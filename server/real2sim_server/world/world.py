@@ -27,7 +27,13 @@ from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
 from .agents import Agents
-from .beyond_log import at_start_again, driven_route, lanes_route, tracks_beyond_log
+from .beyond_log import (
+    Prolonged,
+    at_start_again,
+    driven_route,
+    lanes_route,
+    tracks_beyond_log,
+)
 from .collision.contact_state import ContactState, StepMotion
 from .collision.deformation import Deformation, DeformationTracker
 from .collision.impact import Impact
@@ -118,6 +124,7 @@ class World:
         self._draws = Draws(spec.seed)
         self._path = driven_route(scene, spec, self._clock.horizon)
         self._lap_length = LoggedPath(scene.ego).length if spec.beyond_log == "loop" else math.inf
+        self._prolonged: Prolonged = {}
         self._tracks = self._tracks_of(state)
         self.ground = scene.ground
         self.motion, drawn = self._first_motion()
@@ -592,7 +599,7 @@ class World:
             return state.tracks
         until_us = self._clock.at(self._clock.horizon)
         left = self.traffic.recorded_movers(state.visible) if self.lap else frozenset[str]()
-        return tracks_beyond_log(state, until_us, left=left)
+        return tracks_beyond_log(state, until_us, self._prolonged, left=left)
 
     def _initial_contacts(self) -> ContactState:
         background = self.spec.contact.background

@@ -207,6 +207,23 @@ def test_an_edit_in_a_later_lap_takes_effect(make_world, moving):
     assert world.agents.positions[0, 1] == pytest.approx(8.0)
 
 
+def test_drivers_go_on_after_an_edit_whatever_other_episodes_run(make_scene, moving):
+    scene = make_scene(driven=moving(50, 6, z=0.8), other=moving(70, 6, z=0.8))
+    state = ScenarioState.of(scene)
+    agents = {"drivers": {"driven": {"kind": "external"}}}
+    world = World(scene, state, ResetSpec(**CONTROL, **LOOP, agents=agents))
+    world.set_agent_plan("driven", [world.t_us + 1_000_000], [(60.0, 6.0, 0.0)])
+    World(scene, state, ResetSpec(**CONTROL, **LOOP | {"horizon": 200}))
+    world.step(COAST)
+    world.apply([Translate(object_id="other", y=1.0)])
+    for _ in range(9):
+        world.step(COAST)
+    places = {
+        o.object_id: p for o, p in zip(world.agents.objects, world.agents.positions, strict=True)
+    }
+    assert places["driven"][0] == pytest.approx(60.0)
+
+
 def test_a_recorded_drive_of_a_few_metres_is_no_loop(make_world, moving):
     with pytest.raises(WorldError, match="too short to be driven in a loop"):
         make_world(moving(speed=1.0), spec=LOOP)

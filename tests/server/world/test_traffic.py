@@ -135,6 +135,14 @@ def test_idm_reaches_its_desired_speed_on_a_free_road(make_world, moving):
     assert max(np.diff(speeds)) <= 0.15 + 1e-6
 
 
+def test_idm_that_wants_to_stand_comes_to_a_stop(make_world, moving):
+    agents = {"drivers": {"car": {"kind": "idm", "desired_speed": 0.0}}}
+    world = make_world(car=moving(30, 20, z=0.8, speed=6.0), spec=CONTROL | {"agents": agents})
+    for _ in range(40):
+        world.step(COAST)
+    assert agent_of(world)["velocity"][0] == pytest.approx(0.0, abs=0.1)
+
+
 def test_idm_follows_at_the_equilibrium_gap(make_world, moving):
     # s_e = (s0 + v T) / sqrt(1 - (v/v0)^4) (Treiber et al. 2000, eq. 4).
     agents = {"drivers": {"car": {"kind": "idm", "desired_speed": 15.0}}}

@@ -24,6 +24,9 @@ HARDEST = 8.0
 BACK_TO_LANE = 2.0
 """Time constant with which an offset from the path fades [s]."""
 
+STANDSTILL = 0.1
+"""A desired speed below this is one of standing [m/s]."""
+
 SLOWEST_DESIRED = 3.0
 """Desired speed of objects that hardly moved in the recording [m/s]."""
 
@@ -128,7 +131,7 @@ class Idm:
 
 def acceleration(spec: IdmDriver, speed: float, desired: float, leader: Leader | None) -> float:
     """IDM acceleration [m/s^2], no harder than brakes can."""
-    free = 1.0 - (speed / desired) ** 4
+    free = 1.0 - (speed / max(desired, STANDSTILL)) ** 4
     if leader is None:
         return max(spec.acceleration * free, -HARDEST)
     closing = speed - leader.speed
