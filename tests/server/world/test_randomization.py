@@ -211,7 +211,8 @@ def test_a_wait_is_added_to_the_latency_of_each_plan(begun):
 
 
 def test_a_plan_takes_effect_after_the_drawn_wait(begun):
-    world = begun(1, {"latency_us": 300_000})
+    at_once = {"actuators": {"drive_lag": 0.0, "steering_lag": 0.0}}
+    world = begun(1, {"latency_us": 300_000}, spec={"ego": at_once})
     speeds, wait = [], None
     for _ in range(6):
         world.step(Control(acceleration=-2.0, steering=0.0) if wait is None else None)
