@@ -26,6 +26,7 @@ from .bodies import (
     is_rolling,
     object_properties,
 )
+from .crossing import between, crossing, drifted
 from .impact import Impact, ImpactParticipant
 from .manifold import ContactManifold, contact_impulse, contact_manifold, corners
 from .rigid_body import BodyProperties, BodyState, integrate_sliding
@@ -121,7 +122,8 @@ class _PrescribedMotion(NamedTuple):
 
 @dataclass(eq=False)
 class _SolverState:
-    """Bodies by id while the substeps run; ``heights``: bottom and top of each box [m]."""
+    """Bodies by id while the substeps run; ``heights``: bottom and top of each box [m];
+    ``earlier``: the bodies before the present substep, where what happens within it counts."""
 
     step: CollisionStep
     properties: dict[str, BodyProperties]
@@ -132,6 +134,7 @@ class _SolverState:
     reaches: dict[str, float]
     impulses: dict[tuple[str, str], _PairImpulse] = field(default_factory=dict)
     ignored_pairs: set[frozenset[str]] = field(default_factory=set)
+    earlier: dict[str, BodyState] = field(default_factory=dict)
     now_us: int = 0
 
 
@@ -148,10 +151,12 @@ def solve_collisions(step: CollisionStep) -> CollisionResult:
     substeps = -(-step.dt_us // SUBSTEP_US)
     for k in range(substeps):
         begin, end = step.dt_us * k // substeps, step.dt_us * (k + 1) // substeps
+        if step.contact.swept:
+            state.earlier = dict(state.bodies)
         motion = _move_ego(state, motion, sliding, begin, end)
         _move_objects(state, begin, end)
         state.now_us = end
-        if _resolve_contacts(state):
+        if _resolve_contacts(state, (end - begin) * 1e-6):
             sliding = True
         if sliding:
             motion = ego_motion(state.bodies[EGO], motion, step.spec)
@@ -238,8 +243,9 @@ def _move_objects(state: _SolverState, begin: int, end: int) -> None:
             state.bodies[i] = state.prescribed[i].after(fraction)
 
 
-def _resolve_contacts(state: _SolverState) -> bool:
-    """Let all bodies in contact exchange impulses; whether the ego was pushed."""
+def _resolve_contacts(state: _SolverState, h: float) -> bool:
+    """Let all bodies in contact exchange impulses; whether the ego was pushed in the substep of
+    ``h`` seconds."""
     ego_pushed = False
     for a, b in _near_pairs(state):
         pair = frozenset((a, b))
@@ -247,8 +253,11 @@ def _resolve_contacts(state: _SolverState) -> bool:
             corners(state.bodies[a], state.properties[a]),
             corners(state.bodies[b], state.properties[b]),
         )
-        if manifold is None:
+        if manifold is None and pair in state.ignored_pairs:
             state.ignored_pairs.discard(pair)
+            continue
+        if manifold is None:
+            ego_pushed |= _resolve_crossing(state, a, b, h) and a == EGO
             continue
         if pair in state.ignored_pairs:
             continue
@@ -259,6 +268,30 @@ def _resolve_contacts(state: _SolverState) -> bool:
             if manifold is not None:
                 ego_pushed |= _apply_impulse(state, i, BACKGROUND, manifold) and i == EGO
     return ego_pushed
+
+
+def _resolve_crossing(state: _SolverState, a: str, b: str, h: float) -> bool:
+    """Let bodies that overlapped only within the substep exchange an impulse where they first did;
+    whether they have."""
+    if not (a in state.earlier and b in state.earlier):
+        return False
+    ends = {i: state.bodies[i] for i in (a, b)}
+    first, second = ((state.earlier[i], state.bodies[i]) for i in (a, b))
+    shapes = (state.properties[a], state.properties[b])
+    fraction = crossing(first, second, shapes)
+    if not math.isfinite(fraction):
+        return False
+    at = between(first, fraction), between(second, fraction)
+    manifold = contact_manifold(corners(at[0], shapes[0]), corners(at[1], shapes[1]))
+    if manifold is None:
+        return False
+    state.bodies[a], state.bodies[b] = at
+    if not _apply_impulse(state, a, b, manifold):
+        state.bodies.update(ends)
+        return False
+    for i in (a, b):
+        state.bodies[i] = drifted(state.bodies[i], (1 - fraction) * h)
+    return True
 
 
 def _near_pairs(state: _SolverState) -> list[tuple[str, str]]:
