@@ -54,6 +54,16 @@ def test_an_image_is_built_only_if_no_kernel_is_left_to_compile(name):
     assert "real2sim doctor --warm && real2sim doctor --warmed" in (DOCKER / name).read_text()
 
 
+def test_the_image_for_gpus_is_built_only_if_cuda_is_usable_but_for_the_device():
+    text = (DOCKER / "Dockerfile.gpu").read_text()
+    assert "real2sim doctor --build-gpu" in text
+    build, check = text.index("doctor --build-gpu"), text.index("doctor --need-cuda")
+    assert build < check
+    assert "doctor --need-cuda --without-device" in text
+    # It would otherwise draw on the CPU where the device cannot be had, and say so in the log only.
+    assert "REAL2SIM_BACKEND=cuda" in text
+
+
 @pytest.mark.parametrize("name", IMAGES)
 def test_an_image_can_share_a_database_server(name):
     assert re.search(r"'\.\[server,.*postgres.*\]'", (DOCKER / name).read_text())

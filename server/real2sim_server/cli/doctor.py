@@ -7,12 +7,14 @@ import importlib.util
 import os
 import platform
 import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from ..console import SERVER_MODULES, console, write_json
+from ..console import SERVER_MODULES, CommandError, console, run_command, write_json
 from .command import app
 from .options import JsonFile
 
@@ -37,27 +39,56 @@ def doctor(
     warmed: Annotated[
         bool, typer.Option("--warmed", help="Fail if a worker had kernels to compile.")
     ] = False,
+    build_gpu: Annotated[
+        bool, typer.Option("--build-gpu", help="Compile gsplat's kernels; takes minutes.")
+    ] = False,
+    arch: Annotated[
+        list[str] | None,
+        typer.Option(help="With --build-gpu: sm_90, sm_86 ...; default: of this GPU."),
+    ] = None,
+    need_cuda: Annotated[
+        bool, typer.Option("--need-cuda", help="Fail where rendering on CUDA is not usable.")
+    ] = False,
+    without_device: Annotated[
+        bool,
+        typer.Option("--without-device", help="With --need-cuda: the GPU itself may be missing."),
+    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Say what this machine can do, what is missing, and how to mend it."""
     findings = {"python": platform.python_version(), "cores": str(os.cpu_count())}
     findings |= {name: _version(name) for name in DISTRIBUTIONS}
     missing = [name for name in SERVER_MODULES if importlib.util.find_spec(name) is None]
-    advice = [f"pip install 'real2sim[server]'  # for {', '.join(missing)}"] if missing else []
-    backends: list[dict[str, object]] = []
-    if not missing:
-        backends, more = _inspect_backends()
-        advice += more
+    if missing:
+        advice = [f"pip install 'real2sim[server]'  # for {', '.join(missing)}"]
+        _report(_Report(findings, advice=advice), json)
+        raise typer.Exit(1)
+    if build_gpu:
+        run_command(_build_gpu, findings=findings, arch=arch)
+    report = _inspected(findings)
     compiled: list[str] = []
-    if (warm or warmed) and not missing:
+    if warm or warmed:
         seconds, compiled = _warm_up()
         findings["kernels ready in"] = f"{seconds:.1f} s, {len(compiled)} compiled"
     if warmed and compiled:
-        advice.append(f"real2sim doctor --warm  # compiles {', '.join(sorted(compiled)[:8])}")
-    _print(findings, backends, advice)
-    write_json(json, {"findings": findings, "backends": backends, "advice": advice})
-    if missing or (warmed and compiled):
+        report.advice.append(
+            f"real2sim doctor --warm  # compiles {', '.join(sorted(compiled)[:8])}"
+        )
+    _report(report, json)
+    if need_cuda:
+        run_command(_require_cuda, without_device=without_device)
+    if warmed and compiled:
         raise typer.Exit(1)
+
+
+@dataclass
+class _Report:
+    """What was found; rows of backends and needs as they are printed and written."""
+
+    findings: dict[str, str]
+    backends: list[dict[str, object]] = field(default_factory=list)
+    cuda: list[dict[str, object]] = field(default_factory=list)
+    advice: list[str] = field(default_factory=list)
 
 
 def _version(distribution: str) -> str:
@@ -67,14 +98,73 @@ def _version(distribution: str) -> str:
         return "not installed"
 
 
-def _inspect_backends() -> tuple[list[dict[str, object]], list[str]]:
-    from ..render import describe_backends
+def _build_gpu(*, findings: dict[str, str], arch: list[str] | None) -> None:
+    """Compile gsplat's kernels for ``arch``, or for the GPU of this machine."""
+    from ..render.backends.cuda.gsplat_build import build_kernels
 
-    described = describe_backends()
-    rows: list[dict[str, object]] = [
-        {"name": b.name, "usable": b.usable, "reason": b.reason} for b in described
-    ]
-    return rows, [f"{b.name}: {b.remedy}" for b in described if b.remedy]
+    names = sorted({_capability(name) for name in arch or _own_architecture()})
+    console.print(f"compiling gsplat's kernels for {', '.join(names)}: this takes minutes")
+    built, seconds = build_kernels(names)
+    megabytes = built.library.stat().st_size / 1e6
+    findings["gsplat's kernels"] = f"{built.library}, {megabytes:.1f} MB, in {seconds:.0f} s"
+
+
+def _own_architecture() -> list[str]:
+    import torch
+
+    if not torch.cuda.is_available():
+        raise CommandError(
+            "torch sees no CUDA device here, so --build-gpu needs to be told what for: "
+            "--arch sm_90 for H100 and H200, sm_89 for L4 and RTX 40, sm_86 for RTX 30, sm_80 for "
+            "A100; it may be given several times"
+        )
+    major, minor = torch.cuda.get_device_capability()
+    return [f"sm_{major}{minor}"]
+
+
+def _capability(name: str) -> str:
+    """``9.0`` of ``sm_90`` or of ``9.0``."""
+    digits = name.removeprefix("sm_").replace(".", "")
+    if not digits.isdecimal() or len(digits) not in (2, 3) or int(digits) < 70:
+        raise CommandError(f"--arch {name!r}; allowed are such as sm_75, sm_90, sm_120, or 9.0")
+    return f"{digits[:-1]}.{digits[-1]}"
+
+
+def _inspected(findings: dict[str, str]) -> _Report:
+    import torch
+
+    from ..render import describe_backends, select_backend
+    from ..render.backends.cuda.needs import cuda_needs
+
+    described, used = describe_backends(), select_backend("auto").name
+    # Of use where somebody wants CUDA: where torch is built for it, or a driver is loaded.
+    wanted = torch.version.cuda is not None or Path("/proc/driver/nvidia/version").is_file()
+    needs = cuda_needs() if wanted else []
+    mend = {
+        f"{b.name}: {b.remedy}" for b in described if b.remedy and not (needs and b.name == "cuda")
+    }
+    return _Report(
+        findings=findings,
+        backends=[
+            {"name": b.name, "usable": b.usable, "used": b.name == used, "reason": b.reason}
+            for b in described
+        ],
+        cuda=[vars(need) for need in needs],
+        advice=[*sorted(mend), *(f"{need.name}: {need.remedy}" for need in needs if need.remedy)],
+    )
+
+
+def _require_cuda(*, without_device: bool) -> None:
+    """Leave with an error where CUDA is not usable, or not but for the device."""
+    from ..render.backends.cuda.needs import try_without_device, unmet_need
+
+    need = unmet_need(without_device=without_device)
+    if need is not None:
+        raise CommandError(f"CUDA is not usable: {need.found}; {need.remedy}")
+    try:
+        try_without_device()
+    except Exception as error:
+        raise CommandError(f"CUDA is not usable: {type(error).__name__}: {error}") from error
 
 
 def _warm_up() -> tuple[float, list[str]]:
@@ -93,15 +183,22 @@ def _warm_up() -> tuple[float, list[str]]:
     return time.perf_counter() - start, sorted(names)
 
 
-def _print(findings: dict[str, str], backends: list[dict[str, object]], advice: list[str]) -> None:
+def _report(report: _Report, json: Path | None) -> None:
     table = Table(title="this machine", title_justify="left", show_header=False)
-    for name, value in findings.items():
+    for name, value in report.findings.items():
         table.add_row(name, value)
     console.print(table)
-    if backends:
+    if report.backends:
         table = Table("backend", "usable", "reason", title="rendering", title_justify="left")
-        for row in backends:
-            table.add_row(str(row["name"]), "yes" if row["usable"] else "no", str(row["reason"]))
+        for row in report.backends:
+            usable = "used" if row["used"] else "yes" if row["usable"] else "no"
+            table.add_row(str(row["name"]), usable, str(row["reason"]))
         console.print(table)
-    for line in advice:
-        console.print(f"to mend: {line}", highlight=False)
+    if report.cuda:
+        table = Table("cuda needs", "here", "found", title="CUDA", title_justify="left")
+        for row in report.cuda:
+            table.add_row(str(row["name"]), "yes" if row["met"] else "no", str(row["found"]))
+        console.print(table)
+    for line in report.advice:
+        console.print(f"to mend: {line}", highlight=False, soft_wrap=True, markup=False)
+    write_json(json, asdict(report))

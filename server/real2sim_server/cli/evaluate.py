@@ -9,7 +9,15 @@ import typer
 
 from ..console import CommandError, console, print_figures, staged_progress, write_json
 from .command import command
-from .options import JsonFile, LogFormat, RenderBackend, SceneBundle, Sequence
+from .device import chosen_backend
+from .options import (
+    JsonFile,
+    LogFormat,
+    RenderBackend,
+    RenderDevice,
+    SceneBundle,
+    Sequence,
+)
 
 if TYPE_CHECKING:
     from ..reconstruct.evaluation import Evaluation
@@ -32,6 +40,7 @@ def evaluate(
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for a page with images.")] = None,
     backend: RenderBackend = "auto",
+    device: RenderDevice = None,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
@@ -45,7 +54,7 @@ def evaluate(
         frames=_parse_frames(frames),
         width=width,
         shifts=_parse_shifts(shifts),
-        backend=backend,
+        backend=chosen_backend(backend, device),
         around=around,
     )
     loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)

@@ -16,3 +16,6 @@ LogFormat = Annotated[str | None, typer.Option("--format", help="Default: recogn
 Sequence = Annotated[str | None, typer.Option(help="Where a dataset holds several.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 RenderBackend = Annotated[str, typer.Option(help="auto, cpu, cuda or reference")]
+RenderDevice = Annotated[
+    str | None, typer.Option(help="cpu, cuda, cuda:1 ...; default: that of the backend.")
+]

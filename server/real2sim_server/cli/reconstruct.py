@@ -11,7 +11,16 @@ import typer
 
 from ..console import console, print_figures, refuse_existing, staged_progress, write_json
 from .command import command
-from .options import JsonFile, LogFolder, LogFormat, Overwrite, Sequence
+from .device import chosen_backend
+from .options import (
+    JsonFile,
+    LogFolder,
+    LogFormat,
+    Overwrite,
+    RenderBackend,
+    RenderDevice,
+    Sequence,
+)
 
 if TYPE_CHECKING:
     from ..reconstruct.training.progress import TrainingProgress
@@ -37,6 +46,8 @@ def reconstruct(
     box_noise: Annotated[
         float, typer.Option(min=0, max=1, help="Scatter added to boxes, a share of their size.")
     ] = 0.0,
+    backend: RenderBackend = "auto",
+    device: RenderDevice = None,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
@@ -48,6 +59,7 @@ def reconstruct(
     from ..reconstruct.training.schedule import preset as training_preset
 
     refuse_existing(out, overwrite=overwrite)
+    drawn_by = chosen_backend(backend, device)
     training = training_preset(preset)
     if iterations:
         training = replace(training, iterations=iterations)
@@ -57,7 +69,9 @@ def reconstruct(
         result = reconstruct(
             open_log(log, format=log_format, sequence=sequence),
             out,
-            ReconstructOptions(training=training if iterations else None, box_noise=box_noise),
+            ReconstructOptions(
+                training=training if iterations else None, box_noise=box_noise, backend=drawn_by
+            ),
             resume=resume,
             overwrite=overwrite,
             on_progress=report,

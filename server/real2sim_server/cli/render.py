@@ -11,7 +11,8 @@ import typer
 from .._files import atomic_file
 from ..console import CommandError, console, print_figures, write_json
 from .command import command
-from .options import JsonFile, RenderBackend, SceneBundle
+from .device import chosen_backend
+from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle
 
 if TYPE_CHECKING:
     from ..edit.state import ScenarioState
@@ -35,6 +36,7 @@ def render(
     delete: Annotated[list[str] | None, typer.Option(help="Objects to leave out.")] = None,
     log: Annotated[Path | None, typer.Option(help="Compare with this log's image: PSNR.")] = None,
     backend: RenderBackend = "auto",
+    device: RenderDevice = None,
     json: JsonFile = None,
 ) -> None:
     """Draw one logged camera of a scene; with --log print PSNR against the recorded image."""
@@ -45,6 +47,7 @@ def render(
     if log is not None and (t_us is not None or delete):
         raise CommandError("--log compares whole recorded frames: use --frame, and no --delete")
     _check_output(out, modality)
+    backend = chosen_backend(backend, device)
     loaded = load_scene(scene)
     time_us = _frame_time(loaded, frame or 0) if t_us is None else t_us
     chosen = loaded.rig[camera] if camera else loaded.rig.cameras[0]
@@ -65,7 +68,7 @@ def render(
     }
     figures |= {f"{stage}_ms": ms for stage, ms in picture.timing_ms.items()}
     if log is not None:
-        figures |= _compare(loaded, log, frame or 0, picture.camera)
+        figures |= _compare(loaded, log, frame or 0, picture.camera, backend=backend)
     print_figures(f"{scene.name}, camera {picture.camera}", figures)
     write_json(json, figures)
 
@@ -109,7 +112,9 @@ def _write_image(frame: Frame, modality: str, out: Path) -> None:
         file.write(encode_image(image, modality, CODEC_BY_SUFFIX[out.suffix.lower()]).data)
 
 
-def _compare(scene: Scene, log_path: Path, frame: int, camera: str) -> dict[str, float]:
+def _compare(
+    scene: Scene, log_path: Path, frame: int, camera: str, *, backend: str
+) -> dict[str, float]:
     from ..logs.open import open_log
     from ..reconstruct.evaluation import evaluate_views
 
@@ -118,5 +123,5 @@ def _compare(scene: Scene, log_path: Path, frame: int, camera: str) -> dict[str,
         f"comparing with {log.name}, frame {frame}, over all pixels and over those that LiDAR "
         "covers"
     )
-    report = evaluate_views(scene, log, frames=[frame], cameras=[camera])
+    report = evaluate_views(scene, log, frames=[frame], cameras=[camera], backend=backend)
     return {"psnr_db": report.psnr, "psnr_lidar_db": report.psnr_lidar}

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..logs import DrivingLog, open_log
+from ..render.backends import select_backend
 from ..render.picture_file import write_png
 from ..scene import Scene
 from ..scene.io import save_scene
@@ -95,11 +96,13 @@ class ReconstructOptions:
         training: None builds from LiDAR without training.
         box_noise: scatter added to the boxes of the log, to see how much training mends; see
             ``with_box_noise``.
+        backend: of the renderer; training lies on its device.
     """
 
     initialise: InitialiseOptions | None = None
     training: TrainOptions | None = None
     box_noise: float = 0.0
+    backend: str = "auto"
 
 
 def reconstruct(
@@ -130,8 +133,10 @@ def reconstruct(
         ReconstructError: the log has nothing to build from, or there is nothing to resume.
         LogError: the log cannot be read.
         BundleError: ``out`` exists and may not be replaced.
+        RenderError: the renderer is not usable here; said before anything is read.
     """
     options = options or ReconstructOptions()
+    select_backend(options.backend)
     if resume and options.training is None:
         raise ReconstructError("there is nothing to resume without training: give its options")
     timing_s: dict[str, float] = {}
@@ -152,13 +157,15 @@ def reconstruct(
             Path(out),
             resume=resume,
             stages=_Callbacks(on_progress, on_training, timing_s),
+            backend=options.backend,
         )
     with stages("write"):
         scene = save_scene(scene, out, overwrite=overwrite)
     with stages("evaluate"):
         frames = _evaluated_frames(log, figures)
-        scores = evaluate_views(scene, log, frames=frames)
-        preview = _write_preview(scene, log, Path(out), frames[len(frames) // 2])
+        scores = evaluate_views(scene, log, frames=frames, backend=options.backend)
+        middle = frames[len(frames) // 2]
+        preview = _write_preview(scene, log, Path(out), middle, backend=options.backend)
     return ReconstructReport(
         scene=str(out),
         preview=str(preview),
@@ -191,7 +198,13 @@ def _training_options(training: TrainOptions, initialise: InitialiseOptions | No
 
 
 def _train(
-    log: DrivingLog, options: TrainOptions, out: Path, *, resume: bool, stages: _Callbacks
+    log: DrivingLog,
+    options: TrainOptions,
+    out: Path,
+    *,
+    resume: bool,
+    stages: _Callbacks,
+    backend: str,
 ) -> tuple[Scene, TrainingFigures]:
     folder = out.parent / f"{out.name}.training"
     result = train(
@@ -199,6 +212,7 @@ def _train(
         options,
         folder,
         resume=resume,
+        backend=backend,
         on_progress=stages.on_progress,
         on_training=stages.on_training,
         timing_s=stages.timing_s,
@@ -227,10 +241,11 @@ def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[
     return held_out[:: -(-len(held_out) // EVALUATED_FRAMES)]
 
 
-def _write_preview(scene: Scene, log: DrivingLog, out: Path, frame: int) -> Path:
+def _write_preview(scene: Scene, log: DrivingLog, out: Path, frame: int, *, backend: str) -> Path:
     """The logged image of the first camera above the rendered one."""
     camera = log.rig.cameras[0]
-    rendered = render_logged_view(scene, camera, int(log.frame_times_us[frame]))
+    t_us = int(log.frame_times_us[frame])
+    rendered = render_logged_view(scene, camera, t_us, backend=backend)
     path = out.parent / f"{out.name}.preview.png"
     write_png(path, np.concatenate([log.image(camera.name, frame), rendered]))
     return path

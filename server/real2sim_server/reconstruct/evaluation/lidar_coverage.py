@@ -62,6 +62,7 @@ def evaluate_views(
     frames: Sequence[int],
     cameras: Sequence[str] | None = None,
     width: int | None = None,
+    backend: str = "auto",
 ) -> CoverageReport:
     """Render logged views and compare them with the logged images.
 
@@ -75,6 +76,7 @@ def evaluate_views(
         frames: indices of frames.
         cameras: names; all by default.
         width: of the compared images [px]; the logged width by default.
+        backend: of the renderer.
 
     Raises:
         ReconstructError: no frames or no cameras were named, or the scene lacks a frame.
@@ -84,7 +86,9 @@ def evaluate_views(
     if not names or len(frames) == 0:
         raise ReconstructError("name at least one camera and one frame to evaluate")
     views = tuple(
-        _score(scene, log, log.rig[name], frame, width) for frame in frames for name in names
+        _score(scene, log, log.rig[name], frame, width=width, backend=backend)
+        for frame in frames
+        for name in names
     )
     return CoverageReport(
         views=views,
@@ -113,12 +117,13 @@ def lidar_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]
 
 
 def _score(
-    scene: Scene, log: DrivingLog, camera: Camera, frame: int, width: int | None
+    scene: Scene, log: DrivingLog, camera: Camera, frame: int, *, width: int | None, backend: str
 ) -> CoverageScore:
     truth = log.image(camera.name, frame)
     camera = camera if width is None else camera.resized(width)
     truth = resized(truth, camera)
-    image = render_logged_view(scene, camera, int(log.frame_times_us[frame]))
+    t_us = int(log.frame_times_us[frame])
+    image = render_logged_view(scene, camera, t_us, backend=backend)
     mask = lidar_mask(log, camera, frame)
     return CoverageScore(
         camera.name, frame, psnr(image, truth), psnr(image, truth, mask), float(mask.mean())

@@ -51,7 +51,9 @@ def render_view(
     return frame
 
 
-def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.uint8]:
+def render_logged_view(
+    scene: Scene, camera: Camera, t_us: int, *, backend: str = "auto"
+) -> NDArray[np.uint8]:
     """RGB [H, W, 3] of ``camera`` on the recording vehicle at ``t_us``, objects as recorded.
 
     Raises:
@@ -64,6 +66,7 @@ def render_logged_view(scene: Scene, camera: Camera, t_us: int) -> NDArray[np.ui
         scene.ego.transform(t_us),
         sky=scene.sky,
         options=options,
+        backend=backend,
     )
     return frame.rgb
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.util
 import logging
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -92,10 +91,17 @@ def _by_preference() -> list[RegisteredBackend]:
 
 
 def _preferred() -> str:
-    """Name of the best usable backend; says in the log why the best one of all is not."""
+    """Name of the best usable backend; says in the log why the best one of all is not.
+
+    A warning where there is a GPU: who has one expects that it is used.
+    """
     statuses = [backend.status() for backend in _by_preference() if backend.preference]
     chosen = next((status for status in statuses if status.usable), statuses[-1])
-    _log.info("render backend %s chosen: %s", chosen.name, statuses[0].reason)
+    level, why = logging.INFO, statuses[0].reason
+    if not statuses[0].usable:
+        why = f"{why}; {statuses[0].remedy}"
+        level = logging.WARNING if torch.cuda.is_available() else logging.INFO
+    _log.log(level, "render backend %s chosen: %s", chosen.name, why)
     return chosen.name
 
 
@@ -112,25 +118,11 @@ def _cpu_status() -> BackendStatus:
 
 
 def _cuda_status() -> BackendStatus:
-    if not torch.cuda.is_available():
-        return BackendStatus(
-            "cuda", False, "torch sees no CUDA device", "install a CUDA build of torch and a driver"
-        )
-    if importlib.util.find_spec("gsplat") is None:
-        return BackendStatus(
-            "cuda", False, "gsplat is not installed", "pip install 'real2sim[server,cuda]'"
-        )
-    if importlib.util.find_spec("numba.cuda") is None:
-        return BackendStatus(
-            "cuda", False, "numba-cuda is not installed", "pip install 'real2sim[server,cuda]'"
-        )
-    if importlib.util.find_spec("gsplat.csrc") is None and shutil.which("nvcc") is None:
-        return BackendStatus(
-            "cuda",
-            False,
-            "gsplat is not compiled and there is no nvcc to compile it",
-            "install the CUDA toolkit, or a gsplat wheel built for this torch",
-        )
+    from .cuda.needs import unmet_need
+
+    need = unmet_need()
+    if need is not None:
+        return BackendStatus("cuda", False, need.found, need.remedy)
     return BackendStatus("cuda", True, f"gsplat on {torch.cuda.get_device_name()}")
 
 

@@ -18,7 +18,9 @@ from ....scene import GaussianCloud
 from ...types import Instance, RenderOutput
 from ..base import Placement, RasterRequest, needs_gradients, pixel_directions, place_instances
 from ..warm_up import warm_up_requests
+from .gsplat_build import load_kernels
 from .instance import instance_image
+from .needs import kernels_for_device
 from .screen import track_screen
 from .stage_times import StageTimes
 
@@ -33,6 +35,9 @@ class CudaBackend:
 
     def __init__(self, device: torch.device | str = "cuda") -> None:
         self.device = torch.device(device)
+        kernels = kernels_for_device() if self.device.type == "cuda" else None
+        if kernels is not None:
+            load_kernels(kernels)
         self._resident: weakref.WeakKeyDictionary[GaussianCloud, GaussianCloud] = (
             weakref.WeakKeyDictionary()
         )
@@ -66,7 +71,7 @@ class CudaBackend:
         )
 
     def warm_up(self) -> None:
-        """Load or build gsplat's extension and compile the instance kernel."""
+        """Compile the instance kernel, and let gsplat reserve what it needs."""
         for request in warm_up_requests():
             self.rasterize(request)
 

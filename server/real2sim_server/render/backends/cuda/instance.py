@@ -49,6 +49,15 @@ def instance_image(
     return image.to(torch.uint16)
 
 
+def instance_signature() -> Any:
+    """Types of the arguments of :func:`find_instances`, for compiling it ahead."""
+    from numba import types
+
+    floats = [types.Array(types.float32, dims, "C") for dims in (2, 2, 1)]
+    whole = [types.Array(types.int32, dims, "C") for dims in (1, 2, 1, 3)]
+    return types.void(*floats, *whole, types.int64, types.int64)
+
+
 @cuda.jit
 def find_instances(
     means2d, conics, opacities, ids, offsets, members, image, tile_size, tiles_x

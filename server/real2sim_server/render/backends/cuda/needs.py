@@ -1,0 +1,166 @@
+"""What the CUDA backend needs, what of it is here, and what to do about the rest.
+
+Answers without loading gsplat or compiling anything, so that it can be asked at every start;
+:func:`try_without_device` tries what can be tried on a machine that has no GPU.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .gsplat_build import (
+    CUDA_TORCH,
+    INSTALL,
+    BuiltKernels,
+    built_kernels,
+    cuda_folders,
+    load_kernels,
+)
+
+DRIVER = (
+    "install an NVIDIA driver that is new enough for this CUDA (nvidia-smi shows both); start a "
+    "container with --gpus all, or with docker/compose.gpu.yml"
+)
+BUILD = "real2sim doctor --build-gpu"
+GSPLAT = ((1, 5), (1, 6))
+"""gsplat from, and below: 1.6 calls spherical_harmonics otherwise."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """Something that the backend needs.
+
+    Attributes:
+        name: what it is.
+        met: whether it is here.
+        found: what was found, or what is wrong.
+        remedy: what to do; empty where it is met.
+        of_device: whether only a machine with a GPU can have it.
+    """
+
+    name: str
+    met: bool
+    found: str
+    remedy: str = ""
+    of_device: bool = False
+
+
+def cuda_needs() -> list[Need]:
+    """All needs, in the order in which they are to be mended."""
+    return [_torch(), _device(), _gsplat(), _numba_cuda(), _nvvm(), _kernels()]
+
+
+def unmet_need(*, without_device: bool = False) -> Need | None:
+    """The first that is not met, or None where the backend can draw.
+
+    Args:
+        without_device: leave out what only a machine with a GPU can have.
+    """
+    for need in cuda_needs():
+        if not need.met and not (without_device and need.of_device):
+            return need
+    return None
+
+
+def kernels_for_device() -> BuiltKernels | None:
+    """Compiled kernels for the GPU of this machine; those made last where there is none."""
+    built = built_kernels()
+    if torch.cuda.is_available():
+        capability = torch.cuda.get_device_capability()
+        built = [kernels for kernels in built if kernels.serves(capability)]
+    return built[-1] if built else None
+
+
+def try_without_device() -> None:
+    """Load gsplat's kernels and compile the instance kernel, which needs a driver only to run.
+
+    Raises:
+        RenderError: the kernels cannot be loaded.
+        Exception: whatever the compiler of Numba raises.
+    """
+    from numba import cuda
+
+    kernels = kernels_for_device()
+    if kernels is not None:
+        load_kernels(kernels)
+    from .instance import find_instances, instance_signature
+
+    compile_ptx: Any = cuda.compile_ptx  # type: ignore[attr-defined]
+    compile_ptx(find_instances.py_func, instance_signature(), cc=(9, 0))
+
+
+def _torch() -> Need:
+    version = torch.version.cuda
+    if version is None:
+        return Need("torch", False, f"torch {torch.__version__} is built for CPU only", CUDA_TORCH)
+    return Need("torch", True, f"torch {torch.__version__} for CUDA {version}")
+
+
+def _device() -> Need:
+    if not torch.cuda.is_available():
+        return Need("device", False, "torch sees no CUDA device", DRIVER, of_device=True)
+    major, minor = torch.cuda.get_device_capability()
+    return Need(
+        "device", True, f"{torch.cuda.get_device_name()}, sm_{major}{minor}", of_device=True
+    )
+
+
+def _gsplat() -> Need:
+    version = _version("gsplat")
+    if version is None:
+        return Need("gsplat", False, "gsplat is not installed", INSTALL)
+    lowest, above = GSPLAT
+    if not lowest <= tuple(int(part) for part in version.split(".")[:2]) < above:
+        return Need("gsplat", False, f"gsplat {version} has other functions than 1.5", INSTALL)
+    return Need("gsplat", True, f"gsplat {version}")
+
+
+def _kernels() -> Need:
+    if _version("gsplat") and importlib.util.find_spec("gsplat.csrc") is not None:
+        return Need("kernels", True, "gsplat brings its kernels compiled")
+    kernels = kernels_for_device()
+    if kernels is None:
+        built = sorted({name for kernels in built_kernels() for name in kernels.architectures})
+        found = (
+            f"gsplat's kernels are compiled for {', '.join(built)} only"
+            if built
+            else ("gsplat's kernels are not compiled for this torch")
+        )
+        return Need("kernels", False, found, BUILD)
+    names = ", ".join(kernels.architectures)
+    return Need("kernels", True, f"{kernels.library} for {names}")
+
+
+def _numba_cuda() -> Need:
+    version = _version("numba-cuda")
+    if version is None:
+        return Need("numba-cuda", False, "numba-cuda is not installed", INSTALL)
+    return Need("numba-cuda", True, f"numba-cuda {version}")
+
+
+def _nvvm() -> Need:
+    """Numba compiles instance images and physics with it."""
+    library = next(_nvvm_libraries(), None)
+    if library is None:
+        return Need("libnvvm", False, "libnvvm is not installed", INSTALL)
+    return Need("libnvvm", True, str(library))
+
+
+def _nvvm_libraries() -> Iterator[Path]:
+    for root in cuda_folders():
+        for folder in ("nvvm/lib64", "lib", "lib64"):
+            yield from sorted((root / folder).glob("libnvvm.so*"))
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,83 @@
+"""``--backend`` and ``--device``, and what ``doctor`` says of CUDA."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from real2sim.cli import build_app
+from real2sim_server.cli.device import chosen_backend
+from real2sim_server.console import CommandError
+from real2sim_server.reconstruct import ReconstructOptions, reconstruct
+from real2sim_server.render import RenderError, select_backend
+
+
+@pytest.fixture(autouse=True)
+def no_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    select_backend.cache_clear()
+
+
+def test_the_device_chooses_the_backend() -> None:
+    assert chosen_backend("auto", None) == "auto"
+    assert chosen_backend("auto", "cpu") == "cpu"
+    assert chosen_backend("auto", "cuda") == "cuda"
+    assert chosen_backend("reference", "cpu") == "reference"
+
+
+def test_a_numbered_device_is_the_only_one_that_the_process_sees(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
+    assert chosen_backend("cuda", "cuda:1") == "cuda"
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "5"
+    with pytest.raises(CommandError, match="shows 1 of them"):
+        chosen_backend("cuda", "cuda:1")
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:", "cuda:x", "cpu:0", ""])
+def test_a_device_that_is_none_is_refused(device: str) -> None:
+    with pytest.raises(CommandError, match="allowed are cpu, cuda"):
+        chosen_backend("auto", device)
+
+
+def test_a_backend_of_another_device_is_refused() -> None:
+    with pytest.raises(CommandError, match="does not draw on --device cpu"):
+        chosen_backend("cuda", "cpu")
+
+
+def test_a_reconstruction_that_cannot_draw_ends_before_it_reads_anything(tmp_path: Path) -> None:
+    options = ReconstructOptions(backend="cuda")
+    with pytest.raises(RenderError, match="'cuda' is not usable"):
+        reconstruct(tmp_path / "no_such_log", tmp_path / "scene.r2s", options)
+
+
+def doctor(*arguments: str) -> tuple[int, str]:
+    done = CliRunner().invoke(build_app(), ["doctor", *arguments], env={"COLUMNS": "300"})
+    return done.exit_code, done.output
+
+
+def test_doctor_says_what_is_used_and_what_to_install() -> None:
+    code, output = doctor()
+    assert code == 0
+    assert "used" in output
+    assert "real2sim[server,cuda]" in output or "driver" in output
+
+
+def test_doctor_fails_where_cuda_is_needed_and_not_usable() -> None:
+    code, output = doctor("--need-cuda")
+    assert code == 1
+    assert "CUDA is not usable" in output
+
+
+def test_doctor_asks_what_to_build_for_where_there_is_no_gpu() -> None:
+    code, output = doctor("--build-gpu")
+    assert code == 1
+    assert "--arch sm_90" in output
+    code, output = doctor("--build-gpu", "--arch", "hopper")
+    assert code == 1
+    assert "'hopper'" in output
