@@ -19,6 +19,7 @@ from starlette.requests import HTTPConnection
 from real2sim_proto.scenes import DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
+from ..render.backends import device_of
 from ..scene.io import StagingLimits
 from ..settings import Settings
 from .accounts import Accounts
@@ -105,7 +106,7 @@ class Worker:
             SceneCatalog(settings.scenes_path),
             engine,
             budget=budget,
-            device=_device_of(backend),
+            device=str(device_of(backend)),
             on_load=metrics.scene_loads.observe,
         )
         store = Store(
@@ -313,10 +314,6 @@ async def _cancel(task: asyncio.Task[None]) -> None:
         await task
 
 
-def _device_of(backend: Backend) -> str:
-    return "cuda" if backend.name == "cuda" else "cpu"
-
-
 def _device_info(backend: Backend, settings: Settings) -> DeviceInfo:
     import numba
 
@@ -329,7 +326,7 @@ def _device_info(backend: Backend, settings: Settings) -> DeviceInfo:
     return DeviceInfo(
         backend=backend.name,
         reason=reason,
-        device=_device_of(backend),
+        device=device_of(backend).type,
         threads=settings.threads or numba.get_num_threads(),
     )
 
