@@ -34,7 +34,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H200")
-    monkeypatch.setattr(needs.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(needs, "gsplat_package", lambda: None)
     toolkit = tmp_path / "cuda"
     (toolkit / "lib").mkdir(parents=True)
     (toolkit / "lib" / "libnvvm.so.4").touch()
@@ -60,6 +60,14 @@ def test_kernels_that_are_not_compiled_are_to_be_built(machine: dict[str, str]) 
 
 def test_with_compiled_kernels_nothing_is_missing(machine: dict[str, str]) -> None:
     have_built("8.0", "9.0")
+    assert needs.unmet_need() is None
+
+
+def test_a_gsplat_that_brings_its_kernels_needs_none_built(
+    machine: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "csrc.cpython-311-x86_64-linux-gnu.so").touch()
+    monkeypatch.setattr(needs, "gsplat_package", lambda: tmp_path)
     assert needs.unmet_need() is None
 
 

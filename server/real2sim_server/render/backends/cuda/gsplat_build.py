@@ -73,6 +73,8 @@ def load_kernels(kernels: BuiltKernels) -> None:
     Raises:
         RenderError: the library cannot be loaded.
     """
+    if "gsplat.csrc" in sys.modules:
+        return
     import gsplat
 
     spec = importlib.util.spec_from_file_location("gsplat.csrc", kernels.library)

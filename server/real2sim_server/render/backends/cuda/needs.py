@@ -7,7 +7,6 @@ Answers without loading gsplat or compiling anything, so that it can be asked at
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from .gsplat_build import (
     BuiltKernels,
     built_kernels,
     cuda_folders,
+    gsplat_package,
     load_kernels,
 )
 
@@ -123,7 +123,8 @@ def _gsplat() -> Need:
 
 
 def _kernels() -> Need:
-    if _version("gsplat") and importlib.util.find_spec("gsplat.csrc") is not None:
+    package = gsplat_package()
+    if package is not None and any(package.glob("csrc*.so")):
         return Need("kernels", True, "gsplat brings its kernels compiled")
     kernels = kernels_for_device()
     if kernels is None:
