@@ -45,6 +45,8 @@ def warm_up() -> None:
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
     _sweep(world)
+    # Which lane an ego is in that has left its own.
+    world.context.in_lane(world.instant.ego._replace(offset=10.0))
     # What only perfect tracking and sliding vehicles call.
     _track(EgoSpec(tracker="perfect"))
     # What edits, views and rollouts ask of the ground.
