@@ -47,6 +47,11 @@ class Collider:
         """Whether its pose changes with time."""
         return False
 
+    @property
+    def fastest_point(self) -> float:
+        """Speed [m/s] that no point of it exceeds."""
+        return 0.0
+
     def after(self, duration: float) -> Collider:
         """The collider ``duration`` [s] later."""
         return self
@@ -103,6 +108,13 @@ class Box(Collider):
     def moving(self) -> bool:
         """Whether it has any velocity."""
         return bool(np.any(self.velocity) or np.any(self.angular_velocity))
+
+    @property
+    def fastest_point(self) -> float:
+        """Speed [m/s] that no point of it exceeds."""
+        reach = float(np.linalg.norm(self.size)) / 2
+        spin = float(np.linalg.norm(self.angular_velocity))
+        return float(np.linalg.norm(self.velocity)) + reach * spin
 
     def after(self, duration: float) -> Box:
         """The box ``duration`` [s] later, moved at its velocities."""

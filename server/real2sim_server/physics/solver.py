@@ -231,9 +231,13 @@ class Solver:
         return report
 
     def time_step(self) -> float:
-        """Longest stable substep now [s]: waves, motion, viscosity, and ``dt_scale``."""
+        """Longest stable substep now [s]: waves, motion, viscosity, and ``dt_scale``.
+
+        What moves relative to a collider must not cross more of a cell than what moves past nodes.
+        """
         m, o = self._measure, self.options
         speed = m.max_wave_speed + m.max_speed
+        speed += max((c.fastest_point for c in self._colliders), default=0.0)
         return self._dt_scale * min(o.cfl * self.dx / speed, self._viscous_dt, o.dt_max)
 
     def state(self, name: str) -> BodyState:

@@ -18,15 +18,19 @@ from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform
 from ..physics.body import Body
-from ..physics.colliders import Collider
+from ..physics.colliders import Box, Collider
 from ..physics.materials import Material
 from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .rigid import RigidMotion, best_rotation, cross_matrix, inertia_about
-from .surroundings import nearest
+from .surroundings import closest
 from .tyres import TyreReaction, Tyres
 
 SURFACE_POINTS = 600
+BESIDE = 1.3
+"""Particles of a lattice that are nearer than this many spacings are side by side."""
+NEAR_MAX = 4.0
+"""How far away boxes still count where the gap to the nearest collider is asked for [m]."""
 RIGID_STEP = 0.0025
 """Longest step of rigid motion [s]."""
 SETTLED_SPEED = 0.06
@@ -124,7 +128,10 @@ class DeformableBody:
         self.mode = BodyMode.RIGID
         self.hit = False
         self.state: BodyState | None = None
-        self._surface = _surface_points(particles.positions)
+        self._hull = _hull(particles.positions)
+        self._shell = _shell(particles.positions, self.spacing)
+        self._radius_of: Float | None = None
+        self._radius_m = 0.0
         self._stored_energy = 0.0
         self._deforming_time = self._settle_time = self._sleep_time = 0.0
 
@@ -149,11 +156,18 @@ class DeformableBody:
         pose = self.T_world_object
         return (self.state.positions - pose[:3, 3]) @ pose[:3, :3]
 
-    def surface_points(self) -> Float:
-        """[K, 3] some particles of its surface, in the world [m]."""
+    def hull_points(self) -> Float:
+        """[K, 3] its outermost particles, in the world [m]: what meets a half-space."""
+        return self._world(self._hull)
+
+    def shell_points(self) -> Float:
+        """[K, 3] all particles with nothing beside them, in the world [m]."""
+        return self._world(self._shell)
+
+    def _world(self, which: NDArray[np.int64]) -> Float:
         if self.state is not None:
-            return self.state.positions[self._surface]
-        return apply_transform(self.T_world_object, self.shape.positions[self._surface])
+            return self.state.positions[which]
+        return apply_transform(self.T_world_object, self.shape.positions[which])
 
     def box(self) -> tuple[Float, Float]:
         """Pose [4, 4] and size [3] of the box about its present shape."""
@@ -168,13 +182,51 @@ class DeformableBody:
         return -float(box_penetration(*self.box(), *other.box()))
 
     def gap_to_colliders(self, colliders: Sequence[Collider]) -> tuple[float, float]:
-        """Distance [m] to the nearest collider, and the speed of approach there [m/s]."""
-        points = self.surface_points()
-        distance, normals = nearest(colliders, points)
-        k = int(distance.argmin())
-        if not np.isfinite(distance[k]):
-            return np.inf, 0.0
-        return float(distance[k]), -float(normals[k] @ self.motion.velocity_at(points[k]))
+        """Distance [m] to the nearest collider, and the speed of approach there [m/s].
+
+        Boxes further away than NEAR_MAX are infinitely far.
+        """
+        gap, approach, _ = self._closest(colliders, within=NEAR_MAX, ahead=0.0)
+        return gap, approach
+
+    def meets(self, colliders: Sequence[Collider], *, within: float, ahead: float) -> bool:
+        """Whether it and a collider approach each other and will be ``within`` [m] of each other in
+        the time ``ahead`` [s]."""
+        return self._closest(colliders, within=within, ahead=ahead)[2]
+
+    def _closest(
+        self, colliders: Sequence[Collider], *, within: float, ahead: float
+    ) -> tuple[float, float, bool]:
+        """See ``surroundings.closest``.
+
+        Outermost particles are what meets ground; a box may meet any place of a flat side.
+        """
+        smooth = [c for c in colliders if not isinstance(c, Box)]
+        hull = closest(self.hull_points(), self.motion, smooth, within=within, ahead=ahead)
+        boxes = [c for c in colliders if isinstance(c, Box) and self._may_meet(c, within, ahead)]
+        if not boxes:
+            return hull
+        shell = closest(self.shell_points(), self.motion, boxes, within=within, ahead=ahead)
+        gap, approach, _ = min(hull, shell)
+        return gap, approach, hull[2] or shell[2]
+
+    def _may_meet(self, box: Box, within: float, ahead: float) -> bool:
+        """Whether a box is so near the ball about the body that their surfaces must be compared."""
+        m = self.motion
+        gap = closest(m.centre[None], m, [box], within=within, ahead=ahead)[0] - self._radius
+        speed = float(np.linalg.norm(m.velocity)) + box.fastest_point
+        speed += self._radius * float(np.linalg.norm(m.angular_velocity))
+        return gap < within + speed * ahead
+
+    @property
+    def _radius(self) -> float:
+        """Of a ball about its centre of mass that holds the body [m]."""
+        positions = self.shape.positions if self.state is None else self.state.positions
+        if self._radius_of is not positions:
+            centre = self.rest.masses @ positions / self.rest.mass
+            self._radius_of = positions
+            self._radius_m = float(np.linalg.norm(positions - centre, axis=1).max())
+        return self._radius_m
 
     def solver_body(self) -> Body:
         """The body as it is now, for a solver; momentum and angular momentum are the motion's."""
@@ -373,7 +425,18 @@ def _undeformed(particles: Particles) -> DeformedShape:
     return DeformedShape(particles.positions, eye, eye, np.zeros(n))
 
 
-def _surface_points(positions: Float) -> NDArray[np.int64]:
+def _shell(positions: Float, spacing: float) -> NDArray[np.int64]:
+    """Indices of particles that have no neighbour on one of their six sides."""
+    from scipy.spatial import cKDTree
+
+    neighbours = cKDTree(positions).query_ball_point(
+        positions, BESIDE * spacing, return_length=True
+    )
+    shell: NDArray[np.int64] = np.flatnonzero(neighbours < 7)
+    return shell
+
+
+def _hull(positions: Float) -> NDArray[np.int64]:
     """Indices of particles that lie outermost along evenly spread directions."""
     k = np.arange(SURFACE_POINTS) + 0.5
     z = 1 - 2 * k / SURFACE_POINTS

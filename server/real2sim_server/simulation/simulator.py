@@ -174,12 +174,12 @@ class HybridSimulator:
         ]
         if self._is_near_bodies(body, others, duration):
             return True
+        walls = self._walls(body)
         if asleep:
-            return False
-        gap, approach = body.gap_to_colliders(self._walls(body))
-        if approach > 0 and gap < NEAR_CELLS * body.cell + approach * duration:
+            walls = [c for c in walls if c.moving]
+        if body.meets(walls, within=NEAR_CELLS * body.cell, ahead=duration):
             return True
-        if body.tyres is None:
+        if asleep or body.tyres is None:
             return False
         gap, approach = body.gap_to_colliders(self.road)
         return gap < ROAD_CELLS * body.cell + max(approach, 0) * duration

@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, is_rigid
-from ..physics.colliders import Collider
+from ..physics.colliders import Box, Collider
 from ..physics.errors import PhysicsError
 from ..physics.particles import Particles
 from ..physics.restitution import fit_restitution
@@ -21,6 +21,7 @@ from .embedding import stretched
 from .fill import fill_object
 from .playback import PlacedObject, PlacedObjects
 from .presets import VEHICLES, ObjectPhysics, Preset
+from .surroundings import clearance
 from .tyres import Tyres
 
 STANDS_WITHIN = 0.4
@@ -130,12 +131,27 @@ def require_separation(
                     "start; move one, or leave one out"
                 )
         for collider in colliders:
-            depth = -a.gap_to_colliders([collider])[0]
+            depth = _depth_inside(a, collider)
             if depth > PENETRATION_MAX:
                 raise PhysicsError(
                     f"object {a.name!r} is {depth:.2f} m inside collider {collider.name!r} at the "
                     "start; move one, or leave one out"
                 )
+
+
+def _depth_inside(body: DeformableBody, collider: Collider) -> float:
+    """How far a body would have to be moved to leave a collider [m]; at most 0 where it is outside.
+
+    No particle is deep inside a post, so of a box that holds a particle the overlap counts.
+    """
+    depth = -body.gap_to_colliders([collider])[0]
+    if not isinstance(collider, Box):
+        return depth
+    points = apply_transform(body.T_world_object, body.shape.positions)
+    if depth <= 0 and float(clearance(collider, points)[0].min()) > body.spacing / 2:
+        return depth
+    pose, size = np.asarray(collider.T_world_box), np.asarray(collider.size)
+    return float(box_penetration(*body.box(), pose, size))
 
 
 def _particles_overlap(a: DeformableBody, b: DeformableBody) -> bool:

@@ -1,13 +1,90 @@
 """How far points are from colliders, for many points at once."""
 
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from .._numba import kernel
 from ..geometry.rotation import Float
+from ..physics.backends.base import pack_colliders
 from ..physics.colliders import Box, Collider, HeightField, Plane
+from ..physics.contact.collider_distance import collider_distance, collider_velocity
+from .rigid import RigidMotion
+
+
+@functools.lru_cache(maxsize=64)
+def packed(colliders: tuple[Collider, ...]) -> tuple[Float, Float]:
+    """Rows and heights of colliders as kernels read them, kept while the colliders are the same."""
+    return pack_colliders(colliders, 0.0)
+
+
+def closest(
+    points: Float,
+    motion: RigidMotion,
+    colliders: Sequence[Collider],
+    *,
+    within: float,
+    ahead: float,
+) -> tuple[float, float, bool]:
+    """How near points of a rigid body are to colliders that may move.
+
+    Args:
+        points: [N, 3] of the body, world [m].
+        motion: of the body.
+        colliders: as they are now.
+        within: [m].
+        ahead: [s].
+
+    Returns:
+        Least distance [m], infinite from none; the speed at which that point and the collider
+        approach each other [m/s]; and whether any point that approaches a collider will be
+        ``within`` of it in the time ``ahead``.
+    """
+    if not colliders:
+        return math.inf, 0.0, False
+    rows, heights = packed(tuple(colliders))
+    found: tuple[float, float, bool] = _closest(
+        points,
+        motion.centre,
+        motion.velocity,
+        motion.angular_velocity,
+        rows,
+        heights,
+        within,
+        ahead,
+    )
+    return found
+
+
+@kernel
+def _closest(
+    points: Any, centre: Any, velocity: Any, spin: Any, rows: Any, heights: Any, within: Any,
+    ahead: Any,
+) -> Any:  # fmt: skip
+    least, closing, meets = math.inf, 0.0, False
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        ax, ay, az = x - centre[0], y - centre[1], z - centre[2]
+        vx = velocity[0] + spin[1] * az - spin[2] * ay
+        vy = velocity[1] + spin[2] * ax - spin[0] * az
+        vz = velocity[2] + spin[0] * ay - spin[1] * ax
+        for c in range(len(rows)):
+            distance, n = collider_distance(rows[c], heights, x, y, z)
+            u = collider_velocity(rows[c], x, y, z)
+            approach = (u[0] - vx) * n[0] + (u[1] - vy) * n[1] + (u[2] - vz) * n[2]
+            if distance < least:
+                least, closing = distance, approach
+            if approach > 0.0 and distance < within + approach * ahead:
+                meets = True
+    return least, closing, meets
 
 
 def clearance(collider: Collider, points: Float) -> tuple[Float, Float]:

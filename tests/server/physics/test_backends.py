@@ -106,6 +106,8 @@ def test_single_precision_stays_near_double():
             spacing=0.4,
         ),
         Plane(name="glue", friction=float("inf"), separable=False),
+        Box(name="plate", T_world_box=at(0, 0, -0.01), size=(0.5, 0.5, 0.02), friction=0.3),
+        Box(name="post", T_world_box=at(0.03, 0, -0.01), size=(0.03, 2, 0.02), velocity=(1, 0, 1)),
     ],
     ids=lambda c: c.name,
 )

@@ -26,12 +26,13 @@ SCENES = (
     "moving box",
     "height field",
     "glue",
+    "post",
     "two bodies",
     "leaving",
 )
 TOUCHES = dict.fromkeys(SCENES, 1) | {"two bodies": 2, "leaving": 0}
 CASES = ("free_fall", "affine_patch", "spin", "invariants")
-ALWAYS = ("Metal", "Sand", "height field", "two bodies", "leaving", "free_fall")
+ALWAYS = ("Metal", "Sand", "height field", "post", "two bodies", "leaving", "free_fall")
 TOLERANCES = {"Metal": 1e-7, "Foam": 1e-7}
 """Compiled laws hold the sqrt(2/3) of von Mises in single precision, the reference in double."""
 pytestmark = pytest.mark.timeout(300, func_only=True)

@@ -14,6 +14,7 @@ from ..colliders import Box, Collider, HeightField, Plane
 from ..constitutive import material_row
 from ..constitutive.law import law_of_code
 from ..contact import collider_distance as collider_rows
+from ..contact.particle import THIN_CELLS
 from ..contact.surface import STICKS
 
 TOTALS = 8
@@ -167,7 +168,12 @@ class SolverBackend(Protocol):
         ...
 
 
-def pack_colliders(colliders: Sequence[Collider]) -> tuple[Float, Float]:
+def is_thin(collider: Collider, dx: float) -> bool:
+    """Whether too few nodes of a grid of ``dx`` [m] lie in a collider to stop anything."""
+    return isinstance(collider, Box) and float(np.min(collider.size)) < THIN_CELLS * dx
+
+
+def pack_colliders(colliders: Sequence[Collider], dx: float) -> tuple[Float, Float]:
     """Rows [K, COLLIDER_ROW] and the heights [H] of all height fields, as kernels read them."""
     rows = np.zeros((len(colliders), collider_rows.COLLIDER_ROW))
     heights: list[Float] = []
@@ -176,6 +182,7 @@ def pack_colliders(colliders: Sequence[Collider]) -> tuple[Float, Float]:
         own = collider.friction
         row[collider_rows.FRICTION] = -1.0 if own is None else min(own, float(STICKS))
         row[collider_rows.SEPARABLE] = collider.separable
+        row[collider_rows.THIN] = is_thin(collider, dx)
         if isinstance(collider, Plane):
             row[collider_rows.KIND] = collider_rows.PLANE
             row[collider_rows.POINT : collider_rows.POINT + 3] = collider.point

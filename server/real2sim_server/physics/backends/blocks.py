@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...geometry.rotation import Float
-from ..colliders import Box, Collider
+from ..colliders import Collider
 from . import particle as columns
 from .base import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from .layout import BLOCK, COLLIDER_MARGIN, Int, Layout, arrange
@@ -28,6 +28,7 @@ class _Saved:
     order: Int
     layout: Layout
     by_collider: Float
+    by_thin: Float
     by_body: Float
     totals: tuple[Float, Float]
 
@@ -40,6 +41,7 @@ class WorkspaceShapes(NamedTuple):
     velocity: tuple[int, ...]
     offset: tuple[int, ...]
     by_collider: tuple[int, ...]
+    by_thin: tuple[int, ...]
     by_body: tuple[int, ...]
 
 
@@ -116,7 +118,7 @@ class BlockSimulation:
     def _follow(self, colliders: Sequence[Collider], dt: float) -> None:
         """Take over new poses; arrange anew before a collider is out of the margin."""
         self._set_params(colliders)
-        self._moved += dt * max(_fastest_point(c) for c in colliders)
+        self._moved += dt * max(c.fastest_point for c in colliders)
         if self._moved > COLLIDER_MARGIN / 2 * self._model.dx:
             self._arrange(colliders)
 
@@ -172,6 +174,7 @@ class BlockSimulation:
             self._order,
             self._layout,
             np.array(self._fetch(self._work.by_collider)),
+            np.array(self._fetch(self._work.by_thin)),
             np.array(self._fetch(self._work.by_body)),
             (self._totals[0].copy(), self._totals[1].copy()),
         )
@@ -184,6 +187,7 @@ class BlockSimulation:
         self._work = self._make_work(saved.layout)
         for held, kept in (
             (self._work.by_collider, saved.by_collider),
+            (self._work.by_thin, saved.by_thin),
             (self._work.by_body, saved.by_body),
         ):
             if kept.size:
@@ -245,6 +249,7 @@ class BlockSimulation:
             velocity=(fields, NODES, 4),
             offset=(fields, NODES, 4),
             by_collider=(len(layout.contact_collider), TOTALS),
+            by_thin=(len(layout.thin_collider), TOTALS),
             by_body=(fields if bodies > 1 else 0, bodies, TOTALS),
         )
 
@@ -267,12 +272,18 @@ class BlockSimulation:
         )
         if work.by_collider.size:
             work.by_collider[:] = 0
+        if work.by_thin.size:
+            block = np.repeat(np.arange(len(layout.thin_start) - 1), np.diff(layout.thin_start))
+            # The middle one of the fields around a block is its own.
+            body = layout.field_body[layout.block_fields[block, 13]]
+            np.add.at(self._totals[0], (body, layout.thin_collider), self._fetch(work.by_thin))
+            work.by_thin[:] = 0
         if work.by_body.size:
             np.add.at(self._totals[1], layout.field_body, self._fetch(work.by_body))
             work.by_body[:] = 0
 
     def _set_params(self, colliders: Sequence[Collider]) -> None:
-        rows, heights = pack_colliders(colliders)
+        rows, heights = pack_colliders(colliders, self._model.dx)
         model, dtype = self._model, self._dtype
         self._params = StepParameters(
             table=model.table.astype(dtype),
@@ -296,12 +307,3 @@ def _block_of(cells: Any) -> Int:
     """Block [N, 3] of the first node of particles at ``cells`` [N, 3]."""
     blocks: Int = np.floor((cells - 0.5) / BLOCK).astype(np.int64)
     return blocks
-
-
-def _fastest_point(collider: Collider) -> float:
-    """Speed [m/s] no point of a collider exceeds."""
-    if not isinstance(collider, Box):
-        return 0.0
-    reach = float(np.linalg.norm(np.asarray(collider.size))) / 2
-    spin = float(np.linalg.norm(np.asarray(collider.angular_velocity)))
-    return float(np.linalg.norm(np.asarray(collider.velocity))) + reach * spin

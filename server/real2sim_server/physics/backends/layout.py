@@ -20,7 +20,7 @@ from ...geometry.rotation import Float
 from ..colliders import Collider, HeightField
 from ..contact.collider_distance import collider_distance
 from ..errors import ParticleError
-from .base import pack_colliders
+from .base import is_thin, pack_colliders
 
 Int = NDArray[np.int64]
 
@@ -32,6 +32,9 @@ CHUNKS = 64
 """Parts of about equal work that are divided among threads."""
 BLOCK_REACH = 3.5
 """From the centre of a block to its corners [cells]."""
+PARTICLE_CENTRE, PARTICLE_REACH = 2.5, 6.0
+"""Middle of where a block's particles may be along an axis, from the first node of the block, and
+how far they reach from there, their own radius included [cells]."""
 COLLIDER_MARGIN = 2.0
 """Colliders count as near this much earlier [cells]; moving ones may move by half of it."""
 
@@ -54,6 +57,8 @@ class Layout(NamedTuple):
         group_start: [G + 1], fields of the same block are neighbours and form a group.
         contact_start: [M + 1], near colliders of each field.
         contact_collider: [T].
+        thin_start: [P + 1], near colliders of each block that its particles touch themselves.
+        thin_collider: [S].
         near: [M] bool, whether contact is possible in this field.
     """
 
@@ -68,6 +73,8 @@ class Layout(NamedTuple):
     group_start: Int
     contact_start: Int
     contact_collider: Int
+    thin_start: Int
+    thin_collider: Int
     near: NDArray[np.bool_]
 
 
@@ -112,7 +119,23 @@ def arrange(
 
     block_key = field_key >> BODY_BITS
     group_start = np.append(np.flatnonzero(np.diff(block_key, prepend=-1)), len(field_key))
-    contact_start, contact_collider = _near_colliders(field_coordinates, dx, colliders)
+    thin = np.array([is_thin(c, dx) for c in colliders], dtype=bool)
+    contact_start, contact_collider = _near_colliders(
+        field_coordinates,
+        dx,
+        colliders,
+        middle=(BLOCK - 1) / 2,
+        reach=BLOCK_REACH,
+        wanted=np.full_like(thin, True),
+    )
+    thin_start, thin_collider = _near_colliders(
+        block_coordinates,
+        dx,
+        colliders,
+        middle=PARTICLE_CENTRE,
+        reach=PARTICLE_REACH,
+        wanted=thin,
+    )
     shared = np.repeat(np.diff(group_start) > 1, np.diff(group_start))
     near = shared | (np.diff(contact_start) > 0)
     needed = near[block_fields].any(axis=1)
@@ -128,6 +151,8 @@ def arrange(
         group_start=group_start,
         contact_start=contact_start,
         contact_collider=contact_collider,
+        thin_start=thin_start,
+        thin_collider=thin_collider,
         near=near,
     )
 
@@ -149,16 +174,33 @@ def _unpack(keys: Int) -> tuple[Int, Int]:
     return blocks - COORDINATE_LIMIT, keys & ((1 << BODY_BITS) - 1)
 
 
-def _near_colliders(blocks: Int, dx: float, colliders: Sequence[Collider]) -> tuple[Int, Int]:
-    """Colliders near each block, as starts [M + 1] and a flat list."""
-    centres = (blocks * BLOCK + (BLOCK - 1) / 2) * dx
-    rows, heights = pack_colliders(colliders)
+def _near_colliders(
+    blocks: Int,
+    dx: float,
+    colliders: Sequence[Collider],
+    *,
+    middle: float,
+    reach: float,
+    wanted: NDArray[np.bool_],
+) -> tuple[Int, Int]:
+    """Those of the ``wanted`` colliders near each block, as starts [M + 1] and a flat list.
+
+    Args:
+        blocks: [M, 3].
+        dx: cell size [m].
+        colliders: all.
+        middle: of what may touch along each axis, from the first node of the block [cells].
+        reach: from there to the corners [cells].
+        wanted: [K] bool.
+    """
+    centres = (blocks * BLOCK + middle) * dx
+    rows, heights = pack_colliders(colliders, dx)
     near = np.zeros((len(blocks), len(colliders)), dtype=bool)
-    for k, (row, collider) in enumerate(zip(rows, colliders, strict=True)):
+    for k in np.flatnonzero(wanted).tolist():
         # Distance to a height field is measured along one normal, which misses nearby slopes.
-        slack = BLOCK_REACH if isinstance(collider, HeightField) else 0.0
-        reach = (BLOCK_REACH + COLLIDER_MARGIN + slack) * dx
-        near[:, k] = _distances(row, heights, centres) < reach
+        slack = BLOCK_REACH if isinstance(colliders[k], HeightField) else 0.0
+        far = (reach + COLLIDER_MARGIN + slack) * dx
+        near[:, k] = _distances(rows[k], heights, centres) < far
     start = np.append(0, np.cumsum(near.sum(axis=1)))
     # Strided, as nonzero leaves it, it would have kernels compiled once more.
     return start, np.ascontiguousarray(np.nonzero(near)[1])

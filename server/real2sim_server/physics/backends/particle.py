@@ -18,6 +18,7 @@ from ..constitutive.stress import (
     stress_update,
     wave_hardening,
 )
+from ..contact.particle import resolve_particle_collider
 from ..numerics.device import F32, FOUR, HALF, ZERO, device_function
 from ..numerics.matrices import det
 from .layout import BLOCK
@@ -74,6 +75,7 @@ class Workspace(NamedTuple):
         scratch: [CHUNKS, SCRATCH], see ``cpu.deform``; the CPU's only.
         needs_resort: [P] bool, whether a particle left its block's reach.
         by_collider: [T, TOTALS] float64, of each near collider of each field.
+        by_thin: [S, TOTALS] float64, of each near thin collider of each block.
         by_body: [M, B, TOTALS] float64, on a field from each body; [0, B, TOTALS] for one body.
     """
 
@@ -84,6 +86,7 @@ class Workspace(NamedTuple):
     scratch: NDArray[Any]
     needs_resort: NDArray[np.bool_]
     by_collider: NDArray[np.float64]
+    by_thin: NDArray[np.float64]
     by_body: NDArray[np.float64]
 
 
@@ -114,6 +117,40 @@ def node_position(block: Any, node: Any, dx: Any) -> Any:
     y = (block[1] * BLOCK + node // BLOCK % BLOCK) * dx
     z = (block[2] * BLOCK + node % BLOCK) * dx
     return x, y, z
+
+
+@device_function
+def particle_position(block: Any, p: Any, xi: Any, dx: Any) -> Any:
+    """World position [m] of a particle of a block, in double precision."""
+    x = (block[0] * BLOCK + float(xi[p, 0])) * dx
+    y = (block[1] * BLOCK + float(xi[p, 1])) * dx
+    z = (block[2] * BLOCK + float(xi[p, 2])) * dx
+    return x, y, z
+
+
+@device_function
+def obstructed(
+    p: Any, v: Any, block: Any, dt: Any, state: Any, layout: Any, params: Any, totals: Any
+) -> Any:
+    """Velocity of a particle of a block once the thin colliders near by have had their say.
+
+    Between two of them it may be pushed from one to the other, so they are asked twice.
+
+    Args:
+        totals: [S, TOTALS] rows to add to.
+    """
+    x = particle_position(layout.block_coordinates[block], p, state.xi, params.dx)
+    v = (float(v[0]), float(v[1]), float(v[2]))
+    body = layout.field_body[layout.block_fields[block, 13]]
+    m = float(state.mass[p])
+    first, end = layout.thin_start[block], layout.thin_start[block + 1]
+    for _ in range(min(end - first, 2)):
+        for contact in range(first, end):
+            row = params.collider_rows[layout.thin_collider[contact]]
+            v = resolve_particle_collider(
+                row, dt, params.friction[body], state.volume[p], x, v, m, totals[contact]
+            )
+    return v
 
 
 @device_function

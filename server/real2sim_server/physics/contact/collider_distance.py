@@ -16,7 +16,9 @@ POINT, AXES, HALF_SIZE = 3, 6, 15
 SPIN, SPEED = 18, 21
 """Angular and linear velocity, world axes."""
 FIRST_HEIGHT, COUNT_X, COUNT_Y, SPACING = 24, 25, 26, 27
-COLLIDER_ROW = 28
+THIN = 28
+"""1 where a box is thinner than cells of the grid; see ``particle``."""
+COLLIDER_ROW = 29
 
 
 @device_function

@@ -82,6 +82,7 @@ class CpuSimulation(BlockSimulation):
             scratch=self._array("scratch", (CHUNKS, SCRATCH)),
             needs_resort=np.zeros(len(layout.block_coordinates), np.bool_),
             by_collider=np.zeros(shapes.by_collider),
+            by_thin=np.zeros(shapes.by_thin),
             by_body=np.zeros(shapes.by_body),
         )
 

@@ -15,7 +15,7 @@ from ...numerics.device import ONE, ZERO
 from ...numerics.splines import spline_weights
 from ..kernel import entry, inner
 from ..layout import BLOCK, CHUNKS
-from ..particle import NODES, SIDE, momentum, move, place, velocity_gradient
+from ..particle import NODES, SIDE, momentum, move, obstructed, place, velocity_gradient
 from .contact import resolve_body_contact, resolve_collider_contact
 from .deform import deform_all
 from .simd import LANES, gather, scatter
@@ -178,7 +178,12 @@ def gather_blocks(
             for o in range(27):
                 copy_field(work.velocity[layout.block_fields[block, o]], o, tile)
             begin, end = layout.block_start[block], layout.block_start[block + 1]
-            left_tile = gather_particles(begin, end, dt, params.dx, state, tile.reshape(-1), moving)
+            if moving and layout.thin_start[block] < layout.thin_start[block + 1]:
+                left_tile = gather_obstructed(block, dt, state, layout, work, params)
+            else:
+                left_tile = gather_particles(
+                    begin, end, dt, params.dx, state, tile.reshape(-1), moving
+                )
             deform_all(begin, end, dt, state, params.table, work.scratch[chunk])
             set_flag(work.needs_resort, block, left_tile)
             # Particles that left the tile cannot be scattered to it; all are sorted first.
@@ -221,4 +226,20 @@ def gather_particles(
             L = velocity_gradient(g, dx, f)
             if move(p, dt, dx, (g[0], g[1], g[2]), L, state):
                 needs_resort = True
+    return needs_resort
+
+
+@inner()
+def gather_obstructed(block: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> Any:
+    """The same for a block near thin colliders, which its particles touch themselves."""
+    tile, dx = work.tiles[block].reshape(-1), params.dx
+    needs_resort = False
+    for p in range(layout.block_start[block], layout.block_start[block + 1]):
+        first, f = place(p, state.xi)
+        wx, wy, wz = spline_weights(f[0]), spline_weights(f[1]), spline_weights(f[2])
+        g = gather(tile, first, wx, wy, wz)
+        L = velocity_gradient(g, dx, f)
+        v = obstructed(p, g, block, dt, state, layout, params, work.by_thin)
+        if move(p, dt, dx, v, L, state):
+            needs_resort = True
     return needs_resort

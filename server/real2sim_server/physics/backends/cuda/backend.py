@@ -121,6 +121,7 @@ class CudaSimulation(BlockSimulation):
             scratch=self._array("scratch", (1, 1)),
             needs_resort=self._array("needs_resort", (1,)),
             by_collider=cuda.to_device(np.zeros(host.by_collider)),
+            by_thin=cuda.to_device(np.zeros(host.by_thin)),
             by_body=cuda.to_device(np.zeros(host.by_body)),
         )
 

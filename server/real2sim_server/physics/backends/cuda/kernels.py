@@ -18,6 +18,7 @@ from numba import config, cuda, float64
 from numba.np.numpy_support import from_dtype
 
 from ...contact.node import pair_friction, resolve_node_collider, resolve_node_pair
+from ...contact.particle import resolve_particle_collider
 from ...numerics.device import F32, ONE, ZERO, device_function
 from ...numerics.splines import spline_weights
 from ..base import TOTALS
@@ -34,6 +35,7 @@ from ..particle import (
     momentum,
     move,
     node_position,
+    particle_position,
     place,
     tile_node,
     velocity_gradient,
@@ -242,7 +244,10 @@ def kernels_of(dtype: Any) -> Kernels:
                 first, f = place(p, state.xi)
                 g = gather_sums(first, f, tile)
                 L = velocity_gradient(g, params.dx, f)
-                if move(p, dt, params.dx, (g[0], g[1], g[2]), L, state):
+                v = (float(g[0]), float(g[1]), float(g[2]))
+                if layout.thin_start[block] < layout.thin_start[block + 1]:
+                    v = hold_particle(p, v, block, dt, state, layout, work, params)
+                if move(p, dt, params.dx, v, L, state):
                     progress[NEEDS_RESORT] = 1
             deform(p, dt, state, params.table[state.material[p]])
 
@@ -309,6 +314,26 @@ def obstruct(field, node, at, layout, work, params):
         for c in range(TOTALS):
             if total[c] != 0.0:
                 cuda.atomic.add(work.by_collider, (contact, c), total[c])
+
+
+@cuda.jit(device=True)
+def hold_particle(p, v, block, dt, state, layout, work, params):
+    """Velocity of a particle near thin colliders; ``particle.obstructed`` for many threads."""
+    x = particle_position(layout.block_coordinates[block], p, state.xi, params.dx)
+    friction = params.friction[layout.field_body[layout.block_fields[block, 13]]]
+    volume, m = state.volume[p], float(state.mass[p])
+    first, end = layout.thin_start[block], layout.thin_start[block + 1]
+    total = cuda.local.array(TOTALS, float64)
+    for _ in range(min(end - first, 2)):
+        for contact in range(first, end):
+            for c in range(TOTALS):
+                total[c] = 0.0
+            row = params.collider_rows[layout.thin_collider[contact]]
+            v = resolve_particle_collider(row, dt, friction, volume, x, v, m, total)
+            for c in range(TOTALS):
+                if total[c] != 0.0:
+                    cuda.atomic.add(work.by_thin, (contact, c), total[c])
+    return v
 
 
 @cuda.jit

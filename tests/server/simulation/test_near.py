@@ -1,0 +1,78 @@
+"""What comes near a body is found on flat sides too, and when it is the other that moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_server.physics import Box, FixedCorotated, PhysicsError, box_particles
+from real2sim_server.physics.validation.check import placed as at
+from real2sim_server.simulation.body import BodyMode, DeformableBody
+from real2sim_server.simulation.simulator import HybridSimulator
+from real2sim_server.simulation.spawn import require_separation
+
+SIZE = (1.2, 1.0, 0.4)
+
+
+def block(position=(0.0, 0.0, 0.0), speed=0.0) -> DeformableBody:
+    particles = box_particles(SIZE, spacing=0.1, density=200.0)
+    return DeformableBody(
+        "block",
+        particles,
+        [FixedCorotated(young=2e6)],
+        np.zeros(len(particles), dtype=np.int64),
+        friction=0.4,
+        cell=0.2,
+        T_world_object=at(*position),
+        velocity=np.array([speed, 0.0, 0.0]),
+        angular_velocity=np.zeros(3),
+    )
+
+
+def simulator(body: DeformableBody, *colliders: Box) -> HybridSimulator:
+    return HybridSimulator(
+        [body], colliders, road=(), gravity=(0, 0, 0), backend="cpu", brake_after_hit=1.0
+    )
+
+
+def post(x: float, y=0.0, width=0.05, **options) -> Box:
+    return Box(name="post", T_world_box=at(x, y, 0), size=(width, width, 2.0), **options)
+
+
+@pytest.mark.parametrize("side", [-0.31, 0.04, 0.22])
+def test_a_thin_post_before_a_flat_front_is_met(side):
+    body = block(speed=10.0)
+    simulated = simulator(body, post(1.0, side))
+    for _ in range(20):
+        simulated.advance(0.005)
+    assert [r.other for r in simulated.contact_log.records({"block": body.motion.mass})] == ["post"]
+    assert body.motion.velocity[0] < 3.0
+
+
+def test_a_collider_that_moves_wakes_what_stands_in_its_way():
+    body = block()
+    simulated = simulator(body, post(1.5, velocity=(-20, 0, 0)))
+    assert body.mode == BodyMode.SLEEPING
+    for _ in range(16):
+        simulated.advance(0.005)
+    assert body.motion.velocity[0] < -3.0
+
+
+def test_what_moves_away_or_past_is_not_near():
+    body = block()
+    simulated = simulator(body, post(1.0, velocity=(5, 0, 0)))
+    for _ in range(4):
+        simulated.advance(0.005)
+    assert body.mode == BodyMode.SLEEPING
+
+
+@pytest.mark.parametrize("width", [0.02, 0.3])
+def test_a_post_within_an_object_is_refused(width):
+    body = block()
+    with pytest.raises(PhysicsError, match="inside collider 'post'"):
+        require_separation([body], [(body.T_world_object, SIZE)], [post(0.0, 0.03, width)])
+
+
+def test_a_post_beside_an_object_is_not_refused():
+    body = block()
+    require_separation([body], [(body.T_world_object, SIZE)], [post(0.62, 0.03)])
