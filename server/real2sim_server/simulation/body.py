@@ -23,8 +23,11 @@ from ..physics.materials import Material
 from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .rigid import RigidMotion, best_rotation, cross_matrix, inertia_about
-from .surroundings import closest
+from .rolling import advance_on_wheels
+from .surroundings import closest, packed
 from .tyres import TyreReaction, Tyres
+
+NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
 
 SURFACE_POINTS = 600
 BESIDE = 1.3
@@ -130,6 +133,7 @@ class DeformableBody:
         self.state: BodyState | None = None
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
+        self._centre_of: DeformedShape | None = None
         self._radius_of: Float | None = None
         self._radius_m = 0.0
         self._stored_energy = 0.0
@@ -140,9 +144,8 @@ class DeformableBody:
         """[4, 4] pose; while deforming, the rigid pose nearest to all its particles."""
         pose = np.eye(4)
         if self.state is None:
-            local_centre = self.rest.masses @ self.shape.positions / self.rest.mass
             pose[:3, :3] = self.motion.rotation
-            pose[:3, 3] = self.motion.centre - self.motion.rotation @ local_centre
+            pose[:3, 3] = self.motion.centre - self.motion.rotation @ self._local_centre
             return pose
         rotation = best_rotation(self.rest.positions, self.state.positions, self.rest.masses)
         pose[:3, :3] = rotation
@@ -202,7 +205,9 @@ class DeformableBody:
         Outermost particles are what meets ground; a box may meet any place of a flat side.
         """
         smooth = [c for c in colliders if not isinstance(c, Box)]
-        hull = closest(self.hull_points(), self.motion, smooth, within=within, ahead=ahead)
+        hull = np.inf, 0.0, False
+        if smooth:
+            hull = closest(self.hull_points(), self.motion, smooth, within=within, ahead=ahead)
         boxes = [c for c in colliders if isinstance(c, Box) and self._may_meet(c, within, ahead)]
         if not boxes:
             return hull
@@ -217,6 +222,14 @@ class DeformableBody:
         speed = float(np.linalg.norm(m.velocity)) + box.fastest_point
         speed += self._radius * float(np.linalg.norm(m.angular_velocity))
         return gap < within + speed * ahead
+
+    @property
+    def _local_centre(self) -> Float:
+        """[3] its centre of mass in its own frame while it keeps its shape [m]."""
+        if self._centre_of is not self.shape:
+            self._centre_of = self.shape
+            self._centre: Float = self.rest.masses @ self.shape.positions / self.rest.mass
+        return self._centre
 
     @property
     def _radius(self) -> float:
@@ -278,7 +291,7 @@ class DeformableBody:
 
     def advance_rigid(
         self, duration: float, gravity: Float, road: Sequence[Collider]
-    ) -> list[TyreReaction]:
+    ) -> TyreReaction | None:
         """Fall, roll, slide for ``duration`` [s]; falls asleep when it has stood long enough.
 
         Args:
@@ -287,24 +300,41 @@ class DeformableBody:
             road: colliders that carry tyres.
 
         Returns:
-            What the road did, step by step; nothing without tyres.
+            What the road did; nothing without tyres.
         """
         steps = math.ceil(duration / RIGID_STEP - 1e-6)
         dt = duration / steps
-        reactions = []
-        for _ in range(steps):
-            m = self.motion.with_gravity(dt, gravity)
-            if self.tyres is not None:
-                m, reaction = self.tyres.apply(m, self.T_world_object, road, dt)
-                reactions.append(reaction)
-            self.motion = m.advanced(dt)
-        m = self.motion
+        m, wheels = self.motion, self.tyres or NO_TYRES
+        rotation = np.array(m.rotation)
+        moved = np.array([m.centre, m.velocity, m.angular_velocity])
+        impulse = np.zeros(3)
+        rows, heights = packed(tuple(road))
+        friction_work = advance_on_wheels(
+            rotation,
+            moved,
+            m.mass,
+            m.inertia,
+            -self._local_centre,
+            wheels.patches,
+            wheels.static_load,
+            wheels.rest,
+            wheels.parameters,
+            rows,
+            heights,
+            gravity,
+            dt,
+            steps,
+            impulse,
+        )
+        m = self.motion = replace(
+            m, rotation=rotation, centre=moved[0], velocity=moved[1], angular_velocity=moved[2]
+        )
         slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < SLEEP_SPEED / 2
         standing = slow and self.tyres is not None
         self._settle_time = self._settle_time + duration if standing else 0.0
         if self._settle_time > WHEELS_SLEEP_TIME:
             self.put_to_sleep()
-        return reactions
+        return None if self.tyres is None else TyreReaction(impulse, friction_work)
 
     def activate(self) -> None:
         """Begin to deform; the next ``solver_body`` goes into a solver."""

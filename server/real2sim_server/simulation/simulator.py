@@ -89,7 +89,9 @@ class HybridSimulator:
             self._solve(deforming, duration)
         for body in self.bodies:
             if body.mode == BodyMode.RIGID:
-                self._log_tyres(body, body.advance_rigid(duration, self.gravity, self.road))
+                reaction = body.advance_rigid(duration, self.gravity, self.road)
+                if reaction is not None:
+                    self._log_tyres(body, [reaction])
         if self._solver is None:
             self.colliders = [c.after(duration) for c in self.colliders]
         self.time += duration

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from ..geometry.rotation import Float
 from ..physics.colliders import Collider
 from .rigid import RigidMotion
-from .surroundings import nearest
+from .rolling import UPRIGHT, press
+from .surroundings import nearest, packed
 
-ROLLING = 0.015
-"""Rolling resistance of a free wheel, fraction of its load."""
-ROUNDS = 6
-"""Sweeps over the four patches in one step; their impulses act on each other."""
 LIFT_MAX = 0.3
 """Wheels never go further into their arches than this [m]."""
-UPRIGHT = 0.5
-"""Wheels carry while the body's up axis leans less than 60 degrees from the ground's normal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,73 +110,36 @@ class Tyres:
     ) -> tuple[RigidMotion, TyreReaction]:
         """What the road does to the body over ``duration`` [s] through its tyres.
 
-        Springs and dampers carry along the normal. Across it each patch stops its slip as far as
-        its friction circle lets it: sideways always, along the wheel as far as it is braked.
+        See ``rolling.press``.
 
         Returns:
             The motion after, and what the road did.
         """
-        points = self._points(T_world_object)
-        up = T_world_object[:3, 2]
-        heights, normals = nearest(road, points)
-        loads = self._loads(motion, points, heights, normals, duration)
-        loads = np.where(normals @ up > UPRIGHT, loads, 0.0)
-        before, total, friction_work = motion, np.zeros(3), 0.0
-        for point, normal, load in zip(points, normals, loads, strict=True):
-            motion = motion.with_impulse(load * normal, point)
-            total += load * normal
-        used = np.zeros((4, 2))
-        forward = T_world_object[:3, 0]
-        for _ in range(ROUNDS):
-            for k in np.flatnonzero(loads > 0):
-                motion, used[k], impulse = self._grip(
-                    motion, points[k], normals[k], forward=forward, load=loads[k], used=used[k]
-                )
-                total += impulse
-                slip = (motion.velocity_at(points[k]) + before.velocity_at(points[k])) / 2
-                friction_work -= float(impulse @ slip)
-        return motion, TyreReaction(total, max(friction_work, 0.0))
+        moved = np.array([motion.centre, motion.velocity, motion.angular_velocity])
+        impulse = np.zeros(3)
+        rows, heights = packed(tuple(road))
+        friction_work = press(
+            self._points(T_world_object),
+            np.array(T_world_object[:3, 2]),
+            np.array(T_world_object[:3, 0]),
+            moved,
+            motion.mass,
+            np.linalg.inv(motion.world_inertia),
+            self.static_load,
+            self.rest,
+            self.parameters,
+            rows,
+            heights,
+            duration,
+            impulse,
+        )
+        after = replace(motion, velocity=moved[1], angular_velocity=moved[2])
+        return after, TyreReaction(impulse, friction_work)
+
+    @cached_property
+    def parameters(self) -> Float:
+        """[5] what kernels take, see ``rolling``."""
+        return np.array([self.friction, self.brake, self.frequency, self.damping, self.travel])
 
     def _points(self, T_world_object: Float) -> Float:
         return self.patches @ T_world_object[:3, :3].T + T_world_object[:3, 3]
-
-    def _loads(
-        self, motion: RigidMotion, points: Float, heights: Float, normals: Float, duration: float
-    ) -> Float:
-        """Impulses [4] of springs and dampers along the normals [N s]."""
-        omega = 2 * np.pi * self.frequency
-        mass = self.static_load / 9.81
-        squeeze = np.minimum(self.rest - heights, 2 * self.travel)
-        speed = np.array([n @ motion.velocity_at(p) for p, n in zip(points, normals, strict=True)])
-        force = self.static_load + mass * omega**2 * squeeze
-        force -= 2 * self.damping * omega * mass * speed
-        droop = self.static_load / (mass * omega**2)
-        return np.where(squeeze > -droop, np.maximum(force, 0), 0) * duration
-
-    def _grip(
-        self,
-        motion: RigidMotion,
-        point: Float,
-        normal: Float,
-        *,
-        forward: Float,
-        load: float,
-        used: Float,
-    ) -> tuple[RigidMotion, Float, Float]:
-        """One patch: more impulse across the road, within its friction circle."""
-        along = forward - (forward @ normal) * normal
-        along /= max(float(np.linalg.norm(along)), 1e-9)
-        side = np.cross(normal, along)
-        v = motion.velocity_at(point)
-        axes = np.stack([along, side])
-        slip = axes @ v
-        arm = point - motion.centre
-        inertia = motion.world_inertia
-        bends = [a @ np.cross(np.linalg.solve(inertia, np.cross(arm, a)), arm) for a in axes]
-        wanted = used - slip / (1 / motion.mass + np.array(bends))
-        held = max(self.brake * self.friction, ROLLING) * load
-        wanted[0] = np.clip(wanted[0], -held, held)
-        size = float(np.linalg.norm(wanted))
-        wanted *= min(1.0, self.friction * load / max(size, 1e-12))
-        impulse = (wanted - used) @ axes
-        return motion.with_impulse(impulse, point), wanted, impulse
