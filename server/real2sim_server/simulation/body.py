@@ -130,6 +130,7 @@ class DeformableBody:
         )
         self.mode = BodyMode.RIGID
         self.hit = False
+        self.supports: frozenset[str] = frozenset()
         self.state: BodyState | None = None
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
@@ -218,9 +219,9 @@ class DeformableBody:
     def _may_meet(self, box: Box, within: float, ahead: float) -> bool:
         """Whether a box is so near the ball about the body that their surfaces must be compared."""
         m = self.motion
-        gap = closest(m.centre[None], m, [box], within=within, ahead=ahead)[0] - self._radius
+        gap = closest(m.centre[None], m, [box], within=within, ahead=ahead)[0] - self.reach
         speed = float(np.linalg.norm(m.velocity)) + box.fastest_point
-        speed += self._radius * float(np.linalg.norm(m.angular_velocity))
+        speed += self.reach * float(np.linalg.norm(m.angular_velocity))
         return gap < within + speed * ahead
 
     @property
@@ -232,7 +233,7 @@ class DeformableBody:
         return self._centre
 
     @property
-    def _radius(self) -> float:
+    def reach(self) -> float:
         """Of a ball about its centre of mass that holds the body [m]."""
         positions = self.shape.positions if self.state is None else self.state.positions
         if self._radius_of is not positions:
@@ -292,7 +293,7 @@ class DeformableBody:
     def advance_rigid(
         self, duration: float, gravity: Float, road: Sequence[Collider]
     ) -> TyreReaction | None:
-        """Fall, roll, slide for ``duration`` [s]; falls asleep when it has stood long enough.
+        """Fall, roll, slide for ``duration`` [s].
 
         Args:
             duration: [s].
@@ -332,8 +333,6 @@ class DeformableBody:
         slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < SLEEP_SPEED / 2
         standing = slow and self.tyres is not None
         self._settle_time = self._settle_time + duration if standing else 0.0
-        if self._settle_time > WHEELS_SLEEP_TIME:
-            self.put_to_sleep()
         return None if self.tyres is None else TyreReaction(impulse, friction_work)
 
     def activate(self) -> None:
@@ -437,12 +436,28 @@ class DeformableBody:
         self._stored_energy = s.elastic
         self.state, self.mode, self._settle_time = None, BodyMode.RIGID, 0.0
 
-    def put_to_sleep(self) -> None:
-        """Stand still until something comes near; a deforming body becomes rigid first."""
+    @property
+    def has_parked(self) -> bool:
+        """Whether a rigid body has stood on its wheels for long enough to be put to sleep."""
+        return self._settle_time > WHEELS_SLEEP_TIME
+
+    def put_to_sleep(self, supports: Sequence[str] = ()) -> None:
+        """Stand still until something comes near, or what it rests on moves.
+
+        A deforming body becomes rigid first.
+
+        Args:
+            supports: names of what it rests on.
+        """
+        self.supports = frozenset(supports)
         if self.state is not None:
             self.rigidify()
         self.mode, self._settle_time = BodyMode.SLEEPING, 0.0
         self.motion = replace(self.motion, velocity=np.zeros(3), angular_velocity=np.zeros(3))
+
+    def wake(self) -> None:
+        """Be free to move again."""
+        self.mode = BodyMode.RIGID
 
     def translate(self, by: Float) -> None:
         """Place a rigid body elsewhere, ``by`` [3] [m]."""

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from ..physics.colliders import Collider
 from ..physics.solver import Solver, SolverOptions
-from .body import BodyMode, DeformableBody
+from .body import SLEEP_SPEED, BodyMode, DeformableBody
 from .contacts import ContactLog
-from .spawn import STANDS_WITHIN
+from .support import supports_of
 from .tyres import TyreReaction
 
 STEP = 0.005
@@ -73,8 +73,8 @@ class HybridSimulator:
         self._solver: Solver | None = None
         self._solved: list[str] = []
         for body in self.bodies:
-            if self._stands(body):
-                body.put_to_sleep()
+            if not (np.any(body.motion.velocity) or np.any(body.motion.angular_velocity)):
+                self._put_to_sleep(body)
 
     @property
     def road(self) -> list[Collider]:
@@ -83,6 +83,7 @@ class HybridSimulator:
 
     def advance(self, duration: float) -> None:
         """Go on by ``duration`` [s], at most STEP."""
+        self._wake()
         self._activate(duration)
         deforming = [b for b in self.bodies if b.mode == BodyMode.DEFORMING]
         if deforming:
@@ -92,6 +93,8 @@ class HybridSimulator:
                 reaction = body.advance_rigid(duration, self.gravity, self.road)
                 if reaction is not None:
                     self._log_tyres(body, [reaction])
+                if body.has_parked:
+                    self._put_to_sleep(body)
         if self._solver is None:
             self.colliders = [c.after(duration) for c in self.colliders]
         self.time += duration
@@ -143,8 +146,8 @@ class HybridSimulator:
     def _settle(self, body: DeformableBody, duration: float) -> None:
         """A body that has settled becomes rigid, or falls asleep."""
         body.update_timers(duration)
-        if body.may_sleep:
-            body.put_to_sleep()
+        if body.may_sleep and self._put_to_sleep(body):
+            pass
         elif body.may_rigidify and self._is_free(body):
             body.rigidify()
         else:
@@ -161,12 +164,22 @@ class HybridSimulator:
                 body.brake_after_hit(self._brake_after_hit)
                 return
 
-    def _stands(self, body: DeformableBody) -> bool:
-        """Whether a body that does not move is held by something, or by nothing drawn down."""
-        m = body.motion
-        if np.any(m.velocity) or np.any(m.angular_velocity):
+    def _put_to_sleep(self, body: DeformableBody) -> bool:
+        """Let a body sleep that is held by what itself does not move; whether it is."""
+        others = [b for b in self.bodies if b is not body and not _moves(b)]
+        supports = supports_of(body, self.colliders, self.road, others, self.gravity)
+        if supports is None or {c.name for c in self.colliders if c.moving}.intersection(supports):
             return False
-        return not np.any(self.gravity) or body.gap_to_colliders(self.colliders)[0] < STANDS_WITHIN
+        body.put_to_sleep(supports)
+        return True
+
+    def _wake(self) -> None:
+        """Wake those whose supports have begun to move, and those that rest on these."""
+        moved = {c.name for c in self.colliders if c.moving}
+        moved |= {b.name for b in self.bodies if _moves(b)}
+        for body in self.bodies:
+            if body.mode == BodyMode.SLEEPING and not moved.isdisjoint(body.supports):
+                body.wake()
 
     def _is_near_anything(self, body: DeformableBody, duration: float) -> bool:
         """Whether something will be near within ``duration`` [s]."""
@@ -214,6 +227,13 @@ class HybridSimulator:
         if body.tyres is None:
             return self.colliders
         return [c for c in self.colliders if c.name not in self._road]
+
+
+def _moves(body: DeformableBody) -> bool:
+    """Whether a body moves or turns faster than what sleeps may."""
+    m = body.motion
+    speed = float(np.linalg.norm(m.velocity)) + float(np.linalg.norm(m.angular_velocity))
+    return body.mode != BodyMode.SLEEPING and speed > SLEEP_SPEED
 
 
 def _approach(a: DeformableBody, b: DeformableBody) -> bool:

@@ -24,8 +24,6 @@ from .presets import VEHICLES, ObjectPhysics, Preset
 from .surroundings import clearance
 from .tyres import Tyres
 
-STANDS_WITHIN = 0.4
-"""A vehicle starts on its tyres when they are no further from the road than this [m]."""
 SPEED_MAX = 200.0
 """Faster things are no traffic, and would cross bodies within a step [m/s]."""
 SPIN_MAX = 100.0
@@ -186,7 +184,7 @@ def _spawn_body(
     if preset.wheels and subject.category in VEHICLES:
         moving = float(np.linalg.norm(velocity)) >= 0.1
         tyres = _tyres(subject, particles, gravity, brake=_brake(physics, moving))
-        tyres = tyres.standing(pose, colliders, STANDS_WITHIN)
+        tyres = tyres.standing(pose, colliders)
     body = DeformableBody(
         subject.object_id,
         particles,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -11,9 +11,11 @@ import numpy as np
 from ..geometry.rotation import Float
 from ..physics.colliders import Collider
 from .rigid import RigidMotion
-from .rolling import UPRIGHT, press
-from .surroundings import nearest, packed
+from .rolling import ROLLING, STATIC_GRAVITY, UPRIGHT, press
+from .surroundings import clearance, nearest, packed
 
+ABOVE_MAX = 0.1
+"""Tracked boxes of standing vehicles are at most this high above the road [m]."""
 LIFT_MAX = 0.3
 """Wheels never go further into their arches than this [m]."""
 
@@ -81,13 +83,14 @@ class Tyres:
         fractions = np.array([f * s for f in (front, 1 - front) for s in (left, 1 - left)])
         return cls(patches, weight * fractions, friction=friction, brake=brake)
 
-    def standing(self, T_world_object: Float, road: Sequence[Collider], reach: float) -> Tyres:
-        """Tyres whose rest is how the vehicle stands now, where that is within ``reach`` [m].
+    def standing(self, T_world_object: Float, road: Sequence[Collider]) -> Tyres:
+        """Tyres whose rest is how the vehicle stands now, where wheels are about on the road.
 
-        Tracked boxes miss the road by a few centimetres; that is no reason to jump.
+        Tracked boxes miss the road by a few centimetres; that is no reason to jump. What is higher
+        up falls.
         """
         heights, _ = nearest(road, self._points(T_world_object))
-        near = np.abs(heights) < reach
+        near = (heights < ABOVE_MAX) & (heights > -LIFT_MAX)
         return replace(self, rest=np.where(near.all(), heights, np.zeros(4)))
 
     def braked(self, fraction: float) -> Tyres:
@@ -100,6 +103,25 @@ class Tyres:
         carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
         squeeze = np.where(carrying, self.rest - heights, 0.0)
         return np.clip(squeeze, 0.0, LIFT_MAX)
+
+    def carrying(
+        self, T_world_object: Float, road: Sequence[Collider]
+    ) -> Iterator[tuple[Collider, Float, Float]]:
+        """What carries each wheel that is not in the air, where [3] [m], and its normal [3]."""
+        points = self._points(T_world_object)
+        droop = STATIC_GRAVITY / (2 * np.pi * self.frequency) ** 2
+        over = [clearance(collider, points) for collider in road]
+        for wheel, point in enumerate(points):
+            k = int(np.argmin([heights[wheel] for heights, _ in over]))
+            heights, normals = over[k]
+            upright = normals[wheel] @ T_world_object[:3, 2] > UPRIGHT
+            if upright and self.rest[wheel] - heights[wheel] > -droop:
+                yield road[k], point, normals[wheel]
+
+    def grip_along(self, direction: Float, forward: Float) -> float:
+        """Most friction over load along a direction [3] on the road; less where a wheel rolls."""
+        held = max(self.brake * self.friction, ROLLING)
+        return min(self.friction, held / max(abs(float(direction @ forward)), 1e-9))
 
     def apply(
         self,
