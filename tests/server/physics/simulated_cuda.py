@@ -94,7 +94,7 @@ COLLIDERS = (
         spacing=0.4,
     ),
     Plane(name="glue", point=(0, 0, 0.17), friction=float("inf"), separable=False),
-    Box(name="post", T_world_box=at(0.2, 0.2, 0.145), size=(0.02, 1, 0.05), velocity=(0.5, 0, 1)),
+    Box(name="post", T_world_box=at(0.203, 0.2, 0.134), size=(0.02, 1, 0.05), velocity=(0.5, 0, 1)),
 )
 
 
