@@ -19,7 +19,8 @@ phase         runs on                what happens
 ============  =====================  ==========================================================
 
 A world without sensors moves on a thread of its own: it needs no device, and its planner should not
-wait while other sessions are rendered.
+wait while other sessions are rendered. Steps that wait for that thread are made in one go, phase by
+phase: their log entries are one transaction, and they wake the event loop once.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ from ..rendering.frames import (
     with_pixels,
 )
 from ..rendering.renderer import Renderer, RenderRequest, check_sensors
+from .gathered_calls import GatheredCalls, attempt
+from .log_write import LogWrite, write_together
 from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
 
 T = TypeVar("T")
@@ -141,6 +144,9 @@ class StepPipeline:
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
+        self._steps: GatheredCalls[Transition, EncodedObservation] = GatheredCalls(
+            self._compute_together, self._worlds, on_result=self.send
+        )
         self._evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
 
     def close(self) -> None:
@@ -178,8 +184,59 @@ class StepPipeline:
                 on_result=partial(self.send, transition),
             )
         else:
-            observation = await self.on_world_thread(self._compute, transition)
+            observation = await self._steps.call(transition)
         return await self._finish(observation)
+
+    def _compute_together(
+        self, transitions: Sequence[Transition]
+    ) -> list[EncodedObservation | Exception]:
+        """All phases of steps without images; where one fails, the others go on."""
+        worlds = [attempt(self._advance_and_evaluate, transition) for transition in transitions]
+        moved = [t for t, w in zip(transitions, worlds, strict=True) if isinstance(w, World)]
+        unrecorded = self._record(moved)
+        results: list[EncodedObservation | Exception] = []
+        for transition, world in zip(transitions, worlds, strict=True):
+            if isinstance(world, Exception):
+                results.append(world)
+            elif (error := unrecorded.get(transition)) is not None:
+                results.append(error)
+            else:
+                results.append(attempt(self._encode_blind, transition, world))
+        return results
+
+    def _advance_and_evaluate(self, transition: Transition) -> World:
+        timer = transition.timer
+        timer.stage("queue")
+        world = self.advance(transition)
+        timer.stage("world")
+        timer.stage("render")
+        world.evaluate()
+        return world
+
+    def _record(self, transitions: Sequence[Transition]) -> dict[Transition, Exception]:
+        """Put changes on record, together where that can be; those for which it failed."""
+        writes = [t.record for t in transitions if t.record is not None]
+        logs = [w for w in writes if isinstance(w, LogWrite) and not w.instead]
+        if len(logs) == len(transitions) > 1:
+            try:
+                write_together(logs)
+            except Exception:
+                # Each then finds out for itself: the trouble of one is not that of the others.
+                pass
+            else:
+                for transition in transitions:
+                    transition.recorded = True
+                return {}
+        failed: dict[Transition, Exception] = {}
+        for transition in transitions:
+            if isinstance(error := attempt(_record_one, transition), Exception):
+                failed[transition] = error
+        return failed
+
+    def _encode_blind(self, transition: Transition, world: World) -> EncodedObservation:
+        members = pack_members(world.observe().obs_fields())
+        transition.timer.stage("settle")
+        return self.encode(RenderedObservation(world, (), "obs", members, transition.timer), ())
 
     def _compute(self, transition: Transition) -> RenderedObservation | EncodedObservation:
         """The phases of one job, which ends encoded where all images are raw."""
@@ -237,9 +294,7 @@ class StepPipeline:
             The observation without its images, and the headers of these where all are raw.
         """
         world.evaluate()
-        if transition.record is not None:
-            transition.record()
-            transition.recorded = True
+        _record_one(transition)
         members = pack_members(world.observe().obs_fields())
         if any(sensor.codec != "raw" for sensor in sensors):
             return members, None
@@ -355,6 +410,12 @@ class StepPipeline:
             self._metrics.stages.labels(stage).observe(ms / 1e3)
         for frame in observation.frames:
             self._metrics.frames.labels("drive", frame.codec).inc()
+
+
+def _record_one(transition: Transition) -> None:
+    if transition.record is not None:
+        transition.record()
+        transition.recorded = True
 
 
 def _with_frames(

@@ -32,6 +32,7 @@ from ..http.problems import ServiceError
 from ..storage.errors import StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
+from .log_write import LogWrite
 from .pipeline import EncodedObservation, StepPipeline, Transition
 from .session import Session
 from .wire import EncodedMessage
@@ -284,7 +285,7 @@ class Stepper:
     ) -> tuple[EncodedObservation, bool]:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])
-        store = partial(self._store.record, session.session_id, entries, instead=session.log_unsure)
+        store = LogWrite(self._store, session.session_id, entries, session.log_unsure)
         transition = Transition(change, cameras, record=store, write=write)
         try:
             observation = await self._pipeline.run(transition)

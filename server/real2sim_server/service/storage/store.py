@@ -342,6 +342,16 @@ class Store:
         durable = reply is not None and self._durability != "process"
         self._execute(changes, durable=durable or self._durability == "all")
 
+    def record_together(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> None:
+        """Entries of several sessions by :meth:`record` in one transaction: all, or none of them.
+
+        Args:
+            logs: ids of sessions, and what their logs get.
+        """
+        rows = [{"session_id": session} | vars(entry) for session, log in logs for entry in log]
+        if rows:
+            self._execute([_insert_rows(t.session_log, *rows)], durable=self._durability == "all")
+
     async def withdraw(
         self, session_id: str, *, from_seq: int, replies: Sequence[str] = ()
     ) -> None:

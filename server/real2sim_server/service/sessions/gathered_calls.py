@@ -1,0 +1,106 @@
+"""Calls that wait for a thread, made in one go.
+
+To wake a thread and be woken by it takes longer than what many calls do there, and leaves caches
+cold. What waits when the thread is free is therefore handed over together; a call that waits alone
+is made alone, at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from typing import Generic, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
+R = TypeVar("R")
+
+MOST_TOGETHER = 16
+"""The first of them waits for the last: some milliseconds."""
+
+
+class GatheredCalls(Generic[T, R]):
+    """For callers on one event loop.
+
+    Args:
+        compute: makes the results of several arguments, or what was raised instead, in their order.
+        executor: of one thread, where ``compute`` runs.
+        on_result: called on the event loop with an argument and its result, before its caller is
+            woken.
+    """
+
+    def __init__(
+        self,
+        compute: Callable[[Sequence[T]], Sequence[R | Exception]],
+        executor: Executor,
+        *,
+        on_result: Callable[[T, R], object],
+    ) -> None:
+        self._compute = compute
+        self._executor = executor
+        self._on_result = on_result
+        self._waiting: deque[tuple[T, asyncio.Future[R]]] = deque()
+        self._busy = False
+
+    async def call(self, argument: T) -> R:
+        """The result for ``argument``; what waits still when its caller is cancelled is dropped."""
+        outcome: asyncio.Future[R] = asyncio.get_running_loop().create_future()
+        self._waiting.append((argument, outcome))
+        if not self._busy:
+            self._begin()
+        return await outcome
+
+    def _begin(self) -> None:
+        """Hand over what waits."""
+        while self._waiting and self._waiting[0][1].cancelled():
+            self._waiting.popleft()
+        self._busy = bool(self._waiting)
+        if not self._busy:
+            return
+        count = min(len(self._waiting), MOST_TOGETHER)
+        calls = [self._waiting.popleft() for _ in range(count)]
+        calls = [call for call in calls if not call[1].cancelled()]
+        loop = asyncio.get_running_loop()
+        try:
+            self._executor.submit(self._work, calls, loop)
+        except RuntimeError as error:  # The executor has been shut down.
+            self._end(calls, [error] * len(calls))
+
+    def _work(
+        self, calls: Sequence[tuple[T, asyncio.Future[R]]], loop: asyncio.AbstractEventLoop
+    ) -> None:
+        try:
+            results = self._compute([argument for argument, _ in calls])
+        except Exception as error:
+            results = [error] * len(calls)
+        # A loop that was closed has no waiters left.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(self._end, calls, results)
+
+    def _end(
+        self, calls: Sequence[tuple[T, asyncio.Future[R]]], results: Sequence[R | Exception]
+    ) -> None:
+        self._begin()
+        for (argument, outcome), result in zip(calls, results, strict=True):
+            if outcome.done():
+                continue
+            if isinstance(result, Exception):
+                outcome.set_exception(result)
+                continue
+            try:
+                self._on_result(argument, result)
+            except Exception as error:
+                outcome.set_exception(error)
+            else:
+                outcome.set_result(result)
+
+
+def attempt(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R | Exception:
+    """What ``fn`` returns, or the exception that it raises."""
+    try:
+        return fn(*args, **kwargs)
+    except Exception as error:
+        return error

@@ -1,0 +1,34 @@
+"""Entries of a session's log on their way to the store."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..storage.store import SessionEntry, Store
+
+
+@dataclass(frozen=True, eq=False)
+class LogWrite:
+    """Writes entries when it is called, never on the event loop.
+
+    Attributes:
+        store: takes them.
+        session_id: of the session.
+        entries: of its log.
+        instead: whether they take the place of what may be on record from there on.
+    """
+
+    store: Store
+    session_id: str
+    entries: Sequence[SessionEntry]
+    instead: bool
+
+    def __call__(self) -> None:
+        """Raises as :meth:`Store.record` does."""
+        self.store.record(self.session_id, self.entries, instead=self.instead)
+
+
+def write_together(writes: Sequence[LogWrite]) -> None:
+    """Write the entries of several sessions to their store: all, or none of them."""
+    writes[0].store.record_together([(write.session_id, write.entries) for write in writes])
