@@ -75,6 +75,14 @@ def world(*, json: JsonFile = None) -> None:
     _report(json, world.run())
 
 
+@command("learn", group=app)
+def learn(*, json: JsonFile = None) -> None:
+    """Steps and small images a second, for learning: batches, sessions at once; with ratios."""
+    from ..benchmarks import learn
+
+    _report(json, learn.run())
+
+
 @command("soak", group=app)
 def soak(
     *,

@@ -191,6 +191,8 @@ class StepPipeline:
         self, transitions: Sequence[Transition]
     ) -> list[EncodedObservation | Exception]:
         """All phases of steps without images; where one fails, the others go on."""
+        if len(transitions) == 1:
+            return [attempt(self._compute_blind, transitions[0])]
         worlds = [attempt(self._advance_and_evaluate, transition) for transition in transitions]
         moved = [t for t, w in zip(transitions, worlds, strict=True) if isinstance(w, World)]
         unrecorded = self._record(moved)
@@ -203,6 +205,11 @@ class StepPipeline:
             else:
                 results.append(attempt(self._encode_blind, transition, world))
         return results
+
+    def _compute_blind(self, transition: Transition) -> EncodedObservation:
+        observation = self._compute(transition)
+        assert isinstance(observation, EncodedObservation)
+        return observation
 
     def _advance_and_evaluate(self, transition: Transition) -> World:
         timer = transition.timer

@@ -98,7 +98,7 @@ def test_what_refuses_the_result_is_raised_to_its_caller() -> None:
 
     async def main() -> list[Any]:
         with ThreadPoolExecutor(1) as executor:
-            calls = GatheredCalls(lambda n: list(n), executor, on_result=refuse)
+            calls = GatheredCalls(list, executor, on_result=refuse)
             return await asyncio.gather(calls.call(1), calls.call(2), return_exceptions=True)
 
     first, second = asyncio.run(main())

@@ -1,0 +1,62 @@
+"""Log entries of several sessions: one transaction, and the trouble of one is not the others'."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+from real2sim_server.service.sessions.log_write import LogWrite
+from real2sim_server.service.sessions.pipeline import StepPipeline, Transition
+from real2sim_server.service.storage.store import SessionEntry, Store
+
+
+class Shelf:
+    """A store that refuses the entries of some sessions."""
+
+    def __init__(self, refused: Sequence[str] = ()) -> None:
+        self.refused = set(refused)
+        self.transactions: list[list[str]] = []
+
+    def record(self, session_id: str, entries: Sequence[SessionEntry], *, instead: bool) -> None:
+        self.record_together([(session_id, entries)])
+
+    def record_together(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> None:
+        names = [name for name, _ in logs]
+        if self.refused & set(names):
+            raise OSError(f"no place for {names}")
+        self.transactions.append(names)
+
+
+def recorded(shelf: Shelf, names: Sequence[str], *, unsure: Sequence[str] = ()) -> dict[str, Any]:
+    """What has gone wrong, by session."""
+    entries = [SessionEntry(1, "action", 0, b"", 0)]
+    transitions = {
+        name: Transition(
+            cast(Any, None), {}, record=LogWrite(cast(Store, shelf), name, entries, name in unsure)
+        )
+        for name in names
+    }
+    failed = StepPipeline._record(cast(Any, None), list(transitions.values()))
+    for name, transition in transitions.items():
+        assert transition.recorded == (transition not in failed), name
+    return {name: failed[t] for name, t in transitions.items() if t in failed}
+
+
+def test_entries_of_several_sessions_are_one_transaction() -> None:
+    shelf = Shelf()
+    assert recorded(shelf, ["a", "b", "c"]) == {}
+    assert shelf.transactions == [["a", "b", "c"]]
+
+
+def test_the_trouble_of_one_is_not_that_of_the_others() -> None:
+    shelf = Shelf(refused=["b"])
+    failed = recorded(shelf, ["a", "b", "c"])
+    assert list(failed) == ["b"]
+    assert isinstance(failed["b"], OSError)
+    assert shelf.transactions == [["a"], ["c"]]
+
+
+def test_a_log_whose_end_is_unsure_is_written_by_itself() -> None:
+    shelf = Shelf()
+    assert recorded(shelf, ["a", "b"], unsure=["b"]) == {}
+    assert shelf.transactions == [["a"], ["b"]]
