@@ -168,6 +168,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
         ({"ego": {"tracker": "ilqr"}}, "ego.tracker"),
         ({"ego": {"tracker": "perfect"}}, "ego.tracker"),
         ({"ego": {"actuators": {"drive_delay_us": 50_000}}}, "ego.actuators"),
+        ({"ego": {"suspension": {}}}, "ego.suspension"),
         ({"agents": {"default": "constant_velocity"}}, "agents.default"),
         ({"agents": {"drivers": {"car_0": {"kind": "idm"}}}}, "agents"),
         ({"warmup_us": 100_000}, "warmup_us"),

@@ -19,7 +19,7 @@ from ...edit.track_kernels import poses_at
 from ..broad_phase_kernels import heading
 from ..ego.box import REAR_OVERHANG
 from ..path_kernels import nearest_point, next_in_strip, point_at, sharpest_turn
-from ..traffic.idm import BACK_TO_LANE, HARDEST
+from ..traffic.idm import BACK_TO_LANE, HARDEST, STANDSTILL
 
 NONE, DRIVES, LEFT = 0, 1, 2
 
@@ -108,7 +108,7 @@ def advance_driver(k, dt, bodies, own, tracks, driver, pose):
     free, leader_speed = next_in_strip(path, s, box, bodies, own)
     bend = sharpest_turn(path, s, 2.0 * speed)
     desired = min(tracks.desired[k], math.sqrt(lateral / max(bend, 1e-4)))
-    wish = 1.0 - (speed / desired) ** 4
+    wish = 1.0 - (speed / max(desired, STANDSTILL)) ** 4
     if not math.isinf(free):
         dynamic = speed * headway + speed * (speed - leader_speed) / (2 * math.sqrt(most * braking))
         wish -= ((gap + max(0.0, dynamic)) / max(free, 0.1)) ** 2
