@@ -5,6 +5,7 @@ Attacks on readers, imports and the store are tested beside those.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -445,6 +446,34 @@ def test_text_that_is_no_utf8_closes_the_socket_and_leaves_no_traceback(site, ca
         with pytest.raises(ConnectionClosed):
             drive.recv(timeout=WAIT_S)
         assert drive.close_code == 1007
+    assert caplog.records == []
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("last", [b"\x83\x80\0\0\0\0", b"\x81\x82\0\0\0\0\xff\xfe", b""])
+def test_a_view_whose_client_leaves_while_its_hello_is_refused_leaves_no_error(
+    site, caplog, monkeypatch, last
+):
+    async def refuse_late(*_arguments: Any) -> None:
+        await asyncio.sleep(0.3)
+        refused.set()
+        raise view_route.NoHelloError(4400, "no hello")
+
+    refused = threading.Event()
+    monkeypatch.setattr(view_route, "_check_hello", refuse_late)
+    handshake = (
+        "GET /v1/scenarios/any/view HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+    )
+    with opened(site.url) as connection:
+        connection.sendall(handshake.encode())
+        assert status_of(connection.recv(65536)) == 101
+        connection.sendall(last)
+        connection.shutdown(socket.SHUT_WR)
+        assert refused.wait(WAIT_S)
+        read_to_end(connection)
+    time.sleep(0.1)
     assert caplog.records == []
 
 

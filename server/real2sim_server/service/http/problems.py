@@ -29,7 +29,13 @@ from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObject
 from ...world import WorldError
 from ..accounts import Limit, OverLimitError, RevokedError, seconds_to_wait
 from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
-from ..storage.errors import StoreFullError, StoreUnavailableError, is_full
+from ..storage.errors import (
+    StoreFullError,
+    StoreReadOnlyError,
+    StoreUnavailableError,
+    is_full,
+    is_refused,
+)
 from .disconnects import ClientDisconnectedError
 
 MAX_DETAILS = 50
@@ -82,6 +88,7 @@ _AGAIN = "send it again after Retry-After seconds; under an Idempotency-Key it t
 _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (QueueFullError, ErrorCode.QUEUE_FULL, "send it again after Retry-After seconds"),
     (StoreFullError, ErrorCode.STORAGE_FULL, "free space on the worker, and send it again"),
+    (StoreReadOnlyError, ErrorCode.STORAGE_UNAVAILABLE, _AGAIN),
     (StoreUnavailableError, ErrorCode.STORAGE_UNAVAILABLE, _AGAIN),
     (EngineStoppedError, ErrorCode.DRAINING, None),
     (RevokedError, ErrorCode.UNAUTHORIZED, "ask the operator for another token"),
@@ -149,6 +156,10 @@ def _of_shortage(error: Exception) -> ServiceError | None:
     if isinstance(error, OSError) and is_full(error):
         detail = "the worker has no space left for this"
         return ServiceError(ErrorCode.STORAGE_FULL, detail, hint="free space on the worker")
+    if isinstance(error, OSError) and is_refused(error):
+        log.error("files in trouble", reason=str(error))
+        detail = f"the worker's files cannot be used just now: {error.strerror}"
+        return ServiceError(ErrorCode.STORAGE_UNAVAILABLE, detail, hint=_AGAIN)
     # torch's class is known by its name, so that this module needs no torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return ServiceError(

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Opcode
 from websockets.http11 import Request
@@ -70,6 +71,12 @@ async def receive_text(websocket: WebSocket) -> str:
     return str(text)
 
 
+async def close_quietly(websocket: WebSocket, code: int, reason: str) -> None:
+    """Close a socket, unless its client has left."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        await websocket.close(code, close_reason(reason))
+
+
 def close_reason(text: str) -> str:
     """As much of ``text`` as a close frame holds: 123 bytes (RFC 6455, 5.5)."""
     return text.encode("utf-8", "replace")[:MAX_REASON_BYTES].decode("utf-8", "ignore")
@@ -112,6 +119,12 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         if not self.close_sent and not self.config.ws_per_message_deflate:
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[EXTENSION] = self._send_parts
+
+    async def send(self, message: Any) -> None:
+        """Send one message, unless the connection is ending by what the client did."""
+        if self.transport.is_closing():
+            raise ClientDisconnected
+        await super().send(message)
 
     async def run_asgi(self) -> None:
         """Serve the connection; one that was answered by HTTP, or has left, is no error."""

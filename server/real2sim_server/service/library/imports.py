@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import secrets
 import shutil
@@ -15,6 +17,7 @@ from real2sim_proto.base import ID_PATTERN
 from ...scene import BundleTooLargeError, SceneError
 from ...scene.io import StagingError, StagingLimits, stage_scene
 from ..http.problems import ServiceError
+from ..storage.errors import FULL_ERRNOS, REFUSED_ERRNOS, is_full, is_refused
 from .quotas import Quota, folder_usage
 from .scene_catalog import SCENE_DOCUMENT, bundle_folder
 
@@ -96,6 +99,7 @@ def import_errors(source: Path, *, setting: str) -> Iterator[None]:
 
     Raises:
         ServiceError: IMPORT_FAILED or PAYLOAD_TOO_LARGE.
+        OSError: the worker's disk takes nothing, which is no fault of the file.
     """
     try:
         yield
@@ -107,11 +111,25 @@ def import_errors(source: Path, *, setting: str) -> Iterator[None]:
             "REAL2SIM_IMPORT_MEMORY_BYTES",
         ) from error
     except StagingError as error:
+        _raise_of_disk(error)
         raise _import_failed(f"it cannot be written: {error}") from error
     except SceneError as error:
         raise _import_failed(_public(error, source)) from error
     except OSError as error:
+        if is_full(error) or is_refused(error):
+            raise
         raise _import_failed(f"it cannot be written: {error.strerror}") from error
+
+
+def _raise_of_disk(error: StagingError) -> None:
+    """Raise the system's error where it says that there is no space, or no disk.
+
+    The process that reads has a limit of its own for the size of files, which counts as the file's
+    fault.
+    """
+    for number in (FULL_ERRNOS | REFUSED_ERRNOS) - {errno.EFBIG}:
+        if str(error) == os.strerror(number):
+            raise OSError(number, str(error)) from error
 
 
 def _public(error: Exception, source: Path) -> str:

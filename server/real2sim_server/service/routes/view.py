@@ -15,7 +15,7 @@ from real2sim_proto import ErrorCode
 from ..accounts import Account
 from ..http.accounting import begin_paying
 from ..http.problems import ServiceError, service_error
-from ..http.websocket import close_reason, receive_text
+from ..http.websocket import close_quietly, receive_text
 from ..worker import Worker, WorkerOf
 from .view_connection import ViewConnection
 
@@ -63,13 +63,13 @@ async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
             await _serve(socket, worker, scenario_id, account)
     except NoHelloError as error:
         log.info("view socket refused", code=error.code, reason=str(error))
-        await socket.close(error.code, str(error))
+        await close_quietly(socket, error.code, str(error))
     except WebSocketDisconnect:
         return
     except Exception as error:
         failure = service_error(error, log_unexpected=True)
         code = CLOSED_BY.get(failure.code, CLOSED_FAILED)
-        await socket.close(code, close_reason(failure.detail))
+        await close_quietly(socket, code, failure.detail)
 
 
 async def _serve(socket: WebSocket, worker: Worker, scenario_id: str, account: Account) -> None:

@@ -10,6 +10,19 @@ from pathlib import Path
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
 FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+REFUSED_ERRNOS = frozenset(
+    {
+        errno.EROFS,
+        errno.EIO,
+        errno.EACCES,
+        errno.EPERM,
+        errno.ESTALE,
+        errno.ENODEV,
+        errno.ENXIO,
+        errno.ENOTCONN,
+    }
+)
+"""Of a disk that is read-only, broken or gone, and of folders that belong to others."""
 LITTLE_SPACE = 1 << 20
 """Free bytes below which a failed write is put down to a full disk."""
 
@@ -37,15 +50,21 @@ class StoreTroubleError(StoreError):
 
 
 class StoreUnavailableError(StoreTroubleError):
-    """The database is gone, frozen, locked or not writable."""
+    """The database is gone, frozen or locked."""
 
-    told = "the worker's store does not answer, or cannot be written to"
+    told = "the worker's store does not answer"
 
 
 class StoreBusyError(StoreUnavailableError):
     """One statement was given up; the database is well."""
 
     told = "the worker's store was too busy for this"
+
+
+class StoreReadOnlyError(StoreTroubleError):
+    """The database is there and takes nothing; reading goes on."""
+
+    told = "the worker's store cannot be written to"
 
 
 class StoreFullError(StoreTroubleError):
@@ -80,10 +99,18 @@ def is_full(error: OSError) -> bool:
     return error.errno in FULL_ERRNOS
 
 
+def is_refused(error: OSError) -> bool:
+    """Whether the disk takes nothing at present, or gives nothing."""
+    return error.errno in REFUSED_ERRNOS
+
+
 def _of_sqlite(error: sqlite3.Error, folder: Path | None) -> StoreError | None:
     code = getattr(error, "sqlite_errorcode", None)
     if code is None:
         return None
+    if code in _REFUSED_WRITES or code & 0xFF == sqlite3.SQLITE_READONLY:
+        full = folder is not None and _has_little_space(folder)
+        return StoreFullError(_why(error)) if full else StoreReadOnlyError(_why(error))
     match code & 0xFF:
         case sqlite3.SQLITE_FULL:
             return StoreFullError(_why(error))
@@ -93,7 +120,6 @@ def _of_sqlite(error: sqlite3.Error, folder: Path | None) -> StoreError | None:
         case (
             sqlite3.SQLITE_BUSY
             | sqlite3.SQLITE_LOCKED
-            | sqlite3.SQLITE_READONLY
             | sqlite3.SQLITE_PERM
             | sqlite3.SQLITE_PROTOCOL
             | sqlite3.SQLITE_CORRUPT
@@ -103,6 +129,17 @@ def _of_sqlite(error: sqlite3.Error, folder: Path | None) -> StoreError | None:
     return None
 
 
+_REFUSED_WRITES = frozenset(
+    {
+        sqlite3.SQLITE_IOERR_WRITE,
+        sqlite3.SQLITE_IOERR_FSYNC,
+        sqlite3.SQLITE_IOERR_DIR_FSYNC,
+        sqlite3.SQLITE_IOERR_TRUNCATE,
+        sqlite3.SQLITE_IOERR_DELETE,
+    }
+)
+
+
 def _has_little_space(folder: Path) -> bool:
     try:
         return shutil.disk_usage(folder).free < LITTLE_SPACE
@@ -110,25 +147,25 @@ def _has_little_space(folder: Path) -> bool:
         return False
 
 
-_FULL_STATES = ("53100",)
-_BUSY_STATES = ("40", "55P03", "57014")
-"""Deadlocks and the like, locks and statements that took too long."""
-_PASSING_CLASSES = ("08", "25", "53", "55", "57", "58")
-"""Connection, transaction state, resources, state of the server, operator, system."""
+_KINDS_OF_STATES: tuple[tuple[tuple[str, ...], type[StoreTroubleError]], ...] = (
+    (("53100",), StoreFullError),
+    # Of a server that follows another one, for example.
+    (("25006",), StoreReadOnlyError),
+    # Deadlocks and the like, locks and statements that took too long.
+    (("40", "55P03", "57014"), StoreBusyError),
+    # Connection, transaction state, resources, state of the server, operator, system.
+    (("08", "25", "53", "55", "57", "58"), StoreUnavailableError),
+)
+"""Beginnings of states of a server's errors; the first that fits counts."""
 
 
 def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | None:
-    state = _sqlstate(cause)
-    if state.startswith(_FULL_STATES):
-        return StoreFullError(_why(cause))
-    if state.startswith(_BUSY_STATES):
-        return StoreBusyError(_why(cause))
-    if state.startswith(_PASSING_CLASSES):
-        return StoreUnavailableError(_why(cause))
-    if state:
-        return None
+    if state := _sqlstate(cause):
+        kinds = (kind for states, kind in _KINDS_OF_STATES if state.startswith(states))
+        found = next(kinds, None)
+        return found(_why(cause)) if found is not None else None
     # Without a state the server has not spoken: it is not there, or the way to it is broken.
-    broken = ("OperationalError", "InterfaceError", "TimeoutError")
+    broken = ("OperationalError", "InterfaceError", "TimeoutError", "PendingRollbackError")
     if type(error).__name__ in broken or getattr(error, "connection_invalidated", False):
         return StoreUnavailableError(_why(cause))
     return None

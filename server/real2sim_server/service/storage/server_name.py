@@ -37,7 +37,8 @@ class NameOnServer:
             return
         try:
             self._connection.exec_driver_sql("SELECT 1")
-        except sa.exc.SQLAlchemyError:
+        except Exception:
+            # Drivers let errors of sockets through as they are; the connection is spoilt by any.
             self.drop()
             raise
 

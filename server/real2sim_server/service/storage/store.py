@@ -150,8 +150,13 @@ class Store:
         """Look after the database for ever: notice trouble, and its end."""
         while True:
             await asyncio.sleep(PROBE_S if self._trouble else CHECK_S)
-            with contextlib.suppress(StoreError):
+            try:
                 await self._patiently(self._probe)
+            except StoreError:
+                continue
+            except Exception:
+                # Whatever it was: without this watch the store would never be well again.
+                log.exception("looking after the store failed")
 
     # --- scenarios --------------------------------------------------------------------------
 
@@ -520,7 +525,7 @@ class Store:
         try:
             with self._writer.begin():
                 yield self._writer
-        except sa.exc.DBAPIError as error:
+        except Exception as error:
             if not isinstance(error, sa.exc.IntegrityError):
                 self._drop_writer()
             raise
@@ -584,6 +589,8 @@ class Store:
         try:
             if self._name_on_server is not None:
                 self._name_on_server.hold()
+            if self._trouble is not None and self._file is not None:
+                self._reconnect()
             with self._connected().connect() as connection:
                 connection.execute(sa.select(version)).all()
             if self._trouble is None:
@@ -593,6 +600,13 @@ class Store:
         except Exception as error:
             self._reraise(error)
         self._recovered()
+
+    def _reconnect(self) -> None:
+        """Leave all connections to a file: those that were made while it could not be written to
+        stay read-only for good, and SQLite makes later ones so as long as one of them is open."""
+        with self._write_lock:
+            self._drop_writer()
+            self._connected().dispose()
 
     # --- opening ----------------------------------------------------------------------------
 

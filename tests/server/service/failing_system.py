@@ -1,0 +1,170 @@
+"""A system that fails on demand below one folder, and whose clock can be set: for workers in
+processes of their own, without root.
+
+A small library stands before the system's: writes below the folder fail with the error number in a
+file, and the wall clock is moved by the seconds in another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+SOURCE = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <sys/types.h>
+#include <time.h>
+#include <unistd.h>
+
+#define NEXT(type, name, ...) \
+    static type (*next)(__VA_ARGS__); if (!next) next = dlsym(RTLD_NEXT, #name)
+
+static int number_in(const char *variable) {
+    const char *file = getenv(variable);
+    if (!file) return 0;
+    int fd = (int)(long)((long (*)(int, const char *, int, int))dlsym(RTLD_NEXT, "openat"))(
+        AT_FDCWD, file, O_RDONLY | O_CLOEXEC, 0);
+    if (fd < 0) return 0;
+    char text[16] = {0};
+    ssize_t n = read(fd, text, sizeof text - 1);
+    close(fd);
+    return n > 0 ? atoi(text) : 0;
+}
+
+static int fails_at(const char *path) {
+    const char *folder = getenv("FAILING_FOLDER");
+    if (!folder || !path || strncmp(path, folder, strlen(folder))) return 0;
+    int number = number_in("FAILING_ERRNO_FILE");
+    if (number) errno = number;
+    return number;
+}
+
+static int fails(int fd) {
+    char link[64], path[4096];
+    snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
+    ssize_t n = readlink(link, path, sizeof path - 1);
+    if (n < 0) return 0;
+    path[n] = 0;
+    return fails_at(path);
+}
+
+ssize_t write(int fd, const void *data, size_t size) {
+    NEXT(ssize_t, write, int, const void *, size_t);
+    return fails(fd) ? -1 : next(fd, data, size);
+}
+ssize_t pwrite(int fd, const void *data, size_t size, off_t at) {
+    NEXT(ssize_t, pwrite, int, const void *, size_t, off_t);
+    return fails(fd) ? -1 : next(fd, data, size, at);
+}
+ssize_t pwrite64(int fd, const void *data, size_t size, off64_t at) {
+    NEXT(ssize_t, pwrite64, int, const void *, size_t, off64_t);
+    return fails(fd) ? -1 : next(fd, data, size, at);
+}
+int ftruncate64(int fd, off64_t size) {
+    NEXT(int, ftruncate64, int, off64_t);
+    return fails(fd) ? -1 : next(fd, size);
+}
+int ftruncate(int fd, off_t size) {
+    NEXT(int, ftruncate, int, off_t);
+    return fails(fd) ? -1 : next(fd, size);
+}
+int mkdir(const char *path, mode_t mode) {
+    NEXT(int, mkdir, const char *, mode_t);
+    return fails_at(path) ? -1 : next(path, mode);
+}
+int rename(const char *from, const char *to) {
+    NEXT(int, rename, const char *, const char *);
+    return fails_at(to) ? -1 : next(from, to);
+}
+static int opens_to_write(int flags) {
+    return flags & (O_CREAT | O_TRUNC) || (flags & O_ACCMODE) != O_RDONLY;
+}
+#define OPEN(name) \
+int name(const char *path, int flags, ...) { \
+    va_list more; va_start(more, flags); mode_t mode = va_arg(more, mode_t); va_end(more); \
+    NEXT(int, name, const char *, int, ...); \
+    return opens_to_write(flags) && fails_at(path) ? -1 : next(path, flags, mode); \
+}
+OPEN(open)
+OPEN(open64)
+#define OPENAT(name) \
+int name(int at, const char *path, int flags, ...) { \
+    va_list more; va_start(more, flags); mode_t mode = va_arg(more, mode_t); va_end(more); \
+    NEXT(int, name, int, const char *, int, ...); \
+    return opens_to_write(flags) && fails_at(path) ? -1 : next(at, path, flags, mode); \
+}
+OPENAT(openat)
+OPENAT(openat64)
+
+int clock_gettime(clockid_t which, struct timespec *now) {
+    NEXT(int, clock_gettime, clockid_t, struct timespec *);
+    int done = next(which, now);
+    if (!done && which == CLOCK_REALTIME) now->tv_sec += number_in("CLOCK_OFFSET_FILE");
+    return done;
+}
+"""
+
+
+@dataclass(frozen=True)
+class FailingSystem:
+    """What a worker is started with, and what it is to meet.
+
+    Attributes:
+        folder: below which writes may fail.
+        environment: of the worker's process.
+    """
+
+    folder: Path
+    environment: dict[str, str]
+
+    @contextlib.contextmanager
+    def refusing_writes(self, number: int) -> Iterator[None]:
+        """Writes below the folder fail by this error number, for the length of the block."""
+        switch = Path(self.environment["FAILING_ERRNO_FILE"])
+        switch.write_text(str(number))
+        try:
+            yield
+        finally:
+            switch.unlink()
+
+    def set_clock(self, seconds: int) -> None:
+        """Move the wall clock of the worker."""
+        Path(self.environment["CLOCK_OFFSET_FILE"]).write_text(str(seconds))
+
+
+READ_ONLY, NO_SPACE, BROKEN = errno.EROFS, errno.ENOSPC, errno.EIO
+
+
+def failing_system(folder: Path, place: Path) -> FailingSystem:
+    """One for workers whose state is in ``folder``, made in ``place``; skips without a compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("needs a C compiler")
+    source, library = place / "failing.c", place / "failing.so"
+    source.write_text(SOURCE)
+    command = [compiler, "-shared", "-fPIC", "-O1", "-w", "-o", library, source, "-ldl"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"the library cannot be made here: {done.stderr[-300:]}")
+    environment = {
+        "LD_PRELOAD": str(library),
+        "FAILING_FOLDER": str(folder),
+        "FAILING_ERRNO_FILE": str(place / "errno"),
+        "CLOCK_OFFSET_FILE": str(place / "clock"),
+    }
+    return FailingSystem(folder, environment)

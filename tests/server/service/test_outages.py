@@ -1,0 +1,221 @@
+"""A state folder that cannot be written to, a clock that goes back, a database that is away for
+half a minute: each has an answer of its own, nothing is lost, and all goes on by itself."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+import httpx2
+import pytest
+
+from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
+from real2sim_server.demo.worker import worker_process
+from real2sim_server.scene.io import save_scene, write_splats
+
+from .failing_system import BROKEN, NO_SPACE, READ_ONLY, FailingSystem, failing_system
+from .postgres import Postgres, running_postgres
+from .test_trouble import Site, assert_told, is_ready, stopped, wait_until
+
+pytestmark = [
+    pytest.mark.network,
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+OUTAGE_S = 30.0
+JOB = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
+CUT = {"scene": "tiny", "object_id": "car_red"}
+
+
+# --- a disk that refuses to be written to -----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory) -> FailingSystem:
+    place = tmp_path_factory.mktemp("system")
+    return failing_system(place / "data", place)
+
+
+@pytest.fixture(scope="module")
+def apart(system, tiny_scene, worker_kernels) -> Iterator[httpx2.Client]:
+    """A worker in a process of its own, on that system."""
+    scenes = system.folder.parent / "scenes"
+    save_scene(tiny_scene, scenes / "tiny.r2s")
+    log_file = system.folder.parent / "worker.log"
+    with (
+        mock.patch.dict(os.environ, system.environment),
+        worker_process(scenes=scenes, data=system.folder, log_file=log_file) as worker,
+        httpx2.Client(base_url=worker.url, trust_env=False, timeout=60) as client,
+    ):
+        wait_until(lambda: is_ready(client), 120)
+        yield client
+        assert "Traceback" not in log_file.read_text()
+
+
+@pytest.mark.timeout(300)
+def test_a_folder_that_cannot_be_written_to_is_told_and_nothing_is_lost(apart, system):
+    site = Site(apart)
+    assert site.edit().status_code == 200
+    for number, code, status in (
+        (READ_ONLY, "STORAGE_UNAVAILABLE", 503),
+        (BROKEN, "STORAGE_UNAVAILABLE", 503),
+    ):
+        assert site.step().status_code == 200
+        with system.refusing_writes(number):
+            assert_told(site.edit(f"edit {number}"), code, status)
+            assert_told(site.step(f"step {number}"), code, status)
+            cut = CUT | {"asset_id": f"car_{number}"}
+            assert_told(apart.post("/v1/assets", json=cut), code, status)
+            assert_told(apart.post("/v1/exports", json=JOB), code, status)
+            assert not is_ready(apart)
+            assert apart.get("/livez").status_code == 200
+            site.check_nothing_is_lost()
+            assert apart.get("/v1/scenes/tiny/render?width=32").status_code == 200
+        wait_until(lambda: is_ready(apart))
+        assert site.edit(f"edit {number}").status_code == 200
+        assert site.step(f"step {number}").status_code == 200
+        assert apart.post("/v1/assets", json=cut).status_code == 201
+        site.check_nothing_is_lost()
+
+
+@pytest.mark.timeout(300)
+def test_an_upload_to_a_folder_that_cannot_be_written_to_is_told_so(
+    apart, system, tmp_path, tiny_scene
+):
+    write_splats(tiny_scene.background, tmp_path / "car.ply")
+    form = {"data": {"asset_id": "car", "category": "car"}}
+
+    def upload():
+        return apart.post(
+            "/v1/assets", files={"file": ("car.ply", (tmp_path / "car.ply").read_bytes())}, **form
+        )
+
+    for number, code, status in (
+        (READ_ONLY, "STORAGE_UNAVAILABLE", 503),
+        (NO_SPACE, "STORAGE_FULL", 507),
+    ):
+        with system.refusing_writes(number):
+            assert_told(upload(), code, status)
+    assert upload().status_code == 201
+
+
+@pytest.mark.timeout(300)
+def test_a_job_whose_folder_cannot_be_written_to_fails_by_name(apart, system):
+    job = apart.post("/v1/exports", json=JOB | {"fps": 60, "width": 96}).headers["Location"]
+    with system.refusing_writes(READ_ONLY):
+        time.sleep(1.0)
+    wait_until(lambda: apart.get(job).json()["finished_at"] is not None, 60)
+    ended = apart.get(job).json()
+    if ended["state"] != "succeeded":  # It may have been faster.
+        assert (ended["state"], ended["error"]["code"]) == ("failed", "STORAGE_UNAVAILABLE")
+
+
+@pytest.mark.timeout(300)
+def test_a_clock_that_goes_back_by_an_hour_and_forth_again_changes_nothing(apart, system):
+    site = Site(apart)
+    assert site.edit("before").status_code == 200
+    before = apart.get("/v1/scenarios").json()["scenarios"]
+    made = []
+    for k, seconds in enumerate((-3600, 0)):
+        system.set_clock(seconds)
+        assert site.edit("before").headers["Idempotent-Replayed"] == "true"
+        site.edits -= 1
+        assert site.edit(f"new {k}").status_code == 200
+        assert site.step(f"new {k}").status_code == 200
+        assert site.step(f"new {k}").headers["Idempotent-Replayed"] == "true"
+        site.steps -= 1
+        made.append(apart.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"])
+        job = apart.post("/v1/exports", json=JOB).headers["Location"]
+        wait_until(lambda at=job: apart.get(at).json()["state"] == "succeeded", 60)
+        assert is_ready(apart)
+    listed = [s["scenario_id"] for s in apart.get("/v1/scenarios").json()["scenarios"]]
+    assert [f"/v1/scenarios/{i}" for i in listed[len(before) :]] == made
+    site.check_nothing_is_lost()
+
+
+# --- a database that is away ------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_postgres() -> Iterator[Postgres]:
+    with (
+        tempfile.TemporaryDirectory(prefix="real2sim-pg-") as folder,
+        running_postgres(Path(folder)) as server,
+    ):
+        yield server
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("trouble", [stopped, Postgres.frozen], ids=["stopped", "frozen"])
+def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
+    trouble, own_postgres, start_worker
+):
+    client = start_worker(store_url=own_postgres.new_database(), store_timeout_seconds=2)
+    site = Site(client)
+    assert site.edit().status_code == 200
+    job = client.post("/v1/exports", json=JOB).headers["Location"]
+    made = client.post("/v1/sessions?scene=tiny").json()
+    url = f"/v1/sessions/{made['session_id']}/drive"
+    with client.websocket_connect(
+        url, subprotocols=[DRIVE_SUBPROTOCOL], headers={"Host": "127.0.0.1"}
+    ) as drive:
+
+        def say(**fields):
+            drive.send_bytes(encode({"v": 1, "id": 1, **fields}))
+            while (said := decode(drive.receive_bytes()))["type"] == "progress":
+                pass
+            return said
+
+        hello = say(type="hello", protocols=[DRIVE_SUBPROTOCOL], token=made["token"])
+        assert hello["type"] == "welcome"
+        assert say(type="reset", spec={"action": "control"})["type"] == "obs"
+        plan = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
+        slowest, refused = 0.0, 0
+        with trouble(own_postgres):
+            ended = time.monotonic() + OUTAGE_S
+            while time.monotonic() < ended:
+                began = time.monotonic()
+                assert_told(site.edit("edit"), "STORAGE_UNAVAILABLE", 503)
+                assert_told(site.step("step"), "STORAGE_UNAVAILABLE", 503)
+                said = say(type="action", step=0, plan=plan)
+                assert (said["code"], said["fatal"]) == ("STORAGE_UNAVAILABLE", False)
+                assert not is_ready(client)
+                assert client.get("/livez").status_code == 200
+                slowest, refused = max(slowest, time.monotonic() - began), refused + 3
+                time.sleep(0.5)
+        assert refused > 20
+        assert slowest < 20
+        wait_until(lambda: is_ready(client))
+        assert say(type="action", step=0, plan=plan)["step"] == 1
+    for key in ("edit", "edit"):
+        assert site.edit(key).status_code == 200
+    site.edits -= 1
+    for key in ("step", "step"):
+        assert site.step(key).status_code == 200
+    site.steps -= 1
+    wait_until(lambda: client.get(job).json()["state"] == "succeeded", 60)
+    site.check_nothing_is_lost()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_folder_that_is_read_only_for_half_a_minute_costs_nothing_but_the_time(apart, system):
+    site = Site(apart)
+    assert site.edit().status_code == 200
+    assert site.step().status_code == 200
+    with system.refusing_writes(READ_ONLY):
+        ended = time.monotonic() + OUTAGE_S
+        while time.monotonic() < ended:
+            assert_told(site.edit("edit"), "STORAGE_UNAVAILABLE", 503)
+            assert_told(site.step("step"), "STORAGE_UNAVAILABLE", 503)
+            assert not is_ready(apart)
+            time.sleep(0.5)
+    wait_until(lambda: is_ready(apart))
+    assert site.edit("edit").status_code == 200
+    assert site.step("step").status_code == 200
+    site.check_nothing_is_lost()
