@@ -14,6 +14,7 @@ from real2sim_server import benchmarks
 from real2sim_server.benchmarks import (
     edit,
     environment,
+    learn,
     physics,
     reconstruct,
     render,
@@ -25,7 +26,7 @@ from real2sim_server.cli import bench
 
 MODULES = {
     module.__name__.rpartition(".")[2]: module
-    for module in (edit, physics, reconstruct, render, serve, soak, world)
+    for module in (edit, learn, physics, reconstruct, render, serve, soak, world)
 }
 FIGURES = {"failures": [], "grows": False, "stage_ms": {}}
 

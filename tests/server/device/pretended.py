@@ -19,8 +19,9 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 
 aten = torch.ops.aten
 
-DEVICE = torch.device("cpu")
-"""The device, once :func:`pretending` was entered."""
+# Before anything is differentiated in this process: torch prepares for the devices of then.
+_setup_privateuseone_for_python_backend("pretended")
+DEVICE = torch.device("pretended:0")
 
 TAKES_BOTH = {aten.copy_.default, aten._to_copy.default}
 """Operations that may meet tensors of two devices."""
@@ -161,7 +162,6 @@ def on_copy(shape: torch.Size) -> None:
 @contextmanager
 def pretending() -> Iterator[Counts]:
     """The device is there; what it is asked for is counted from zero."""
-    _register()
     plain = {name: getattr(torch, name) for name in FACTORIES}
     for name, make in plain.items():
         setattr(torch, name, functools.partial(_made, make))
@@ -179,15 +179,5 @@ def _made(make: Any, *args: Any, device: Any = None, **options: Any) -> torch.Te
     return make(*args, **options).to(device)
 
 
-_library: list[torch.library.Library] = []
-
-
-def _register() -> None:
-    global DEVICE  # noqa: PLW0603 - torch knows the device only once it is registered
-    if _library:
-        return
-    _setup_privateuseone_for_python_backend("pretended")
-    DEVICE = torch.device("pretended:0")
-    library = torch.library.Library("_", "IMPL")
-    library.fallback(lambda func, *args, **kwargs: run(func, args, kwargs), "PrivateUse1")
-    _library.append(library)
+_library = torch.library.Library("_", "IMPL")
+_library.fallback(lambda func, *args, **kwargs: run(func, args, kwargs), "PrivateUse1")

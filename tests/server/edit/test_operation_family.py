@@ -27,6 +27,7 @@ from real2sim_proto.operations import (
     SetTime,
     SetTrajectory,
     SetVelocity,
+    Spawn,
     Translate,
 )
 from real2sim_server.edit import EditError, ScenarioState, apply_operations
@@ -84,8 +85,8 @@ def examples(state: ScenarioState) -> list[Any]:
     ]
 
 
-NEEDS_MORE = {Restore, Insert}
-"""A deleted object, an asset library: tested with what they need elsewhere."""
+NEEDS_MORE = {Restore, Insert, Spawn}
+"""A deleted object, an asset library, a driver: tested with what they need elsewhere."""
 
 
 @pytest.fixture

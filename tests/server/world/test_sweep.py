@@ -159,7 +159,9 @@ def test_of_a_thousand_fast_drives_none_passes_through_a_car(make_scene, on_coll
 
 @pytest.mark.parametrize("dt_us", [50_000, 100_000, 500_000, 1_000_000])
 def test_time_place_and_speed_of_a_contact_do_not_depend_on_the_clock(make_world, moving, dt_us):
-    world = make_world(car=moving(45, 0, z=0.8), spec={"action": "control", "dt_us": dt_us})
+    at_once = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
+    spec = {"action": "control", "dt_us": dt_us, "ego": at_once}
+    world = make_world(car=moving(45, 0, z=0.8), spec=spec)
     (event,) = drive(world, Control(acceleration=4.0, steering=0.0))
 
     # 10 t + 2 t^2 = 43 - 3.65.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sqlite3
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ from sqlalchemy.pool import StaticPool
 DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
 """Argument of a PostgreSQL driver that limits its waiting [s]. Only pg8000 limits reading too, so
 that a server that is frozen is noticed."""
+
+RETRY_S = 0.01
+"""Between two attempts to change the journal of an SQLite database [s]."""
 
 SERVER_SHARE = 0.8
 """Of the time that a statement may take, before the server itself gives it up."""
@@ -44,12 +49,33 @@ def connect(url: str, *, timeout_s: float) -> sa.Engine:
         if not cursor.execute("PRAGMA page_count").fetchone()[0]:
             # Freed pages can be given back in pieces, if this is said before there is any.
             cursor.execute("PRAGMA auto_vacuum=INCREMENTAL")
-        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
+        keep_write_ahead_journal(cursor, timeout_s)
+        for pragma in ("synchronous=NORMAL", "foreign_keys=ON"):
             cursor.execute(f"PRAGMA {pragma}")
         cursor.execute(f"PRAGMA busy_timeout={round(timeout_s * 1000)}")
         cursor.close()
 
     return engine
+
+
+def keep_write_ahead_journal(cursor: sqlite3.Cursor, timeout_s: float) -> None:
+    """Let a database keep a write-ahead journal.
+
+    Of several connections that change the journal of one file at once, SQLite refuses all but one
+    without letting them wait; so they try again here.
+
+    Raises:
+        sqlite3.OperationalError: the file stays locked for ``timeout_s``, or cannot be used.
+    """
+    last = time.monotonic() + timeout_s
+    while True:
+        try:
+            cursor.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > last:
+                raise
+            time.sleep(RETRY_S)
 
 
 def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:

@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy as sa
 
 from real2sim_server.service.storage import migrations, tables
-from real2sim_server.service.storage.database import connect
+from real2sim_server.service.storage.database import connect, keep_write_ahead_journal
 from real2sim_server.service.storage.tokens import token_hash
 
 from ..postgres import Postgres
@@ -184,6 +184,32 @@ def test_workers_that_start_at_once_on_one_database_all_come_up(url, old):
     for thread in threads:
         thread.join()
     assert errors == []
+
+
+class Locked:
+    """A cursor whose database another connection holds for a while."""
+
+    def __init__(self, times: int, code: int = sqlite3.SQLITE_BUSY) -> None:
+        self.left, self.code = times, code
+
+    def execute(self, _statement: str) -> None:
+        self.left -= 1
+        if self.left >= 0:
+            error = sqlite3.OperationalError("database is locked")
+            error.sqlite_errorcode = self.code
+            raise error
+
+
+def test_who_finds_the_journal_changed_by_another_connection_tries_again():
+    cursor = Locked(3)
+    keep_write_ahead_journal(cursor, 30)
+    assert cursor.left == -1
+
+
+@pytest.mark.parametrize(("cursor", "timeout_s"), [(Locked(9**9), 0.0), (Locked(1, 8), 30)])
+def test_a_journal_that_cannot_be_changed_is_told(cursor, timeout_s):
+    with pytest.raises(sqlite3.OperationalError):
+        keep_write_ahead_journal(cursor, timeout_s)
 
 
 def test_the_files_of_a_store_are_for_its_owner_alone(tmp_path):
