@@ -125,21 +125,26 @@ def project_eight(cluster, view, first, count, planes, found):
 def gather_eight(cluster, first, count, planes):
     """Lay ``count`` Gaussians side by side in the planes."""
     for lane in range(count):
-        i = first + lane
+        gather_lane(cluster, first + lane, lane, planes)
+
+
+@inlined()
+def gather_lane(cluster, i, lane, planes):
+    """Lay Gaussian ``i`` into a lane of the planes."""
+    for k in range(3):
+        planes[(MEAN + k) * LANES + lane] = cluster.means[i, k]
+    planes[OPACITY * LANES + lane] = cluster.opacities[i]
+    if cluster.covars.shape[0] > 0:
+        covar, plane = cluster.covars[i], SHAPE * LANES + lane
+        for row in range(3):
+            for column in range(row, 3):
+                planes[plane] = covar[row, column]
+                plane += LANES
+    else:
+        for k in range(4):
+            planes[(SHAPE + k) * LANES + lane] = cluster.quats[i, k]
         for k in range(3):
-            planes[(MEAN + k) * LANES + lane] = cluster.means[i, k]
-        planes[OPACITY * LANES + lane] = cluster.opacities[i]
-        if cluster.covars.shape[0] > 0:
-            covar, plane = cluster.covars[i], SHAPE * LANES + lane
-            for row in range(3):
-                for column in range(row, 3):
-                    planes[plane] = covar[row, column]
-                    plane += LANES
-        else:
-            for k in range(4):
-                planes[(SHAPE + k) * LANES + lane] = cluster.quats[i, k]
-            for k in range(3):
-                planes[(SHAPE + 4 + k) * LANES + lane] = cluster.scales[i, k]
+            planes[(SHAPE + 4 + k) * LANES + lane] = cluster.scales[i, k]
 
 
 @inlined(fastmath=FASTMATH)

@@ -21,13 +21,10 @@ from ..footprint import footprints_of_eight, tile_columns, tile_rows
 from ..kernel import inlined, kernel
 from ..lanes import LANES
 from ..project import FIELDS as RECORD_FIELDS
-from ..project import write_color
+from ..project import gather_lane, write_color
 from ..project_lanes import (
-    MEAN,
-    OPACITY,
     PROJECTION,
     REACH_MAX,
-    SHAPE,
     place_eight,
     place_eight_deformed,
     shape_eight,
@@ -287,21 +284,7 @@ def gather_listed(cluster, chosen, first, size, ahead, planes):
     """Lay ``size`` Gaussians side by side in the planes; like gather_eight, from a list."""
     prefetch(cluster.means, chosen[ahead])
     for lane in range(size):
-        i = chosen[first + lane]
-        for k in range(3):
-            planes[(MEAN + k) * LANES + lane] = cluster.means[i, k]
-        planes[OPACITY * LANES + lane] = cluster.opacities[i]
-        if cluster.covars.shape[0] > 0:
-            covar, plane = cluster.covars[i], SHAPE * LANES + lane
-            for row in range(3):
-                for column in range(row, 3):
-                    planes[plane] = covar[row, column]
-                    plane += LANES
-        else:
-            for k in range(4):
-                planes[(SHAPE + k) * LANES + lane] = cluster.quats[i, k]
-            for k in range(3):
-                planes[(SHAPE + 4 + k) * LANES + lane] = cluster.scales[i, k]
+        gather_lane(cluster, chosen[first + lane], lane, planes)
 
 
 @kernel()
