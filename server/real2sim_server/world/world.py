@@ -187,7 +187,12 @@ class World:
     @property
     def warming_up(self) -> bool:
         """Whether the ego still moves as recorded."""
-        return self.t_us < self._clock.start_us + self.spec.warmup_us
+        return self.t_us < self._warm_up_end_us
+
+    @property
+    def _warm_up_end_us(self) -> int:
+        """End of the time in which the ego moves as recorded."""
+        return self._clock.start_us + self.spec.warmup_us
 
     @property
     def drawn(self) -> dict[str, float]:
@@ -463,7 +468,7 @@ class World:
         t_us, before = self.t_us, self.agents
         end_us = t_us + self._clock.dt_us
         traffic = self.traffic.advance(self._tracks, end_us, lambda: self._surroundings(before))
-        if end_us <= self._clock.start_us + self.spec.warmup_us:
+        if end_us <= self._warm_up_end_us:
             recorded = logged_motion(self.scene.ego, end_us, self.spec.ego)
             return StepMotion(controller, recorded, traffic, self._contacts, None)
         return self._contacts.advance(
@@ -484,7 +489,7 @@ class World:
         )
         self.T_world_vehicle = self._ego_pose()
         if self.spec.ego.suspension is not None and self.spec.action != "pose":
-            recorded = self.t_us <= self._clock.start_us + self.spec.warmup_us
+            recorded = self.t_us <= self._warm_up_end_us
             ego = self.spec.ego
             self._attitude = (
                 LEVEL if recorded else sprung(self._attitude, before, self.motion, seconds, ego)
@@ -528,7 +533,7 @@ class World:
         """Contacts where bodies pass through each other; the first may end the episode. While the
         ego moves as recorded, nobody drives into anybody."""
         found = self._contacts.ego_contacts(start, self.T_world_vehicle, self.motion, self.agents)
-        if self.t_us <= self._clock.start_us + self.spec.warmup_us:
+        if self.t_us <= self._warm_up_end_us:
             self._contacts = self._contacts.after_warm_up(found.touching)
             return StepContacts(touching=found.touching)
         contacts = contacts_of_overlaps(found, self.t_us)
