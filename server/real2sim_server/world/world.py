@@ -6,12 +6,10 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Pose
 from real2sim_proto.episode import ResetSpec, SensorSpec
-from real2sim_proto.operations import Operation, Spawn
+from real2sim_proto.operations import Operation
 
 from ..edit import (
     EditError,
@@ -22,18 +20,11 @@ from ..edit import (
     compose,
 )
 from ..edit.tracks import PackedTracks
-from ..geometry.rotation import yaw_quaternion
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
 from .agents import Agents
-from .beyond_log import (
-    Prolonged,
-    at_start_again,
-    driven_route,
-    lanes_route,
-    tracks_beyond_log,
-)
+from .beyond_log import lanes_route
 from .collision.contact_state import ContactState, StepMotion
 from .collision.deformation import Deformation, DeformationTracker
 from .collision.impact import Impact
@@ -49,11 +40,13 @@ from .ego.reference import PlannedTrajectory
 from .ego.route import command_ahead, route_ahead
 from .ego.suspension import LEVEL, sprung, tilted
 from .episode import episode_clock, takes_effect_us
+from .episode_route import EpisodeRoute
 from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
+from .placement import placed
 from .randomization import (
     RandomizedIdm,
     estimate_error,
@@ -122,9 +115,8 @@ class World:
         self.lap = 0
         self._clock = episode_clock(scene, spec)
         self._draws = Draws(spec.seed)
-        self._path = driven_route(scene, spec, self._clock.horizon)
-        self._lap_length = LoggedPath(scene.ego).length if spec.beyond_log == "loop" else math.inf
-        self._prolonged: Prolonged = {}
+        self._episode_route = EpisodeRoute.of(scene, spec, self._clock)
+        self._path = self._episode_route.route
         self._tracks = self._tracks_of(state)
         self.ground = scene.ground
         self.motion, drawn = self._first_motion()
@@ -317,7 +309,9 @@ class World:
                 f"made for revision {base_revision}; the session is at {self.revision}",
                 hint="look at the objects again and send the edit for the present revision",
             )
-        outcome = apply_operations(self.state, [self._placed(o) for o in operations])
+        s, t_us = self._path_point.s, self.t_us
+        known = [placed(o, self._path, s, self.ground, t_us=t_us) for o in operations]
+        outcome = apply_operations(self.state, known)
         self.state, self._tracks = outcome.state, self._tracks_of(outcome.state)
         self.traffic = self.traffic.edited(
             self._tracks, self._surroundings(self._tracks.at(self.t_us))
@@ -384,21 +378,6 @@ class World:
         """A world that goes on from here on its own; it shares everything that never changes."""
         return copy.copy(self)
 
-    def _placed(self, operation: Operation) -> Operation:
-        """The operation with what is known here only: now, and where the ego is on its route."""
-        if not isinstance(operation, Spawn):
-            return operation
-        known: dict[str, Any] = {}
-        if operation.start_us is None:
-            known["start_us"] = self.t_us
-        if (place := operation.place) is not None:
-            x, y, _, yaw = self._path.at(self._path_point.s + place.ahead)
-            x, y = x - place.offset * math.sin(yaw), y + place.offset * math.cos(yaw)
-            w, qx, qy, qz = yaw_quaternion(yaw + math.pi if place.oncoming else yaw).tolist()
-            pose = Pose(position=(x, y, self.ground.height(x, y)), quaternion=(w, qx, qy, qz))
-            known |= {"pose": pose, "place": None}
-        return operation.model_copy(update=known)
-
     # --- phases of a step -------------------------------------------------------------------
 
     def _check_running(self) -> None:
@@ -431,22 +410,19 @@ class World:
 
     def _put_back(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
         """The ego of a loop, back at the start of the recorded drive once it is at its end."""
-        laps = max(math.floor(self._path_point.s / self._lap_length), 0)
-        self._seam = None
-        if laps == 0:
+        put = self._episode_route.put_back(self.motion, self._path_point)
+        self._seam = put.seam if put is not None else None
+        if put is None:
             return controller, []
-        way, near, before = laps * self._lap_length, self._path_point, self.motion
         surroundings = self._surroundings(self.agents)
-        self.motion = at_start_again(before, near, self._path, near.s - way)
-        self._path_point = self._path.nearest(self.motion.x, self.motion.y, near_s=near.s - way)
+        self.motion, self._path_point = put.motion, put.point
         self.T_world_vehicle = self._ego_pose()
         self.T_world_body = tilted(self.T_world_vehicle, self._attitude, self.spec.ego)
-        self.lap += laps
+        self.lap += put.laps
         self._tracks = self._tracks_of(self.state)
-        self.traffic = self.traffic.put_back(self._tracks, surroundings, way)
-        self._seam = Seam.between(before[:3], self.motion[:3])
-        data = {"lap": float(self.lap), **self._seam._asdict()}
-        return controller.put_back(self._seam), [Event("looped", self.t_us, data=data)]
+        self.traffic = self.traffic.put_back(self._tracks, surroundings, put.way)
+        data = {"lap": float(self.lap), **put.seam._asdict()}
+        return controller.put_back(put.seam), [Event("looped", self.t_us, data=data)]
 
     def _let_agents_react(self) -> list[Event]:
         """Objects stop repeating the log once the ego is too far from where it was recorded."""
@@ -600,11 +576,8 @@ class World:
     def _tracks_of(self, state: ScenarioState) -> PackedTracks[ObjectState]:
         """Where the recording and edits have the objects; in later laps without those that moved
         in the recording, which are over."""
-        if self.spec.beyond_log == "end":
-            return state.tracks
-        until_us = self._clock.at(self._clock.horizon)
         left = self.traffic.recorded_movers(state.visible) if self.lap else frozenset[str]()
-        return tracks_beyond_log(state, until_us, self._prolonged, left=left)
+        return self._episode_route.tracks(state, left=left)
 
     def _initial_contacts(self) -> ContactState:
         background = self.spec.contact.background
@@ -635,7 +608,7 @@ class World:
         seam: Seam | None = None,
     ) -> Instant:
         height = float(self.T_world_vehicle[2, 3])
-        laps = self.lap * self._lap_length if self.lap else 0.0
+        laps = self.lap * self._episode_route.lap_length if self.lap else 0.0
         return Instant(
             step=self.steps,
             t_us=self.t_us,
