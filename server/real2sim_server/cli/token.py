@@ -31,7 +31,7 @@ def add(
     ] = None,
     bytes_per_day: Annotated[float | None, typer.Option(help="Sent and received.")] = None,
     engine_seconds_per_minute: Annotated[
-        float | None, typer.Option(help="Of the thread that owns the device.")
+        float | None, typer.Option(help="Of the device's thread, or of steps without images.")
     ] = None,
     sessions: Annotated[int | None, typer.Option(help="Open at a time.")] = None,
 ) -> None:

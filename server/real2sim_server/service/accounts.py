@@ -1,7 +1,8 @@
 """Who takes how much of a worker: an account for each name of a token.
 
 Figures are counted where they arise: requests and bytes on the event loop, engine time on the
-engine's thread. Each has one writer, so that counting is an addition and needs no lock. Limits are
+engine's thread, that of steps without images on the thread of worlds. Each has one writer, so that
+counting is an addition and needs no lock. Limits are
 looked at before something begins; what has begun is finished, and counts.
 """
 
@@ -15,11 +16,14 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from typing import Any, TypeVar
 
 import structlog
 
 from .storage.tokens import token_hash
 from .token_file import DEFAULT_NAME, TokenFileError, TokenLimits, read_token_file
+
+T = TypeVar("T")
 
 RELOAD_S = 1.0
 """Between looks whether the file of tokens has changed."""
@@ -98,6 +102,8 @@ class Account:
         requests: and messages of sockets, those that were let in.
         received_bytes, sent_bytes: bodies and messages.
         engine_seconds: written by the engine's thread alone.
+        world_seconds: of the processor, for what needs no engine; written by the thread of worlds
+            alone.
         refusals: by limit.
         revoked: whether the token is no more.
         on_revoked: called on the event loop when that comes to be.
@@ -109,6 +115,7 @@ class Account:
     received_bytes: int = 0
     sent_bytes: int = 0
     engine_seconds: float = 0.0
+    world_seconds: float = 0.0
     refusals: dict[Limit, int] = field(default_factory=lambda: dict.fromkeys(Limit, 0))
     revoked: bool = False
     on_revoked: set[Callable[[], object]] = field(default_factory=set)
@@ -116,12 +123,17 @@ class Account:
     def __post_init__(self) -> None:
         self.limit(self.limits)
 
+    @property
+    def computing_seconds(self) -> float:
+        """What limits of engine time count: on the engine, or instead of it."""
+        return self.engine_seconds + self.world_seconds
+
     def limit(self, limits: TokenLimits) -> None:
         """Other limits from now on; what was taken up to now does not count against them."""
         self.limits = limits
         self._requests = _meter(limits.requests_per_second, 1.0, self.requests)
         self._bytes = _meter(limits.bytes_per_day, 86_400.0, self.received_bytes + self.sent_bytes)
-        self._engine = _meter(limits.engine_seconds_per_minute, 60.0, self.engine_seconds)
+        self._engine = _meter(limits.engine_seconds_per_minute, 60.0, self.computing_seconds)
 
     def admit(self) -> None:
         """Let one request or message in, and count it. On the event loop.
@@ -144,7 +156,7 @@ class Account:
 
     def check_engine(self) -> None:
         """Raises OverLimitError while the account has had its time on the engine."""
-        if self._engine is not None and (wait := self._engine.wait_s(self.engine_seconds)):
+        if self._engine is not None and (wait := self._engine.wait_s(self.computing_seconds)):
             allowed = self.limits.engine_seconds_per_minute
             raise self._over(Limit.ENGINE, f"more than {allowed:g} s of the engine a minute", wait)
 
@@ -210,6 +222,31 @@ def admit_message() -> None:
     if payer is not None:
         payer.account.admit()
         payer.on_engine = False
+
+
+async def computing_account() -> Account | None:
+    """Whose computing time the running task is about to take; None for nobody's.
+
+    Raises:
+        OverLimitError: of engine time; a job waits instead.
+    """
+    payer = PAYER.get()
+    if payer is None:
+        return None
+    if payer.account.limits.engine_seconds_per_minute is not None:
+        await payer.let_on_engine()
+    return payer.account
+
+
+def counted_world_time(account: Account | None, fn: Callable[..., T], *args: Any) -> T:
+    """``fn(*args)``, its processor time counted for ``account``; on the thread of worlds."""
+    if account is None:
+        return fn(*args)
+    began = time.thread_time()
+    try:
+        return fn(*args)
+    finally:
+        account.world_seconds += time.thread_time() - began
 
 
 def owner_name() -> str:
@@ -309,6 +346,7 @@ class Accounts:
             account.requests, account.refusals = before.requests, dict(before.refusals)
             account.received_bytes, account.sent_bytes = before.received_bytes, before.sent_bytes
             account.engine_seconds = before.engine_seconds
+            account.world_seconds = before.world_seconds
             account.limit(account.limits)
         self._by_name[name] = account
         return account

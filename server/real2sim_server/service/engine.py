@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import structlog
 
-from .accounts import PAYER, Account
+from .accounts import PAYER, Account, computing_account
 from .lanes import Lane, Lanes
 
 T = TypeVar("T")
@@ -204,9 +204,7 @@ class Engine:
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
-        payer = PAYER.get()
-        if payer is not None and payer.account.limits.engine_seconds_per_minute is not None:
-            await payer.let_on_engine()
+        await computing_account()
         awaited = _LoopFuture(on_result)
         job = self._submit(lambda: fn(*args, **kwargs), label, lane, awaited)
         try:

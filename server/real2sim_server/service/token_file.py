@@ -39,7 +39,8 @@ class TokenLimits(_Strict):
     Attributes:
         requests_per_second: requests and messages of sockets; a second's worth at once.
         bytes_per_day: sent and received together; a day's worth at once.
-        engine_seconds_per_minute: of the thread that owns the device; a minute's worth at once.
+        engine_seconds_per_minute: of the thread that owns the device, and of the processor for
+            steps that need none; a minute's worth at once.
         sessions: open at a time.
     """
 

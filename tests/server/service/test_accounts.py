@@ -26,6 +26,7 @@ from real2sim_server.service.accounts import (
     RevokedError,
 )
 from real2sim_server.service.engine import Engine
+from real2sim_server.service.sessions.pipeline import Transition
 from real2sim_server.service.token_file import (
     TokenFileError,
     TokenLimits,
@@ -428,6 +429,48 @@ def test_a_step_over_the_engine_limit_is_refused_and_may_be_sent_again(start_wor
         time.sleep(0.5)
         drive.send_bytes(encode(step))
         assert answer(drive)["step"] == 1
+
+
+def test_steps_without_images_count_as_engine_time_and_are_limited_with_it(
+    start_worker, tokens_file
+):
+    alice = add_token(tokens_file, "alice", TokenLimits(engine_seconds_per_minute=600))
+    client = start_worker(token=SINGLE, tokens_file=tokens_file)
+    made = client.post(
+        "/v1/sessions?scene=tiny", json={"reset": {"action": "control"}}, headers=bearer(alice)
+    ).json()
+    path = f"/v1/sessions/{made['session_id']}/step"
+    account = client.app.state.worker.accounts.of_owner("alice")
+    by_reset = account.world_seconds
+    assert client.post(path, json={"n": 5}, headers=bearer(alice)).status_code == 200
+    by_steps = account.world_seconds
+    assert 0 < by_reset < by_steps
+    step = {"v": 1, "type": "action", "id": 3, "step": 5}
+    step["plan"] = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
+    with driving(client, made, token=alice) as drive:
+        drive.send_bytes(encode(step))
+        assert answer(drive)["step"] == 6
+        assert account.world_seconds > by_steps
+        told = figure(client, "engine_seconds_total", "alice")
+        assert told == pytest.approx(account.engine_seconds + account.world_seconds)
+        account.world_seconds += 700
+        drive.send_bytes(encode(step | {"step": 6}))
+        assert answer(drive)["code"] == "TOO_MUCH_ENGINE_TIME"
+    refused = client.post(path, json={}, headers=bearer(alice))
+    assert refused.json()["code"] == "TOO_MUCH_ENGINE_TIME"
+
+
+def test_steps_that_are_made_together_count_for_whoever_asked_for_each(client):
+    client.post("/v1/sessions?scene=tiny", json={"reset": {}})
+    sessions = client.app.state.worker.sessions
+    (session,) = sessions
+    world = session.running_world()
+    accounts = [Account("alice"), None, Account("bob")]
+    steps = [Transition(world.fork, {}, account=account) for account in accounts]
+    results = sessions.pipeline._compute_together(steps)
+    assert not [result for result in results if isinstance(result, Exception)]
+    assert accounts[0].world_seconds > 0
+    assert accounts[2].world_seconds > 0
 
 
 def test_who_holds_a_removed_token_is_disconnected_and_their_sessions_are_closed_to_them(

@@ -41,6 +41,7 @@ from ...geometry.transform import invert_transform
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
 from ...world import World
+from ..accounts import Account, computing_account, counted_world_time
 from ..engine import Engine
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
@@ -80,6 +81,7 @@ class Transition:
         timer: of the stages.
         recorded: whether ``record`` is done.
         sent: whether ``write`` is done.
+        account: that pays where no engine counts.
     """
 
     change: Callable[[], World]
@@ -89,6 +91,7 @@ class Transition:
     timer: PhaseTimer = field(default_factory=PhaseTimer)
     recorded: bool = False
     sent: bool = False
+    account: Account | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +164,8 @@ class StepPipeline:
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
-        return await asyncio.get_running_loop().run_in_executor(self._worlds, fn, *args)
+        counted = partial(counted_world_time, await computing_account(), fn, *args)
+        return await asyncio.get_running_loop().run_in_executor(self._worlds, counted)
 
     # --- a change of the world ----------------------------------------------------------------
 
@@ -184,6 +188,7 @@ class StepPipeline:
                 on_result=partial(self.send, transition),
             )
         else:
+            transition.account = await computing_account()
             observation = await self._steps.call(transition)
         return await self._finish(observation)
 
@@ -192,8 +197,8 @@ class StepPipeline:
     ) -> list[EncodedObservation | Exception]:
         """All phases of steps without images; where one fails, the others go on."""
         if len(transitions) == 1:
-            return [attempt(self._compute_blind, transitions[0])]
-        worlds = [attempt(self._advance_and_evaluate, transition) for transition in transitions]
+            return [_counted(self._compute_blind, transitions[0])]
+        worlds = [_counted(self._advance_and_evaluate, transition) for transition in transitions]
         moved = [t for t, w in zip(transitions, worlds, strict=True) if isinstance(w, World)]
         unrecorded = self._record(moved)
         results: list[EncodedObservation | Exception] = []
@@ -203,7 +208,7 @@ class StepPipeline:
             elif (error := unrecorded.get(transition)) is not None:
                 results.append(error)
             else:
-                results.append(attempt(self._encode_blind, transition, world))
+                results.append(_counted(self._encode_blind, transition, world))
         return results
 
     def _compute_blind(self, transition: Transition) -> EncodedObservation:
@@ -417,6 +422,12 @@ class StepPipeline:
             self._metrics.stages.labels(stage).observe(ms / 1e3)
         for frame in observation.frames:
             self._metrics.frames.labels("drive", frame.codec).inc()
+
+
+def _counted(fn: Callable[..., T], transition: Transition, *args: Any) -> T | Exception:
+    """A part of a step on the thread of worlds, its time counted for whoever asked for it; the
+    transaction of several steps counts for nobody."""
+    return attempt(counted_world_time, transition.account, fn, transition, *args)
 
 
 def _record_one(transition: Transition) -> None:
