@@ -69,7 +69,7 @@ def _settings(data: Path | None) -> Settings:
 
 
 def _database(settings: Settings) -> Path:
-    from ..service.storage.database import file_of, shown_url
+    from ..service.storage.connection import file_of, shown_url
 
     file = file_of(settings.database_url)
     if file is None:

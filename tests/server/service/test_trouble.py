@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from real2sim_server.service.storage import store as store_module
+from real2sim_server.service.storage import clock as clock_module
 
 from .postgres import Postgres, running_postgres
 
@@ -203,7 +203,7 @@ def test_a_clock_that_is_set_back_by_an_hour_changes_nothing(client, monkeypatch
     site = Site(client)
     assert site.edit("before").status_code == 200
     hour_ns, time_ns = 3600 * 10**9, time.time_ns
-    monkeypatch.setattr(store_module.time, "time_ns", lambda: time_ns() - hour_ns)
+    monkeypatch.setattr(clock_module.time, "time_ns", lambda: time_ns() - hour_ns)
     again = site.edit("before")
     assert again.headers["Idempotent-Replayed"] == "true"
     site.edits -= 1

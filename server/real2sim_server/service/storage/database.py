@@ -1,126 +1,413 @@
-"""The database of a store: how it is reached, how long it may take, and what reaches the disk."""
+"""The database of a store: statements on a thread of its own, what reaches the disk, and trouble.
+
+It knows no tables but the one that shows whether it is well; what is asked is the store's.
+"""
 
 from __future__ import annotations
 
-import os
-import sqlite3
+import asyncio
+import contextlib
+import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NoReturn, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.engine import make_url
-from sqlalchemy.pool import StaticPool
+import structlog
 
-DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
-"""Argument of a PostgreSQL driver that limits its waiting [s]. Only pg8000 limits reading too, so
-that a server that is frozen is noticed."""
+from . import tables as t
+from .connection import connect, file_of, shown_url
+from .errors import (
+    StoreBusyError,
+    StoreError,
+    StoreTroubleError,
+    StoreUnavailableError,
+    sorted_error,
+)
+from .migrations import prepare_schema
+from .ownership import StateFolderError, owned_name
+from .server_name import NameOnServer
 
-RETRY_S = 0.01
-"""Between two attempts to change the journal of an SQLite database [s]."""
+T = TypeVar("T")
 
-SERVER_SHARE = 0.8
-"""Of the time that a statement may take, before the server itself gives it up."""
+TIMEOUT_S = 5.0
+PATIENCE = 3.0
+"""Timeouts that a caller waits for its turn and its answer."""
+PROBE_S = 1.0
+"""Between questions whether a store in trouble is well again."""
+CHECK_S = 5.0
+"""Between questions whether a store is still well."""
+SCHEMA_TIMEOUT_S = 3600.0
+"""Of a migration: it may have to rewrite everything."""
+
+Durability = Literal["all", "edits", "process"]
+"""What is on the disk before it is acknowledged: all, all but steps of sessions, or nothing; what
+is not is safe when the process dies, and the last of it lost when the machine does."""
+
+OnCall = Callable[[str, float, bool], None]
+"""Told of a call: ``read`` or ``write``, its seconds, and whether it went well."""
+
+log = structlog.get_logger(__name__)
 
 
-def connect(url: str, *, timeout_s: float) -> sa.Engine:
-    """An engine for ``url``; SQLite's folder is made, its journal is a write-ahead one.
+@dataclass(frozen=True, eq=False)
+class Write:
+    """A statement that writes. Rows beside it, not in it, so that it is compiled only once."""
+
+    statement: sa.Executable
+    rows: list[dict[str, Any]] | None = None
+
+
+class Database:
+    """SQLAlchemy Core on one thread of its own, so that the event loop never waits for a disk.
+
+    A database in trouble is noticed within ``timeout_s``. From then on calls are refused at once,
+    until a probe of :meth:`watch` finds it well again.
+
+    One thread is enough: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which has
+    one writer at a time anyway, and the order of appends is the order of the calls. Code that
+    computes on another thread may write from there, by :meth:`execute`: to be woken by a thread
+    and to wake another one takes longer than an append.
 
     Args:
-        url: SQLAlchemy URL.
-        timeout_s: of one statement, of a lock, and of an answer of the server [s].
+        url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
+        worker_id: name to hold as long as the database is open; None for a guest.
+        timeout_s: of a statement, a lock, an answer [s].
+        durability: what reaches the disk before it is acknowledged.
+        on_call: told of each read and write, on the thread that did it.
     """
-    parsed = make_url(url)
-    if parsed.get_backend_name() != "sqlite":
-        return _server_engine(parsed, timeout_s)
-    file = file_of(url)
-    if file is None:
-        # Such a database belongs to its connection, whichever thread uses it.
-        other_threads = {"check_same_thread": False}
-        engine = sa.create_engine(parsed, poolclass=StaticPool, connect_args=other_threads)
-    else:
-        file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        make_private(file)
-        engine = sa.create_engine(parsed, connect_args={"timeout": timeout_s})
 
-    @sa.event.listens_for(engine, "connect")
-    def set_up(connection: Any, _record: object) -> None:
-        cursor = connection.cursor()
-        if not cursor.execute("PRAGMA page_count").fetchone()[0]:
-            # Freed pages can be given back in pieces, if this is said before there is any.
-            cursor.execute("PRAGMA auto_vacuum=INCREMENTAL")
-        keep_write_ahead_journal(cursor, timeout_s)
-        for pragma in ("synchronous=NORMAL", "foreign_keys=ON"):
-            cursor.execute(f"PRAGMA {pragma}")
-        cursor.execute(f"PRAGMA busy_timeout={round(timeout_s * 1000)}")
-        cursor.close()
+    def __init__(
+        self,
+        url: str,
+        *,
+        worker_id: str | None = None,
+        timeout_s: float = TIMEOUT_S,
+        durability: Durability = "edits",
+        on_call: OnCall | None = None,
+    ) -> None:
+        self.url = url
+        self._on_call = on_call
+        self._worker_id = worker_id
+        self._timeout_s = timeout_s
+        self._durability = durability
+        self._trouble: StoreTroubleError | None = None
+        self._trouble_since = 0.0
+        self._file: Path | None = None
+        self._name_on_server: NameOnServer | None = None
+        self._owned = contextlib.ExitStack()
+        self._writer_is_durable = False
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="store")
+        self._write_lock = threading.Lock()
+        self._engine: sa.Engine | None = None
+        self._writer: sa.Connection | None = None
 
-    return engine
+    async def open(self, first: Write) -> None:
+        """Connect, create what is missing, and execute the first statement.
 
+        Raises:
+            StoreError: the database cannot be opened, or is of a newer version.
+            StateFolderError: another worker of that name is on it.
+        """
+        await self._run(partial(self._open, first))
 
-def keep_write_ahead_journal(cursor: sqlite3.Cursor, timeout_s: float) -> None:
-    """Let a database keep a write-ahead journal.
+    async def close(self) -> None:
+        """Finish what was begun and disconnect."""
+        await self._run(self._close)
+        self._executor.shutdown()
 
-    Of several connections that change the journal of one file at once, SQLite refuses all but one
-    without letting them wait; so they try again here.
+    @property
+    def trouble(self) -> StoreTroubleError | None:
+        """What is wrong with the database; None while it is well."""
+        return self._trouble
 
-    Raises:
-        sqlite3.OperationalError: the file stays locked for ``timeout_s``, or cannot be used.
-    """
-    last = time.monotonic() + timeout_s
-    while True:
+    async def watch(self) -> None:
+        """Look after the database for ever: notice trouble, and its end."""
+        while True:
+            await asyncio.sleep(PROBE_S if self._trouble else CHECK_S)
+            try:
+                await self.on_thread(self._probe)
+            except StoreError:
+                continue
+            except Exception:
+                # Whatever it was: without this watch the store would never be well again.
+                log.exception("looking after the store failed")
+
+    # --- statements -------------------------------------------------------------------------
+
+    async def read(self, query: sa.Select[Any]) -> list[dict[str, Any]]:
+        """Rows of a query."""
+
+        def read() -> list[dict[str, Any]]:
+            self._refuse_while_down()
+            try:
+                with self._timed("read"), self._connected().connect() as connection:
+                    return [dict(row) for row in connection.execute(query).mappings()]
+            except Exception as error:
+                self._reraise(error)
+
+        self._refuse_while_down()
+        return await self.on_thread(read)
+
+    async def write(self, *changes: Write) -> list[int]:
+        """Rows changed by each statement, in one transaction; the answer is a promise.
+
+        Raises:
+            ConflictError: a row that must be new exists.
+        """
+        self._refuse_while_down()
+        return await self.on_thread(partial(self.execute, changes))
+
+    def execute(self, changes: Sequence[Write], *, promised: bool = True) -> list[int]:
+        """Like :meth:`write`, on the calling thread; never on the event loop.
+
+        Args:
+            changes: all of them, or none.
+            promised: whether somebody relies on them beyond a session: then they are on the disk
+                before this returns, unless ``durability`` is ``process``.
+        """
+        self._refuse_while_down()
+        durable = self._durability == "all" or (promised and self._durability == "edits")
+        # SQLite lets those who find it locked sleep and try again; they had better queue here.
+        if not self._write_lock.acquire(timeout=self._timeout_s):
+            raise self._noted(StoreUnavailableError("the write before this one has not ended"))
         try:
-            cursor.execute("PRAGMA journal_mode=WAL")
+            with self._timed("write"), self._transaction(durable=durable) as connection:
+                counts = [connection.execute(c.statement, c.rows).rowcount for c in changes]
+        except Exception as error:
+            self._reraise(error)
+        finally:
+            self._write_lock.release()
+        if self._trouble is not None:
+            self._recovered()
+        return counts
+
+    async def on_thread(self, fn: Callable[[], T]) -> T:
+        """``fn()`` on the thread of the database, awaited as long as any answer.
+
+        Raises:
+            StoreUnavailableError: it was not done in that time.
+        """
+        return await self._run(fn, patience_s=PATIENCE * self._timeout_s)
+
+    # --- size -------------------------------------------------------------------------------
+
+    async def used_bytes(self) -> int | None:
+        """What a database of SQLite takes, without what it could give back; None for a server."""
+        if self._connected().dialect.name != "sqlite":
+            return None
+        return await self.on_thread(self._pages_bytes)
+
+    async def give_back(self, pages: int) -> bool:
+        """Give free pages of a database file back to the disk; whether there are more."""
+        if self._file is None:
+            return False
+        return await self.on_thread(partial(self._shrink, pages))
+
+    def _pages_bytes(self) -> int:
+        with self._connected().connect() as connection:
+            count, free, size = (
+                connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
+                for name in ("page_count", "freelist_count", "page_size")
+            )
+        return int((count - free) * size)
+
+    def _shrink(self, pages: int) -> bool:
+        try:
+            with self._write_lock, self._connected().connect() as connection:
+                raw = connection.connection.dbapi_connection
+                assert raw is not None
+                cursor = raw.cursor()
+                (before,) = cursor.execute("PRAGMA freelist_count").fetchone()
+                # A step a page; the driver makes but one of what has no columns, save in scripts.
+                cursor.executescript(f"PRAGMA incremental_vacuum({pages})")
+                (after,) = cursor.execute("PRAGMA freelist_count").fetchone()
+                more = 0 < after < before
+                if not more:
+                    cursor.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+                cursor.close()
+                return bool(more)
+        except Exception as error:
+            self._reraise(error)
+
+    # --- inside -----------------------------------------------------------------------------
+
+    async def _run(self, fn: Callable[[], T], *, patience_s: float | None = None) -> T:
+        """``fn()`` on the database's thread; done also when the caller is cancelled or has left.
+
+        Raises:
+            StoreUnavailableError: it was not done within ``patience_s``.
+        """
+        work = asyncio.get_running_loop().run_in_executor(self._executor, fn)
+        work.add_done_callback(_looked_at)
+        done, _ = await asyncio.wait((work,), timeout=patience_s)
+        if not done:
+            raise self._noted(StoreUnavailableError(f"no answer within {patience_s:g} s"))
+        return work.result()
+
+    @contextlib.contextmanager
+    def _timed(self, kind: str) -> Iterator[None]:
+        started, done = time.perf_counter(), False
+        try:
+            yield
+            done = True
+        finally:
+            if self._on_call is not None:
+                self._on_call(kind, time.perf_counter() - started, done)
+
+    @contextlib.contextmanager
+    def _transaction(self, *, durable: bool) -> Iterator[sa.Connection]:
+        """A transaction of its own, committed at the end; the caller holds the write lock."""
+        if self._file is None:
+            with self._connected().begin() as connection:
+                yield connection
             return
-        except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > last:
-                raise
-            time.sleep(RETRY_S)
+        if self._writer is None:
+            # Fetching a connection from the pool and giving it back takes as long as an append.
+            self._writer, self._writer_is_durable = self._connected().connect(), False
+        if durable != self._writer_is_durable:
+            self._set_durable(self._writer, durable=durable)
+        try:
+            with self._writer.begin():
+                yield self._writer
+        except Exception as error:
+            if not isinstance(error, sa.exc.IntegrityError):
+                self._drop_writer()
+            raise
+
+    def _set_durable(self, writer: sa.Connection, *, durable: bool) -> None:
+        # NORMAL loses no committed transaction when the process dies, only when the machine does.
+        pragma = f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}"
+        connection = writer.connection.dbapi_connection
+        assert connection is not None
+        cursor = connection.cursor()
+        cursor.execute(pragma)
+        cursor.close()
+        self._writer_is_durable = durable
+
+    def _drop_writer(self) -> None:
+        """A connection that has failed may be in any state; the next write gets another one."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with contextlib.suppress(sa.exc.SQLAlchemyError):
+                writer.invalidate()
+                writer.close()
+
+    def _connected(self) -> sa.Engine:
+        if self._engine is None:
+            raise StoreError("the store is not open")
+        return self._engine
+
+    # --- trouble ----------------------------------------------------------------------------
+
+    def _refuse_while_down(self) -> None:
+        trouble = self._trouble
+        if isinstance(trouble, StoreUnavailableError):
+            raise type(trouble)(trouble.reason)
+
+    def _reraise(self, error: Exception) -> NoReturn:
+        """Raise the error as callers get it; trouble is noted."""
+        found = sorted_error(error, folder=self._file.parent if self._file else None)
+        if isinstance(found, StoreTroubleError):
+            self._noted(found)
+        if found is None or found is error:
+            raise error
+        raise found from error
+
+    def _noted(self, trouble: StoreTroubleError) -> StoreTroubleError:
+        if isinstance(trouble, StoreBusyError):
+            return trouble
+        if self._trouble is None:
+            self._trouble_since = time.monotonic()
+            log.error("store in trouble", kind=type(trouble).__name__, reason=trouble.reason)
+        self._trouble = trouble
+        return trouble
+
+    def _recovered(self) -> None:
+        self._trouble = None
+        seconds = round(time.monotonic() - self._trouble_since, 1)
+        log.warning("store well again", after_s=seconds)
+
+    def _probe(self) -> None:
+        """Do what shows whether the database is well: read, and after trouble write."""
+        version = t.schema_version.c.version
+        try:
+            if self._name_on_server is not None:
+                self._name_on_server.hold()
+            if self._trouble is not None and self._file is not None:
+                self._reconnect()
+            with self._connected().connect() as connection:
+                connection.execute(sa.select(version)).all()
+            if self._trouble is None:
+                return
+            with self._write_lock, self._transaction(durable=True) as connection:
+                connection.execute(sa.update(t.schema_version).values(version=version))
+        except Exception as error:
+            self._reraise(error)
+        self._recovered()
+
+    def _reconnect(self) -> None:
+        """Leave all connections to a file: those that were made while it could not be written to
+        stay read-only for good, and SQLite makes later ones so as long as one of them is open."""
+        with self._write_lock:
+            self._drop_writer()
+            self._connected().dispose()
+
+    # --- opening ----------------------------------------------------------------------------
+
+    def _open(self, first: Write) -> None:
+        try:
+            self._file = file_of(self.url)
+            self._engine = connect(self.url, timeout_s=self._timeout_s)
+            self._prepare()
+            self._own_name()
+            with self._engine.begin() as connection:
+                connection.execute(first.statement, first.rows)
+        except (StateFolderError, StoreError):
+            self._close()
+            raise
+        except (sa.exc.SQLAlchemyError, OSError) as error:
+            self._close()
+            reason = getattr(error, "orig", None) or error
+            raise StoreError(f"cannot open the store {shown_url(self.url)!r}: {reason}") from error
+
+    def _prepare(self) -> None:
+        """Bring the schema up to date, with time enough for it."""
+        engine = self._connected()
+        with engine.connect():
+            pass  # Whether anybody is there is found out in the usual time.
+        if self._file is None and engine.dialect.name == "sqlite":
+            prepare_schema(engine)
+            return
+        long_running = connect(self.url, timeout_s=SCHEMA_TIMEOUT_S)
+        try:
+            prepare_schema(long_running)
+        finally:
+            long_running.dispose()
+
+    def _own_name(self) -> None:
+        if self._worker_id is None:
+            return
+        if self._file is not None:
+            self._owned.enter_context(owned_name(self._file, self._worker_id))
+        elif self._connected().dialect.name == "postgresql":
+            self._name_on_server = NameOnServer(self._connected(), self._worker_id)
+            self._name_on_server.hold()
+            self._owned.callback(self._name_on_server.drop)
+
+    def _close(self) -> None:
+        self._drop_writer()
+        self._owned.close()
+        if self._engine is not None:
+            self._engine.dispose()
+            self._engine = None
 
 
-def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
-    limit = DRIVER_TIMEOUTS.get(url.get_driver_name())
-    # The others take whole seconds.
-    seconds = timeout_s if limit == "timeout" else max(1, round(timeout_s))
-    arguments = {limit: seconds} if limit else {}
-    engine = sa.create_engine(
-        url, pool_pre_ping=True, pool_timeout=timeout_s, connect_args=arguments
-    )
-    if url.get_backend_name() == "postgresql":
-
-        @sa.event.listens_for(engine, "connect")
-        def set_up(connection: Any, _record: object) -> None:
-            cursor = connection.cursor()
-            for name in ("statement_timeout", "lock_timeout"):
-                cursor.execute(f"SET {name} = {round(timeout_s * SERVER_SHARE * 1000)}")
-            cursor.close()
-            connection.commit()
-
-    return engine
-
-
-def file_of(url: str) -> Path | None:
-    """The file of an SQLite database; None for others and for those in memory."""
-    parsed = make_url(url)
-    if parsed.get_backend_name() != "sqlite" or not parsed.database:
-        return None
-    return None if parsed.database == ":memory:" else Path(parsed.database).absolute()
-
-
-def make_private(file: Path) -> None:
-    """Make sure that nobody but its owner can read a database file; made where it is missing.
-
-    SQLite gives its journals the permissions of the file.
-    """
-    os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-    for path in (file, *(file.with_name(file.name + end) for end in ("-wal", "-shm"))):
-        if path.exists() and path.stat().st_mode & 0o077:
-            path.chmod(0o600)
-
-
-def shown_url(url: str) -> str:
-    """The URL without its password."""
-    try:
-        return make_url(url).render_as_string(hide_password=True)
-    except sa.exc.ArgumentError:
-        return "<no SQLAlchemy URL>"
+def _looked_at(work: asyncio.Future[Any]) -> None:
+    """Nobody may be left to be told how it ended."""
+    if not work.cancelled():
+        work.exception()

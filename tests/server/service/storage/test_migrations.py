@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy as sa
 
 from real2sim_server.service.storage import migrations, tables
-from real2sim_server.service.storage.database import connect, keep_write_ahead_journal
+from real2sim_server.service.storage.connection import connect, keep_write_ahead_journal
 from real2sim_server.service.storage.tokens import token_hash
 
 from ..postgres import Postgres

@@ -133,10 +133,10 @@ def test_as_many_pages_are_given_back_at_once_as_asked_for(tmp_path):
 
 async def _free_pages(store) -> int:
     def ask() -> int:
-        with store._connected().connect() as connection:
+        with store.database._connected().connect() as connection:
             return connection.exec_driver_sql("PRAGMA freelist_count").scalar_one()
 
-    return await store._run(ask)
+    return await store.database.on_thread(ask)
 
 
 @pytest.mark.slow
