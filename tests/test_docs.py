@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from real2sim_proto import HTTP_STATUS, RETRYABLE, ErrorCode
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDERS = (REPOSITORY, REPOSITORY / "docs", REPOSITORY / "docs/site")
 PAGES = sorted(page for folder in FOLDERS for page in folder.glob("*.md"))
@@ -38,6 +40,13 @@ def test_the_newest_release_in_the_changelog_is_the_version() -> None:
         version = tomllib.load(file)["project"]["version"]
     heads = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text("utf-8"), re.M)
     assert heads[:2] == ["Unreleased", version]
+
+
+def test_the_rest_page_has_every_error_code_with_its_status() -> None:
+    page = (REPOSITORY / "docs/rest.md").read_text("utf-8")
+    rows = re.findall(r"^\| `([A-Z_]+)` \| (\d+) \| .+ \| (yes)? ?\|$", page, re.M)
+    told = [(code, int(status), bool(again)) for code, status, again in rows]
+    assert told == [(c.value, HTTP_STATUS[c], c in RETRYABLE) for c in ErrorCode]
 
 
 @pytest.mark.slow

@@ -10,15 +10,25 @@ from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).parent
+REPOSITORY = FOLDER.parents[1]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 def check_target(name: str, config, *, drive: Path | None = None, inputs: int = 2000) -> None:
     """Give a reader ``inputs`` damaged inputs, or as many as ``REAL2SIM_FUZZ_INPUTS`` says."""
-    given = os.environ.get("REAL2SIM_FUZZ_CORPUS")
-    corpus = Path(given) if given else config.cache.mkdir("fuzz")
+    corpus = corpus_folder(config)
     options = ["--drive", drive] if drive is not None else []
     _check(_run("run_target.py", name, "--corpus", corpus, *options, inputs=_inputs(inputs)))
+
+
+def corpus_folder(config) -> Path:
+    """Where inputs of interest are kept from run to run."""
+    if given := os.environ.get("REAL2SIM_FUZZ_CORPUS"):
+        return Path(given)
+    cache = getattr(config, "cache", None)  # None with ``-p no:cacheprovider``.
+    folder = Path(cache.mkdir("fuzz")) if cache is not None else REPOSITORY / "out/fuzz"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def check_service(*names: str, inputs: int) -> None:

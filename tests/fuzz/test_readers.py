@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -29,6 +30,13 @@ NAMES = (
     "packed_zip", "recording", "recording_zip", "mcap", "pickle", "checkpoint", "checkpoint_zip",
     "old_checkpoint", "image", "sweep", "protobuf", "tfrecord", "parquet", "feather", "message",
 )  # fmt: skip
+
+
+def test_without_a_cache_of_pytest_there_is_a_place_for_the_corpus(monkeypatch, tmp_path):
+    monkeypatch.delenv("REAL2SIM_FUZZ_CORPUS", raising=False)
+    monkeypatch.setattr(check, "REPOSITORY", tmp_path)
+    assert check.corpus_folder(SimpleNamespace()) == tmp_path / "out/fuzz"
+    assert (tmp_path / "out/fuzz").is_dir()
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
 Its parts, lowest first; each imports only those before it, and no file is part of a circle:
 
-- ``storage``: a ``Database`` that executes, a ``Store`` of what is asked of it: scenarios, sessions,
-  jobs, stored answers; who owns them.
+- ``storage``: a ``Database`` that executes, a ``Store`` of what is asked of it: scenarios,
+  sessions, jobs, stored answers; who owns them.
 - ``token_file``, ``accounts``: named tokens, and what their holders take.
 - ``preflight``: what is refused before anything heavy is loaded.
 - ``first_run``: a second process that compiles, begun before anything heavy is loaded.
