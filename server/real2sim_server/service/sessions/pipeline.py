@@ -355,15 +355,20 @@ class StepPipeline:
         return RenderedObservation(world, images, "view", members, timer)
 
     async def first_render(self, scene: Scene, state: ScenarioState) -> None:
-        """Render a scene from its first camera, to have everything compiled and in memory."""
+        """Render a scene from its first camera, to have everything compiled and in memory.
+
+        The picture is the worker's own and small: the limit of pixels is for those asked for.
+        """
+        camera = scene.rig[scene.rig.names[0]].resized(WARM_UP_WIDTH)
         request = RenderRequest(
             scene=scene,
             instances=instances_at(scene, state, scene.start_us),
             T_world_vehicle=scene.ego.transform(scene.start_us),
             t_us=scene.start_us,
-            sensors=(SensorSpec(camera=scene.rig.names[0], width=WARM_UP_WIDTH),),
+            sensors=(SensorSpec(camera=camera.name, width=WARM_UP_WIDTH),),
         )
-        await self._renderer.render(request, stream="warm-up")
+        draw = partial(self._renderer.render_images, between=self._engine.give_way)
+        await self._engine.call(draw, request, [camera], label="warm-up")
 
     # --- inside ---------------------------------------------------------------------------------
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -34,6 +35,16 @@ def test_welcome_tells_what_there_is(site, join):
     assert {o.object_id for o in welcome.objects} == {"car_red", "car_blue", "post"}
     assert (welcome.start_us, welcome.end_us, welcome.step) == (0, 2_000_000, None)
     assert welcome.versions["scene_hash"] == site.session(info).row.scene_hash
+
+
+def test_a_worker_for_small_pictures_drives_as_well(site, join, monkeypatch):
+    sessions = site.worker.sessions
+    for checks in (sessions.pipeline, site.worker.renderer):
+        monkeypatch.setattr(checks, "_max_pixels", 1000)
+    monkeypatch.setattr(sessions, "_warm", WeakSet())
+    planner = join(site.create())
+    assert planner.reset(sensors=[CAMERA | {"width": 16}])["step"] == 0
+    assert planner.reset(sensors=[CAMERA])["code"] == "INVALID_REQUEST"
 
 
 def test_the_first_observation_shows_step_0(planner):
