@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+from collections.abc import Callable
 
 import pytest
 
 from real2sim_server.settings import Settings, unknown_variables
+
+from ..worker_processes import Finished, run_real2sim
 
 LOST = (
     "import sys\n"
@@ -17,19 +17,21 @@ LOST = (
     "renderer.warm_up = lose\n"
 )
 WITHOUT_CUDA = "import torch; torch.cuda.is_available = lambda: False\n"
-MAIN = "import sys; from real2sim.cli import main; sys.argv[0] = 'real2sim'; main()"
 
 
-def serve(*arguments: str, before: str = "", **variables: str) -> subprocess.CompletedProcess[str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("REAL2SIM_")}
-    return subprocess.run(
-        [sys.executable, "-c", before + MAIN, "serve", *arguments],
-        env=kept | {f"REAL2SIM_{name}": value for name, value in variables.items()},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+@pytest.fixture
+def serve(tmp_path) -> Callable[..., Finished]:
+    """Runs ``real2sim serve`` to its end."""
+
+    def run(*arguments: str, before: str = "", **variables: str) -> Finished:
+        return run_real2sim(
+            ["serve", *arguments],
+            log_file=tmp_path / "log",
+            environment={f"REAL2SIM_{name}": value for name, value in variables.items()},
+            before=before,
+        )
+
+    return run
 
 
 @pytest.fixture
@@ -43,42 +45,42 @@ def folders(tmp_path) -> dict[str, str]:
     }
 
 
-def test_a_lost_device_ends_the_command_with_an_error_code(folders):
+def test_a_lost_device_ends_the_command_with_an_error_code(serve, folders):
     done = serve(before=LOST, **folders)
-    assert done.returncode == 1, done.stderr[-2000:]
-    assert "device lost" in done.stderr
+    assert done.exit_code == 1, done.printed
+    assert "device lost" in done.printed
 
 
-def test_a_worker_that_is_to_draw_on_cuda_and_cannot_is_refused_in_a_sentence(folders):
+def test_a_worker_that_is_to_draw_on_cuda_and_cannot_is_refused_in_a_sentence(serve, folders):
     done = serve(**(folders | {"BACKEND": "cuda"}), before=WITHOUT_CUDA)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert "backend 'cuda' is not usable" in done.stderr
-    assert "pip install" in done.stderr or "driver" in done.stderr
+    assert done.exit_code == 1
+    assert "Traceback" not in done.printed
+    assert "backend 'cuda' is not usable" in done.printed
+    assert "pip install" in done.printed or "driver" in done.printed
 
 
-def test_a_store_that_cannot_be_opened_is_told_in_a_sentence(folders):
+def test_a_store_that_cannot_be_opened_is_told_in_a_sentence(serve, folders):
     url = "postgresql+pg8000://nobody:hunter2@127.0.0.1:9/none"
     done = serve(STORE_URL=url, LOG_FORMAT="json", **folders)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert "hunter2" not in done.stderr
-    *_, last = done.stderr.strip().splitlines()
+    assert done.exit_code == 1
+    assert "Traceback" not in done.printed
+    assert "hunter2" not in done.printed
+    *_, last = done.printed.strip().splitlines()
     assert last.startswith("error: cannot open the store")
-    assert len(done.stderr) < 1500
+    assert len(done.printed) < 1500
 
 
-def test_a_short_token_is_refused_without_showing_it(folders):
+def test_a_short_token_is_refused_without_showing_it(serve, folders):
     done = serve(TOKEN="hunter2", **folders)
-    assert done.returncode == 1
-    assert "setting token" in done.stderr
-    assert "hunter2" not in done.stderr
+    assert done.exit_code == 1
+    assert "setting token" in done.printed
+    assert "hunter2" not in done.printed
 
 
-def test_a_misspelt_variable_is_refused_with_the_setting_that_is_meant(folders):
+def test_a_misspelt_variable_is_refused_with_the_setting_that_is_meant(serve, folders):
     done = serve(TOKEN_FLIE="x", **folders)
-    assert done.returncode == 1
-    assert "REAL2SIM_TOKEN_FLIE is no setting; do you mean REAL2SIM_TOKEN_FILE?" in done.stderr
+    assert done.exit_code == 1
+    assert "REAL2SIM_TOKEN_FLIE is no setting; do you mean REAL2SIM_TOKEN_FILE?" in done.printed
 
 
 def test_other_unknown_variables_are_not_in_the_way():
@@ -96,12 +98,12 @@ def test_a_token_is_read_from_a_file(tmp_path, monkeypatch):
         Settings(token="battery staple")
 
 
-def test_a_token_file_that_is_not_there_is_told(folders, tmp_path):
+def test_a_token_file_that_is_not_there_is_told(serve, folders, tmp_path):
     done = serve("--token-file", str(tmp_path / "none"), **folders)
-    assert done.returncode == 1
-    assert "the token cannot be read" in done.stderr
+    assert done.exit_code == 1
+    assert "the token cannot be read" in done.printed
 
 
-def test_a_token_as_an_argument_is_warned_of(folders):
+def test_a_token_as_an_argument_is_warned_of(serve, folders):
     done = serve("--token", "correct horse", before=LOST, **folders)
-    assert "--token shows in the process list" in done.stderr
+    assert "--token shows in the process list" in done.printed

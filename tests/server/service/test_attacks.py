@@ -13,8 +13,6 @@ import re
 import resource
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -35,6 +33,8 @@ from real2sim_server.service.routes import view as view_route
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.service.sessions import handshake
 from real2sim_server.settings import Settings
+
+from ..worker_processes import printed_url, start_real2sim
 
 TOKEN = "a long enough secret"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -269,44 +269,32 @@ def allow_descriptors(count: int) -> None:
 
 
 @contextlib.contextmanager
-def worker_process(
-    folder: Path, *, descriptors: int, **settings: str
-) -> Iterator[tuple[str, list[str]]]:
+def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, list[str]]]:
     """A worker of its own; its address, and after the block the lines of its log."""
-    code = (
-        "import sys; from real2sim_server.settings import Settings; "
-        "from real2sim_server.service.serve import run; sys.exit(run(Settings()))"
+    limit = f"({descriptors}, {descriptors})"
+    log_file = folder / "worker.log"
+    process = start_real2sim(
+        ["serve", "--port", "0", "--data", str(folder)],
+        log_file=log_file,
+        environment={
+            "REAL2SIM_BACKEND": "cpu",
+            "REAL2SIM_LOG_FORMAT": "json",
+            "REAL2SIM_DRAIN_SECONDS": "0",
+        },
+        before=f"import resource; resource.setrlimit(resource.RLIMIT_NOFILE, {limit})",
     )
-    limit = f'ulimit -n {descriptors}; exec "$0" -c "$1"'
-    environment = {
-        "REAL2SIM_PORT": "0",
-        "REAL2SIM_DATA_DIR": str(folder),
-        "REAL2SIM_BACKEND": "cpu",
-        "REAL2SIM_LOG_FORMAT": "json",
-        "REAL2SIM_DRAIN_SECONDS": "0",
-    }
-    process = subprocess.Popen(
-        ["sh", "-c", limit, sys.executable, code],
-        env=os.environ | environment | settings,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    url = printed_url(process, log_file)
+    ended = time.monotonic() + 120
+    while httpx2.get(f"{url}/readyz", timeout=120).status_code != 200:
+        assert time.monotonic() < ended
+        time.sleep(0.1)
     lines: list[str] = []
-    with process:
-        first = process.stderr.readline()
-        url = re.search(r"http://127\.0\.0\.1:\d+", first).group()
-        reading = threading.Thread(target=lambda: lines.extend(process.stderr))
-        reading.start()
-        ended = time.monotonic() + 120
-        while httpx2.get(f"{url}/readyz", timeout=120).status_code != 200:
-            assert time.monotonic() < ended
-            time.sleep(0.1)
-        try:
-            yield url, lines
-        finally:
-            process.send_signal(signal.SIGTERM)
-            process.wait(60)
-            reading.join()
+    try:
+        yield url, lines
+    finally:
+        os.kill(process.pid, signal.SIGTERM)
+        process.join(60)
+        lines.extend(log_file.read_text().splitlines())
 
 
 def create_session(site: RunningWorker) -> dict[str, Any]:

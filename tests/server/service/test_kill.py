@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import httpx2
 import pytest
 
-from real2sim_server.demo.worker import worker_process
+from ..worker_processes import KillableWorker
 
 pytestmark = pytest.mark.network
 
@@ -19,18 +19,16 @@ MOST_BETWEEN = 6
 @pytest.fixture
 def start(scenes_dir, tmp_path):
     """Starts workers in processes of their own on the same store; the next kills the one before."""
+    folders = {"scenes": scenes_dir, "data": tmp_path / "data"}
+    worker = KillableWorker(**folders, log_file=tmp_path / "worker.log")
     with ExitStack() as stack:
-        runs = []
+        stack.callback(worker.kill)
 
         def another() -> httpx2.Client:
-            if runs:
-                runs[-1].process.kill()
-                runs[-1].process.wait()
-            log_file = tmp_path / f"worker_{len(runs)}.log"
-            worker = worker_process(scenes=scenes_dir, data=tmp_path / "data", log_file=log_file)
-            runs.append(stack.enter_context(worker))
-            runs[-1].wait_listening(60)
-            client = httpx2.Client(base_url=runs[-1].url, trust_env=False, timeout=60)
+            worker.kill()
+            worker.start()
+            worker.wait_listening()
+            client = httpx2.Client(base_url=worker.url, trust_env=False, timeout=60)
             return stack.enter_context(client)
 
         yield another

@@ -12,7 +12,8 @@ import pytest
 import real2sim
 from real2sim.planners.idm import Idm
 from real2sim_server.demo.street import unpack_street
-from real2sim_server.demo.worker import WorkerProcess, worker_process
+
+from ..worker_processes import KillableWorker, killable_worker
 
 pytestmark = pytest.mark.network
 
@@ -34,32 +35,31 @@ DRIVE = {
 class Workers:
     """One worker after another, on the demo's street and one store."""
 
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self._folder, self._stack = folder, stack
-        self._runs: list[WorkerProcess] = []
-        unpack_street(folder / "scenes", "street")
-        self.client = self._another()
+    def __init__(self, worker: KillableWorker, stack: ExitStack) -> None:
+        self._worker, self._stack = worker, stack
+        self.client = self._connected()
 
     def kill(self) -> None:
         """End the worker as it is; ``client`` is of the next one."""
-        self._runs[-1].process.kill()
-        self._runs[-1].process.wait()
-        self.client = self._another()
+        self._worker.kill_and_start()
+        self.client = self._connected()
 
-    def _another(self) -> real2sim.Client:
-        folder = self._folder
-        log_file = folder / f"worker_{len(self._runs)}.log"
-        worker = worker_process(scenes=folder / "scenes", data=folder / "data", log_file=log_file)
-        self._runs.append(self._stack.enter_context(worker))
-        client = self._stack.enter_context(real2sim.connect(self._runs[-1].url, timeout=120))
+    def _connected(self) -> real2sim.Client:
+        self._worker.wait_listening()
+        client = self._stack.enter_context(real2sim.connect(self._worker.url, timeout=120))
         client.wait_ready()
         return client
 
 
 @pytest.fixture
 def workers(tmp_path: Path) -> Iterator[Workers]:
-    with ExitStack() as stack:
-        yield Workers(tmp_path, stack)
+    scenes, data = tmp_path / "scenes", tmp_path / "data"
+    unpack_street(scenes, "street")
+    with (
+        killable_worker(scenes=scenes, data=data, log_file=tmp_path / "log") as worker,
+        ExitStack() as stack,
+    ):
+        yield Workers(worker, stack)
 
 
 def hashed(obs: real2sim.Observation) -> str:

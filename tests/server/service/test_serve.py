@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -27,6 +26,8 @@ from real2sim_server.service.preflight import (
     url_of,
 )
 from real2sim_server.service.serve import DrainingServer, run, running_worker, server_config
+
+from ..worker_processes import printed_url, start_real2sim
 
 pytestmark = pytest.mark.network
 
@@ -186,30 +187,24 @@ def test_a_render_of_a_client_that_left_is_not_drawn(make_settings):
     assert depth == 0
 
 
-def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(make_settings):
+def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(
+    make_settings, tmp_path
+):
     settings = make_settings(log_level="info")
     environment = {
         f"REAL2SIM_{name.upper()}": str(value)
         for name, value in settings.model_dump(exclude_none=True).items()
     }
-    code = (
-        "import sys; from real2sim_server.settings import Settings; "
-        "from real2sim_server.service.serve import run; sys.exit(run(Settings()))"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        env=os.environ | environment,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        first, second = process.stderr.readline(), process.stderr.readline()
-        url = re.search(r"http://127\.0\.0\.1:\d+", first).group()
-        answer = httpx2.get(f"{url}/v1/server", timeout=30)
-        process.send_signal(signal.SIGTERM)
-        lines = process.stderr.read().splitlines()
-    assert process.returncode == 0
-    assert second == f"Studio: {url}/ui/\n"
+    log_file = tmp_path / "log"
+    process = start_real2sim(["serve"], log_file=log_file, environment=environment)
+    url = printed_url(process, log_file)
+    answer = httpx2.get(f"{url}/v1/server", timeout=30)
+    os.kill(process.pid, signal.SIGTERM)
+    process.join(60)
+    first, second, *lines = log_file.read_text().splitlines()
+    assert process.exitcode == 0
+    assert url in first
+    assert second == f"Studio: {url}/ui/"
     requests = [entry for line in lines if (entry := json.loads(line))["event"] == "request"]
     assert [(r["path"], r["status"]) for r in requests] == [("/v1/server", 200)]
     assert requests[0]["client"] == "127.0.0.1"

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 import random
-import signal
 import socket
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import real2sim
 from real2sim_server.scene.io import save_scene
+
+from ...worker_processes import KillableWorker, killable_worker
 
 pytestmark = pytest.mark.network
 
@@ -146,46 +141,18 @@ def test_an_unknown_snapshot_is_refused(site):
 # --- a worker that is killed ------------------------------------------------------------------
 
 
-class Killable:
-    """A worker in a process of its own, that can be killed and started again."""
-
-    def __init__(self, root: Path) -> None:
-        with contextlib.closing(socket.socket()) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
-        self.root, self.process = root, None
-        self.url = f"http://127.0.0.1:{self.port}"
-
-    def start(self) -> None:
-        command = [sys.executable, "-m", "real2sim", "serve", "--port", str(self.port)]
-        command += ["--scenes", str(self.root / "scenes"), "--data", str(self.root / "data")]
-        environment = os.environ | {"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"}
-        with (self.root / "worker.log").open("ab") as log:
-            self.process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
-
-    def kill(self) -> None:
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait(timeout=30)
-
-    def kill_and_start(self, delay: float) -> None:
-        time.sleep(delay)
-        self.kill()
-        self.start()
-
-
 @pytest.fixture(scope="module")
-def killable(tmp_path_factory, tiny_scene) -> Iterator[Killable]:
+def killable(tmp_path_factory, tiny_scene) -> Iterator[KillableWorker]:
     root = tmp_path_factory.mktemp("killable")
     save_scene(tiny_scene, root / "scenes" / "tiny.r2s")
-    worker = Killable(root)
-    worker.start()
-    with real2sim.connect(worker.url) as client:
-        client.wait_ready(120)
-    yield worker
-    worker.kill()
+    folders = {"scenes": root / "scenes", "data": root / "data"}
+    with killable_worker(**folders, log_file=root / "worker.log") as worker:
+        yield worker
 
 
-def drive(worker: Killable, *, kill_at: tuple[int, ...] = (), delay: float = 0.0) -> list[str]:
+def drive(
+    worker: KillableWorker, *, kill_at: tuple[int, ...] = (), delay: float = 0.0
+) -> list[str]:
     """Hashes of all observations of an episode with an edit in it.
 
     Kills come ``delay`` seconds after the episode has reached a step, whatever it does then.
