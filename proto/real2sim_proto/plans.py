@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import operator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -30,7 +30,7 @@ def check_times(times_us: list[int], poses: int) -> None:
     """Raises ValueError unless there is one time for each pose and they increase."""
     if len(times_us) != poses:
         raise ValueError(f"{len(times_us)} times for {poses} poses")
-    if any(b <= a for a, b in itertools.pairwise(times_us)):
+    if any(map(operator.ge, times_us, times_us[1:])):
         raise ValueError("times_us must increase strictly")
 
 

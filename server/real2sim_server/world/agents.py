@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,15 @@ def rows_of(agents: Agents) -> dict[str, int]:
 def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
     """The row in ``before`` of each object of ``after``, [K] int64; -1 where it was not there."""
     if before.objects is after.objects:
-        return np.arange(len(after.objects))
+        return _all_rows(len(after.objects))
     rows = rows_of(before)
     return np.array([rows.get(o.object_id, -1) for o in after.objects], np.int64)
+
+
+@lru_cache(maxsize=64)
+def _all_rows(count: int) -> NDArray[np.int64]:
+    """Shared by all who ask: nobody writes into it."""
+    return np.arange(count)
 
 
 def agent_fields(agents: Agents) -> list[dict[str, Any]]:

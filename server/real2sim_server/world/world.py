@@ -44,6 +44,7 @@ from .episode_route import EpisodeRoute
 from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
+from .evolve import evolved
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
 from .placement import placed
@@ -255,7 +256,8 @@ class World:
             start, plan, events, contacts, seam = self._pending
             self._pending = None
             contacts = self._overlap_contacts(start) if contacts is None else contacts
-            self._contacts = replace(self._contacts, touching=contacts.touching)
+            if contacts.touching != self._contacts.touching:
+                self._contacts = evolved(self._contacts, touching=contacts.touching)
             self.instant = self._instant(contacts, plan, seam)
             self.accumulator = scoring.update_accumulator(
                 self.accumulator, self.instant, self._context

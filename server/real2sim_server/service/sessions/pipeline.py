@@ -32,6 +32,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
+from prometheus_client import Histogram
+
 from real2sim_proto import ErrorCode
 from real2sim_proto.codec import DEFAULT_MAX_BYTES
 from real2sim_proto.episode import SensorSpec
@@ -146,6 +148,7 @@ class StepPipeline:
         self._renderer = renderer
         self._metrics = metrics
         self._max_pixels = max_pixels
+        self._stages: dict[str, Histogram] = {}
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
         self._steps: GatheredCalls[Transition, EncodedObservation] = GatheredCalls(
             self._compute_together, self._worlds, on_result=self.send
@@ -424,7 +427,9 @@ class StepPipeline:
 
     def _count(self, observation: EncodedObservation) -> None:
         for stage, ms in observation.timing_ms.items():
-            self._metrics.stages.labels(stage).observe(ms / 1e3)
+            if (found := self._stages.get(stage)) is None:
+                found = self._stages[stage] = self._metrics.stages.labels(stage)
+            found.observe(ms / 1e3)
         for frame in observation.frames:
             self._metrics.frames.labels("drive", frame.codec).inc()
 

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar
+from typing import Any, Literal, NoReturn, TypeVar, cast
 
 import sqlalchemy as sa
 import structlog
@@ -56,10 +56,21 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Write:
-    """A statement that writes. Rows beside it, not in it, so that it is compiled only once."""
+    """A statement that writes. Rows beside it, not in it, so that it is compiled only once.
 
-    statement: sa.Executable
-    rows: list[dict[str, Any]] | None = None
+    Attributes:
+        statement: as text it goes to the driver as it is, with tuples as rows.
+        rows: that it is made with, once for each.
+    """
+
+    statement: sa.Executable | str
+    rows: list[dict[str, Any]] | list[tuple[Any, ...]] | None = None
+
+    def made_by(self, connection: sa.Connection) -> sa.CursorResult[Any]:
+        """What comes of it."""
+        if isinstance(self.statement, str):
+            return connection.exec_driver_sql(self.statement, cast("Any", self.rows))
+        return connection.execute(self.statement, cast("Any", self.rows))
 
 
 class Database:
@@ -125,6 +136,11 @@ class Database:
         """What is wrong with the database; None while it is well."""
         return self._trouble
 
+    @property
+    def is_file(self) -> bool:
+        """Whether it is a file of SQLite's."""
+        return self._file is not None
+
     async def watch(self) -> None:
         """Look after the database for ever: notice trouble, and its end."""
         while True:
@@ -177,7 +193,7 @@ class Database:
             raise self._noted(StoreUnavailableError("the write before this one has not ended"))
         try:
             with self._timed("write"), self._transaction(durable=durable) as connection:
-                counts = [connection.execute(c.statement, c.rows).rowcount for c in changes]
+                counts = [c.made_by(connection).rowcount for c in changes]
         except Exception as error:
             self._reraise(error)
         finally:
@@ -366,7 +382,7 @@ class Database:
             self._prepare()
             self._own_name()
             with self._engine.begin() as connection:
-                connection.execute(first.statement, first.rows)
+                first.made_by(connection)
         except (StateFolderError, StoreError):
             self._close()
             raise

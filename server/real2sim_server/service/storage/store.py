@@ -278,10 +278,9 @@ class Store:
         reply: StoredReply | None = None,
     ) -> None:
         """Like :meth:`append_session_entries`, on the calling thread; never on the event loop."""
-        rows = [{"session_id": session_id} | vars(entry) for entry in entries]
-        if not rows:
+        if not entries:
             return
-        changes = [_insert_rows(t.session_log, *rows), *_reply_writes(reply)]
+        changes = [self._append([(session_id, entries)]), *_reply_writes(reply)]
         if instead:
             changes.insert(0, _log_end(session_id, entries[0].seq))
         # A stored answer is a promise beyond the session.
@@ -293,9 +292,15 @@ class Store:
         Args:
             logs: ids of sessions, and what their logs get.
         """
+        if any(entries for _, entries in logs):
+            self.database.execute([self._append(logs)], promised=False)
+
+    def _append(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> Write:
+        if self.database.is_file:
+            values = [(session, *vars(entry).values()) for session, log in logs for entry in log]
+            return Write(_APPEND, values)
         rows = [{"session_id": session} | vars(entry) for session, log in logs for entry in log]
-        if rows:
-            self.database.execute([_insert_rows(t.session_log, *rows)], promised=False)
+        return _insert_rows(t.session_log, *rows)
 
     async def withdraw(
         self, session_id: str, *, from_seq: int, replies: Sequence[str] = ()
@@ -391,6 +396,14 @@ def _log_row(
 
 def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
     return Write(_insert(table), [dict(row) for row in rows])
+
+
+_APPEND = (
+    "INSERT INTO session_log (session_id, seq, kind, step, payload, created_us) "
+    "VALUES (?, ?, ?, ?, ?, ?)"
+)
+"""Of an entry, for SQLite, in the order of :class:`SessionEntry`. Every step of a session makes
+one: to have the statement put together by SQLAlchemy takes as long as the append."""
 
 
 @cache

@@ -142,10 +142,10 @@ class _Sweep:
             return [], []
         if self._slack > 0.0:
             near, _ = self._first(self._rough, self._slack, COARSE)
-            if not np.isfinite(near).any():
+            if min(near.tolist()) == math.inf:
                 return [], []
         first, touching = self._first(self.way, 0.0, TOLERANCE)
-        if not np.isfinite(first).any():
+        if min(first.tolist()) == math.inf:
             return [], []
         names = [objects[k].object_id for k in np.flatnonzero(touching).tolist()]
         begun = [
@@ -214,11 +214,11 @@ class _Sweep:
 
     def _way(self, motions: list[Motion]) -> Float:
         """Rows for the kernels, evenly over the step."""
-        rows, yaw = [], motions[0].yaw
+        rows, yaw, axle, last = [], motions[0].yaw, self._axle, len(motions) - 1
         for k, motion in enumerate(motions):
-            fraction = k / (len(motions) - 1)
+            fraction = k / last
             yaw += math.remainder(motion.yaw - yaw, math.tau)
-            x, y = motion.x + self._axle * math.cos(yaw), motion.y + self._axle * math.sin(yaw)
+            x, y = motion.x + axle * math.cos(yaw), motion.y + axle * math.sin(yaw)
             low = self._low + (self._low_after - self._low) * fraction
             rows.append((fraction, x, y, yaw, low))
         return np.array(rows)
@@ -267,7 +267,7 @@ class _Sweep:
 
 def _height(T_world_vehicle: Float, ahead: float) -> float:
     """Of the vehicle's floor [m], so far ahead of the rear axle."""
-    return float(T_world_vehicle[2, 3]) + ahead * float(T_world_vehicle[2, 0])
+    return T_world_vehicle.item(2, 3) + ahead * T_world_vehicle.item(2, 0)
 
 
 def _deviation(start: StepStart, motion: Motion, ego: EgoSpec, size: Size) -> float:

@@ -45,9 +45,9 @@ class PlannedTrajectory:
 
     def after(self, t_us: int) -> PlannedTrajectory:
         """What of it is still to come: its end, at once, where all of it is over."""
-        over = int(np.searchsorted(self.times_us, t_us, side="right"))
-        if over == 0:
+        if t_us < self.times_us.item(0):
             return self
+        over = int(np.searchsorted(self.times_us, t_us, side="right"))
         if over == len(self.times_us):
             return PlannedTrajectory(np.array([t_us + 1]), self.poses[-1:])
         return PlannedTrajectory(self.times_us[over:], self.poses[over:])

@@ -44,12 +44,12 @@ def reset_payload(spec: ResetSpec) -> bytes:
 
 def plan_payload(plan: Plan | None) -> bytes:
     """Of a plan; None goes on with the one before. Equal plans have equal bytes."""
-    return encode({"plan": None if plan is None else plan.model_dump()})
+    return encode({"plan": None if plan is None else vars(plan)})
 
 
 def action_payload(plan: Plan | None, *, latency_us: int = 0, missed: bool = False) -> bytes:
     """Of a step: its plan, how long that took to make, whether it missed its deadline."""
-    fields: dict[str, Any] = {"plan": None if plan is None else plan.model_dump()}
+    fields: dict[str, Any] = {"plan": None if plan is None else vars(plan)}
     if latency_us:
         fields["latency_us"] = latency_us
     if missed:

@@ -7,9 +7,10 @@ places can hop sideways, jump or spin without either, so its way is compared wit
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 from .instant import EgoSample, Instant, ScoringContext
+from .window import Window
 
 MAX_ACCELERATION, MAX_CURVATURE = 10.4, 0.3
 """Waymax, kinematic infeasibility, for steps of 0.1 s [m/s^2], [1/m]."""
@@ -34,7 +35,10 @@ SETTLED = 0.2
 """Speed across below which a vehicle that was pushed rolls again [m/s]."""
 
 
-@dataclass(frozen=True)
+Samples = Window[tuple[EgoSample, float]]
+
+
+@dataclass(frozen=True, eq=False)
 class Feasibility:
     """The motion of the ego so far.
 
@@ -45,7 +49,7 @@ class Feasibility:
         first: number of the first of them; None without.
     """
 
-    samples: tuple[tuple[EgoSample, float], ...] = ()
+    samples: Samples = field(default_factory=Window)
     pushed: bool = False
     steps: int = 0
     first: int | None = None
@@ -53,11 +57,11 @@ class Feasibility:
     def updated(self, instant: Instant, way: float, context: ScoringContext) -> Feasibility:
         """After one more clock step; ``way``: driven so far [m]."""
         ego = instant.ego
-        pushed = any(c.impulse != (0.0, 0.0) for c in instant.contacts)
+        pushed = bool(instant.contacts) and any(c.impulse != (0.0, 0.0) for c in instant.contacts)
         if pushed or (self.pushed and not _settled(ego)):
-            return replace(self, samples=((ego, way),), pushed=True)
+            return Feasibility(Window((ego, way)), True, self.steps, self.first)
         kept = max(round(SPIN_S / context.dt), 1) + 1
-        samples = (*self.samples, (ego, way))[-kept:]
+        samples = self.samples.pushed((ego, way), kept)
         if _is_feasible(samples, context.dt):
             return Feasibility(samples, False, self.steps, self.first)
         first = instant.step if self.first is None else self.first
@@ -69,17 +73,17 @@ def _settled(ego: EgoSample) -> bool:
     return abs(ego.lateral_speed) < SETTLED and rolling
 
 
-def _is_feasible(samples: tuple[tuple[EgoSample, float], ...], dt: float) -> bool:
+def _is_feasible(samples: Samples, dt: float) -> bool:
     stride = max(round(STEP_S / dt), 1)
-    now, way = samples[-1]
+    now, way = samples.newest()
     if len(samples) > stride:
-        before, _ = samples[-1 - stride]
+        before, _ = samples.newest(stride)
         if not _follows(before, now, stride * dt):
             return False
     turns = max(round(SPIN_S / dt), 1)
     if len(samples) <= turns:
         return True
-    before, driven = samples[-1 - turns]
+    before, driven = samples.newest(turns)
     return abs(now.yaw - before.yaw) <= MAX_CURVATURE * (way - driven) + SPIN_NOISE
 
 

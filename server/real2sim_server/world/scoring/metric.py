@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from .accumulator import MetricAccumulator
 from .blind_spots import Aspect, cannot_see
 from .instant import Instant, ScoringContext
+
+NO_TERMS: Mapping[str, float] = MappingProxyType({})
 
 
 class Score(NamedTuple):
@@ -35,8 +38,7 @@ class Score(NamedTuple):
         }
 
 
-@dataclass(frozen=True)
-class MetricValue:
+class MetricValue(NamedTuple):
     """What a metric is worth.
 
     Attributes:
@@ -47,7 +49,7 @@ class MetricValue:
     """
 
     value: float | None
-    terms: dict[str, float] = field(default_factory=dict)
+    terms: Mapping[str, float] = NO_TERMS
     assumed: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
 
@@ -84,7 +86,13 @@ class Metric:
         found = self.formula(accumulator, context)
         blind = "" if self.sees is None else cannot_see(self.sees, accumulator, context)
         return Score(
-            self.name, self.version, found.value, found.terms, found.assumed, found.missing, blind
+            self.name,
+            self.version,
+            found.value,
+            dict(found.terms),
+            found.assumed,
+            found.missing,
+            blind,
         )
 
 

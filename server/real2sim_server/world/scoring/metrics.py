@@ -40,6 +40,8 @@ def no_collision(accumulator: MetricAccumulator) -> float:
 def nuplan_no_collision(accumulator: MetricAccumulator) -> float:
     """NC of nuPlan: product of max(0, 1 - n/(m + 1)) with m = 0 for road users and vehicles, 1
     for objects."""
+    if not accumulator.at_fault:
+        return 1.0
     allowed = {"vru": 0, "vehicle": 0, "object": 1}
     return math.prod(
         max(0.0, 1 - accumulator.at_fault.get(kind, 0) / (m + 1)) for kind, m in allowed.items()
@@ -138,8 +140,8 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 4 * terms["SL"] + 2 * terms["C"]
     makes_progress = float(terms["EP"] >= 0.2)
-    multipliers = (terms[name] for name in ("feasible", "NC", "DAC", "DDC"))
-    value = math.prod(multipliers) * makes_progress * weighted / 16
+    possible = terms["feasible"] * terms["NC"] * terms["DAC"] * terms["DDC"]
+    value = possible * makes_progress * weighted / 16
     assumed = (NO_MAP,) if limit is not None else ("SL: no speed limit known", NO_MAP)
     if expert < LEAST_ROUTE:
         assumed = (*assumed, *assumed_progress(accumulator, context))

@@ -20,7 +20,7 @@ def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
     """
     assert accumulator.ego is not None
     position, found = accumulator.impact_position, accumulator.feasibility
-    samples = tuple((_moved(ego, seam), way) for ego, way in found.samples)
+    samples = found.samples.mapped(lambda sample: (_moved(sample[0], seam), sample[1]))
     return replace(
         accumulator,
         ego=_moved(accumulator.ego, seam),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from ..ego.reference import PlannedTrajectory
+from ..evolve import evolved
 from .accumulator import MetricAccumulator
 from .comfort import ComfortAccumulator, plans_agree
 from .comfort_kernels import windowed_sum
@@ -17,6 +17,7 @@ from .hazard import time_to_collision
 from .instant import ContactRecord, EgoSample, Instant, ScoringContext
 from .metric import METRICS
 from .put_back import put_back
+from .window import Window
 
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
 ONCOMING_WINDOW_S = 1.0
@@ -52,7 +53,7 @@ def _begun(
         states={m.name: m.begin(instant, context) for m in METRICS.values() if m.begin},
         comfort=ComfortAccumulator().updated(ego.speed, ego.yaw, context.dt),
         comfort_with_history=with_history.updated(ego.speed, ego.yaw, context.dt),
-        feasibility=Feasibility(samples=((ego, 0.0),)),
+        feasibility=Feasibility(Window((ego, 0.0))),
     )
 
 
@@ -80,7 +81,7 @@ def update_accumulator(
     limit = context.speed_limit
     way = math.hypot(ego.x - before.x, ego.y - before.y)
     distance = accumulator.distance + way
-    return replace(
+    return evolved(
         accumulator,
         **_compared_plans(accumulator, instant.plan),
         steps=accumulator.steps + 1,
@@ -133,7 +134,7 @@ def _with_contacts(
         return (
             accumulator
             if secondary == accumulator.secondary
-            else replace(accumulator, secondary=secondary)
+            else evolved(accumulator, secondary=secondary)
         )
     at_fault, contacts = dict(accumulator.at_fault), dict(accumulator.contacts)
     hit = set(accumulator.hit)
@@ -154,7 +155,7 @@ def _with_contacts(
             kind = fault_class(record.category)
             at_fault[kind] = at_fault.get(kind, 0) + 1
         hit.add(name)
-    return replace(
+    return evolved(
         accumulator,
         at_fault=at_fault,
         contacts=contacts,
@@ -189,7 +190,7 @@ def _with_pushes(
     contact that lasts, in which an engine may push against a wall, adds no more."""
     pushing = [c for c in instant.contacts if c.impulse != (0.0, 0.0)]
     if not pushing:
-        return replace(accumulator, pushes={}) if accumulator.pushes else accumulator
+        return evolved(accumulator, pushes={}) if accumulator.pushes else accumulator
     kept = max(round(CRASH_S / context.dt), 1)
     pushes: dict[str, tuple[tuple[float, float], ...]] = {}
     impulse, delta_v = accumulator.impulse, accumulator.delta_v
@@ -200,7 +201,7 @@ def _with_pushes(
         strength = math.hypot(sum(x for x, _ in pushes[name]), sum(y for _, y in pushes[name]))
         delta_v = max(delta_v, strength / context.ego_mass)
         impulse += math.hypot(*record.impulse)
-    return replace(accumulator, pushes=pushes, impulse=impulse, delta_v=delta_v)
+    return evolved(accumulator, pushes=pushes, impulse=impulse, delta_v=delta_v)
 
 
 def _compared_plans(

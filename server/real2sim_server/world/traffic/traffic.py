@@ -18,6 +18,7 @@ from ...edit.tracks import PackedTracks
 from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
 from ..errors import WorldError
+from ..evolve import evolved
 from ..path import Float
 from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import AgentDriver, Surroundings
@@ -133,7 +134,7 @@ class Traffic:
         """
         base = tracks.at(t_us)
         if not (self.drivers or self.spawner or self._assigns_drivers):
-            return replace(self, agents=base)
+            return evolved(self, agents=base)
         before = surroundings()
         drivers = {i: d.advance(before) for i, d in self.drivers.items()}
         moved = replace(self, drivers=MappingProxyType(drivers))

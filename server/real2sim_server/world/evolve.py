@@ -1,0 +1,15 @@
+"""The next version of a record that never changes."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+R = TypeVar("R")
+
+
+def evolved(record: R, **changes: Any) -> R:
+    """``dataclasses.replace`` for frozen records that check nothing when they are made: a third of
+    its time, which counts where every step makes several."""
+    found = object.__new__(type(record))
+    found.__dict__.update(record.__dict__, **changes)
+    return found
