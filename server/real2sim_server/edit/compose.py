@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 
 from real2sim_proto.operations import EraseRegion
@@ -60,6 +61,24 @@ def compose(
         if subject.edited:
             edited.append((subject, transform))
     return instances + contact_shadows(scene, edited, t_us)
+
+
+def things_of(
+    scene: Scene, state: ScenarioState, objects: Iterable[ObjectState]
+) -> tuple[Instance, ...] | None:
+    """The background and ``objects`` as :func:`compose` draws them, wherever they stand; None
+    where edits make the background hang on where they do, or put shadows under them.
+
+    Raises:
+        UnknownObjectError: ``state`` is of another scene.
+    """
+    shown = tuple(objects)
+    as_recorded = all(state.objects.get(name) is known for name, known in state.recorded.items())
+    if state.erased or not as_recorded or any(subject.edited for subject in shown):
+        return None
+    nowhere = transform_from(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    standing = (_standing(scene, subject, nowhere, scene.start_us) for subject in shown)
+    return (Instance(scene.background), *standing)
 
 
 def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> Instance:

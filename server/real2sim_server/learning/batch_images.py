@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..render import Backend, RasterOptions, View, rasterize_batch
+from ..render import (
+    Backend,
+    RasterOptions,
+    View,
+    WorldViews,
+    rasterize_batch,
+    rasterize_worlds,
+)
 from ..render.quantize import to_uint8
 from ..scene import Camera
 from ..world.batch import BatchWorld
@@ -43,11 +50,21 @@ def batch_images(
         backend: draws.
     """
     width, height = cameras[0].width, cameras[0].height
-    views = []
-    for w in worlds:
-        instances = batch.instances(w)
-        views += [View(instances, camera.viewmat(batch.poses[w]), camera.K) for camera in cameras]
-    if not views:
+    if not len(worlds):
         return np.zeros((0, len(cameras), height, width, 3), np.uint8)
-    drawn = rasterize_batch(views, width, height, sky=batch.scene.sky, options=RGB, backend=backend)
+    sky = batch.scene.sky
+    shown = batch.shown(worlds)
+    poses = batch.poses[list(worlds)]
+    viewmats = np.stack([camera.viewmat(poses) for camera in cameras], axis=1)
+    if shown is None:
+        views = [
+            View(batch.instances(w), viewmat, camera.K)
+            for w, each in zip(worlds, viewmats, strict=True)
+            for viewmat, camera in zip(each, cameras, strict=True)
+        ]
+        drawn = rasterize_batch(views, width, height, sky=sky, options=RGB, backend=backend)
+    else:
+        Ks = np.stack([camera.K for camera in cameras])
+        seen = WorldViews(shown.things, shown.poses, shown.there, shown.times_us, viewmats, Ks)
+        drawn = rasterize_worlds(seen, width, height, sky=sky, options=RGB, backend=backend)
     return to_uint8(drawn.rgb).reshape(len(worlds), len(cameras), height, width, 3)

@@ -4,8 +4,15 @@ from .backends import Backend, BackendStatus, describe_backends, select_backend
 from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
 from .frame import Frame, render_cameras, warm_up
 from .modalities import encode_image
-from .rasterize import View, rasterize, rasterize_batch
-from .types import Instance, RasterOptions, RenderError, RenderOutput, ScreenStatistics
+from .rasterize import View, rasterize, rasterize_batch, rasterize_worlds
+from .types import (
+    Instance,
+    RasterOptions,
+    RenderError,
+    RenderOutput,
+    ScreenStatistics,
+    WorldViews,
+)
 
 __all__ = [
     "Backend",
@@ -18,6 +25,7 @@ __all__ = [
     "RenderOutput",
     "ScreenStatistics",
     "View",
+    "WorldViews",
     "describe_backends",
     "encode_depth",
     "encode_image",
@@ -25,6 +33,7 @@ __all__ = [
     "encode_rgb",
     "rasterize",
     "rasterize_batch",
+    "rasterize_worlds",
     "render_cameras",
     "select_backend",
     "warm_up",

@@ -17,7 +17,15 @@ from ..geometry.transform import are_rigid
 from ..scene import GaussianCloud, TimeColour
 from .backends.base import Backend, BatchBackend, RasterRequest, is_reduced
 from .backends.select import select_backend
-from .types import Detail, Instance, RasterOptions, RenderError, RenderOutput, Sky
+from .types import (
+    Detail,
+    Instance,
+    RasterOptions,
+    RenderError,
+    RenderOutput,
+    Sky,
+    WorldViews,
+)
 
 DEFAULT_OPTIONS = RasterOptions()
 SMALL_IMAGES = RasterOptions(depth=False, instance=False, detail="auto")
@@ -153,6 +161,74 @@ def rasterize_batch(
         if isinstance(chosen, BatchBackend) and is_reduced(everything):
             return chosen.rasterize_batch(requests)
         return _joined([chosen.rasterize(request) for request in requests])
+
+
+def rasterize_worlds(
+    worlds: WorldViews,
+    width: int,
+    height: int,
+    *,
+    sky: Sky | None = None,
+    options: RasterOptions = SMALL_IMAGES,
+    backend: str | Backend = "auto",
+) -> RenderOutput:
+    """Draw many worlds of the same things: [W C] images, by world and then by camera.
+
+    They are the images that :func:`rasterize_batch` gives of the same views, bit for bit. What is
+    prepared for small images takes time by thing and not by image, where the backend can.
+
+    Args:
+        worlds: at least one, with one camera at least.
+        width, height: of all images [px].
+        sky, options, backend: as in :func:`rasterize_batch`.
+
+    Raises:
+        RenderError: as :func:`rasterize_batch`.
+    """
+    like = RasterRequest(
+        instances=worlds.things,
+        viewmats=_float64(worlds.viewmats.reshape(-1, 4, 4)[:1], "viewmats", (4, 4)),
+        Ks=_float64(worlds.Ks[:1], "Ks", (3, 3)),
+        width=width,
+        height=height,
+        sky=sky,
+        options=options,
+    )
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    with torch.no_grad():
+        if isinstance(chosen, BatchBackend) and is_reduced(like):
+            _check_worlds(worlds, like)
+            return chosen.rasterize_worlds(worlds, like)
+    views = views_of(worlds)
+    return rasterize_batch(views, width, height, sky=sky, options=options, backend=chosen)
+
+
+def views_of(worlds: WorldViews) -> list[View]:
+    """Each image of ``worlds`` by itself."""
+    views = []
+    for w, viewmats in enumerate(worlds.viewmats):
+        t_us = int(worlds.times_us[w])
+        instances = [
+            replace(worlds.things[k], T_world_object=worlds.poses[w, k], t_us=t_us)
+            for k in np.flatnonzero(worlds.shown[w]).tolist()
+        ]
+        views += [View(instances, *camera) for camera in zip(viewmats, worlds.Ks, strict=True)]
+    return views
+
+
+def _check_worlds(worlds: WorldViews, like: RasterRequest) -> None:
+    """The things and the cameras as any request; of poses those that are shown."""
+    _check_request(like, check_values=True)
+    viewmats = _float64(worlds.viewmats.reshape(-1, 4, 4), "viewmats", (4, 4))
+    _check_cameras(
+        replace(
+            like, viewmats=viewmats, Ks=torch.from_numpy(worlds.Ks).tile(len(worlds.viewmats), 1, 1)
+        )
+    )
+    poses = worlds.poses[worlds.shown]
+    if not are_rigid(poses).all():
+        for place, pose in zip(np.argwhere(worlds.shown).tolist(), poses, strict=True):
+            _check_rigid(pose, f"poses{place}")
 
 
 def _joined(outputs: Sequence[RenderOutput]) -> RenderOutput:

@@ -46,6 +46,27 @@ class Instance:
     t_us: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class WorldViews:
+    """What C cameras see in W worlds that are made of the same K things.
+
+    Attributes:
+        things: K of them; where they stand and their instants are said below.
+        poses: [W, K, 4, 4] float64, ``T_world_object``.
+        shown: [W, K] bool, which of them are there.
+        times_us: [W] int64, instants at which their colours are taken [us].
+        viewmats: [W, C, 4, 4] float64, ``T_camera_world``.
+        Ks: [C, 3, 3] float64 [px].
+    """
+
+    things: tuple[Instance, ...]
+    poses: NDArray[np.float64]
+    shown: NDArray[np.bool_]
+    times_us: NDArray[np.int64]
+    viewmats: NDArray[np.float64]
+    Ks: NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class RasterOptions:
     """Options of rasterize(), named after gsplat.rasterization.
@@ -125,4 +146,12 @@ class RenderOutput:
     between: Callable[[], object] | None = None
 
 
-__all__ = ["Instance", "RasterOptions", "RenderError", "RenderOutput", "ScreenStatistics", "Sky"]
+__all__ = [
+    "Instance",
+    "RasterOptions",
+    "RenderError",
+    "RenderOutput",
+    "ScreenStatistics",
+    "Sky",
+    "WorldViews",
+]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .cloud import GaussianCloud
@@ -58,6 +59,11 @@ class TimeColour:
         phase = (t_us - self.start_us) / (self.end_us - self.start_us)
         return colour_basis(phase, int(self.coefficients.shape[1]), self.basis)
 
+    def tones_of(self, times_us: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Values [M, F] at many instants [us], each row as :meth:`tones` gives it."""
+        phases = (times_us - self.start_us) / (self.end_us - self.start_us)
+        return _basis_values(phases, int(self.coefficients.shape[1]), self.basis)
+
     def at(self, cloud: GaussianCloud, t_us: int) -> GaussianCloud:
         """``cloud`` with the colours of ``t_us``."""
         tones = self.tones(t_us).to(cloud.device)
@@ -72,11 +78,15 @@ class TimeColour:
 
 def colour_basis(phase: float, count: int, basis: str) -> Tensor:
     """Values [count] float32 of the basis functions at ``phase``, held to [0, 1]."""
-    s = min(max(phase, 0.0), 1.0)
+    return torch.from_numpy(_basis_values(np.array([phase]), count, basis)[0])
+
+
+def _basis_values(phases: NDArray[np.float64], count: int, basis: str) -> NDArray[np.float32]:
+    s = np.clip(phases, 0.0, 1.0)[:, None]
     k = np.arange(count)
     if basis == "cosine":
         values = np.cos(np.pi * (k + 1) * s)
     else:
         angle = 2 * np.pi * (k // 2 + 1) * s
         values = np.where(k % 2 == 0, np.sin(angle), np.cos(angle))
-    return torch.from_numpy(values.astype(np.float32))
+    return values.astype(np.float32)

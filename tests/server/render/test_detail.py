@@ -15,10 +15,13 @@ from real2sim_server.render import (
     RasterOptions,
     RenderError,
     View,
+    WorldViews,
     rasterize,
     rasterize_batch,
+    rasterize_worlds,
 )
 from real2sim_server.render.backends.cpu.detail.hierarchy import hierarchy_of
+from real2sim_server.render.rasterize import views_of
 from real2sim_server.render.types import SMALL_IMAGE_PIXELS
 from real2sim_server.scene import GaussianCloud, Scene, Sky, TimeColour
 from real2sim_server.scene.io import read_packed
@@ -94,6 +97,53 @@ def test_images_of_a_batch_are_those_drawn_alone(street: Scene) -> None:
         assert torch.equal(batch.rgb[k], alone.rgb[0])
         assert torch.equal(batch.depth[k], alone.depth[0])
         assert torch.equal(batch.instance[k], alone.instance[0])
+
+
+def worlds_of_three() -> WorldViews:
+    """Two worlds with two cameras: a wall, one that changes its colour, and nothing at all."""
+    far = np.stack([transform_from([x, 0, 2.0], [1.0, 0, 0, 0]) for x in (-1.0, 0.0, 1.0)])
+    poses = np.stack([far, far[::-1]])
+    poses[1, 0] = np.nan
+    cloud = wall(300)
+    colour = TimeColour(torch.full((300, 2, 3), 0.4), "cosine", 0, 1_000_000)
+    return WorldViews(
+        things=(
+            Instance(wall(200), instance_id=1),
+            Instance(cloud, instance_id=2, scale=(0.5, 1.0, 1.0), colour=colour),
+            Instance(GaussianCloud.empty()),
+        ),
+        poses=poses,
+        shown=np.array([[True, True, True], [False, True, True]]),
+        times_us=np.array([100_000, 700_000]),
+        viewmats=np.tile(
+            np.stack([np.eye(4), transform_from([1.0, 0, 0], [1.0, 0, 0, 0])]), (2, 1, 1, 1)
+        ),
+        Ks=np.stack([K, K * [[0.5], [0.5], [1.0]]]),
+    )
+
+
+def test_worlds_of_the_same_things_are_drawn_as_views_one_by_one() -> None:
+    worlds, sky = worlds_of_three(), Sky.uniform((0.2, 0.4, 0.6))
+    one, many = (
+        draw(given, 40, 30, sky=sky, options=EVERYTHING, backend="cpu")
+        for draw, given in ((rasterize_batch, views_of(worlds)), (rasterize_worlds, worlds))
+    )
+    assert one.rgb.shape == (4, 30, 40, 3)
+    for part in ("rgb", "alpha", "depth", "instance"):
+        assert torch.equal(getattr(one, part), getattr(many, part)), part
+    assert not torch.equal(many.rgb[0], many.rgb[2])
+
+
+def test_worlds_are_drawn_by_any_backend() -> None:
+    small = rasterize_worlds(worlds_of_three(), 20, 16, backend="reference")
+    assert small.rgb.shape == (4, 16, 20, 3)
+
+
+def test_a_world_with_a_pose_that_is_not_rigid_is_refused_by_its_place() -> None:
+    worlds = worlds_of_three()
+    worlds.poses[1, 2] = np.nan
+    with pytest.raises(RenderError, match=r"poses\[1, 2\]"):
+        rasterize_worlds(worlds, 20, 16, backend="cpu")
 
 
 def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:

@@ -9,10 +9,12 @@ import numba
 import numpy as np
 import pytest
 
+from real2sim_proto.base import Pose
 from real2sim_proto.episode import ResetSpec
+from real2sim_proto.operations import EraseRegion
 from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.demo.street import SHIPPED
-from real2sim_server.edit import ScenarioState
+from real2sim_server.edit import ScenarioState, apply_operations
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import read_packed
 from real2sim_server.world import World
@@ -199,3 +201,24 @@ def test_bad_actions_are_refused(
     batch = BatchWorld(street, ResetSpec(action=action), 2)
     with pytest.raises(ValueError, match=r"actions|plan_us"):
         batch.step(actions, plan_us=plan_us)
+
+
+def test_what_worlds_show_stands_in_arrays_as_in_instances(street: Scene) -> None:
+    batch = BatchWorld(street, ResetSpec(action="control"), 2)
+    batch.reset([1], start_us=[street.start_us + 3_000_000])
+    shown = batch.shown([0, 1])
+    assert shown is not None
+    for w in (0, 1):
+        drawn = batch.instances(w)
+        there = np.flatnonzero(shown.there[w]).tolist()
+        assert [shown.things[k].instance_id for k in there] == [i.instance_id for i in drawn]
+        assert all(shown.things[k].cloud is i.cloud for k, i in zip(there, drawn, strict=True))
+        for k, instance in list(zip(there, drawn, strict=True))[1:]:
+            assert np.array_equal(shown.poses[w, k], instance.T_world_object)
+            assert shown.times_us[w] == instance.t_us
+
+
+def test_edited_worlds_are_shown_one_by_one(street: Scene) -> None:
+    region = EraseRegion(pose=Pose(position=(0, 0, 0)), size=(1, 1, 1))
+    state = apply_operations(ScenarioState.of(street), [region]).state
+    assert BatchWorld(street, ResetSpec(action="control"), 2, state=state).shown([0]) is None

@@ -9,7 +9,14 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from ..types import SMALL_IMAGE_PIXELS, Instance, RasterOptions, RenderOutput, Sky
+from ..types import (
+    SMALL_IMAGE_PIXELS,
+    Instance,
+    RasterOptions,
+    RenderOutput,
+    Sky,
+    WorldViews,
+)
 
 ALPHA_MAX = 0.999
 """No single Gaussian covers a pixel more than this, so that transmittance stays above 0."""
@@ -98,6 +105,11 @@ class BatchBackend(Protocol):
     def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:
         """All images of ``requests``, which are of one size, one sky and the same options, and for
         each of which :func:`is_reduced` holds; the same bits as one by one."""
+        ...
+
+    def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
+        """All images of ``worlds``, by world and then by camera; sizes, sky and options are those
+        of ``like``, for which :func:`is_reduced` holds. The same bits as one by one."""
         ...
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 
-from ...edit import ObjectState, ScenarioState, compose
+from ...edit import ObjectState, ScenarioState, compose, things_of
 from ...geometry.transform import transform_from
 from ...render.types import Instance
 from ...scene import Scene
@@ -77,6 +77,23 @@ class _Instant:
 
 
 @dataclass(frozen=True, eq=False)
+class ThingsInWorlds:
+    """What the renderer draws of W worlds.
+
+    Attributes:
+        things: the background and N objects, whose own poses and instants say nothing.
+        poses: [W, 1 + N, 4, 4] float64, ``T_world_object``.
+        there: [W, 1 + N] bool, which of them exist now.
+        times_us: [W] int64, of colours that change over time [us].
+    """
+
+    things: tuple[Instance, ...]
+    poses: Float
+    there: Flags
+    times_us: Longs
+
+
+@dataclass(frozen=True, eq=False)
 class BatchStep:
     """What a step has brought, by world.
 
@@ -134,6 +151,7 @@ class BatchWorld:
         first = self._begin(spec.start_us)
         self.objects, self._tracks = tracks_of(self.state, spec)
         self._rows = {o.object_id: k for k, o in enumerate(self.objects)}
+        self._things = things_of(scene, self.state, self.objects)
         self._road = road_of(scene.ground, first.route, first.context)
         self._vehicle = tuple(vehicle_parameters(spec.ego))
         ego = spec.ego
@@ -249,6 +267,25 @@ class BatchWorld:
         """What the renderer draws of one world now; nothing is copied."""
         shown_us = min(int(self.times_us[w]), self.scene.end_us)
         return compose(self.scene, self.state, self.agents(w), shown_us)
+
+    def shown(self, worlds: Sequence[int]) -> ThingsInWorlds | None:
+        """What :meth:`instances` gives of some worlds, in arrays; None where an edit of the state
+        makes it hang on each world: its background, and shadows under moved objects."""
+        if self._things is None:
+            return None
+        chosen = np.asarray(worlds, np.int64)
+        rows = self._now.objects[chosen]
+        present = self._now.present[chosen]
+        poses = np.empty((len(chosen), len(self._things), 4, 4))
+        poses[:, 0] = np.eye(4)
+        quaternions = np.where(present[..., None], rows[..., 3:7], (1.0, 0.0, 0.0, 0.0))
+        poses[:, 1:] = transform_from(rows[..., :3], quaternions)
+        return ThingsInWorlds(
+            things=self._things,
+            poses=poses,
+            there=np.concatenate([np.ones((len(chosen), 1), np.bool_), present], axis=1),
+            times_us=np.minimum(self.times_us[chosen], self.scene.end_us),
+        )
 
     def _begin(self, start_us: int | None) -> World:
         """The world at the start of an episode, kept for the next one from there."""

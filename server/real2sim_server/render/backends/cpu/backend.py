@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...types import RenderOutput, Sky
+from ...types import RenderOutput, Sky, WorldViews
 from ..base import (
     Placement,
     RasterRequest,
@@ -92,6 +92,11 @@ class CpuBackend:
         """Draw small images of many requests at once, see SmallImages."""
         with self._lock:
             return self._small.draw(requests)
+
+    def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
+        """Draw small images of many worlds of the same things at once, see SmallImages."""
+        with self._lock:
+            return self._small.draw_worlds(worlds, like)
 
     def warm_up(self) -> None:
         """Compile every kernel, or load it from the disk cache."""

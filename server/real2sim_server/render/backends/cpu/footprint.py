@@ -125,6 +125,20 @@ def _side_reach(eight: Planes, top: Lanes, tip: Lanes, side: int) -> Lanes:
 
 
 @inlined()
+def in_one_tile(footprint: Any) -> Any:
+    """Whether the box around it is a single tile: nothing is left to ask of rows and columns."""
+    columns = ((footprint >> FIELD) - footprint) & FIELD_MASK
+    rows = ((footprint >> 3 * FIELD) - (footprint >> 2 * FIELD)) & FIELD_MASK
+    return columns == 1 and rows == 1
+
+
+@inlined()
+def only_tile(footprint: Any, tiles_x: Any) -> Any:
+    """Number of that tile."""
+    return ((footprint >> 2 * FIELD) & FIELD_MASK) * tiles_x + (footprint & FIELD_MASK)
+
+
+@inlined()
 def tile_rows(footprint: Any) -> Any:
     """Range of tile rows."""
     return (footprint >> 2 * FIELD) & FIELD_MASK, (footprint >> 3 * FIELD) & FIELD_MASK

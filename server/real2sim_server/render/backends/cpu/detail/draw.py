@@ -17,7 +17,13 @@ from numba import carray, prange  # type: ignore[attr-defined]
 
 from ....._numba import PARALLEL_LOOPS, func
 from ..blend import blend_tile, open_tile, write_tile
-from ..footprint import footprints_of_eight, tile_columns, tile_rows
+from ..footprint import (
+    footprints_of_eight,
+    in_one_tile,
+    only_tile,
+    tile_columns,
+    tile_rows,
+)
 from ..kernel import inlined, kernel
 from ..lanes import LANES
 from ..project import FIELDS as RECORD_FIELDS
@@ -328,11 +334,14 @@ def tile_lists(values, footprints, order, shape):
     """Records by tile, near to far, and where the list of each tile begins."""
     tiles_x, tiles_y = (shape[2] + TILE - 1) // TILE, (shape[1] + TILE - 1) // TILE
     starts = np.zeros(tiles_x * tiles_y + 2, np.int64)
-    for place in range(order.shape[0]):
-        index = np.int64(order[place] & LOW_BITS)
-        first, last = tile_rows(footprints[index])
+    for index in range(order.shape[0]):
+        footprint = footprints[index]
+        if in_one_tile(footprint):
+            starts[only_tile(footprint, tiles_x) + 2] += 1
+            continue
+        first, last = tile_rows(footprint)
         for row in range(first, last):
-            left, right = tile_columns(values, footprints[index], index, row)
+            left, right = tile_columns(values, footprint, index, row)
             for column in range(left, right):
                 starts[row * tiles_x + column + 2] += 1
     for tile in range(2, starts.shape[0]):
@@ -340,9 +349,15 @@ def tile_lists(values, footprints, order, shape):
     lists = np.empty(starts[starts.shape[0] - 1], np.int32)
     for place in range(order.shape[0]):
         index = np.int64(order[place] & LOW_BITS)
-        first, last = tile_rows(footprints[index])
+        footprint = footprints[index]
+        if in_one_tile(footprint):
+            tile = only_tile(footprint, tiles_x) + 1
+            lists[starts[tile]] = index
+            starts[tile] += 1
+            continue
+        first, last = tile_rows(footprint)
         for row in range(first, last):
-            left, right = tile_columns(values, footprints[index], index, row)
+            left, right = tile_columns(values, footprint, index, row)
             for column in range(left, right):
                 tile = row * tiles_x + column + 1
                 lists[starts[tile]] = index

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....types import Instance, RasterOptions, RenderOutput
+from ....types import Instance, RasterOptions, RenderOutput, WorldViews
 from ...base import RasterRequest
 from ..inputs import Workspace, array_of, timed, view_of
 from ..records import RECORD
@@ -43,6 +44,14 @@ class SmallImages:
             draws = _draws(requests)
         with timed(timing, "blend"):
             return self._drawn(requests[0], draws, timing)
+
+    def draw_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
+        """All images of worlds of the same things; sizes, sky and options are those of ``like``."""
+        timing: dict[str, float] = {}
+        with timed(timing, "project"):
+            draws = _world_draws(worlds, like)
+        with timed(timing, "blend"):
+            return self._drawn(like, draws, timing)
 
     def _drawn(self, like: RasterRequest, draws: _Draws, timing: dict[str, float]) -> RenderOutput:
         options, images = like.options, len(draws.views)
@@ -154,11 +163,9 @@ def _draws(requests: Sequence[RasterRequest]) -> _Draws:
             cameras.append(viewmats[c])
             views.append(tuple(view_of(request, c)))
             sky_matrices.append(viewmats[c][:3, :3].T @ np.linalg.inv(Ks[c]))
-    scale = np.array(scales, np.float64).reshape(-1, 3)
-    T_world_object = np.array(poses).reshape(-1, 4, 4)
-    T_camera_object = np.array(cameras)[image_of] @ T_world_object if poses else T_world_object
-    rotation, offset = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
-    position = -(rotation.transpose(0, 2, 1) @ offset[..., None])[..., 0]
+    T_camera_object = np.array(poses).reshape(-1, 4, 4)
+    if poses:
+        T_camera_object = np.array(cameras)[image_of] @ T_camera_object
     tones = np.zeros((len(drawn), max((len(t) for _, t in coloured), default=0)), np.float32)
     for index, values in coloured:
         tones[index, : len(values)] = values
@@ -167,15 +174,81 @@ def _draws(requests: Sequence[RasterRequest]) -> _Draws:
         table=table_of(held),
         tones=tones,
         draws=np.array(drawn, np.int64).reshape(-1, 2),
-        linear=np.ascontiguousarray(rotation * scale[:, None, :]),
-        offset=np.ascontiguousarray(offset),
-        camera_position=position.astype(np.float32),
-        scale=scale.astype(np.float32),
+        **_places(T_camera_object, np.array(scales, np.float64).reshape(-1, 3)),
         first_draws=np.array(firsts, np.int64),
         views=np.array(views, np.float32),
         sky_matrices=np.array(sky_matrices, np.float32),
         gaussians=gaussians,
     )
+
+
+def _world_draws(worlds: WorldViews, like: RasterRequest) -> _Draws:
+    """The same of worlds of the same things: one row of the table and one hierarchy each."""
+    filled = np.array([len(thing.cloud) > 0 for thing in worlds.things], np.bool_)
+    held = [_hierarchy(thing) for thing in worlds.things if len(thing.cloud)]
+    rows = np.cumsum(filled) - 1
+    cameras = len(worlds.Ks)
+    shown = np.repeat(worlds.shown & filled, cameras, axis=0)
+    image_of, thing_of = np.nonzero(shown)
+    world_of = image_of // cameras
+    viewmats = worlds.viewmats.reshape(-1, 4, 4)
+    ids = np.array([thing.instance_id for thing in worlds.things], np.int64)
+    scales = np.array([thing.scale for thing in worlds.things], np.float64).reshape(-1, 3)
+    sizes = np.array([len(thing.cloud) for thing in worlds.things], np.int64)
+    numbers = replace(like, Ks=torch.from_numpy(worlds.Ks), options=_filtered(like.options))
+    views = np.array([tuple(view_of(numbers, c)) for c in range(cameras)], np.float32)
+    inverse = np.linalg.inv(worlds.Ks)
+    images = len(viewmats)
+    return _Draws(
+        held=held,
+        table=table_of(held),
+        tones=_tones(worlds, thing_of, worlds.times_us[world_of]),
+        draws=np.stack([rows[thing_of], ids[thing_of]], axis=1),
+        **_places(viewmats[image_of] @ worlds.poses[world_of, thing_of], scales[thing_of]),
+        first_draws=np.append(0, np.cumsum(shown.sum(1))).astype(np.int64),
+        views=np.tile(views, (images // cameras, 1)),
+        sky_matrices=(
+            viewmats[:, :3, :3].transpose(0, 2, 1) @ np.tile(inverse, (images // cameras, 1, 1))
+        ).astype(np.float32),
+        gaussians=max(1, int((shown @ sizes).max(initial=0))),
+    )
+
+
+def _tones(
+    worlds: WorldViews, thing_of: NDArray[np.int64], times_us: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Of each draw [D, F]."""
+    counts = [
+        0 if thing.colour is None else int(thing.colour.coefficients.shape[1])
+        for thing in worlds.things
+    ]
+    tones = np.zeros((len(thing_of), max(counts, default=0)), np.float32)
+    for k, thing in enumerate(worlds.things):
+        if thing.colour is None:
+            continue
+        own = thing_of == k
+        tones[own, : counts[k]] = thing.colour.tones_of(times_us[own])
+    return tones
+
+
+class _Places(TypedDict):
+    """Where draws stand before their cameras, see draw_images."""
+
+    linear: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    camera_position: NDArray[np.float32]
+    scale: NDArray[np.float32]
+
+
+def _places(T_camera_object: NDArray[np.float64], scale: NDArray[np.float64]) -> _Places:
+    rotation, offset = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
+    position = -(rotation.transpose(0, 2, 1) @ offset[..., None])[..., 0]
+    return {
+        "linear": np.ascontiguousarray(rotation * scale[:, None, :]),
+        "offset": np.ascontiguousarray(offset),
+        "camera_position": position.astype(np.float32),
+        "scale": scale.astype(np.float32),
+    }
 
 
 def _filtered(options: RasterOptions) -> RasterOptions:
