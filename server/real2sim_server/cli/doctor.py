@@ -178,6 +178,7 @@ def _warm_up() -> tuple[float, list[str]]:
         render.warm_up()
         world.warm_up()
         world.warm_up_planning()
+        world.warm_up_deformation()
     began = (found for _, found in recorder.buffer if found.is_start)
     names = {found.data["dispatcher"].__name__ for found in began}
     return time.perf_counter() - start, sorted(names)

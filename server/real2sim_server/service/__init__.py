@@ -7,7 +7,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``token_file``, ``accounts``: named tokens, and what their holders take.
 - ``preflight``: what is refused before anything heavy is loaded.
 - ``first_run``: a second process that compiles, begun before anything heavy is loaded.
-- ``warm_up``: kernels compiled or loaded before they are needed.
+- ``warm_up``: kernels compiled or loaded before they are needed, or beside what does not need them.
 - ``lanes``, ``engine``: the thread that owns the device, and whose turn it is.
 - ``http``: what every answer shares: errors, authorisation, idempotency, limits, metrics,
   connections, sockets.

@@ -11,9 +11,17 @@ from contextlib import asynccontextmanager, contextmanager
 
 import structlog
 
-from real2sim_proto.episode import EgoSpec
+from real2sim_proto.episode import ResetSpec
 
-from ..world import kernels_on_disk, planning_on_disk, plans_ahead, warm_up_planning
+from ..world import (
+    deformation_on_disk,
+    kernels_on_disk,
+    may_deform,
+    planning_on_disk,
+    plans_ahead,
+    warm_up_deformation,
+    warm_up_planning,
+)
 from ..world import warm_up as warm_up_world
 from .first_run import LOWEST_PRIORITY, compile_beside, take_begun
 
@@ -31,6 +39,7 @@ class KernelWarmUp:
 
     def __init__(self) -> None:
         self._planning = asyncio.Event()
+        self.deformation = DeformationKernels()
 
     async def run(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
         """What a worker needs before it takes work."""
@@ -54,9 +63,11 @@ class KernelWarmUp:
         finally:
             self._planning.set()
 
-    async def ready(self, ego: EgoSpec) -> None:
-        """Wait for the kernels that a vehicle needs."""
-        if plans_ahead(ego):
+    async def ready(self, spec: ResetSpec) -> None:
+        """Wait for the kernels that an episode cannot begin without."""
+        if may_deform(spec):
+            self.deformation.begin()
+        if plans_ahead(spec.ego):
             await self._planning.wait()
 
     async def _run_first(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
@@ -69,6 +80,50 @@ class KernelWarmUp:
         else:
             await warm_up_renderer()
         await asyncio.to_thread(warm_up_world)
+
+
+class DeformationKernels:
+    """What images after impacts need. They take as long as all the rest, and few sessions have an
+    impact, so they are made from the first episode on that may have one: in the background, and an
+    image that needs them before waits for them, no other. Belongs to the event loop.
+
+    Attributes:
+        ready: whether images may be drawn after impacts; read on any thread.
+    """
+
+    def __init__(self) -> None:
+        self.ready = False
+        self._making: asyncio.Task[None] | None = None
+
+    def begin(self) -> None:
+        """Make them, unless they are there or being made."""
+        if self._making is None:
+            self._making = asyncio.create_task(self._make())
+
+    async def wait(self) -> None:
+        """Return once they are there, or cannot be made ahead: then they are made when needed."""
+        self.begin()
+        assert self._making is not None
+        await asyncio.wait([self._making])
+
+    async def close(self) -> None:
+        """End the process that compiles them, if there is one."""
+        if self._making is not None:
+            self._making.cancel()
+            await asyncio.wait([self._making])
+
+    async def _make(self) -> None:
+        try:
+            if not await asyncio.to_thread(deformation_on_disk):
+                log.info("compiling kernels of deformation, on the first run only")
+                beside = compile_beside("warm_up_deformation", niceness=LOWEST_PRIORITY)
+                async with _awaited(beside):
+                    pass
+            await asyncio.to_thread(warm_up_deformation)
+        except Exception:
+            log.exception("warm-up of deformation failed")
+        finally:
+            self.ready = True
 
 
 @asynccontextmanager

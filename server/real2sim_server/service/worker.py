@@ -142,7 +142,11 @@ class Worker:
                     settings.worker_id, settings.max_sessions, settings.session_idle_seconds
                 ),
                 pipeline=StepPipeline(
-                    engine, renderer, metrics, max_pixels=settings.max_pixels_per_step
+                    engine,
+                    renderer,
+                    metrics,
+                    deformation=kernels.deformation,
+                    max_pixels=settings.max_pixels_per_step,
                 ),
                 kernels=kernels,
                 store=store,
@@ -183,6 +187,7 @@ class Worker:
             await self.scene_cache.refresh()
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
+            at_exit.push_async_callback(self.kernels.deformation.close)
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.connections.watch()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.accounts.watch()))

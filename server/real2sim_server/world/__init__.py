@@ -9,10 +9,13 @@ from .observation import Observation, ego_fields
 from .path import LoggedPath
 from .scoring import Score, metrics_version
 from .warm_up import (
+    deformation_on_disk,
     kernels_on_disk,
+    may_deform,
     planning_on_disk,
     plans_ahead,
     warm_up,
+    warm_up_deformation,
     warm_up_planning,
 )
 from .world import World
@@ -28,11 +31,14 @@ __all__ = [
     "World",
     "WorldError",
     "agent_fields",
+    "deformation_on_disk",
     "ego_fields",
     "kernels_on_disk",
+    "may_deform",
     "metrics_version",
     "planning_on_disk",
     "plans_ahead",
     "warm_up",
+    "warm_up_deformation",
     "warm_up_planning",
 ]

@@ -11,8 +11,12 @@ from real2sim_proto.plans import TrajectoryPlan
 
 from .._numba import is_on_disk
 from ..edit import ScenarioState
+from ..render.types import Instance
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
+from .collision.deformation import DeformationTracker
+from .collision.impact import Impact, ImpactParticipant
 from .collision.obstacles import ObstacleGrid
+from .collision.rigid_body import BodyProperties, BodyState
 from .collision.sweep import StepStart, swept_contacts
 from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
 from .ego.motion import Motion
@@ -21,6 +25,8 @@ from .ego.trackers import make_tracker
 from .world import World
 
 PERIOD_US = 100_000
+CAR = (4.0, 2.0, 1.5)
+DEFORMED_AFTER_US = 20_000
 STEPS = 20
 """More than fill the window of the comfort metrics."""
 
@@ -63,6 +69,19 @@ def warm_up_planning() -> None:
     _track(EgoSpec(tracker="ilqr"))
 
 
+def warm_up_deformation() -> None:
+    """Like :func:`warm_up`, for images of objects after impacts, which few sessions have: one car
+    runs into another, and one into the background, see :func:`may_deform`."""
+    scene = _street(_filling())
+    subjects = {o.object_id: o for o in ScenarioState.of(scene).objects.values()}
+    for against_background in (False, True):
+        tracker = DeformationTracker(scene)
+        tracker = tracker.with_impact(_impact(against_background=against_background), subjects)
+        tracker.solve(DEFORMED_AFTER_US)
+        drawn = Instance(scene.objects["ahead"].cloud)
+        tracker.deformed_instance("ahead", drawn, DEFORMED_AFTER_US)
+
+
 def kernels_on_disk() -> bool:
     """Whether an earlier run left what :func:`warm_up` compiles longest."""
     return is_on_disk(advance_vehicle)
@@ -71,6 +90,18 @@ def kernels_on_disk() -> bool:
 def planning_on_disk() -> bool:
     """Whether an earlier run left what :func:`warm_up_planning` compiles."""
     return is_on_disk(prepare_schedule)
+
+
+def deformation_on_disk() -> bool:
+    """Whether an earlier run left what :func:`warm_up_deformation` compiles."""
+    from ..physics.backends.cpu.kernels import advance  # Imported only where something deforms.
+
+    return is_on_disk(advance)
+
+
+def may_deform(spec: ResetSpec) -> bool:
+    """Whether images of an episode may need what :func:`warm_up_deformation` compiles."""
+    return bool(spec.sensors) and spec.on_collision == "continue" and spec.contact.dents
 
 
 def plans_ahead(ego: EgoSpec) -> bool:
@@ -104,22 +135,57 @@ def _track(ego: EgoSpec) -> None:
     tracker.command(tracker.advance(motion, 0.0, PERIOD_US // 2), 0.0)
 
 
-def _street() -> Scene:
-    """The ego behind one car and beside another, touching neither, in a scene of one Gaussian."""
-    cloud = GaussianCloud(
-        means=torch.zeros(1, 3),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        scales=torch.full((1, 3), 0.1),
-        opacities=torch.full((1,), 0.5),
-        sh=torch.zeros(1, 1, 3),
+def _impact(*, against_background: bool) -> Impact:
+    """The object ``ahead`` is hit from behind by the ego, or hits the background."""
+    properties = BodyProperties(mass=1500.0, inertia=2500.0, length=4.0, width=2.0)
+    behind, ahead = (
+        ImpactParticipant(properties, BodyState(x, 0.0, 0.0, speed, 0.0, 0.0), low=0.0, high=1.5)
+        for x, speed in ((-2.0, 10.0), (2.0, 0.0))
     )
+    return Impact(
+        object_id=None if against_background else "ahead",
+        other_id="ahead" if against_background else None,
+        t_us=0,
+        point=(0.0, 0.0),
+        normal=(-1.0, 0.0),
+        approach_speed=10.0,
+        relative_speed=10.0,
+        impulse=(-7500.0, 0.0),
+        delta_v=5.0,
+        object_delta_v=5.0,
+        energy=3.75e4,
+        participants=(behind, None if against_background else ahead),
+    )
+
+
+def _filling() -> GaussianCloud:
+    """Gaussians all over a car, so that particles fill it."""
+    places = np.stack(np.meshgrid(*(np.linspace(-s / 2, s / 2, 9) for s in CAR), indexing="ij"))
+    means = torch.from_numpy(places.reshape(3, -1).T.astype(np.float32).copy())
+    return _cloud(means)
+
+
+def _cloud(means: torch.Tensor) -> GaussianCloud:
+    count = len(means)
+    return GaussianCloud(
+        means=means,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        scales=torch.full((count, 3), 0.1),
+        opacities=torch.full((count,), 0.5),
+        sh=torch.zeros(count, 1, 3),
+    )
+
+
+def _street(of_cars: GaussianCloud | None = None) -> Scene:
+    """The ego behind one car and beside another, touching neither, in a scene of one Gaussian."""
+    cloud = _cloud(torch.zeros(1, 3))
     times = np.arange(STEPS + 2) * PERIOD_US
     camera = Camera("front", 16, 16, np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), np.eye(4))
     return Scene(
         "warm-up",
         cloud,
         {
-            name: SceneObject(name, "car", (4.0, 2.0, 1.5), cloud, _drive(times, *place))
+            name: SceneObject(name, "car", CAR, of_cars or cloud, _drive(times, *place))
             for name, place in {"ahead": (12.0, 0.0), "beside": (1.0, 3.0)}.items()
         },
         None,

@@ -6,11 +6,15 @@ from fnmatch import fnmatch
 
 import pytest
 
-from real2sim_proto.episode import EgoSpec
+from real2sim_proto.episode import ContactSpec, EgoSpec, ResetSpec, SensorSpec
 from real2sim_server.service import first_run, warm_up
 from real2sim_server.service.warm_up import KernelWarmUp
 from real2sim_server.world import plans_ahead
 from real2sim_server.world.driving import advance_vehicle
+
+
+def episode(tracker: str) -> ResetSpec:
+    return ResetSpec(ego=EgoSpec(tracker=tracker))
 
 
 async def nothing() -> None:
@@ -33,7 +37,7 @@ def test_only_ilqr_plans_ahead():
 
 
 def test_episodes_with_other_trackers_wait_for_nothing():
-    assert not is_waiting(KernelWarmUp().ready(EgoSpec(tracker="lqr")))
+    assert not is_waiting(KernelWarmUp().ready(episode("lqr")))
 
 
 def test_an_episode_whose_tracker_plans_ahead_waits_for_its_kernels(monkeypatch):
@@ -50,12 +54,12 @@ def test_an_episode_whose_tracker_plans_ahead_waits_for_its_kernels(monkeypatch)
         kernels = KernelWarmUp()
 
         async def begin() -> None:
-            await kernels.ready(EgoSpec(tracker="ilqr"))
+            await kernels.ready(episode("ilqr"))
             ended.append("begun")
 
         await asyncio.gather(begin(), kernels.run_planning())
 
-    assert is_waiting(KernelWarmUp().ready(EgoSpec(tracker="ilqr")))
+    assert is_waiting(KernelWarmUp().ready(episode("ilqr")))
     asyncio.run(episode_while_compiling())
     assert ended == ["compiled", "begun"]
 
@@ -74,9 +78,53 @@ def test_where_kernels_fail_nobody_waits_for_them(monkeypatch, part):
     async def failed() -> None:
         with pytest.raises(RuntimeError, match="no compiler"):
             await (kernels.run(nothing) if part == "run" else kernels.run_planning())
-        await asyncio.wait_for(kernels.ready(EgoSpec(tracker="ilqr")), 1)
+        await asyncio.wait_for(kernels.ready(episode("ilqr")), 1)
 
     asyncio.run(failed())
+
+
+def test_kernels_of_deformation_are_made_from_the_first_episode_on_that_may_need_them(monkeypatch):
+    made = []
+    monkeypatch.setattr(warm_up, "deformation_on_disk", lambda: True)
+    monkeypatch.setattr(warm_up, "warm_up_deformation", lambda: made.append("kernels"))
+    crash = ResetSpec(sensors=[SensorSpec(camera="front")], on_collision="continue")
+    without = [
+        crash.model_copy(update=change)
+        for change in (
+            {"sensors": []},
+            {"on_collision": "terminate"},
+            {"contact": ContactSpec(dents=False)},
+        )
+    ]
+
+    async def begin() -> None:
+        kernels = KernelWarmUp()
+        for spec in without:
+            await kernels.ready(spec)
+        await asyncio.sleep(0.05)
+        assert made == []
+        for _ in range(2):
+            await kernels.ready(crash)
+        await kernels.deformation.wait()
+        assert kernels.deformation.ready
+
+    asyncio.run(begin())
+    assert made == ["kernels"]
+
+
+def test_where_kernels_of_deformation_fail_images_are_drawn_all_the_same(monkeypatch):
+    def fail() -> None:
+        raise RuntimeError("no compiler")
+
+    monkeypatch.setattr(warm_up, "deformation_on_disk", lambda: True)
+    monkeypatch.setattr(warm_up, "warm_up_deformation", fail)
+
+    async def wait() -> bool:
+        kernels = warm_up.DeformationKernels()
+        await asyncio.wait_for(kernels.wait(), 5)
+        return kernels.ready
+
+    assert asyncio.run(wait())
 
 
 def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypatch, tmp_path):

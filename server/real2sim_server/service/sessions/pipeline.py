@@ -57,6 +57,7 @@ from ..rendering.frames import (
     with_pixels,
 )
 from ..rendering.renderer import Renderer, RenderRequest, check_sensors
+from ..warm_up import DeformationKernels
 from .gathered_calls import GatheredCalls, attempt
 from .log_write import LogWrite, write_together
 from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
@@ -84,6 +85,7 @@ class Transition:
         recorded: whether ``record`` is done.
         sent: whether ``write`` is done.
         account: that pays where no engine counts.
+        moved: the new world, kept where its images have to wait for kernels.
     """
 
     change: Callable[[], World]
@@ -94,6 +96,7 @@ class Transition:
     recorded: bool = False
     sent: bool = False
     account: Account | None = None
+    moved: World | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +134,10 @@ class EncodedObservation:
     timing_ms: Mapping[str, float]
 
 
+class _KernelsMissingError(Exception):
+    """An image has to wait for kernels of deformation; nothing has happened."""
+
+
 class StepPipeline:
     """Makes observations of changed worlds, and views of present ones.
 
@@ -138,15 +145,23 @@ class StepPipeline:
         engine: runs what is rendered.
         renderer: renders and encodes.
         metrics: gets durations by stage.
+        deformation: kernels that images after impacts need.
         max_pixels: over all images of one instant.
     """
 
     def __init__(
-        self, engine: Engine, renderer: Renderer, metrics: Metrics, *, max_pixels: int
+        self,
+        engine: Engine,
+        renderer: Renderer,
+        metrics: Metrics,
+        *,
+        deformation: DeformationKernels,
+        max_pixels: int,
     ) -> None:
         self._engine = engine
         self._renderer = renderer
         self._metrics = metrics
+        self._deformation = deformation
         self._max_pixels = max_pixels
         self._stages: dict[str, Histogram] = {}
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
@@ -183,17 +198,24 @@ class StepPipeline:
         """
         observation: RenderedObservation | EncodedObservation
         if transition.cameras:
-            observation = await self._engine.call(
-                self._compute,
-                transition,
-                label="drive",
-                lane=Lane.DRIVE,
-                on_result=partial(self.send, transition),
-            )
+            try:
+                observation = await self._on_engine(transition)
+            except _KernelsMissingError:
+                await self._deformation.wait()
+                observation = await self._on_engine(transition)
         else:
             transition.account = await computing_account()
             observation = await self._steps.call(transition)
         return await self._finish(observation)
+
+    async def _on_engine(self, transition: Transition) -> RenderedObservation | EncodedObservation:
+        return await self._engine.call(
+            self._compute,
+            transition,
+            label="drive",
+            lane=Lane.DRIVE,
+            on_result=partial(self.send, transition),
+        )
 
     def _compute_together(
         self, transitions: Sequence[Transition]
@@ -263,6 +285,7 @@ class StepPipeline:
         timer.stage("world")
         images: Sequence[RenderedImage] = ()
         if sensors:
+            self._require_kernels(world)
             evaluation = self._evaluators.submit(self.evaluate, transition, world, sensors, cameras)
             try:
                 images = self.render(world, sensors, cameras, timer)
@@ -279,7 +302,9 @@ class StepPipeline:
 
     def advance(self, transition: Transition) -> World:
         """The new world, as far as images show it."""
-        return transition.change()
+        if transition.moved is None:
+            transition.moved = transition.change()
+        return transition.moved
 
     def render(
         self,
@@ -339,9 +364,13 @@ class StepPipeline:
             QueueFullError: too much waits for the engine.
         """
         cameras = self._checked(world.scene, sensors)
-        rendered = await self._engine.call(
-            self._compute_view, world, sensors, cameras, PhaseTimer(), label="view"
-        )
+        timer = PhaseTimer()
+        view = partial(self._compute_view, world, sensors, cameras, timer)
+        try:
+            rendered = await self._engine.call(view, label="view")
+        except _KernelsMissingError:
+            await self._deformation.wait()
+            rendered = await self._engine.call(view, label="view")
         return await self._finish(rendered)
 
     def _compute_view(
@@ -352,6 +381,7 @@ class StepPipeline:
         timer: PhaseTimer,
     ) -> RenderedObservation:
         timer.stage("queue")
+        self._require_kernels(world)
         images = self._images(world, sensors, cameras, between=self._engine.give_way)
         timer.stage("render")
         members = pack_members({"t_us": world.t_us, "revision": world.revision})
@@ -390,6 +420,13 @@ class StepPipeline:
                 hint="ask for smaller or fewer images, or for codec 'jpeg' or 'png'",
             )
         return cameras
+
+    def _require_kernels(self, world: World) -> None:
+        """Raises _KernelsMissingError where images of a world would compile on the engine, which
+        belongs to all sessions."""
+        shapes = world.deformation
+        if shapes is not None and shapes.has_impacts and not self._deformation.ready:
+            raise _KernelsMissingError
 
     def _images(
         self,

@@ -73,7 +73,7 @@ class Stepper:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
-        await self._kernels.ready(spec.ego)
+        await self._kernels.ready(spec)
         record = ("reset", 0, reset_payload(spec))
         observation, _ = await self._observe(session, _beginning(session, spec), cameras, record)
         session.begin(observation.world, cameras)
@@ -86,7 +86,7 @@ class Stepper:
         ``reply`` makes the answer that is stored with it.
         """
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
-        await self._kernels.ready(spec.ego)
+        await self._kernels.ready(spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         stored = await asyncio.to_thread(reply, world, ())
         await self._record(session, [("reset", 0, reset_payload(spec))], reply=stored)
@@ -95,7 +95,7 @@ class Stepper:
     async def begin(self, session: Session, spec: ResetSpec) -> None:
         """Like restart(), for a session that is not in the store yet; see beginning_entries()."""
         cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
-        await self._kernels.ready(spec.ego)
+        await self._kernels.ready(spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
 

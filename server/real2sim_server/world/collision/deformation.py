@@ -67,6 +67,10 @@ class Deformation(Protocol):
     what is drawn instead of an object's own Gaussians.
     """
 
+    @property
+    def has_impacts(self) -> bool:
+        """Whether there is anything to solve, now or later."""
+
     def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
         """After an impact; ``subjects``: all objects by id."""
 
@@ -88,6 +92,11 @@ class DeformationTracker:
 
     scene: Scene
     deformed: Mapping[str, _DeformedObject] = field(default_factory=dict)
+
+    @property
+    def has_impacts(self) -> bool:
+        """Whether any object may be deformed."""
+        return bool(self.deformed)
 
     def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
         """After an impact; slow ones leave no trace."""
