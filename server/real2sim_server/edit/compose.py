@@ -76,9 +76,21 @@ def things_of(
     as_recorded = all(state.objects.get(name) is known for name, known in state.recorded.items())
     if state.erased or not as_recorded or any(subject.edited for subject in shown):
         return None
+    return (Instance(scene.background), *_anywhere(scene, shown))
+
+
+def things_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
+    """Everything that is drawn of a scenario at its start or comes later, but shadows: the
+    background and every visible object, wherever. Raises like :func:`things_of`."""
+    placed = state.tracks.at(scene.start_us)
+    poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
+    background = Instance(composed_background(scene, state, poses))
+    return [background, *_anywhere(scene, state.tracks.objects)]
+
+
+def _anywhere(scene: Scene, objects: Iterable[ObjectState]) -> Iterable[Instance]:
     nowhere = transform_from(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    standing = (_standing(scene, subject, nowhere, scene.start_us) for subject in shown)
-    return (Instance(scene.background), *standing)
+    return (_standing(scene, subject, nowhere, scene.start_us) for subject in objects)
 
 
 def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> Instance:

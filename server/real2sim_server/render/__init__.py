@@ -3,6 +3,14 @@
 from .backends import Backend, BackendStatus, describe_backends, select_backend
 from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
 from .frame import Frame, render_cameras, warm_up
+from .levels import (
+    levels_bytes,
+    levels_estimate,
+    make_levels,
+    scene_levels_bytes,
+    uses_levels,
+    without_levels,
+)
 from .modalities import encode_image
 from .rasterize import View, rasterize, rasterize_batch, rasterize_worlds
 from .types import (
@@ -31,10 +39,16 @@ __all__ = [
     "encode_image",
     "encode_instance",
     "encode_rgb",
+    "levels_bytes",
+    "levels_estimate",
+    "make_levels",
     "rasterize",
     "rasterize_batch",
     "rasterize_worlds",
     "render_cameras",
+    "scene_levels_bytes",
     "select_backend",
+    "uses_levels",
     "warm_up",
+    "without_levels",
 ]

@@ -121,7 +121,13 @@ class Worker:
         job_log = JobLog(store, settings.worker_id)
         jobs = Jobs(job_log, _jobs_quota(settings), on_end=metrics.observe_ended_job)
         kernels = KernelWarmUp()
-        renderer = Renderer(engine, backend, metrics, max_pixels=settings.max_pixels_per_step)
+        renderer = Renderer(
+            engine,
+            backend,
+            metrics,
+            max_pixels=settings.max_pixels_per_step,
+            budget=budget,
+        )
         worker = cls(
             settings=settings,
             engine=engine,
@@ -288,7 +294,11 @@ class Worker:
         self.metrics.watch_accounts(self.accounts, self.sessions.owned)
         self.metrics.session_limit.set(self.settings.max_sessions)
         self.metrics.watch(self.metrics.queue_depth, lambda: self.engine.queue_depth)
-        self.metrics.watch(self.metrics.scene_bytes, lambda: self.scene_cache.resident_bytes)
+        levels = self.renderer.levels
+        self.metrics.watch(
+            self.metrics.scene_bytes,
+            lambda: self.scene_cache.resident_bytes + levels.held_bytes,
+        )
         for state, count in self.scene_cache.counters().items():
             self.metrics.watch(self.metrics.scenes.labels(state), count)
 

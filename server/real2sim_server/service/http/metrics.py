@@ -57,7 +57,9 @@ class Metrics:
         )
         self.scenes = Gauge("real2sim_scenes", "scenes by state", ("state",), registry=registry)
         self.scene_bytes = Gauge(
-            "real2sim_scene_memory_bytes", "bytes of resident scenes", registry=registry
+            "real2sim_scene_memory_bytes",
+            "bytes of resident scenes and their levels of detail",
+            registry=registry,
         )
         self.scene_loads = Histogram(
             "real2sim_scene_load_duration_seconds",

@@ -17,6 +17,7 @@ import structlog
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import SceneState
 
+from ...render import scene_levels_bytes
 from ...scene import BundleError, Scene
 from ...scene.io import SceneSummary, load_scene
 from ..engine import Engine
@@ -158,9 +159,10 @@ class SceneCache:
     def idle(self) -> list[IdleItem]:
         """Scenes that no session pins. May be called on any thread, as what it returns."""
         return [
-            IdleItem(r.used_at, r.scene.nbytes, partial(self._drop, name, r.scene.nbytes))
+            IdleItem(r.used_at, nbytes, partial(self._drop, name, nbytes))
             for name, r in list(self._resident.items())
             if not r.pins
+            for nbytes in (r.scene.nbytes + scene_levels_bytes(r.scene),)
         ]
 
     # --- using ------------------------------------------------------------------------------

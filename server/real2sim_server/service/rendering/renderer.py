@@ -24,7 +24,9 @@ from ..engine import Engine, lower_priority
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..lanes import Lane
+from ..library.memory import MemoryBudget
 from .frames import EncodedFrame, RenderedImage, encode_frame
+from .levels import DetailLevels
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -79,11 +81,22 @@ class Renderer:
         backend: rasterizes.
         metrics: gets durations by stage.
         max_pixels: over all sensors and modalities of one request.
+        budget: of memory, which levels of detail count in.
+
+    Attributes:
+        levels: of detail; small images wait for them before they go to the engine.
     """
 
     def __init__(
-        self, engine: Engine, backend: Backend, metrics: Metrics, *, max_pixels: int
+        self,
+        engine: Engine,
+        backend: Backend,
+        metrics: Metrics,
+        *,
+        max_pixels: int,
+        budget: MemoryBudget | None = None,
     ) -> None:
+        self.levels = DetailLevels(backend, budget)
         self._engine = engine
         self._backend = backend
         self._metrics = metrics
@@ -97,7 +110,8 @@ class Renderer:
         )
 
     def close(self) -> None:
-        """End the encoder threads."""
+        """End its threads."""
+        self.levels.close()
         self._encoders.shutdown(cancel_futures=True)
         self._bulk_encoders.shutdown(cancel_futures=True)
 
@@ -110,11 +124,13 @@ class Renderer:
         """Render and encode all sensors of a request.
 
         Raises:
-            ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
+            ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST for too many pixels, or OUT_OF_MEMORY
+                for levels of detail.
             QueueFullError, RenderError: as the engine and the rasterizer do.
         """
         rig = request.rig or request.scene.rig
         cameras = check_sensors(rig, request.sensors, max_pixels=self._max_pixels)
+        await self.levels.ready(request.sensors, cameras, lambda: request.instances)
         submitted = time.perf_counter()
         lane = _lane(cameras, stream)
         images, render_ms = await self._engine.call(

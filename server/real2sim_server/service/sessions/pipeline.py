@@ -38,7 +38,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.codec import DEFAULT_MAX_BYTES
 from real2sim_proto.episode import SensorSpec
 
-from ...edit import ScenarioState, instances_at
+from ...edit import ScenarioState, instances_at, things_at_start
 from ...geometry.transform import invert_transform
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
@@ -179,6 +179,21 @@ class StepPipeline:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
         cameras = self._checked(scene, sensors)
         return {s.camera: c for s, c in zip(sensors, cameras, strict=True)}
+
+    async def levels_ready(
+        self,
+        scene: Scene,
+        state: ScenarioState,
+        sensors: Sequence[SensorSpec],
+        cameras: Mapping[str, Camera],
+    ) -> None:
+        """Wait until small images of a scenario have what they are drawn from, off the engine.
+
+        Raises:
+            ServiceError: OUT_OF_MEMORY.
+        """
+        sizes = [cameras[sensor.camera] for sensor in sensors]
+        await self._renderer.levels.ready(sensors, sizes, lambda: things_at_start(scene, state))
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
@@ -364,6 +379,8 @@ class StepPipeline:
             QueueFullError: too much waits for the engine.
         """
         cameras = self._checked(world.scene, sensors)
+        things = partial(things_at_start, world.scene, world.state)
+        await self._renderer.levels.ready(sensors, cameras, things)
         timer = PhaseTimer()
         view = partial(self._compute_view, world, sensors, cameras, timer)
         try:

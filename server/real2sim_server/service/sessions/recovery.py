@@ -40,7 +40,9 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
     await pipeline.on_world_thread(_apply_all, replayer, before)
     session.snapshots = replayer.snapshots
     if last.kind == "action":
-        cameras = pipeline.cameras(start.scene, _world(replayer).spec.sensors)
+        sensors = _world(replayer).spec.sensors
+        cameras = pipeline.cameras(start.scene, sensors)
+        await pipeline.levels_ready(start.scene, start.state, sensors, cameras)
         observation = await pipeline.run(Transition(lambda: replayer.apply(last), cameras))
         session.begin(observation.world, cameras)
         session.lockstep.reset(observation.world.steps, over=observation.world.over)
@@ -49,7 +51,9 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
         session.newest = observation.message
         return
     world = await pipeline.on_world_thread(replayer.apply, last)
-    session.begin(world, pipeline.cameras(start.scene, world.spec.sensors))
+    cameras = pipeline.cameras(start.scene, world.spec.sensors)
+    await pipeline.levels_ready(start.scene, start.state, world.spec.sensors, cameras)
+    session.begin(world, cameras)
     session.lockstep.reset(world.steps, over=world.over)
 
 

@@ -72,8 +72,7 @@ class Stepper:
         Raises:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
-        cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
-        await self._kernels.ready(spec)
+        cameras = await self._announced(session, spec)
         record = ("reset", 0, reset_payload(spec))
         observation, _ = await self._observe(session, _beginning(session, spec), cameras, record)
         session.begin(observation.world, cameras)
@@ -85,8 +84,7 @@ class Stepper:
 
         ``reply`` makes the answer that is stored with it.
         """
-        cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
-        await self._kernels.ready(spec)
+        cameras = await self._announced(session, spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         stored = await asyncio.to_thread(reply, world, ())
         await self._record(session, [("reset", 0, reset_payload(spec))], reply=stored)
@@ -94,10 +92,17 @@ class Stepper:
 
     async def begin(self, session: Session, spec: ResetSpec) -> None:
         """Like restart(), for a session that is not in the store yet; see beginning_entries()."""
-        cameras = self._pipeline.cameras(session.start.scene, spec.sensors)
-        await self._kernels.ready(spec)
+        cameras = await self._announced(session, spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
+
+    async def _announced(self, session: Session, spec: ResetSpec) -> dict[str, Camera]:
+        """Cameras of an episode, once all that it would wait for on the way is there."""
+        start = session.start
+        cameras = self._pipeline.cameras(start.scene, spec.sensors)
+        await self._kernels.ready(spec)
+        await self._pipeline.levels_ready(start.scene, start.state, spec.sensors, cameras)
+        return cameras
 
     def beginning_entries(self, session: Session) -> list[SessionEntry]:
         """The log of a session that is not in the store yet: its first episode, if it has one."""

@@ -74,6 +74,8 @@ class Hierarchy:
 
 
 _making = threading.Lock()
+"""One at a time is merged; who asks for levels that are there does not wait for it."""
+_keeping = threading.Lock()
 _plain: weakref.WeakKeyDictionary[GaussianCloud, Hierarchy] = weakref.WeakKeyDictionary()
 _coloured: weakref.WeakKeyDictionary[TimeColour, tuple[weakref.ref[GaussianCloud], Hierarchy]] = (
     weakref.WeakKeyDictionary()
@@ -82,16 +84,36 @@ _coloured: weakref.WeakKeyDictionary[TimeColour, tuple[weakref.ref[GaussianCloud
 
 def hierarchy_of(cloud: GaussianCloud, colour: TimeColour | None = None) -> Hierarchy:
     """The levels of a cloud; made at the first call: about a second for a million Gaussians."""
+    known = known_hierarchy(cloud, colour)
+    if known is not None:
+        return known
     with _making:
-        if colour is None:
-            known = _plain.get(cloud)
-            if known is None:
-                known = _plain[cloud] = make_hierarchy(cloud, None)
+        known = known_hierarchy(cloud, colour)
+        if known is not None:
             return known
+        made = make_hierarchy(cloud, colour)
+        with _keeping:
+            if colour is None:
+                _plain[cloud] = made
+            else:
+                _coloured[colour] = weakref.ref(cloud), made
+        return made
+
+
+def known_hierarchy(cloud: GaussianCloud, colour: TimeColour | None = None) -> Hierarchy | None:
+    """The levels of a cloud, if they are made already."""
+    with _keeping:
+        if colour is None:
+            return _plain.get(cloud)
         held = _coloured.get(colour)
-        if held is None or held[0]() is not cloud:
-            held = _coloured[colour] = weakref.ref(cloud), make_hierarchy(cloud, colour)
-        return held[1]
+        return held[1] if held is not None and held[0]() is cloud else None
+
+
+def held_bytes() -> int:
+    """Memory of the levels of all clouds that are alive [bytes]."""
+    with _keeping:
+        held = [*_plain.values(), *(hierarchy for _, hierarchy in _coloured.values())]
+    return sum(hierarchy.nbytes for hierarchy in held)
 
 
 def deformed_hierarchy(

@@ -1,0 +1,95 @@
+"""What small images are drawn from is counted, and made before the engine needs it."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+
+import pytest
+
+from real2sim_proto.episode import SensorSpec
+from real2sim_server.edit import ScenarioState, things_at_start
+from real2sim_server.render import levels_bytes, scene_levels_bytes, select_backend
+from real2sim_server.render.backends.cpu.detail import hierarchy
+from real2sim_server.service.http.problems import ServiceError
+from real2sim_server.service.library.memory import MemoryBudget
+from real2sim_server.service.rendering.levels import DetailLevels
+
+from ...conftest import make_tiny_scene
+
+SMALL = {"action": "control", "sensors": [{"camera": "front", "detail": "auto"}]}
+
+
+@pytest.fixture
+def makers(monkeypatch) -> list[str]:
+    """Names of the threads on which levels were made."""
+    names: list[str] = []
+    make = hierarchy.make_hierarchy
+
+    def noted(*cloud):
+        names.append(threading.current_thread().name)
+        return make(*cloud)
+
+    monkeypatch.setattr(hierarchy, "make_hierarchy", noted)
+    return names
+
+
+def make_ready(scene, levels: DetailLevels, **sensor: object) -> None:
+    spec = SensorSpec(camera="front", **({"detail": "auto"} | sensor))
+    camera = scene.rig["front"].resized(spec.width or scene.rig["front"].width)
+    things = things_at_start(scene, ScenarioState.of(scene))
+    try:
+        asyncio.run(levels.ready([spec], [camera], lambda: things))
+    finally:
+        levels.close()
+
+
+@pytest.mark.network
+def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(client, makers):
+    while client.get("/readyz").status_code != 200:
+        time.sleep(0.05)
+    makers.clear()
+    made = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": SMALL})
+    assert made.status_code == 201, made.text
+    assert len(makers) == 4
+    assert all(name.startswith("levels") for name in makers)
+    session, token = made.json()["session_id"], made.json()["token"]
+    worker = client.app.state.worker
+    held = worker.renderer.levels.held_bytes
+    assert held > 0
+    free = worker.scene_cache.budget.total_bytes - worker.scene_cache.budget.free_bytes
+    assert free >= held + worker.scene_cache.resident_bytes
+    seen = client.post(
+        f"/v1/sessions/{session}/step",
+        json={"plan": {"kind": "control", "acceleration": 1.0, "steering": 0.0}},
+        headers={"Authorization": f"Bearer {token}"},
+    )
+    assert seen.status_code == 200, seen.text
+    assert len(makers) == 4
+
+
+def test_they_are_counted_with_their_scene(tiny_scene, makers):
+    budget = MemoryBudget(10**9)
+    levels = DetailLevels(select_backend("cpu"), budget)
+    before = levels_bytes()
+    known = scene_levels_bytes(tiny_scene)
+    make_ready(tiny_scene, levels)
+    assert scene_levels_bytes(tiny_scene) > 0
+    assert levels_bytes() - before == scene_levels_bytes(tiny_scene) - known
+    assert budget.free_bytes == 10**9 - levels_bytes()
+
+
+@pytest.mark.parametrize("sensor", [{"detail": "full"}, {"width": 1000}])
+def test_other_images_need_none(makers, sensor):
+    make_ready(make_tiny_scene(), DetailLevels(select_backend("cpu")), **sensor)
+    assert makers == []
+
+
+def test_where_they_do_not_fit_the_answer_says_so(makers):
+    levels = DetailLevels(select_backend("cpu"), MemoryBudget(1000))
+    with pytest.raises(ServiceError, match="small images") as refused:
+        make_ready(make_tiny_scene(), levels)
+    assert refused.value.code == "OUT_OF_MEMORY"
+    assert makers == []
+    assert levels.held_bytes == levels_bytes()
