@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SOURCES := proto client server tests scripts docs/conf.py docs/images/make.py
 PYTEST := $(BIN)/python -m pytest -q
+# One process more than cores, since many tests wait: for a worker, a time limit, a page.
+PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1))") --dist loadfile
 
 # What a change breaks first: the contract, the SDK, the layers, and the packages whose tests
 # compile little. The others belong to `make test`.
@@ -22,10 +24,10 @@ demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
 
 check: lint
-	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile $(FAST)
+	$(PYTEST) $(PARALLEL) $(FAST)
 
 test: $(STAMP)
-	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) $(PARALLEL)
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 0 --run-slow -m "slow or gpu or ray"
@@ -52,7 +54,7 @@ schema: $(STAMP)
 	$(BIN)/python -m real2sim_server.service.write_openapi docs/openapi.json
 
 coverage: $(STAMP)
-	$(PYTEST) -n auto --maxprocesses 4 --dist loadfile --cov --cov-report=html:out/coverage --cov-report=term
+	$(PYTEST) $(PARALLEL) --cov --cov-report=html:out/coverage --cov-report=term
 
 # What an image installs, with hashes, from constraints.txt; and the notices that go with it. torch
 # and what comes with it are apart: builds for CPU and CUDA differ.

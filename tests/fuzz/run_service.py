@@ -46,7 +46,7 @@ def main() -> int:
     faulthandler.enable()
     with tempfile.TemporaryDirectory() as folder, attacked(Path(folder)) as site:
         attacks = {name: ATTACKS[name](site, Path(folder)) for name in given.targets}
-        warm_up(site, attacks)
+        warm_up(site, attacks, min(30, given.inputs))
         limit_memory()
         reports = [run(site, n, a, given.inputs, given.seed) for n, a in attacks.items()]
         site.driver.leave()
@@ -54,13 +54,13 @@ def main() -> int:
     return 0
 
 
-def warm_up(site: Site, attacks: dict[str, Attack]) -> None:
+def warm_up(site: Site, attacks: dict[str, Attack], inputs: int) -> None:
     """What is compiled or loaded at first use is no fault of an input."""
     for call in rest.described_calls(site):
         site.restore()
         rest.answered(site, call.data(), whole=True, rng=random.Random(1))
     for name, attack in attacks.items():
-        for number in range(30):
+        for number in range(inputs):
             attack(number, random.Random(f"warm {name} {number}"))
     site.tidy()
     site.log.taken()

@@ -43,7 +43,7 @@ def worker_kernels():
 
 @pytest.mark.timeout(300)
 def test_damaged_requests_and_messages_are_refused_and_nobody_else_notices():
-    _check().check_service(*WAYS, inputs=50)
+    _check().check_service(*WAYS, inputs=15)
 
 
 @pytest.mark.slow

@@ -82,7 +82,7 @@ def trained(
 @pytest.mark.parametrize(
     ("method", "steps"),
     [
-        ("gradient", 10),
+        ("gradient", 6),
         ("mcmc", 5),
         pytest.param("gradient", 50, marks=pytest.mark.slow),
         pytest.param("mcmc", 50, marks=pytest.mark.slow),
@@ -92,7 +92,7 @@ def test_all_that_training_does_lies_on_the_device(
     log: DrivingLog, scene: Scene, cuda_backend: Backend, method: str, steps: int, tmp_path: Path
 ) -> None:
     densify = DensifyOptions(
-        method=method, every=steps // 5, reset_every=steps // 3, start=0.0, stop=0.8
+        method=method, every=max(1, steps // 5), reset_every=max(2, steps // 3), start=0.0, stop=0.8
     )
     weights = replace(OPTIONS.losses, object_entropy=0.1, sky=0.1, opacity=0.01, scale=0.01)
     rates = replace(OPTIONS.learning_rates, camera=1e-4)

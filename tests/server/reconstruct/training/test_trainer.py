@@ -119,25 +119,35 @@ def losses_of(folder) -> list[tuple[int, float]]:
     return [(line["iteration"], line["loss"]) for line in map(json.loads, lines)]
 
 
+BROKEN_OFF = replace(TINY, iterations=40, mirror=0.5)
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_log, tiny_scene, tmp_path_factory):
+    """A run to its end, and its folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    trainer = Trainer(tiny_log, tiny_scene, BROKEN_OFF, folder=folder)
+    trainer.run()
+    return trainer, folder
+
+
 @pytest.mark.parametrize(
     ("every", "until", "since"), [(20, 33, 20), (12, 38, 36)], ids=["early", "among priors"]
 )
 def test_a_run_that_was_broken_off_goes_on_bit_for_bit(
-    tiny_log, tiny_scene, tmp_path, every, until, since
+    tiny_log, tiny_scene, whole, tmp_path, every, until, since
 ):
-    options = replace(TINY, iterations=40, mirror=0.5, checkpoint_every=every)
-    whole = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "whole")
-    whole.run()
-    broken = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "broken")
-    broken.run(until=until)
-    resumed = Trainer(tiny_log, tiny_scene, options, folder=tmp_path / "broken")
+    expected, folder = whole
+    options = replace(BROKEN_OFF, checkpoint_every=every)
+    Trainer(tiny_log, tiny_scene, options, folder=tmp_path).run(until=until)
+    resumed = Trainer(tiny_log, tiny_scene, options, folder=tmp_path)
     resumed.resume()
     assert resumed.iteration == since
     resumed.run()
-    for name, tensor in whole.model.parameters().items():
+    for name, tensor in expected.model.parameters().items():
         assert torch.equal(tensor, resumed.model.parameters()[name]), name
-    assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "broken")
-    assert [i for i, _ in losses_of(tmp_path / "broken")] == [10, 20, 30, 40]
+    assert losses_of(folder) == losses_of(tmp_path)
+    assert [i for i, _ in losses_of(tmp_path)] == [10, 20, 30, 40]
 
 
 def test_resuming_with_other_options_is_refused(tiny_log, tiny_scene, tmp_path):
