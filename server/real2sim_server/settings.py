@@ -43,7 +43,8 @@ class Settings(BaseSettings):
         store_max_bytes: size above which the oldest ended sessions are removed.
         session_retention_days: after which ended sessions are removed, and unused ones ended.
         job_retention_days: after which ended jobs are removed, with their files.
-        backend: what draws: ``auto`` chooses by the hardware at hand.
+        backend: what draws: ``auto`` chooses by the hardware at hand; ``nvrtc`` are the kernels of
+            our own for a GPU, which serve and do not train.
         threads: of numba and torch; 0 for one per core.
         scene_memory_bytes: budget of resident scenes and assets together.
         max_sessions: open sessions; more are refused at creation.
@@ -95,7 +96,7 @@ class Settings(BaseSettings):
     session_retention_days: float = Field(default=30.0, gt=0, le=36_500)
     job_retention_days: float = Field(default=30.0, gt=0, le=36_500)
     durability: Literal["all", "edits", "process"] = "edits"
-    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+    backend: Literal["auto", "cpu", "cuda", "nvrtc", "reference"] = "auto"
     threads: int = Field(default=0, ge=0, le=1024)
     scene_memory_bytes: int = Field(default=8 * GIB, gt=0)
     max_sessions: int = Field(default=32, ge=0)

@@ -7,7 +7,7 @@ import os
 from ..console import CommandError
 
 ON_CPU = ("auto", "cpu", "reference")
-ON_CUDA = ("auto", "cuda")
+ON_CUDA = ("auto", "cuda", "nvrtc")
 
 
 def chosen_backend(backend: str, device: str | None) -> str:
@@ -17,7 +17,7 @@ def chosen_backend(backend: str, device: str | None) -> str:
     works on the same one.
 
     Args:
-        backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        backend: ``auto``, ``cpu``, ``cuda``, ``nvrtc`` or ``reference``.
         device: ``cpu``, ``cuda``, ``cuda:1`` ...; None takes the backend's own.
 
     Raises:

@@ -27,6 +27,7 @@ DISTRIBUTIONS = (
     "uvicorn",
     "gsplat",
     "numba-cuda",
+    "cuda-core",
 )
 
 
@@ -44,7 +45,9 @@ def doctor(
     ] = False,
     arch: Annotated[
         list[str] | None,
-        typer.Option(help="With --build-gpu: sm_90, sm_86 ...; default: of this GPU."),
+        typer.Option(
+            help="With --build-gpu and --serving-kernels: sm_90, sm_86 ...; default: of this GPU."
+        ),
     ] = None,
     need_cuda: Annotated[
         bool, typer.Option("--need-cuda", help="Fail where rendering on CUDA is not usable.")
@@ -52,6 +55,14 @@ def doctor(
     without_device: Annotated[
         bool,
         typer.Option("--without-device", help="With --need-cuda: the GPU itself may be missing."),
+    ] = False,
+    serving_kernels: Annotated[
+        bool,
+        typer.Option(
+            "--serving-kernels",
+            help="Compile the kernels of --backend nvrtc for --arch, by default for all that are "
+            "tested, and say what each takes; fails where one spills. Needs no GPU.",
+        ),
     ] = False,
     json: JsonFile = None,
 ) -> None:
@@ -66,6 +77,8 @@ def doctor(
     if build_gpu:
         run_command(_build_gpu, findings=findings, arch=arch)
     report = _inspected(findings)
+    if serving_kernels:
+        run_command(_compile_serving, report=report, arch=arch)
     compiled: list[str] = []
     if warm or warmed:
         seconds, compiled = _warm_up()
@@ -83,11 +96,12 @@ def doctor(
 
 @dataclass
 class _Report:
-    """What was found; rows of backends and needs as they are printed and written."""
+    """What was found; rows of backends, needs and kernels as they are printed and written."""
 
     findings: dict[str, str]
     backends: list[dict[str, object]] = field(default_factory=list)
     cuda: list[dict[str, object]] = field(default_factory=list)
+    kernels: list[dict[str, object]] = field(default_factory=list)
     advice: list[str] = field(default_factory=list)
 
 
@@ -130,19 +144,44 @@ def _capability(name: str) -> str:
     return f"{digits[:-1]}.{digits[-1]}"
 
 
+def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
+    """Put down what each serving kernel takes on each architecture."""
+    from ..render.backends.nvrtc.needs import compiler_needs
+
+    for need in compiler_needs():
+        if not need.met:
+            raise CommandError(f"{need.found}; {need.remedy}")
+    from ..render.backends.nvrtc.compile import ARCHITECTURES, compile_kernels
+    from ..render.backends.nvrtc.usage import MULTIPROCESSORS
+
+    rows = report.kernels
+    given = [f"sm_{_capability(name).replace('.', '')}" for name in arch or []]
+    for architecture in given or ARCHITECTURES:
+        _, usages = compile_kernels(architecture)
+        known = architecture in MULTIPROCESSORS
+        for kernel, usage in usages.items():
+            occupancy = usage.occupancy(architecture) if known else None
+            rows.append({"architecture": architecture, "kernel": kernel, **vars(usage)})
+            rows[-1]["occupancy"] = occupancy
+    spilled = [f"{row['kernel']} on {row['architecture']}" for row in rows if row["spilled"]]
+    if spilled:
+        raise CommandError(f"registers do not hold {', '.join(spilled)}: they would run slowly")
+
+
 def _inspected(findings: dict[str, str]) -> _Report:
     import torch
 
     from ..render import describe_backends, select_backend
     from ..render.backends.cuda.needs import cuda_needs
+    from ..render.backends.nvrtc.needs import compiler_needs
 
     described, used = describe_backends(), select_backend("auto").name
     # Of use where somebody wants CUDA: where torch is built for it, or a driver is loaded.
     wanted = torch.version.cuda is not None or Path("/proc/driver/nvidia/version").is_file()
-    needs = cuda_needs() if wanted else []
-    mend = {
-        f"{b.name}: {b.remedy}" for b in described if b.remedy and not (needs and b.name == "cuda")
-    }
+    needs = [*cuda_needs(), *compiler_needs()] if wanted else []
+    # What both backends for a GPU need is said once: by the needs, or for the first of them.
+    told = {"cuda", "nvrtc"} if needs else {"nvrtc"}
+    mend = {f"{b.name}: {b.remedy}" for b in described if b.remedy and b.name not in told}
     return _Report(
         findings=findings,
         backends=[
@@ -199,6 +238,12 @@ def _report(report: _Report, json: Path | None) -> None:
         table = Table("cuda needs", "here", "found", title="CUDA", title_justify="left")
         for row in report.cuda:
             table.add_row(str(row["name"]), "yes" if row["met"] else "no", str(row["found"]))
+        console.print(table)
+    if report.kernels:
+        columns = list(report.kernels[0])
+        table = Table(*columns, title="serving kernels", title_justify="left")
+        for row in report.kernels:
+            table.add_row(*(f"{row[name]}" for name in columns))
         console.print(table)
     for line in report.advice:
         console.print(f"to mend: {line}", highlight=False, soft_wrap=True, markup=False)

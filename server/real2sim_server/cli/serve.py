@@ -29,7 +29,7 @@ def serve(
     token: Annotated[
         str | None, typer.Option(help="Shows in the process list: better --token-file.")
     ] = None,
-    backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda or reference")] = None,
+    backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda, nvrtc or reference")] = None,
 ) -> None:
     """Start a worker. Settings not given here come from REAL2SIM_* variables."""
     from pydantic import ValidationError

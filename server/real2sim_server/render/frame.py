@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..scene import Camera
-from .backends.base import Backend
+from .backends.base import Backend, FrameBackend, RasterRequest
 from .backends.select import select_backend
 from .modalities import modalities_drawn, modality_of, options_for
-from .rasterize import DEFAULT_OPTIONS, rasterize
-from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
+from .rasterize import DEFAULT_OPTIONS, checked_request
+from .types import Instance, RasterOptions, RenderError, Sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,8 @@ def render_cameras(
     backend: str | Backend = "auto",
     between: Callable[[], object] | None = None,
 ) -> list[Frame]:
-    """Frames of ``cameras`` in their order; cameras of one size are drawn in one call.
+    """Frames of ``cameras`` in their order; cameras of one size are drawn in one call,
+    and all in one where the backend can.
 
     Args:
         instances: what is in the world, see rasterize().
@@ -88,21 +90,26 @@ def render_cameras(
     groups: dict[tuple[int, int], list[int]] = {}
     for index, camera in enumerate(cameras):
         groups.setdefault((camera.width, camera.height), []).append(index)
-    frames: dict[int, Frame] = {}
-    for (width, height), members in groups.items():
-        group = [cameras[index] for index in members]
-        output = rasterize(
-            instances,
-            np.stack([camera.viewmat(vehicle) for camera in group]),
-            np.stack([camera.K for camera in group]),
-            width,
-            height,
+    drawn = tuple(instances)
+    requests = [
+        checked_request(
+            drawn,
+            np.stack([cameras[index].viewmat(vehicle) for index in members]),
+            np.stack([cameras[index].K for index in members]),
+            size,
             sky=sky,
             options=options,
-            backend=backend,
             between=between,
         )
-        frames.update(zip(members, _frames(group, vehicle, output, modalities), strict=True))
+        for size, members in groups.items()
+    ]
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    frames: dict[int, Frame] = {}
+    for members, (images, timing_ms) in zip(
+        groups.values(), _drawn(requests, modalities, chosen), strict=True
+    ):
+        group = [cameras[index] for index in members]
+        frames.update(zip(members, _frames(group, vehicle, images, timing_ms), strict=True))
     return [frames[index] for index in range(len(cameras))]
 
 
@@ -114,14 +121,30 @@ def warm_up(backend: str | Backend = "auto") -> None:
     render_cameras([], [camera], np.eye(4), backend=chosen)
 
 
+def _drawn(
+    requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
+) -> Iterator[tuple[Mapping[str, NDArray[Any]], dict[str, float]]]:
+    """Images [C, H, W, ...] by modality of each request, and milliseconds by stage."""
+    if isinstance(backend, FrameBackend) and backend.modalities.issuperset(modalities):
+        start = time.perf_counter()
+        finished = backend.frames(requests, modalities) if requests else []
+        cameras = sum(request.cameras for request in requests)
+        each = (time.perf_counter() - start) * 1e3 / max(cameras, 1)
+        for request, images in zip(requests, finished, strict=True):
+            yield images, {"total": each * request.cameras}
+        return
+    for request in requests:
+        output = backend.rasterize(request)
+        yield {name: modality_of(name).pixels(output) for name in modalities}, output.timing_ms
+
+
 def _frames(
     cameras: Sequence[Camera],
     vehicle: NDArray[np.float64],
-    output: RenderOutput,
-    modalities: Sequence[str],
+    images: Mapping[str, NDArray[Any]],
+    timing_ms: Mapping[str, float],
 ) -> list[Frame]:
-    images = {name: modality_of(name).pixels(output) for name in modalities}
-    share = {stage: value / len(cameras) for stage, value in output.timing_ms.items()}
+    share = {stage: value / len(cameras) for stage, value in timing_ms.items()}
     return [
         Frame(
             camera=camera.name,

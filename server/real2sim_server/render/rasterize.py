@@ -85,7 +85,7 @@ def rasterize(
         width, height: size of all C images [px].
         sky: behind everything, in place of ``options.background``.
         options: planes, blur, mode and which images are made.
-        backend: ``auto``, ``cpu``, ``cuda``, ``reference``, or a Backend.
+        backend: ``auto``, ``cpu``, ``cuda``, ``nvrtc``, ``reference``, or a Backend.
         check_values: False for callers that make new clouds for every call, which would be checked
             each time, and answer for their values themselves.
         between: called between pieces of the work, see RasterRequest.
@@ -93,19 +93,48 @@ def rasterize(
     Raises:
         RenderError: for anything that is not as said above; nothing is drawn then.
     """
+    request = checked_request(
+        instances,
+        viewmats,
+        Ks,
+        (width, height),
+        sky=sky,
+        options=options,
+        check_values=check_values,
+        between=between,
+    )
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    return chosen.rasterize(request)
+
+
+def checked_request(
+    instances: Sequence[Instance],
+    viewmats: Tensor | ArrayLike,
+    Ks: Tensor | ArrayLike,
+    size: tuple[int, int],
+    *,
+    sky: Sky | None = None,
+    options: RasterOptions = DEFAULT_OPTIONS,
+    check_values: bool = True,
+    between: Callable[[], object] | None = None,
+) -> RasterRequest:
+    """What a backend may trust: the arguments of :func:`rasterize`, ``size`` is width and height.
+
+    Raises:
+        RenderError: as :func:`rasterize`.
+    """
     request = RasterRequest(
         instances=tuple(instances),
         viewmats=_float64(viewmats, "viewmats", (4, 4)),
         Ks=_float64(Ks, "Ks", (3, 3)),
-        width=width,
-        height=height,
+        width=size[0],
+        height=size[1],
         sky=sky,
         options=options,
         between=between,
     )
     _check_request(request, check_values=check_values)
-    chosen = select_backend(backend) if isinstance(backend, str) else backend
-    return chosen.rasterize(request)
+    return request
 
 
 def rasterize_batch(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -81,3 +82,20 @@ def test_doctor_asks_what_to_build_for_where_there_is_no_gpu() -> None:
     code, output = doctor("--build-gpu", "--arch", "hopper")
     assert code == 1
     assert "'hopper'" in output
+
+
+def test_doctor_compiles_the_serving_kernels_without_a_gpu(tmp_path: Path) -> None:
+    pytest.importorskip("cuda.core")
+    report = tmp_path / "report.json"
+    code, output = doctor("--serving-kernels", "--arch", "9.0", "--json", str(report))
+    assert code == 0, output
+    rows = json.loads(report.read_text())["kernels"]
+    assert {row["architecture"] for row in rows} == {"sm_90"}
+    assert "blend" in {row["kernel"] for row in rows}
+    assert all(row["spilled"] == 0 and 0 < row["occupancy"] <= 1 for row in rows)
+    assert "blend" in output
+
+
+def test_the_serving_backend_is_refused_without_a_gpu() -> None:
+    with pytest.raises(RenderError, match="'nvrtc' is not usable"):
+        select_backend("nvrtc")

@@ -14,9 +14,14 @@ from fastapi.testclient import TestClient
 from real2sim_proto import decode
 from real2sim_server.render import select_backend
 from real2sim_server.render.backends import Backend, BackendStatus, RegisteredBackend
+from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.render.backends.select import BACKENDS
 from real2sim_server.service.app import create_app
 from real2sim_server.settings import Settings
+
+from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
+from . import pretended
+from .pretended_launcher import PretendedLauncher
 
 SENSORS = [
     {"camera": name, "modalities": ["rgb", "depth", "instance"], "codec": "raw"}
@@ -49,13 +54,25 @@ def start_worker(scenes_dir: Path, tmp_path: Path) -> Iterator[Callable[[str], T
         yield start
 
 
-@pytest.fixture
-def as_cuda(cuda_backend: Backend, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What is asked for as ``cuda`` is the backend on the pretended device."""
-    status = BackendStatus("cuda", True, "pretended")
-    monkeypatch.setitem(BACKENDS, "cuda", RegisteredBackend(lambda: status, lambda: cuda_backend))
+@pytest.fixture(params=["cuda", "nvrtc"])
+def on_device(
+    request: pytest.FixtureRequest,
+    device_counts: pretended.Counts,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[str]:
+    """Name of a backend that works on the pretended device."""
+    if request.param == "nvrtc" and COMPILER is None:
+        pytest.skip(NEEDS_COMPILER)
+    backend: Backend = (
+        NvrtcBackend(PretendedLauncher())
+        if request.param == "nvrtc"
+        else request.getfixturevalue("cuda_backend")
+    )
+    status = BackendStatus(request.param, True, "pretended")
+    made = RegisteredBackend(lambda: status, lambda: backend)
+    monkeypatch.setitem(BACKENDS, request.param, made)
     select_backend.cache_clear()
-    yield
+    yield request.param
     select_backend.cache_clear()
 
 
@@ -96,9 +113,9 @@ def image(frame: dict[str, Any]) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_worker_on_the_device_shows_what_the_reference_shows(
-    start_worker: Callable[[str], TestClient], as_cuda: None
+    start_worker: Callable[[str], TestClient], on_device: str
 ) -> None:
-    given, expected = (pictures(start_worker(name)) for name in ("cuda", "reference"))
+    given, expected = (pictures(start_worker(name)) for name in (on_device, "reference"))
     assert len(given) == len(expected) == 12
     for here, there in zip(given, expected, strict=True):
         assert here.shape == there.shape

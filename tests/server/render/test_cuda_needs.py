@@ -114,7 +114,7 @@ def test_drawing_on_the_cpu_beside_a_gpu_is_warned_of(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(select.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(needs, "_version", VERSIONS.get)
+    monkeypatch.setattr(needs, "installed_version", VERSIONS.get)
     monkeypatch.setattr(
         needs, "_kernels", lambda: needs.Need("kernels", False, "none", needs.BUILD)
     )

@@ -40,7 +40,7 @@ def test_backend_that_cannot_be_used_is_refused_with_the_remedy(
 
 def test_every_backend_is_described_with_a_reason_and_a_remedy_where_needed() -> None:
     statuses = describe_backends()
-    assert {status.name for status in statuses} == {"cuda", "cpu", "reference"}
+    assert {status.name for status in statuses} == {"cuda", "cpu", "nvrtc", "reference"}
     for status in statuses:
         assert status.reason
         assert bool(status.remedy) != status.usable

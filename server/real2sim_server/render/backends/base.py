@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..types import (
@@ -110,6 +111,24 @@ class BatchBackend(Protocol):
     def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
         """All images of ``worlds``, by world and then by camera; sizes, sky and options are those
         of ``like``, for which :func:`is_reduced` holds. The same bits as one by one."""
+        ...
+
+
+@runtime_checkable
+class FrameBackend(Protocol):
+    """A Backend that draws images of several sizes in one go, as they leave the renderer."""
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        """Those of which :meth:`frames` makes images."""
+        ...
+
+    def frames(
+        self, requests: Sequence[RasterRequest], modalities: Sequence[str]
+    ) -> list[dict[str, NDArray[Any]]]:
+        """Images [C, H, W, ...] by modality of each request, on the host and for the caller to
+        keep; what the modality's ``pixels`` makes of :meth:`Backend.rasterize`, within one level
+        of a byte."""
         ...
 
 

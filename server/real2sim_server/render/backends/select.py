@@ -65,8 +65,8 @@ def select_backend(name: str = "auto") -> Backend:
     """The one backend of that name, made on first use.
 
     Args:
-        name: of a registered backend (``cpu``, ``cuda``, ``reference``), or ``auto``: cuda where
-            it is usable, else cpu.
+        name: of a registered backend (``cpu``, ``cuda``, ``nvrtc``, ``reference``), or ``auto``:
+            cuda where it is usable, else cpu.
 
     Raises:
         RenderError: unknown, or not usable here; the message says what to do.
@@ -126,6 +126,15 @@ def _cuda_status() -> BackendStatus:
     return BackendStatus("cuda", True, f"gsplat on {torch.cuda.get_device_name()}")
 
 
+def _nvrtc_status() -> BackendStatus:
+    from .nvrtc.needs import unmet_need
+
+    need = unmet_need()
+    if need is not None:
+        return BackendStatus("nvrtc", False, need.found, need.remedy)
+    return BackendStatus("nvrtc", True, f"kernels of our own on {torch.cuda.get_device_name()}")
+
+
 def _make_cpu() -> Backend:
     from .cpu.backend import CpuBackend
 
@@ -138,6 +147,12 @@ def _make_cuda() -> Backend:
     return CudaBackend()
 
 
+def _make_nvrtc() -> Backend:
+    from .nvrtc.backend import NvrtcBackend
+
+    return NvrtcBackend()
+
+
 def _make_reference() -> Backend:
     from .reference import ReferenceBackend
 
@@ -147,6 +162,8 @@ def _make_reference() -> Backend:
 BACKENDS: dict[str, RegisteredBackend] = {
     "cuda": RegisteredBackend(_cuda_status, _make_cuda, preference=2),
     "cpu": RegisteredBackend(_cpu_status, _make_cpu, preference=1),
+    # Not taken by itself: it draws without gradients, so training could not go on with it.
+    "nvrtc": RegisteredBackend(_nvrtc_status, _make_nvrtc),
     "reference": RegisteredBackend(
         lambda: BackendStatus("reference", True, "plain torch, slow"), _make_reference
     ),

@@ -54,7 +54,7 @@ class Need:
 
 def cuda_needs() -> list[Need]:
     """All needs, in the order in which they are to be mended."""
-    return [_torch(), _device(), _gsplat(), _numba_cuda(), _nvvm(), _kernels()]
+    return [torch_need(), device_need(), _gsplat(), _numba_cuda(), _nvvm(), _kernels()]
 
 
 def unmet_need(*, without_device: bool = False) -> Need | None:
@@ -96,14 +96,16 @@ def try_without_device() -> None:
     compile_ptx(find_instances.py_func, instance_signature(), cc=(9, 0))
 
 
-def _torch() -> Need:
+def torch_need() -> Need:
+    """A torch that is built for CUDA."""
     version = torch.version.cuda
     if version is None:
         return Need("torch", False, f"torch {torch.__version__} is built for CPU only", CUDA_TORCH)
     return Need("torch", True, f"torch {torch.__version__} for CUDA {version}")
 
 
-def _device() -> Need:
+def device_need() -> Need:
+    """A GPU that torch sees."""
     if not torch.cuda.is_available():
         return Need("device", False, "torch sees no CUDA device", DRIVER, of_device=True)
     major, minor = torch.cuda.get_device_capability()
@@ -113,7 +115,7 @@ def _device() -> Need:
 
 
 def _gsplat() -> Need:
-    version = _version("gsplat")
+    version = installed_version("gsplat")
     if version is None:
         return Need("gsplat", False, "gsplat is not installed", INSTALL)
     lowest, above = GSPLAT
@@ -140,7 +142,7 @@ def _kernels() -> Need:
 
 
 def _numba_cuda() -> Need:
-    version = _version("numba-cuda")
+    version = installed_version("numba-cuda")
     if version is None:
         return Need("numba-cuda", False, "numba-cuda is not installed", INSTALL)
     return Need("numba-cuda", True, f"numba-cuda {version}")
@@ -160,7 +162,8 @@ def _nvvm_libraries() -> Iterator[Path]:
             yield from sorted((root / folder).glob("libnvvm.so*"))
 
 
-def _version(distribution: str) -> str | None:
+def installed_version(distribution: str) -> str | None:
+    """Of a distribution, or None where it is not installed."""
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:

@@ -1,0 +1,229 @@
+"""The backend that draws frames for serving: tables, launches, images.
+
+Cameras of several requests, of one size each, are drawn together; so are the images of sessions on
+one scene. Neither launches nor copies depend on the number of objects.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...types import RasterOptions, RenderError, RenderOutput
+from ..base import RasterRequest, needs_gradients
+from ..warm_up import warm_up_requests
+from .launcher import CudaLauncher, Launcher
+from .memory import PAIRS_PER_SPLAT, REPORT_BYTES, FrameMemory, Images, tile_passes
+from .records import IMAGES, MAX_CAMERAS, PAIRS_WANTED, PIECE, SEEN_WANTED
+from .residence import Residence
+from .tables import Tables, tables_of
+
+BY_TILE = 16
+"""Added to the number of a pass that sorts pairs by tile."""
+DEPTH_PASSES = 4
+SEEN_SHARE = 4
+"""At first one in so many Gaussians of each camera is thought to be seen."""
+FINISHED = {"rgb": "bytes", "depth": "solid", "instance": "instance"}
+"""Images as they leave the renderer, by modality."""
+
+
+class NvrtcBackend:
+    """Rasterizer for an NVIDIA GPU, without gradients. One call at a time; others wait."""
+
+    name = "nvrtc"
+
+    def __init__(self, launcher: Launcher | None = None) -> None:
+        self._launcher = launcher or CudaLauncher()
+        self.device = self._launcher.device
+        self._residence = Residence(self._launcher)
+        self._memory = FrameMemory(self._launcher)
+        self._lock = threading.RLock()
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        """Those of :meth:`frames`."""
+        return frozenset(FINISHED)
+
+    def warm_up(self) -> None:
+        """Reserve memory, by a small frame."""
+        for request in warm_up_requests():
+            self.rasterize(request)
+
+    def rasterize(self, request: RasterRequest) -> RenderOutput:
+        """Draw all cameras in one go. Images stay on the device.
+
+        Raises:
+            RenderError: the request needs gradients.
+        """
+        start = time.perf_counter()
+        options = request.options
+        names = [
+            "rgb",
+            "alpha",
+            *(name for name in ("depth", "instance") if getattr(options, name)),
+        ]
+        parts: list[dict[str, Tensor]] = []
+        for piece in _pieces(request):
+            with self._lock:
+                images, tables = self._draw([piece], names)
+            parts.append({name: _tensor(images, name, tables, piece) for name in names})
+        whole = {
+            name: torch.cat([part[name] for part in parts]) if len(parts) > 1 else parts[0][name]
+            for name in names
+        }
+        return RenderOutput(
+            rgb=whole["rgb"],
+            alpha=whole["alpha"],
+            depth=whole.get("depth"),
+            instance=whole.get("instance"),
+            timing_ms={"total": (time.perf_counter() - start) * 1e3},
+        )
+
+    def frames(
+        self, requests: Sequence[RasterRequest], modalities: Sequence[str]
+    ) -> list[dict[str, NDArray[Any]]]:
+        """Images of all requests as they leave the renderer, see FrameBackend."""
+        pieces = [(k, piece) for k, request in enumerate(requests) for piece in _pieces(request)]
+        found: list[list[dict[str, NDArray[Any]]]] = [[] for _ in requests]
+        for batch in _batches(pieces):
+            drawn = self._frame([piece for _, piece in batch], modalities)
+            for (k, _), images in zip(batch, drawn, strict=True):
+                found[k].append(images)
+        return [
+            parts[0]
+            if len(parts) == 1
+            else {name: np.concatenate([part[name] for part in parts]) for name in modalities}
+            for parts in found
+        ]
+
+    def _frame(
+        self, requests: Sequence[RasterRequest], modalities: Sequence[str]
+    ) -> list[dict[str, NDArray[Any]]]:
+        names = [FINISHED[name] for name in modalities]
+        with self._lock:
+            images, _ = self._draw(requests, names, keeps_images=True)
+        memory = images.memory.numpy()
+        results, first = [], 0
+        for request in requests:
+            pixels = request.cameras * request.height * request.width
+            shape = (request.cameras, request.height, request.width)
+            results.append(
+                {
+                    modality: _section(memory, images, name, first, pixels).reshape(
+                        *shape, *IMAGES[name][1]
+                    )
+                    for modality, name in zip(modalities, names, strict=True)
+                }
+            )
+            first += pixels
+        return results
+
+    def _draw(
+        self, requests: Sequence[RasterRequest], names: Sequence[str], *, keeps_images: bool = False
+    ) -> tuple[Images, Tables]:
+        """Images on the device, or with ``keeps_images`` on the host, when they are whole.
+
+        Space is what frames before have needed; a frame that needs more is drawn again.
+        """
+        if any(needs_gradients(request) for request in requests):
+            raise RenderError(
+                "backend 'nvrtc' draws without gradients; train with --backend cuda, which is "
+                "gsplat: real2sim doctor --build-gpu"
+            )
+        memory = self._memory
+        tables = tables_of(requests, self._residence, self._launcher)
+        looked_at = int(
+            (tables.objects["count"].astype(np.int64) * tables.objects["cameras"]).sum()
+        )
+        least = max(looked_at // SEEN_SHARE, PIECE)
+        memory.reserve(least, PAIRS_PER_SPLAT * least)
+        places = tables.objects["tones"].copy()
+        while True:
+            tables.objects["tones"] = places
+            images = memory.images(names, tables.pixels)
+            frame = memory.upload(tables, images, requests[0].options)
+            self._launch(frame, tables)
+            given = images.memory if keeps_images else images.memory[:REPORT_BYTES]
+            host = self._launcher.host_memory(len(given))
+            host.copy_(given, non_blocking=True)
+            self._launcher.wait()
+            report = host.numpy()[:REPORT_BYTES].view(np.uint32)
+            seen, pairs = int(report[SEEN_WANTED]), int(report[PAIRS_WANTED])
+            if not tables.pieces or (
+                seen <= memory.seen_capacity and pairs <= memory.pair_capacity
+            ):
+                return replace(images, memory=host) if keeps_images else images, tables
+            memory.reserve(seen + seen // 4, pairs + pairs // 4)
+
+    def _launch(self, frame: int, tables: Tables) -> None:
+        """Queue the kernels of a frame."""
+        launch, memory = self._launcher.launch, self._memory
+        launch("find_seen", max(tables.pieces, 1), frame)
+        if tables.pieces:
+            launch("project_seen", tables.pieces, frame)
+            for number in range(DEPTH_PASSES):
+                self._sort(frame, number)
+            launch("count_pairs", memory.seen_capacity // PIECE, frame)
+            launch("make_pairs", memory.seen_capacity // PIECE, frame)
+            for number in range(tile_passes(tables.tiles)):
+                self._sort(frame, BY_TILE + number)
+            launch("find_ranges", memory.sort_blocks, frame)
+        launch("blend", tables.tiles, frame)
+
+    def _sort(self, frame: int, argument: int) -> None:
+        self._launcher.launch("count_digits", self._memory.sort_blocks, frame, argument)
+        self._launcher.launch("scatter_digits", self._memory.sort_blocks, frame, argument)
+
+
+def _pieces(request: RasterRequest) -> Iterator[RasterRequest]:
+    """The request in parts of at most MAX_CAMERAS."""
+    for first in range(0, request.cameras, MAX_CAMERAS):
+        last = min(first + MAX_CAMERAS, request.cameras)
+        yield replace(request, viewmats=request.viewmats[first:last], Ks=request.Ks[first:last])
+
+
+def _batches(
+    pieces: Sequence[tuple[int, RasterRequest]],
+) -> Iterator[list[tuple[int, RasterRequest]]]:
+    """Requests that are drawn together: of the same options, at most MAX_CAMERAS."""
+    batch: list[tuple[int, RasterRequest]] = []
+    for item in pieces:
+        cameras = item[1].cameras + sum(piece.cameras for _, piece in batch)
+        if batch and (cameras > MAX_CAMERAS or not _alike(item[1].options, batch[0][1].options)):
+            yield batch
+            batch = []
+        batch.append(item)
+    if batch:
+        yield batch
+
+
+def _alike(a: RasterOptions, b: RasterOptions) -> bool:
+    """But for the background, which each camera has for itself."""
+    return replace(a, background=b.background) == b
+
+
+def _tensor(images: Images, name: str, tables: Tables, request: RasterRequest) -> Tensor:
+    """An image [C, H, W, ...] of a frame of one request, on the device."""
+    start, nbytes = images.places[name]
+    dtype, channels = IMAGES[name]
+    shape = (request.cameras, request.height, request.width, *channels)
+    flat = images.memory[start : start + nbytes]
+    return flat.view(getattr(torch, np.dtype(dtype).name)).reshape(shape)
+
+
+def _section(
+    memory: NDArray[np.uint8], images: Images, name: str, first: int, pixels: int
+) -> NDArray[Any]:
+    """Numbers of ``pixels`` pixels from ``first`` on, in memory of the host."""
+    dtype, channels = IMAGES[name]
+    each = np.dtype(dtype).itemsize * int(np.prod(channels))
+    start = images.places[name][0] + first * each
+    return memory[start : start + pixels * each].view(dtype)

@@ -1,0 +1,93 @@
+"""What the backend asks of a device, and the device that is a GPU."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .compile import KERNELS, compiled_kernels
+from .records import THREADS
+
+
+class Launcher(Protocol):
+    """A device that runs the kernels, one after the other.
+
+    Attributes:
+        device: on which its memory lies.
+    """
+
+    device: torch.device
+
+    def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
+        """Queue ``kernel`` for that many blocks.
+
+        Args:
+            kernel: one of KERNELS.
+            blocks: at least one.
+            frame: address of a Frame on the device.
+            argument: see the kernel.
+        """
+        ...
+
+    def pointer(self, tensor: Tensor) -> int:
+        """Address of what a contiguous tensor on the device holds."""
+        ...
+
+    def host_memory(self, nbytes: int) -> Tensor:
+        """[nbytes] uint8 that the device can copy from and to without help."""
+        ...
+
+    def wait(self) -> None:
+        """Return when all that was queued is done."""
+        ...
+
+
+class CudaLauncher:
+    """The current CUDA device of torch, on torch's current stream.
+
+    Raises:
+        RenderError: the kernels do not compile for it.
+    """
+
+    def __init__(self) -> None:
+        from cuda.core import Device, ObjectCode
+
+        index = torch.cuda.current_device()
+        self.device = torch.device("cuda", index)
+        torch.zeros(1, device=self.device)  # torch makes the context that all share.
+        Device(index).set_current()
+        major, minor = torch.cuda.get_device_capability(index)
+        code = ObjectCode.from_cubin(compiled_kernels(f"sm_{major}{minor}"))
+        self._kernels = {name: code.get_kernel(name) for name in KERNELS}
+        self._streams: dict[int, Any] = {}
+
+    def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
+        """See Launcher."""
+        from cuda.core import LaunchConfig, launch
+
+        config = LaunchConfig(grid=blocks, block=THREADS)
+        launch(self._stream(), config, self._kernels[kernel], frame, np.uint32(argument))
+
+    def pointer(self, tensor: Tensor) -> int:
+        """See Launcher."""
+        assert tensor.device == self.device
+        return int(tensor.data_ptr())
+
+    def host_memory(self, nbytes: int) -> Tensor:
+        """See Launcher; torch keeps what is given back for the next frame."""
+        return torch.empty(nbytes, dtype=torch.uint8, pin_memory=True)
+
+    def wait(self) -> None:
+        """See Launcher."""
+        torch.cuda.current_stream(self.device).synchronize()
+
+    def _stream(self) -> Any:
+        from cuda.core import Stream
+
+        handle = torch.cuda.current_stream(self.device).cuda_stream
+        if handle not in self._streams:
+            self._streams[handle] = Stream.from_handle(handle)
+        return self._streams[handle]

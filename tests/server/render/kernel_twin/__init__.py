@@ -1,0 +1,85 @@
+"""The serving kernels on the CPU: their own source, compiled as C++.
+
+``cuda_on_cpu.h`` stands in for CUDA, fibers for the threads of a block. So what the tests look at
+is the source that a GPU runs, line for line, with its barriers and its sums within a warp; not a
+second text that may differ from it. Needs g++, as CI's machines have it; tests skip where it is
+not.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import shutil
+import subprocess
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from real2sim_server.render.backends.nvrtc.compile import FOLDER
+
+HERE = Path(__file__).parent
+COMPILER = shutil.which("g++")
+NEEDS_COMPILER = "the kernels run on the CPU by g++, which is not installed"
+FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-U_FORTIFY_SOURCE")
+WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-Wno-unused-function")
+FAULTS = {1: "no such kernel", 2: "threads of a block part ways at a barrier"}
+
+
+@functools.cache
+def twin() -> ctypes.CDLL:
+    """The compiled kernels; compiled once for each state of the sources."""
+    sources = sorted([*FOLDER.iterdir(), *HERE.glob("*.h"), *HERE.glob("*.cpp")])
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources) + repr(FLAGS).encode())
+    folder = Path(tempfile.gettempdir()) / "real2sim-kernel-twin"
+    library = folder / f"{digest.hexdigest()[:16]}.so"
+    if not library.is_file():
+        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as made:
+            target = Path(made) / library.name
+            command = [str(COMPILER), *FLAGS, *WARNINGS, "-I", str(FOLDER), "-o", str(target)]
+            subprocess.run([*command, str(HERE / "twin.cpp")], check=True)
+            target.replace(library)
+    loaded = ctypes.CDLL(str(library))
+    arguments = [ctypes.c_char_p, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_int]
+    loaded.run.argtypes = arguments
+    for name in ("exponential", "logarithm"):
+        function = getattr(loaded, name)
+        function.argtypes, function.restype = [ctypes.c_float], ctypes.c_float
+    return loaded
+
+
+class TwinLauncher:
+    """A Launcher that runs the kernels on the CPU.
+
+    Args:
+        backwards: run blocks, and the threads of each, in the opposite order.
+
+    Attributes:
+        launches: number of launches of each kernel.
+    """
+
+    def __init__(self, *, backwards: bool = False) -> None:
+        self.device = torch.device("cpu")
+        self.launches: Counter[str] = Counter()
+        self._backwards = backwards
+
+    def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
+        self.launches[kernel] += 1
+        fault = twin().run(kernel.encode(), blocks, frame, argument, self._backwards)
+        assert fault == 0, f"{kernel}: {FAULTS[fault]}"
+
+    def pointer(self, tensor: Tensor) -> int:
+        assert tensor.device == self.device
+        assert tensor.is_contiguous()
+        return int(tensor.data_ptr())
+
+    def host_memory(self, nbytes: int) -> Tensor:
+        return torch.empty(nbytes, dtype=torch.uint8)
+
+    def wait(self) -> None:
+        """Everything is done when it is launched."""
