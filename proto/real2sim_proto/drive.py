@@ -19,7 +19,7 @@ from pydantic import (
 from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, Vector3
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .operations import Operation
-from .plans import Plan, PlanPoses, PlanTimes, check_times
+from .plans import Gear, Plan, PlanPoses, PlanTimes, check_times
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import CameraInfo, ObjectInfo
 
@@ -58,7 +58,8 @@ class EgoState(ServerModel):
     position: Vector3
     quaternion: Quaternion
     yaw: float = Field(description="heading in the world [rad]")
-    speed: float = Field(description="along vehicle x [m/s]")
+    speed: float = Field(description="along vehicle x, below 0 backwards [m/s]")
+    gear: Gear = "drive"
     lateral_speed: float = Field(default=0.0, description="of the rear axle along vehicle y [m/s]")
     acceleration: float = Field(description="along vehicle x [m/s^2]")
     steering: float = Field(description="road-wheel angle [rad]")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -134,10 +135,15 @@ class EgoSpec(Model):
     )
     max_braking: Annotated[float, Field(gt=0, le=50)] = Field(default=8.0, description="[m/s^2]")
     max_speed: Annotated[float, Field(gt=0, le=150)] = Field(default=60.0, description="[m/s]")
+    max_reverse_speed: Annotated[float, Field(ge=0, le=20)] = Field(
+        default=5.0,
+        description="in reverse gear, which commands engage and plans that lead backwards; 0: it "
+        "has none [m/s]",
+    )
     vehicle: VehicleSpec = VehicleSpec()
     actuators: ActuatorSpec = ActuatorSpec()
     suspension: SuspensionSpec | None = Field(
-        default=None,
+        default=SuspensionSpec(),
         description="body and cameras pitch under drive and brakes and roll in bends; None: rigid",
     )
 
@@ -427,8 +433,24 @@ class ScoringSpec(Model):
     )
 
 
+ENDLESS_US = 3_600_000_000
+"""Length of episodes beyond the log that name no horizon: an hour, unless the client ends them."""
+
+MAX_HORIZON = 1_000_000
+
+
 class ResetSpec(Model):
     """How an episode begins and runs."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _goes_on_beyond_the_log(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping) or fields.get("horizon") is not None:
+            return fields
+        dt_us = fields.get("dt_us", 100_000)
+        if fields.get("beyond_log", "end") == "end" or not isinstance(dt_us, int) or dt_us < 1:
+            return fields
+        return {**fields, "horizon": min(ENDLESS_US // dt_us, MAX_HORIZON)}
 
     seed: int = Field(
         default=0,
@@ -443,8 +465,9 @@ class ResetSpec(Model):
     horizon: int | None = Field(
         default=None,
         ge=1,
-        le=1_000_000,
-        description="steps; default, and most where `beyond_log` is 'end': to the end of the log",
+        le=MAX_HORIZON,
+        description="steps; default, and most where `beyond_log` is 'end': to the end of the log; "
+        "default where the episode goes on: an hour, at most 1,000,000 steps",
     )
     beyond_log: Literal["end", "loop", "extend"] = Field(
         default="end",

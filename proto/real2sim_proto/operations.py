@@ -6,14 +6,30 @@ erased regions and colliders share one name space.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, field_validator, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, field_validator, model_validator
 
 from .base import Identifier, Metres, Microseconds, Model, Pose, Quaternion, Track, Vector3
 from .episode import AgentDriver, IdmDriver
 
 Frame = Literal["world", "object"]
+
+DRAWN_PREFIX = "spawned:"
+"""Of the ids of road users that `agents.spawn` lets come and go."""
+
+
+def _not_drawn(object_id: Any) -> Any:
+    if isinstance(object_id, str) and object_id.startswith(DRAWN_PREFIX):
+        raise ValueError(
+            f"{object_id!r} came by agents.spawn and leaves by itself; edits name objects of the "
+            "scene and those that edits have put there, such as 'spawned_1' by the edit spawn"
+        )
+    return object_id
+
+
+ObjectId = Annotated[Identifier, BeforeValidator(_not_drawn)]
+"""Id of an object that edits can name."""
 
 MaterialName = Literal["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"]
 """What an object may be made of; the numbers behind the names belong to the physics."""
@@ -54,7 +70,7 @@ class Translate(Model):
     """Shift an object: the whole trajectory, or a time range of it with smooth ends."""
 
     op: Literal["translate"] = "translate"
-    object_id: Identifier
+    object_id: ObjectId
     x: Metres = 0.0
     y: Metres = 0.0
     z: Metres = 0.0
@@ -67,7 +83,7 @@ class Rotate(Model):
     """Turn an object about its own centre, at all times or in a time range with smooth ends."""
 
     op: Literal["rotate"] = "rotate"
-    object_id: Identifier
+    object_id: ObjectId
     angle: Annotated[float, Field(ge=-1e4, le=1e4)] = Field(description="[rad]")
     axis: Vector3 = Field(default=(0.0, 0.0, 1.0), description="of any length above 0")
     frame: Frame = Field(default="world", description="frame of the axis")
@@ -84,7 +100,7 @@ class Scale(Model):
     """Multiply an object's size and Gaussians along its own axes."""
 
     op: Literal["scale"] = "scale"
-    object_id: Identifier
+    object_id: ObjectId
     x: Annotated[float, Field(ge=0.01, le=100.0)] = 1.0
     y: Annotated[float, Field(ge=0.01, le=100.0)] = 1.0
     z: Annotated[float, Field(ge=0.01, le=100.0)] = 1.0
@@ -98,7 +114,7 @@ class SetPose(Model):
     """Place an object; it stands there for the whole time range of the scene."""
 
     op: Literal["set_pose"] = "set_pose"
-    object_id: Identifier
+    object_id: ObjectId
     pose: Pose
     snap: Snap = False
 
@@ -107,7 +123,7 @@ class SetTrajectory(Model):
     """Replace an object's trajectory; the object exists only within its time stamps."""
 
     op: Literal["set_trajectory"] = "set_trajectory"
-    object_id: Identifier
+    object_id: ObjectId
     trajectory: Track
     snap: Snap = False
 
@@ -116,7 +132,7 @@ class Retime(Model):
     """Let an object do the same earlier, later, faster or slower."""
 
     op: Literal["retime"] = "retime"
-    object_id: Identifier
+    object_id: ObjectId
     delay_us: Microseconds = Field(default=0, description="later by this; negative: earlier")
     speed: Annotated[float, Field(ge=0.01, le=100.0)] = Field(
         default=1.0, description="2 takes half the time, from its first pose on"
@@ -127,7 +143,7 @@ class Duplicate(Model):
     """Add a copy of an object, shifted by x, y, z."""
 
     op: Literal["duplicate"] = "duplicate"
-    object_id: Identifier
+    object_id: ObjectId
     new_id: Identifier | None = Field(default=None, description="default: <object_id>_copy<n>")
     x: Metres = 0.0
     y: Metres = 0.0
@@ -140,14 +156,14 @@ class Delete(Model):
     """Remove an object, erased region or collider. Its id stays reserved for `restore`."""
 
     op: Literal["delete"] = "delete"
-    object_id: Identifier
+    object_id: ObjectId
 
 
 class Restore(Model):
     """Bring a deleted object, erased region or collider back as it was."""
 
     op: Literal["restore"] = "restore"
-    object_id: Identifier
+    object_id: ObjectId
 
 
 class Insert(Model):
@@ -224,7 +240,7 @@ class Replace(Model):
     """Give an object another look, fitted into its box: an asset's, or a recorded object's."""
 
     op: Literal["replace"] = "replace"
-    object_id: Identifier
+    object_id: ObjectId
     asset_id: Identifier | None = Field(default=None, description="from the asset library")
     recorded_id: Identifier | None = Field(
         default=None, description="instead of an asset: the look of this object of the scene"
@@ -255,7 +271,7 @@ class SetPhysics(Model):
     """Say what an object is for the physics. What is left out goes back to its default."""
 
     op: Literal["set_physics"] = "set_physics"
-    object_id: Identifier
+    object_id: ObjectId
     mass: Annotated[float, Field(gt=0, le=1e7)] | None = Field(
         default=None, description="[kg]; default: by category and size"
     )
@@ -270,7 +286,7 @@ class SetVelocity(Model):
     """Velocity with which an object enters the physics; left out, that of its trajectory."""
 
     op: Literal["set_velocity"] = "set_velocity"
-    object_id: Identifier
+    object_id: ObjectId
     linear: Vector3Speed | None = Field(default=None, description="of the box centre [m/s]")
     angular: Vector3Speed | None = Field(default=None, description="[rad/s]")
     frame: Frame = Field(default="world", description="axes of both; 'object' counts x forward")

@@ -53,13 +53,23 @@ class TrajectoryPlan(Model):
         return self
 
 
+Gear = Literal["drive", "reverse"]
+
+
 class Control(Model):
     """Direct actuation for one step."""
 
     kind: Literal["control"] = "control"
-    acceleration: Annotated[float, Field(ge=-100, le=100)] = Field(description="[m/s^2]")
+    acceleration: Annotated[float, Field(ge=-100, le=100)] = Field(
+        description="in the direction of the gear; below 0 it brakes, to a stop at most [m/s^2]"
+    )
     steering: Annotated[float, Field(ge=-1.6, le=1.6)] = Field(
-        description="road-wheel angle [rad], positive to the left"
+        description="road-wheel angle [rad], positive to the left in either gear"
+    )
+    gear: Gear = Field(
+        default="drive",
+        description="it is engaged at rest; a vehicle that still rolls the other way brakes by "
+        "`acceleration`, whatever its sign",
     )
 
 

@@ -17,6 +17,7 @@ import typer
 
 from real2sim import cli
 from real2sim._commands import drive as drive_command
+from real2sim_proto.episode import ResetSpec
 
 from .fake_episode import IMAGE
 from .fake_worker import FakeWorker
@@ -142,6 +143,40 @@ def test_drive_reports_rates_and_saves_frames(run: Run, worker: FakeWorker, tmp_
     assert frames == [f"{step:06d}.jpg" for step in range(6)]
     picture = simplejpeg.decode_jpeg((out / "front" / frames[-1]).read_bytes())
     assert np.abs(picture.astype(int) - IMAGE).max() <= 8
+
+
+@pytest.mark.network
+def test_drive_asks_for_what_its_flags_say(run: Run, worker: FakeWorker) -> None:
+    done = run(
+        *("drive", "--scene", "street", "--steps", "1", "--url", worker.url),
+        *("--beyond-log", "loop", "--spawn", '{"density": 30}', "--seed", "4"),
+        *("--randomization", '{"latency_us": 5000}', "--reset", '{"agents": {"default": "idm"}}'),
+    )
+    assert done.returncode == 0, done.stderr
+    (reset,) = [m for m in worker.messages if m["type"] == "reset"]
+    spec = ResetSpec.model_validate(reset["spec"])
+    assert (spec.seed, spec.beyond_log, spec.horizon) == (4, "loop", 36_000)
+    assert (spec.agents.default, spec.agents.spawn.density) == ("idm", 30)
+    assert spec.randomization.latency_us == 5000
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (("--spawn", "{"), "--spawn is no JSON"),
+        (("--randomization", "3"), "--randomization is no JSON object"),
+        (("--reset", '{"horison": 3}'), "horison"),
+        (("--beyond-log", "for ever"), "beyond_log"),
+    ],
+)
+@pytest.mark.network
+def test_flags_that_are_wrong_are_named(
+    run: Run, worker: FakeWorker, flags: tuple[str, str], sentence: str
+) -> None:
+    done = run("drive", "--scene", "street", "--url", worker.url, *flags)
+    assert done.returncode != 0
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.network

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -46,6 +47,37 @@ def drive(
     warmup_us: Annotated[
         int, typer.Option(min=0, help="The vehicle moves as recorded for so long; plans wait.")
     ] = 0,
+    beyond_log: Annotated[
+        str,
+        typer.Option(
+            help="What --steps beyond the recording lead to: 'end' of the episode, 'loop' or "
+            "'extend'."
+        ),
+    ] = "end",
+    spawn: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSON",
+            help="Road users come and go along the route: agents.spawn of reset, '{}' for its "
+            "defaults, for example '{\"density\": 30}'.",
+        ),
+    ] = None,
+    randomization: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSON",
+            help='What --seed draws: randomization of reset, for example \'{"start": '
+            '{"lateral": 0.5}}\'.',
+        ),
+    ] = None,
+    reset: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSON",
+            help='Any other options of reset, for example \'{"ego": {"tracker": "lqr"}}\'; '
+            "those that have flags of their own are not taken from here.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Save frames there: CAMERA/STEP.jpg, summary.json.")
     ] = None,
@@ -59,6 +91,7 @@ def drive(
 
     if (scene is None) == (scenario is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")
+    options = _reset_options(reset, beyond_log, spawn=spawn, randomization=randomization)
     driver = load_planner(planner)
     needs = needs_of(driver)
     with (
@@ -78,14 +111,48 @@ def drive(
                 steps=steps,
                 sensors=_sensors(names, width, needs.sensors(session.welcome.cameras)),
                 on_observation=on_observation,
-                seed=seed,
-                dt_us=dt_us,
-                warmup_us=warmup_us,
-                action=needs.action,
-                # A planner that does not say what it needs is shown everything.
-                privileged=needs.privileged or not hasattr(driver, "needs"),
+                **options
+                | {
+                    "seed": seed,
+                    "dt_us": dt_us,
+                    "warmup_us": warmup_us,
+                    "action": needs.action,
+                    # A planner that does not say what it needs is shown everything.
+                    "privileged": needs.privileged or not hasattr(driver, "needs"),
+                },
             )
     _report(summary, out=out, json_file=json_file)
+
+
+def _reset_options(
+    reset: str | None, beyond_log: str, *, spawn: str | None, randomization: str | None
+) -> dict[str, Any]:
+    """Options of reset that flags name as JSON.
+
+    Raises:
+        typer.BadParameter: no JSON object.
+    """
+    options = _json_object("--reset", reset)
+    if beyond_log != "end":
+        options["beyond_log"] = beyond_log
+    if spawn is not None:
+        options["agents"] = {
+            **options.get("agents", {}),
+            "spawn": _json_object("--spawn", spawn),
+        }
+    if randomization is not None:
+        options["randomization"] = _json_object("--randomization", randomization)
+    return options
+
+
+def _json_object(flag: str, text: str | None) -> dict[str, Any]:
+    try:
+        found = json.loads(text or "{}")
+    except json.JSONDecodeError as error:
+        raise typer.BadParameter(f"{flag} is no JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise typer.BadParameter(f"{flag} is no JSON object, as {{}} is")
+    return found
 
 
 def _sensors(

@@ -54,7 +54,7 @@ def batch_images(
         return np.zeros((0, len(cameras), height, width, 3), np.uint8)
     sky = batch.scene.sky
     shown = batch.shown(worlds)
-    poses = batch.poses[list(worlds)]
+    poses = np.stack([batch.body_pose(w) for w in worlds])
     viewmats = np.stack([camera.viewmat(poses) for camera in cameras], axis=1)
     if shown is None:
         views = [

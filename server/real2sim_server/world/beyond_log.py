@@ -39,7 +39,7 @@ BEND_FADES = 40.0
 SPACING, FADED = 2.0, 160.0
 """Of the places behind the recorded drive, and where the rest of the way is straight [m]."""
 
-LONGEST_ROUTE = 20_000.0
+LONGEST_ROUTE = 100_000.0
 """[m]"""
 
 FASTEST = 15.0

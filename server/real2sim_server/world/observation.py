@@ -91,6 +91,7 @@ def ego_fields(
     motion: Motion, T_world_vehicle: Float, size: tuple[float, float, float]
 ) -> dict[str, Any]:
     """The wire's EgoState as a plain map; ``size`` of the ego's box [m]."""
+    gear = {"gear": "reverse"} if motion.reversing else {}
     return {
         "position": T_world_vehicle[:3, 3].tolist(),
         "quaternion": _quaternion(T_world_vehicle),
@@ -101,6 +102,7 @@ def ego_fields(
         "steering": motion.steering,
         "yaw_rate": motion.yaw_rate,
         "size": size,
+        **gear,
     }
 
 
@@ -111,4 +113,10 @@ def _quaternion(T_world_vehicle: Float) -> tuple[float, float, float, float]:
     w, z = 1 + xx + yy + zz, 1 - xx - yy + zz
     q = (w, zy - yz, xz - zx, yx - xy) if w >= z else (yx - xy, xz + zx, yz + zy, z)
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0])
-    return (q[0] / length, q[1] / length, q[2] / length, q[3] / length)
+    # A body that stands level would have minus zeros.
+    return (
+        q[0] / length + 0.0,
+        q[1] / length + 0.0,
+        q[2] / length + 0.0,
+        q[3] / length + 0.0,
+    )

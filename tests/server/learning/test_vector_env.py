@@ -62,7 +62,7 @@ def test_images_and_rewards_are_those_of_single_worlds(street: Scene) -> None:
     camera = fitted(street.rig["front"], 84, 84)
     drawn = rasterize(
         world.instances(),
-        camera.viewmat(world.T_world_vehicle)[None],
+        camera.viewmat(world.T_world_body)[None],
         camera.K[None],
         84,
         84,

@@ -34,6 +34,7 @@ def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
     """Raise where a world of the batch is not the single one."""
     assert np.array(world.motion.numbers) == pytest.approx(batch.motions[w], abs=CLOSE)
     assert world.T_world_vehicle == pytest.approx(batch.poses[w], abs=CLOSE)
+    assert world.T_world_body == pytest.approx(batch.body_pose(w), abs=CLOSE)
     assert world.path_point.s == pytest.approx(batch.route_s[w], abs=CLOSE)
     assert world.path_point.offset == pytest.approx(batch.route_offset[w], abs=CLOSE)
     assert world.observe().route == pytest.approx(batch.routes()[w], abs=1e-4)
@@ -170,7 +171,6 @@ def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
         ({"ego": {"tracker": "ilqr"}}, "ego.tracker"),
         ({"ego": {"tracker": "perfect"}}, "ego.tracker"),
         ({"ego": {"actuators": {"drive_delay_us": 50_000}}}, "ego.actuators"),
-        ({"ego": {"suspension": {}}}, "ego.suspension"),
         ({"agents": {"default": "constant_velocity"}}, "agents.default"),
         ({"agents": {"drivers": {"car_0": {"kind": "idm"}}}}, "agents"),
         ({"warmup_us": 100_000}, "warmup_us"),

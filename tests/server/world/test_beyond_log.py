@@ -9,7 +9,7 @@ import pytest
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec
-from real2sim_proto.operations import Translate
+from real2sim_proto.operations import OPERATION, Translate
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.geometry.rotation import yaw_quaternion
@@ -23,6 +23,7 @@ from real2sim_server.world.recording.replay import (
     action_payload,
     reset_payload,
 )
+from real2sim_server.world.recording.stored_spec import stored_spec
 
 COAST = Control(acceleration=0.0, steering=0.0)
 CONTROL = {"action": "control", "privileged": True}
@@ -68,8 +69,20 @@ def test_a_horizon_beyond_the_log_is_refused_by_default(make_world):
 
 
 @pytest.mark.parametrize("beyond_log", ["loop", "extend"])
-def test_without_a_horizon_an_episode_ends_with_the_log(make_world, beyond_log):
-    assert make_world(spec={"beyond_log": beyond_log}).horizon == 120
+def test_without_a_horizon_an_episode_goes_on_for_an_hour(make_world, beyond_log):
+    world = make_world(spec=CONTROL | {"beyond_log": beyond_log})
+    assert world.horizon == 36_000
+    for _ in range(130):
+        world.step(COAST)
+    assert not world.over
+    assert ResetSpec(beyond_log=beyond_log, dt_us=1000, horizon=None).horizon == 1_000_000
+
+
+def test_stored_episodes_without_a_horizon_end_with_the_log():
+    fields = ResetSpec(beyond_log="loop", horizon=5).model_dump()
+    assert stored_spec(fields).horizon == 5
+    assert stored_spec(fields | {"horizon": None}).horizon is None
+    assert ResetSpec().horizon is None
 
 
 def test_within_the_log_a_loop_is_the_same_drive(make_world, moving):
@@ -317,6 +330,13 @@ def test_an_edit_leaves_spawned_cars_alone(street):
     before = spawned(world)
     world.apply([Translate(object_id="parked", y=-1.0)])
     assert spawned(world) == before != []
+
+
+def test_edits_that_name_a_drawn_road_user_say_what_they_may_name():
+    with pytest.raises(ValueError, match=r"'spawned:1' came by agents.spawn .* 'spawned_1'"):
+        Translate(object_id="spawned:1", y=-1.0)
+    with pytest.raises(ValueError, match="leaves by itself"):
+        OPERATION.validate_python({"op": "delete", "object_id": "spawned:1"})
 
 
 def test_a_struck_spawned_car_is_moved_by_physics(street):

@@ -97,6 +97,10 @@ def backwards(step: int) -> Pose:
     return -min(t * t, 4 * t - 4) if t > 2 else -t * t, 0.0, 0.0
 
 
+def backwards_at_full_speed(step: int) -> Pose:
+    return way(step), 0.0, math.pi
+
+
 def off_road(step: int) -> Pose:
     """In a wide turn off to the left."""
     s, radius = way(step), 40.0
@@ -117,7 +121,9 @@ def test_the_recorded_drive_gets_everything(judged):
     assert world.metrics()["feasible"] == 1.0
 
 
-@pytest.mark.parametrize("planner", [hop, small_hop, jump, teleport, spin, crab, rush])
+@pytest.mark.parametrize(
+    "planner", [hop, small_hop, jump, teleport, spin, crab, rush, backwards_at_full_speed]
+)
 def test_what_no_car_can_do_is_worth_nothing(judged, planner):
     found, world = judged(planner)
 

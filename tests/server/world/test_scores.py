@@ -333,6 +333,35 @@ def test_a_standing_ego_collides_with_nobody():
     assert ttc_of(car(8.0, speed=-5.0), speed=0.0) == math.inf
 
 
+def test_what_an_ego_that_drives_backwards_comes_near_to_is_behind_it():
+    # Its tail at -0.4 - 0.95 m, the car's front at -8 + 2 m: 4.65 m at 4 m/s.
+    assert ttc_of(car(-8.0), speed=-4.0) == pytest.approx(1.2)
+    assert ttc_of(car(8.0), speed=-4.0) == math.inf
+
+
+def test_an_ego_in_reverse_gear_runs_into_what_is_behind_it():
+    box = (-4.0, 0.0, 0.0, 4.0, 2.0)
+    assert side_of_contact(HERE, 3.0, box, 1.0, axle=1.35) == "rear"
+    assert side_of_contact(HERE, 3.0, box, 1.0, axle=1.35, reversing=True) == "front"
+
+
+@pytest.mark.parametrize(("facing", "progress"), [(0.0, 1.0), (math.pi, 0.0)])
+def test_way_driven_tail_first_is_no_progress(facing, progress):
+    given = context(40, expert_s=tuple(0.4 * k for k in range(41)), route_end_s=16.0)
+    speed = math.copysign(4.0, math.cos(facing))
+    instants = [
+        Instant(k, k * 100_000, ego(0.4 * k, speed=speed, yaw=facing), NOBODY) for k in range(41)
+    ]
+    found = scores(instants, given)
+
+    assert found["feasible"].value == 1.0
+    assert found["pdms"].terms["EP"] == pytest.approx(progress)
+    assert found["pdms"].value <= (7 + 5 * progress) / 12 + 1e-9
+    for name in ("nuplan_cls", "hugsim_hd", "carla_ds", "alpasim"):
+        assert (found[name].value > 0) == bool(progress), name
+    assert ("16 m of the route driven tail first" in found["neuroncap"].cannot_see) == bool(facing)
+
+
 def test_coming_too_near_costs_the_ttc_term():
     # 0.8 s from a car that is there for a moment.
     near = drive([10.0] * 41, others=lambda k: car(14.0 + k) if k == 20 else NOBODY)

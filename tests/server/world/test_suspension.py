@@ -107,7 +107,7 @@ def driven(make_world, **ego):
 
 
 def test_cameras_see_it_and_contact_does_not(make_world):
-    rigid, sprung_world = driven(make_world), driven(make_world, suspension={})
+    rigid, sprung_world = driven(make_world, suspension=None), driven(make_world)
 
     assert rigid.T_world_body is rigid.T_world_vehicle
     np.testing.assert_array_equal(sprung_world.T_world_vehicle, rigid.T_world_vehicle)

@@ -22,18 +22,23 @@ from ..collision.overlaps import EgoContacts
 from ..collision.sweep import StepStart
 from ..driving import HOLD, KINDS, vehicle_parameters
 from ..ego.controller import EgoController
+from ..ego.gear import can_reverse
+from ..ego.legs import may_lead_backwards
 from ..ego.motion import Motion
 from ..ego.route import WAYPOINT_SPACING, WAYPOINTS
+from ..ego.suspension import LEVEL, BodyAttitude, sprung_side_by_side, tilted
 from ..path import Float
 from ..scoring.fault import ego_at_fault
 from ..traffic.idm import Idm
 from ..world import World
 from .step_kernels import (
     BEYOND,
+    MOVED,
     OFFSET,
     PATH_X,
     PATH_YAW,
     PLACES,
+    STANDS,
     STATE,
     S,
     routes_ahead,
@@ -49,7 +54,7 @@ Longs = NDArray[np.int64]
 
 @dataclass(eq=False)
 class _Instant:
-    """All worlds at one instant; arguments of step_worlds."""
+    """All worlds at one instant; arguments of step_worlds but the last, which gear is engaged."""
 
     motions: Float
     poses: Float
@@ -58,6 +63,7 @@ class _Instant:
     present: Flags
     drivers: NDArray[np.int8]
     driving: Float
+    reversing: Flags
 
     @classmethod
     def of(cls, worlds: int, objects: int) -> _Instant:
@@ -69,11 +75,15 @@ class _Instant:
             present=np.zeros((worlds, objects), np.bool_),
             drivers=np.zeros((worlds, objects), np.int8),
             driving=np.zeros((worlds, objects, 3)),
+            reversing=np.zeros(worlds, np.bool_),
         )
 
     @property
     def arrays(self) -> tuple[NDArray[np.generic], ...]:
-        return tuple(vars(self).values())
+        return tuple(value for name, value in vars(self).items() if name != "reversing")
+
+    def motion(self, w: int) -> Motion:
+        return Motion._make((*self.motions[w].tolist(), (), bool(self.reversing[w])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +175,7 @@ class BatchWorld:
             np.zeros(worlds, np.bool_) for _ in range(3)
         )
         self.touching: list[frozenset[str]] = [frozenset()] * worlds
+        self._attitudes = np.tile(np.array(LEVEL), (worlds, 1))
         self._near = np.zeros(worlds, np.bool_)
         self.reset()
 
@@ -187,6 +198,11 @@ class BatchWorld:
     def poses(self) -> Float:
         """[W, 4, 4] float64, ``T_world_vehicle``; a view."""
         return self._now.poses
+
+    def body_pose(self, w: int) -> Float:
+        """``T_world_body`` [4, 4] float64 of one ego on its springs, which carries its cameras."""
+        attitude = BodyAttitude(*self._attitudes[w].tolist())
+        return tilted(self._now.poses[w], attitude, self.spec.ego)
 
     @property
     def route_s(self) -> Float:
@@ -232,8 +248,10 @@ class BatchWorld:
         given, after_us = self._checked(actions, plan_us)
         going, before, after = ~self.over, self._now, self._next
         times_us = self.times_us
+        kinds = going.astype(np.int8)
+        self._move_in_gear(kinds, times_us, given, after_us)
         step_worlds(
-            *(going, times_us, self.spec.dt_us, self._law, given, after_us, True),
+            *(kinds, times_us, self.spec.dt_us, self._law, given, after_us, True),
             *(self._vehicle, self._limits, self._tracks, self._road),
             *before.arrays,
             *after.arrays,
@@ -241,6 +259,15 @@ class BatchWorld:
         )
         self._now, self._next = after, before
         self.steps[going] += 1
+        if self.spec.ego.suspension is not None:
+            seconds = self.spec.dt_us * 1e-6
+            self._attitudes[going] = sprung_side_by_side(
+                self._attitudes[going],
+                before.motions[going],
+                after.motions[going],
+                seconds,
+                self.spec.ego,
+            )
         self.off_road |= going & (after.places[:, BEYOND] > 0)
         at_fault, contacts = (np.zeros(self.worlds, np.int64) for _ in range(2))
         for w in np.flatnonzero(going).tolist():
@@ -320,6 +347,25 @@ class BatchWorld:
         self.start_us[w], self.steps[w], self.horizons[w] = world.t_us, 0, world.horizon
         self.terminated[w] = self.truncated[w] = self.off_road[w] = False
         self.touching[w] = world.contacts.touching
+        now.reversing[w], self._attitudes[w] = world.motion.reversing, LEVEL
+
+    def _move_in_gear(
+        self, kinds: NDArray[np.int8], times_us: Longs, given: Float, after_us: Longs
+    ) -> None:
+        """Move the egos that are, or may come to be, in reverse gear: one by one, as few are."""
+        now, after = self._now, self._next
+        after.reversing[:] = now.reversing
+        if not can_reverse(self.spec.ego):
+            return
+        geared = now.reversing | (now.motions[:, 3] < 0)
+        if self._law != HOLD:
+            geared |= may_lead_backwards(given)
+        for w in np.flatnonzero(geared & (kinds != STANDS)).tolist():
+            motion, t_us = now.motion(w), int(times_us[w])
+            controller = self._controller(motion, t_us, given[w], after_us)
+            moved = controller.advance(motion, t_us, self.spec.dt_us)[1]
+            after.motions[w], after.reversing[w] = moved.numbers, moved.reversing
+            kinds[w] = MOVED
 
     def _checked(self, actions: ArrayLike, plan_us: ArrayLike | None) -> tuple[Float, Longs]:
         given = np.ascontiguousarray(actions, dtype=np.float64)
@@ -359,10 +405,8 @@ class BatchWorld:
     def _contacts(self, w: int, t_us: int, action: Float, plan_us: Longs) -> EgoContacts:
         """By the same functions as a single world."""
         before, after = self._next, self._now
-        motion = Motion._make((*before.motions[w].tolist(), ()))
-        controller = EgoController(self.spec, self.scene.ego).with_plan(
-            self._plan(t_us, action, plan_us), motion, t_us, t_us
-        )
+        motion = before.motion(w)
+        controller = self._controller(motion, t_us, action, plan_us)
         start = StepStart(
             motion,
             before.poses[w],
@@ -372,8 +416,13 @@ class BatchWorld:
             lambda since_us: controller.advance(motion, t_us, since_us)[1],
         )
         contacts = ContactState(self.spec, self.scene.ego_size, None, self.touching[w])
-        moved = Motion._make((*after.motions[w].tolist(), ()))
-        return contacts.ego_contacts(start, after.poses[w], moved, self._agents(after, w))
+        return contacts.ego_contacts(start, after.poses[w], after.motion(w), self._agents(after, w))
+
+    def _controller(
+        self, motion: Motion, t_us: int, action: Float, plan_us: Longs
+    ) -> EgoController:
+        plan = self._plan(t_us, action, plan_us)
+        return EgoController(self.spec, self.scene.ego).with_plan(plan, motion, t_us, t_us)
 
     def _plan(self, t_us: int, action: Float, plan_us: Longs) -> Control | TrajectoryPlan:
         if self._law == HOLD:

@@ -28,6 +28,9 @@ S, OFFSET, PATH_X, PATH_Y, PATH_Z, PATH_YAW, BEYOND = range(7)
 corner of the ego box is off the road [m]."""
 PLACES = 7
 
+STANDS, GOES, MOVED = 0, 1, 2
+"""What becomes of a world in a step."""
+
 
 @kernel(parallel=PARALLEL_LOOPS, nogil=True)
 def step_worlds(
@@ -38,7 +41,8 @@ def step_worlds(
     """Move all worlds that are ``going`` by a step.
 
     Args:
-        going: [W] bool.
+        going: [W] int8: STANDS, GOES, or MOVED where the ego's new motion is in ``new_motions``
+            already.
         times_us: [W] int64, before the step [us].
         dt_us: of the step [us].
         law: HOLD for commands, else the tracker of trajectories.
@@ -60,6 +64,7 @@ def step_worlds(
             step_world(
                 times_us[w], dt_us, law, actions[w], plan_us, frame_is_vehicle, vehicle, tracks,
                 road, motions[w], places[w], objects[w], present[w], drivers[w], driving[w],
+                going[w] == MOVED,
                 new_motions[w], new_poses[w], new_places[w], new_objects[w], new_present[w],
                 new_drivers[w], new_driving[w],
             )  # fmt: skip
@@ -82,7 +87,7 @@ def step_worlds(
 @func
 def step_world(
     t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle, tracks, road,
-    motion, place, objects, present, drivers, driving,
+    motion, place, objects, present, drivers, driving, is_moved,
     new_motion, new_pose, new_place, new_objects, new_present, new_drivers, new_driving,
 ):  # fmt: skip
     """Move one world: objects, then the ego."""
@@ -91,11 +96,12 @@ def step_world(
         t_us, dt_us, bodies, rows, tracks, drivers, driving, objects,
         new_drivers, new_driving, new_objects, new_present,
     )  # fmt: skip
-    state = to_fixed_tuple(motion, STATE)
-    moved = advanced(state, t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle)
-    for k in range(STATE):
-        new_motion[k] = moved[k]
-    new_motion[4] = (moved[3] - state[3]) / (dt_us * 1e-6)
+    if not is_moved:
+        state = to_fixed_tuple(motion, STATE)
+        moved = advanced(state, t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle)
+        for k in range(STATE):
+            new_motion[k] = moved[k]
+    new_motion[4] = (new_motion[3] - motion[3]) / (dt_us * 1e-6)
     stand(new_motion, new_pose, place[S], new_place, road)
 
 

@@ -32,7 +32,6 @@ def check_batchable(spec: ResetSpec) -> None:
         "ego.actuators.*_delay_us": not (
             spec.ego.actuators.steering_delay_us or spec.ego.actuators.drive_delay_us
         ),
-        "ego.suspension": spec.ego.suspension is None,
         "agents.default": spec.agents.default in {"log", "idm"},
         "agents (but default)": spec.agents == AgentsSpec(default=spec.agents.default),
         "contact.background": not spec.contact.background,

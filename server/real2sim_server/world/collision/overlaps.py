@@ -97,7 +97,9 @@ def ego_contacts(
         speed = float(np.sqrt(relative @ relative))
         contacts.append(OverlapContact(name, speed))
         driven = math.hypot(motion.speed, motion.lateral_speed)
-        records.append(_object_record(box, driven, agents, k, relative_speed=speed))
+        records.append(
+            _object_record(box, driven, agents, k, relative_speed=speed, reversing=motion.reversing)
+        )
     if obstacles is not None:
         body, properties = ego_body(motion, spec.ego), ego_properties(spec.ego, ego_size)
         if obstacles.manifold(body, properties) is not None:
@@ -127,6 +129,7 @@ def _object_record(
     k: int,
     *,
     relative_speed: float,
+    reversing: bool,
 ) -> ContactRecord:
     subject: ObjectState = agents.objects[k]
     x, y, _ = agents.positions[k].tolist()
@@ -136,7 +139,11 @@ def _object_record(
     return ContactRecord(
         object_id=subject.object_id,
         category=subject.category,
-        side=side_of_contact(box, ego_speed, other, speed, axle=box[3] / 2 - REAR_OVERHANG),
+        side=side_of_contact(
+            *(box, ego_speed, other, speed),
+            axle=box[3] / 2 - REAR_OVERHANG,
+            reversing=reversing,
+        ),
         relative_speed=relative_speed,
         ego_speed=ego_speed,
         object_speed=speed,

@@ -352,7 +352,8 @@ def _pair_impulse(
             second = (state.bodies[pair[1]], state.properties[pair[1]])
             speeds = (speeds[0], math.hypot(second[0].vx, second[0].vy))
             vx, vy = vx - second[0].vx, vy - second[0].vy
-            side = _side(first, second, speeds)
+            reversing = pair[0] == EGO and state.step.motion.reversing
+            side = _side(first, second, speeds, reversing=reversing)
         participants = (
             _participant(state, pair[0]),
             None if pair[1] == BACKGROUND else _participant(state, pair[1]),
@@ -389,6 +390,8 @@ def _side(
     first: tuple[BodyState, BodyProperties],
     second: tuple[BodyState, BodyProperties],
     speeds: tuple[float, float],
+    *,
+    reversing: bool,
 ) -> Side:
     boxes = []
     for body, properties in (first, second):
@@ -396,7 +399,8 @@ def _side(
         y = body.y + properties.box_ahead * math.sin(body.yaw)
         boxes.append((x, y, body.yaw, properties.length, properties.width))
     axle = boxes[0][3] / 2 - REAR_OVERHANG
-    return side_of_contact(boxes[0], speeds[0], boxes[1], speeds[1], axle=axle)
+    (ego, other), (ego_speed, speed) = boxes, speeds
+    return side_of_contact(ego, ego_speed, other, speed, axle=axle, reversing=reversing)
 
 
 def _separated(body: BodyState, manifold: ContactManifold, fraction: float) -> BodyState:

@@ -189,7 +189,11 @@ class _Sweep:
         record = ContactRecord(
             object_id=subject.object_id,
             category=subject.category,
-            side=side_of_contact(box, ego_speed, other, object_speed, axle=self._axle),
+            side=side_of_contact(
+                *(box, ego_speed, other, object_speed),
+                axle=self._axle,
+                reversing=motion.reversing,
+            ),
             relative_speed=relative,
             ego_speed=ego_speed,
             object_speed=object_speed,

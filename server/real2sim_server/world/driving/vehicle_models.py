@@ -28,10 +28,13 @@ class VehicleModel(NamedTuple):
         steady_steering: ``steady_steering(rolling, curvature, speed, vehicle)``, the road-wheel
             angle [rad] that keeps a curvature [1/m] at a speed [m/s], where wheels that only roll
             would need the angle ``rolling``. Trackers steer by it.
+        backwards: name of the model whose mirror image drives backwards in its place, at the low
+            speeds of a reverse gear; None for a model that cannot.
     """
 
     step: Any
     steady_steering: Any
+    backwards: str | None = "kinematic_bicycle"
 
 
 VEHICLE_MODELS: Mapping[str, VehicleModel] = {

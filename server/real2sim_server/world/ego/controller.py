@@ -9,16 +9,17 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import EgoSpec, ResetSpec
-from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
+from real2sim_proto.plans import Control, Gear, PoseCommand, TrajectoryPlan
 
 from ...edit.tracks import sample
 from ...scene import Trajectory
 from ..driving import Command
 from ..errors import WorldError
 from ..seam import Seam
+from .gear import advance_in_gear, can_reverse
 from .motion import Motion, advance_motion, constant_law, teleported
-from .reference import PlannedTrajectory, Pose, ReferenceTrajectory
-from .trackers import make_tracker
+from .reference import PlannedTrajectory, Pose
+from .trackers import tracker_of
 
 Plan = TrajectoryPlan | Control | PoseCommand
 WorldPlan = PlannedTrajectory | Control | PoseCommand
@@ -45,18 +46,35 @@ class Controller(Protocol):
 
 @dataclass(frozen=True)
 class ConstantCommand:
-    """The same command all the time."""
+    """The same command all the time.
+
+    Attributes:
+        constant: acceleration in the direction of the gear, and road-wheel angle.
+        spec: of the vehicle.
+        gear: in which it was given; None: the one that is engaged.
+    """
 
     constant: Command
     spec: EgoSpec
+    gear: Gear | None = "drive"
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
         """The vehicle ``dt_us`` later."""
-        return advance_motion(motion, constant_law(self.constant), self.spec, dt_us)
+        backwards, law = self._backwards(motion), constant_law(self.constant)
+        forwards = not (backwards or motion.reversing or motion.speed < 0)
+        if forwards or not can_reverse(self.spec):
+            return advance_motion(motion, law, self.spec, dt_us)
+        if backwards:
+            law = constant_law(Command(self.constant.acceleration, -self.constant.steering))
+        return advance_in_gear(motion, law, self.spec, dt_us, since=0.0, backwards=backwards)
 
     def command(self, motion: Motion, t: float) -> Command:
-        """That command."""
-        return self.constant
+        """That command, along the heading."""
+        acceleration, steering = self.constant
+        return Command(-acceleration if self._backwards(motion) else acceleration, steering)
+
+    def _backwards(self, motion: Motion) -> bool:
+        return self.gear == "reverse" if self.gear is not None else motion.reversing
 
     def put_back(self, seam: Seam) -> Self:
         """Itself: a command has no place."""
@@ -149,6 +167,13 @@ class EgoController:
                 f"{self.spec.action!r}",
                 hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}",
             )
+        if isinstance(plan, Control) and plan.gear == "reverse" and not can_reverse(self.spec.ego):
+            raise WorldError(
+                ErrorCode.INVALID_ACTION,
+                "gear 'reverse' for a vehicle without one: ego.max_reverse_speed is 0, or ego."
+                f"dynamics {self.spec.ego.dynamics!r} cannot go backwards",
+                hint="reset with ego.max_reverse_speed above 0, or send gear 'drive'",
+            )
         if isinstance(plan, TrajectoryPlan) and plan.times_us[0] <= t_us:
             raise WorldError(
                 ErrorCode.INVALID_ACTION,
@@ -198,7 +223,8 @@ class EgoController:
             case PlannedTrajectory():
                 return self._tracker(motion, t_us, plan.after(t_us))
             case Control():
-                return ConstantCommand(Command(plan.acceleration, plan.steering), self.spec.ego)
+                command = Command(plan.acceleration, plan.steering)
+                return ConstantCommand(command, self.spec.ego, plan.gear)
             case PoseCommand():
                 return Teleport((plan.x, plan.y, plan.yaw), self.spec.ego)
             case _:
@@ -215,10 +241,7 @@ class EgoController:
         return self._tracker(motion, t_us, PlannedTrajectory(times, poses))
 
     def _tracker(self, motion: Motion, t_us: int, trajectory: PlannedTrajectory) -> Controller:
-        spec = self.spec.ego
-        return make_tracker(
-            ReferenceTrajectory(motion, start_us=t_us, trajectory=trajectory, spec=spec), spec
-        )
+        return tracker_of(motion, t_us, trajectory, self.spec.ego)
 
 
 def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) -> Controller:
@@ -226,7 +249,7 @@ def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) ->
     if controller.spec.action == "pose":
         return Teleport((motion.x, motion.y, motion.yaw), spec)
     return ConstantCommand(
-        Command(-min(EMERGENCY_BRAKING, spec.max_braking), motion.steering), spec
+        Command(-min(EMERGENCY_BRAKING, spec.max_braking), motion.steering), spec, gear=None
     )
 
 

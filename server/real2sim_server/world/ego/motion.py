@@ -38,6 +38,7 @@ class Motion(NamedTuple):
 
     Attributes:
         pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
+        reversing: whether the reverse gear is engaged, see :mod:`.gear`.
     """
 
     x: float
@@ -50,6 +51,7 @@ class Motion(NamedTuple):
     lateral_speed: float = 0.0
     drive: float = 0.0
     pending: tuple[Command, ...] = ()
+    reversing: bool = False
 
     @property
     def velocity(self) -> tuple[float, float]:
@@ -62,8 +64,8 @@ class Motion(NamedTuple):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All but the pending commands, as :mod:`.driving` takes a state."""
-        x, y, yaw, speed, acceleration, steering, yaw_rate, lateral_speed, drive, _ = self
+        """All but pending commands and gear, as :mod:`.driving` takes a state."""
+        x, y, yaw, speed, acceleration, steering, yaw_rate, lateral_speed, drive, _, _ = self
         kinematic = (float(x), float(y), float(yaw), float(speed), float(acceleration))
         return (*kinematic, float(steering), float(yaw_rate), float(lateral_speed), float(drive))
 
@@ -114,7 +116,7 @@ def advance_motion(
         arguments = law.arguments(since, schedule)
     state, waiting = advance_vehicle(numbers, pending, arguments, vehicle, dt_us)
     delayed = tuple(Command(*row) for row in waiting.tolist())
-    return Motion._make((*state, delayed))
+    return Motion._make((*state, delayed, False))
 
 
 def commanded(motion: Motion, law: ControlLaw, spec: EgoSpec, *, since: float = 0.0) -> Command:
@@ -146,6 +148,7 @@ def teleported(
         acceleration=(speed - motion.speed) / seconds,
         steering=_steering_of(speed, turn / seconds, spec),
         yaw_rate=turn / seconds,
+        reversing=speed < 0.0 and spec.max_reverse_speed > 0.0,
     )
 
 
@@ -167,6 +170,7 @@ def logged_motion(ego: Trajectory, t_us: int, spec: EgoSpec) -> Motion:
         speed=speed,
         steering=_steering_of(speed, yaw_rate, spec),
         yaw_rate=yaw_rate,
+        reversing=speed < -SLOW and spec.max_reverse_speed > 0.0,
     )
 
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from real2sim_proto.episode import EgoSpec, SuspensionSpec
 
-from ..driving import GRAVITY, VehicleParameters, vehicle_parameters, wheel_load
+from ..driving import GRAVITY, PlanarState, VehicleParameters, vehicle_parameters, wheel_load
 from ..path import Float
 from .motion import Motion
 
@@ -33,6 +33,12 @@ class BodyAttitude(NamedTuple):
 
 
 LEVEL = BodyAttitude()
+
+SPEED, ACCELERATION, TURN = (
+    PlanarState._fields.index(name) for name in ("speed", "acceleration", "yaw_rate")
+)
+
+Value = TypeVar("Value", float, Float)
 
 
 class Suspension(NamedTuple):
@@ -94,6 +100,41 @@ def sprung(
     return BodyAttitude(*pitch, *roll)
 
 
+def sprung_side_by_side(
+    attitudes: Float, before: Float, after: Float, seconds: float, ego: EgoSpec
+) -> Float:
+    """What :func:`sprung` does, to the bit, of many vehicles.
+
+    Args:
+        attitudes: [W, 4] float64, a :class:`BodyAttitude` a row.
+        before, after: [W, 9] float64, a ``driving.PlanarState`` a row.
+        seconds: of the step.
+        ego: of a vehicle on springs that is steered.
+    """
+    springs = suspension_of(ego)
+    vehicle, mass, height = springs.vehicle, springs.vehicle.mass, springs.vehicle.height
+
+    def transfer(base: float, arm: float, acceleration: Float) -> Float:
+        load: Float = np.maximum(mass * (GRAVITY * arm - acceleration * height) / base, 0.0)
+        return load - wheel_load(mass, height, base, arm, 0.0)
+
+    most = vehicle.friction * GRAVITY
+    along = np.minimum(np.maximum(after[:, ACCELERATION], -most), most)
+    sideways = (before[:, SPEED] * before[:, TURN] + after[:, SPEED] * after[:, TURN]) / 2
+    left = np.minimum(np.maximum(sideways, -most), most)
+    to_front = transfer(vehicle.wheelbase, vehicle.rear, along)
+    to_left = transfer(springs.track, springs.track / 2, left)
+    pitch = _oscillated(
+        attitudes[:, 0], attitudes[:, 1], springs.pitch * to_front, seconds,
+        (springs.pitch_frequency, springs.damping),
+    )  # fmt: skip
+    roll = _oscillated(
+        attitudes[:, 2], attitudes[:, 3], -springs.roll * to_left, seconds,
+        (springs.roll_frequency, springs.damping),
+    )  # fmt: skip
+    return np.stack([*pitch, *roll], axis=1)
+
+
 def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Float:
     """``T_world_body`` [4, 4] of the body over a vehicle that stands level on the ground."""
     if attitude == LEVEL or ego.suspension is None:
@@ -152,8 +193,8 @@ def _transfer(vehicle: VehicleParameters, base: float, arm: float, acceleration:
 
 
 def _oscillated(
-    value: float, rate: float, rest: float, seconds: float, oscillator: tuple[float, float]
-) -> tuple[float, float]:
+    value: Value, rate: Value, rest: Value, seconds: float, oscillator: tuple[float, float]
+) -> tuple[Value, Value]:
     """Value and rate of a damped oscillator (its frequency [rad/s] and damping, below 1) that is
     drawn to ``rest``, ``seconds`` later: exact for steps of any length."""
     frequency, damping = oscillator

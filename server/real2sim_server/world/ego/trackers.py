@@ -6,12 +6,16 @@ import math
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
+
 from real2sim_proto.episode import EgoSpec
 
 from ..driving import KINDS, LQR, MOVING, Command
 from ..seam import Seam
+from .gear import advance_in_gear, backwards_spec, can_reverse, command_in_gear, mirrored
+from .legs import Leg, legs_of
 from .motion import Motion, advance_motion, commanded, teleported
-from .reference import ReferenceTrajectory
+from .reference import PlannedTrajectory, ReferenceTrajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +74,8 @@ class PerfectTracker:
             return teleported(motion, self.reference.last_pose, self.spec, dt_us)
         x, y, vx, vy, yaw = self.reference.at(t)
         if math.hypot(vx, vy) > MOVING:
-            yaw = math.atan2(vy, vx)
+            back = vx * math.cos(yaw) + vy * math.sin(yaw) < 0 and can_reverse(self.spec)
+            yaw = math.atan2(-vy, -vx) if back else math.atan2(vy, vx)
         return teleported(motion, (x, y, yaw), self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
@@ -82,10 +87,101 @@ class PerfectTracker:
         return replace(self, reference=self.reference.put_back(seam))
 
 
+@dataclass(frozen=True, eq=False)
+class GearedLeg:
+    """A leg of a plan as it is followed.
+
+    Attributes:
+        backwards: whether in reverse gear; the reference is then the mirror image's.
+        begin_us, end_us: from the beginning of the plan [us].
+        reference: what is followed.
+    """
+
+    backwards: bool
+    begin_us: int
+    end_us: int
+    reference: ReferenceTrajectory
+
+
+@dataclass(frozen=True, eq=False)
+class GearedTracker:
+    """A controller that changes gear where its plan turns back.
+
+    Attributes:
+        kind: number of the tracker, see :mod:`.driving.trackers`.
+        legs: of the plan, one after the other.
+        spec: of the vehicle.
+    """
+
+    kind: int
+    legs: tuple[GearedLeg, ...]
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later, ``since`` seconds after the plan began."""
+        at_us = round(since * 1e6)
+        end_us = at_us + dt_us
+        while at_us < end_us:
+            leg = self._leg_at(at_us)
+            until_us = end_us if leg is self.legs[-1] else min(end_us, leg.end_us)
+            motion = advance_in_gear(
+                motion,
+                leg.reference.control_law(self.kind),
+                self.spec,
+                until_us - at_us,
+                since=(at_us - leg.begin_us) * 1e-6,
+                backwards=leg.backwards,
+            )
+            at_us = until_us
+        return motion
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """What to do in a motion, ``t`` seconds after the plan began."""
+        leg = self._leg_at(round(t * 1e6))
+        law = leg.reference.control_law(self.kind)
+        since = t - leg.begin_us * 1e-6
+        return command_in_gear(motion, law, self.spec, since=since, backwards=leg.backwards)
+
+    def put_back(self, seam: Seam) -> Self:
+        """The tracker of a vehicle that was put back over the seam."""
+        legs = [replace(leg, reference=leg.reference.put_back(seam)) for leg in self.legs]
+        return replace(self, legs=tuple(legs))
+
+    def _leg_at(self, at_us: int) -> GearedLeg:
+        return next((leg for leg in self.legs if at_us < leg.end_us), self.legs[-1])
+
+
+def tracker_of(
+    motion: Motion, start_us: int, trajectory: PlannedTrajectory, spec: EgoSpec
+) -> ControlledTracker | GearedTracker | PerfectTracker:
+    """The tracker that the spec names, of a vehicle that is in ``motion`` at ``start_us``."""
+    if spec.tracker != "perfect" and can_reverse(spec):
+        legs = legs_of(trajectory, motion)
+        if len(legs) > 1 or legs[0].backwards or motion.reversing or motion.speed < 0:
+            geared = [_geared(leg, motion, start_us, spec) for leg in legs]
+            return GearedTracker(KINDS[spec.tracker], tuple(geared), spec)
+    ahead = ReferenceTrajectory(motion, start_us=start_us, trajectory=trajectory, spec=spec)
+    return make_tracker(ahead, spec)
+
+
+def _geared(leg: Leg, motion: Motion, start_us: int, spec: EgoSpec) -> GearedLeg:
+    begin_us, trajectory = leg.begin_us or start_us, leg.trajectory
+    if leg.cusp is not None:
+        x, y, yaw = leg.cusp
+        motion = Motion(x, y, yaw)
+    if leg.backwards:
+        motion, spec = mirrored(motion), backwards_spec(spec)
+        turned = trajectory.poses + np.array([0.0, 0.0, math.pi])
+        trajectory = PlannedTrajectory(trajectory.times_us, turned)
+    reference = ReferenceTrajectory(motion, start_us=begin_us, trajectory=trajectory, spec=spec)
+    end_us = int(trajectory.times_us[-1]) - start_us
+    return GearedLeg(leg.backwards, begin_us - start_us, end_us, reference)
+
+
 def make_tracker(
     reference: ReferenceTrajectory, spec: EgoSpec
 ) -> ControlledTracker | PerfectTracker:
-    """The tracker that the spec names."""
+    """The tracker that the spec names, of a plan that leads forwards."""
     if spec.tracker == "perfect":
         return PerfectTracker(reference, spec)
     return ControlledTracker(KINDS[spec.tracker], reference, spec)

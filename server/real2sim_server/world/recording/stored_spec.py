@@ -11,6 +11,7 @@ BEFORE: Mapping[str, Any] = {
     "ego": {
         "actuators": {"steering_lag": 0.0, "drive_lag": 0.0, "foreseen": False},
         "suspension": None,
+        "max_reverse_speed": 0.0,
     },
     "contact": {"swept": False},
 }
@@ -27,7 +28,11 @@ def stored_spec(fields: Mapping[str, Any]) -> ResetSpec:
     Raises:
         ValueError: it is no spec.
     """
-    return ResetSpec.model_validate(_completed(fields, BEFORE))
+    spec = ResetSpec.model_validate(_completed(fields, BEFORE))
+    if fields.get("horizon") is None:
+        # To the end of the log, also where the episode could have gone on.
+        return spec.model_copy(update={"horizon": None})
+    return spec
 
 
 def _completed(fields: Mapping[str, Any], absent: Mapping[str, Any]) -> dict[str, Any]:

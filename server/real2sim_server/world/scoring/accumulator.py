@@ -26,7 +26,8 @@ class MetricAccumulator:
         start_s: along the route where the scores begin [m].
         distance: driven [m].
         outside: part of it beside all lanes that go the ego's way [m].
-        s, furthest: along the route: now and at most [m].
+        tail_first: way along the route that was made facing against it, in reverse gear [m].
+        s, furthest: along the route: now and at most; the latter less what was tail first [m].
         offset: from the route now [m].
         at_fault: at-fault contacts of the ego, by kind: vehicle, vru, object.
         contacts: contacts begun, by category.
@@ -58,6 +59,7 @@ class MetricAccumulator:
     start_s: float = 0.0
     distance: float = 0.0
     outside: float = 0.0
+    tail_first: float = 0.0
     s: float = 0.0
     furthest: float = 0.0
     offset: float = 0.0

@@ -83,6 +83,8 @@ def _uncounted(
             found.append(f"standing still where the recorded drive goes {recorded:.0f} m")
     if "direction" not in sees and accumulator.oncoming >= NOT_NOTICED:
         found.append(f"up to {accumulator.oncoming:.0f} m in a second against the route")
+    if "progress" not in sees and accumulator.tail_first >= NOT_NOTICED:
+        found.append(f"{accumulator.tail_first:.0f} m of the route driven tail first")
     if "lane" not in sees and accumulator.outside >= NOT_NOTICED:
         found.append(f"{accumulator.outside:.0f} m beside all lanes that were driven")
     without_fault = accumulator.collisions - sum(accumulator.at_fault.values())

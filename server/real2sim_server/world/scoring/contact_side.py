@@ -18,6 +18,7 @@ def side_of_contact(
     speed: float,
     *,
     axle: float,
+    reversing: bool = False,
 ) -> Side:
     """The side of the ego on which two boxes came into contact, after nuPlan's ``CollisionType``.
 
@@ -26,12 +27,16 @@ def side_of_contact(
         ego_speed, speed: before the contact, along and across [m/s].
         axle: from the middle of the ego box back to the rear axle, from which what is behind is
             seen [m].
+        reversing: whether the ego drives in reverse gear: its tail is then what runs into things,
+            as its front does otherwise.
     """
     if abs(ego_speed) <= STOPPED:
         return "stopped_ego"
     if abs(speed) <= STOPPED:
         return "stopped_track"
     x, y, yaw, length, width = ego_box
+    if reversing:
+        yaw += math.pi
     cos, sin = math.cos(yaw), math.sin(yaw)
     bearing = math.atan2(box[1] - y + axle * sin, box[0] - x + axle * cos) - yaw
     if abs(math.remainder(bearing, math.tau)) > BEHIND:

@@ -31,6 +31,9 @@ is rarely known better."""
 SPIN_S, SPIN_NOISE = 1.0, 0.1
 """Turning on the spot: time over which it is looked at [s], noise of headings in it [rad]."""
 
+FASTEST_BACKWARDS = 8.0
+"""More than the reverse gear of a car gives [m/s]."""
+
 SETTLED = 0.2
 """Speed across below which a vehicle that was pushed rolls again [m/s]."""
 
@@ -90,6 +93,8 @@ def _is_feasible(samples: Samples, dt: float) -> bool:
 def _follows(before: EgoSample, now: EgoSample, h: float) -> bool:
     """Whether a car gets from one sample to another ``h`` seconds later."""
     if abs(now.speed - before.speed) > MAX_ACCELERATION * h * (1 + 1e-9):
+        return False
+    if now.speed < -FASTEST_BACKWARDS and now.speed < before.speed:
         return False
     speed = max(
         math.hypot(before.speed, before.lateral_speed), math.hypot(now.speed, now.lateral_speed)

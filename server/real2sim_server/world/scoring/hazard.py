@@ -20,8 +20,9 @@ def time_to_collision(
 ) -> float:
     """First time [s] in steps of 0.1 s up to 3 s at which the ego box overlaps an object's.
 
-    All keep their velocities. Objects ahead count; when the ego is in several lanes or off the
-    road, all that are not behind it (nuPlan, NAVSIM).
+    All keep their velocities. Objects ahead count, or behind an ego that drives backwards; when
+    the ego is in several lanes or off the road, all that are not on its other side (nuPlan,
+    NAVSIM).
 
     Args:
         instant: now.
@@ -32,10 +33,16 @@ def time_to_collision(
     ego, others = instant.ego, instant.others
     if not others.ids or math.hypot(ego.speed, ego.lateral_speed) < STANDSTILL:
         return NEVER
+    moving = (ego.x, ego.y, ego.yaw, ego.speed, ego.lateral_speed, ego.z)
+    ahead = context.centre_ahead
+    if ego.speed < -STANDSTILL:
+        # The mirror image, for which what lies where it drives to is ahead.
+        moving = (ego.x, ego.y, ego.yaw + math.pi, -ego.speed, -ego.lateral_speed, ego.z)
+        ahead = -ahead
     step: int = first_overlap_step(
-        (ego.x, ego.y, ego.yaw, ego.speed, ego.lateral_speed, ego.z),
+        moving,
         context.ego_size,
-        context.centre_ahead,
+        ahead,
         off_lane,
         (others.centres, others.yaws, others.sizes, others.velocities),
         np.array([i in hit for i in others.ids]) if hit else np.zeros(len(others.ids), np.bool_),

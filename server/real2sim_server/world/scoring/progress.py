@@ -22,8 +22,8 @@ def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
 
 
 def progress_along_route(accumulator: MetricAccumulator) -> float:
-    """Way along the route [m]."""
-    return max(accumulator.s - accumulator.start_s, 0.0)
+    """Way along the route [m]; not what was driven tail first, which is no way to drive there."""
+    return max(accumulator.s - accumulator.tail_first - accumulator.start_s, 0.0)
 
 
 def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:

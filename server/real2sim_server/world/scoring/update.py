@@ -78,6 +78,8 @@ def update_accumulator(
         accumulator.backward, max(before.s - ego.s, 0.0), max(round(ONCOMING_WINDOW_S / dt), 1)
     )
     lane_run = accumulator.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
+    backing = ego.speed < 0 and math.cos(ego.yaw - ego.path_yaw) < 0
+    tail_first = accumulator.tail_first + (max(ego.s - before.s, 0.0) if backing else 0.0)
     limit = context.speed_limit
     way = math.hypot(ego.x - before.x, ego.y - before.y)
     distance = accumulator.distance + way
@@ -88,7 +90,8 @@ def update_accumulator(
         distance=distance,
         outside=accumulator.outside + (0.0 if context.in_lane(ego) else way),
         s=ego.s,
-        furthest=max(accumulator.furthest, ego.s)
+        tail_first=tail_first,
+        furthest=max(accumulator.furthest, ego.s - tail_first)
         if abs(ego.offset) < HUGSIM_REACHED
         else accumulator.furthest,
         offset=ego.offset,

@@ -11,6 +11,7 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentsSpec, IdmDriver, LaneSpec, SpawnSpec
+from real2sim_proto.operations import DRAWN_PREFIX
 
 from ...edit import ObjectState, ScenarioState
 from ...geometry.rotation import quaternion_yaw
@@ -24,7 +25,7 @@ from .driver import AgentDriver, Surroundings, level_quaternion
 from .idm import Idm, highest_speed
 from .lane import lane_beside
 
-PREFIX = "spawned:"
+PREFIX = DRAWN_PREFIX
 """Of the ids of spawned objects; no id on the wire may hold a colon, so none is taken."""
 
 LOOKS = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle"})

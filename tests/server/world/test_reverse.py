@@ -1,0 +1,189 @@
+"""Reverse gear: commands and plans that lead backwards."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from real2sim_proto.episode import EgoSpec, ResetSpec
+from real2sim_proto.plans import Control, TrajectoryPlan
+from real2sim_server.edit import ScenarioState
+from real2sim_server.world import World, WorldError
+from real2sim_server.world.batch import BatchWorld
+from real2sim_server.world.ego.controller import EgoController
+from real2sim_server.world.ego.motion import Motion
+from real2sim_server.world.recording.stored_spec import stored_spec
+
+BEHIND, ASIDE = 11.0, 2.5
+"""A gap beside the road, from where the vehicle has stopped [m]."""
+
+Pose = tuple[float, float, float]
+
+
+def smooth(u: float) -> float:
+    """From 0 to 1 with no speed or acceleration at the ends."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
+def parking(t_us: int) -> Pose:
+    """Past the gap from 2 m/s to rest at second 2, a pause, and backwards into it."""
+    t = t_us * 1e-6
+    way = 2 * t - t * t / 2 if t < 2 else 2.0
+    back = BEHIND * smooth((t - 3) / 8)
+    u = back / BEHIND
+    bend = ASIDE / BEHIND * 30 * (u * (1 - u)) ** 2
+    return way - back, -ASIDE * smooth(u), math.atan(bend)
+
+
+def plan_of(t_us: int, poses: int = 30) -> TrajectoryPlan:
+    times = [t_us + 100_000 * k for k in range(1, poses + 1)]
+    return TrajectoryPlan(times_us=times, poses=[parking(t) for t in times], frame="world")
+
+
+def parked(make_scene, *, anew: bool = True, **ego) -> tuple[Motion, float]:
+    """The vehicle after it has parked, and its greatest distance from the plan on the way [m]."""
+    controller = EgoController(ResetSpec(ego=ego), make_scene().ego)
+    motion, worst = Motion(0.0, 0.0, 0.0, 2.0), 0.0
+    for t_us in range(0, 12_000_000, 100_000):
+        if anew or not t_us:
+            plan = plan_of(t_us) if anew else plan_of(t_us, 120)
+            controller = controller.with_plan(plan, motion, t_us, t_us)
+        controller, motion = controller.advance(motion, t_us, 100_000)
+        x, y, _ = parking(t_us + 100_000)
+        worst = max(worst, math.hypot(motion.x - x, motion.y - y))
+    return motion, worst
+
+
+@pytest.mark.parametrize("dynamics", ["kinematic_bicycle", "dynamic_bicycle"])
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr", "perfect"])
+def test_a_plan_that_parks_backwards_is_followed(make_scene, tracker, dynamics):
+    motion, worst = parked(make_scene, tracker=tracker, dynamics=dynamics)
+
+    assert worst < 0.2
+    assert (motion.x, motion.y) == pytest.approx((2 - BEHIND, -ASIDE), abs=0.15)
+    assert abs(motion.yaw) < 0.12
+    assert abs(motion.speed) < 0.05
+
+
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
+def test_one_plan_with_both_gears_is_followed_through_dead_times(make_scene, tracker):
+    delays = {"drive_delay_us": 100_000, "steering_delay_us": 100_000}
+
+    assert parked(make_scene, anew=False, tracker=tracker, actuators=delays)[1] < 0.2
+
+
+def test_a_vehicle_without_the_gear_does_not_reverse(make_scene):
+    motion, _ = parked(make_scene, tracker="pursuit", max_reverse_speed=0.0)
+
+    assert motion.speed >= 0.0
+    assert not motion.reversing
+
+
+def commanded(make_world, *commands: tuple[str, float, int], **ego) -> World:
+    world = make_world(spec={"action": "control", "ego": ego})
+    for gear, acceleration, steps in commands:
+        for _ in range(steps):
+            world.step(Control(acceleration=acceleration, steering=0.3, gear=gear))
+    return world
+
+
+def test_a_command_drives_backwards_once_the_vehicle_stands(make_world):
+    rolling = commanded(make_world, ("reverse", 4.0, 20))
+    assert rolling.motion.speed > 0
+    world = commanded(make_world, ("reverse", 4.0, 50))
+
+    assert -5.0 <= world.motion.speed < -1.0
+    # Wheels to the left take the tail to the left: the nose turns right.
+    assert world.motion.yaw_rate < 0
+    ego = world.observe().ego_fields()
+    assert (ego["gear"], ego["speed"]) == ("reverse", world.motion.speed)
+    assert world.metrics()["feasible"] == 1.0
+
+
+def test_no_faster_than_the_gear_goes_and_brakes_to_a_stop(make_world):
+    fast = commanded(make_world, ("reverse", 4.0, 100), max_reverse_speed=3.0)
+    stopped = commanded(make_world, ("reverse", 4.0, 50), ("reverse", -4.0, 40))
+
+    assert fast.motion.speed == -3.0
+    assert stopped.motion.speed == 0.0
+    assert math.copysign(1.0, stopped.motion.speed) == 1.0
+
+
+@pytest.mark.parametrize("delay_us", [0, 200_000])
+def test_what_was_braking_when_the_gear_changed_does_not_drive(make_world, delay_us):
+    world = commanded(
+        make_world,
+        ("drive", -8.0, 30),
+        ("reverse", 0.0, 30),
+        actuators={"drive_delay_us": delay_us, "drive_lag": 0.5},
+    )
+
+    assert world.motion.reversing
+    assert world.motion.speed == 0.0
+
+
+def test_a_command_without_a_gear_never_reverses(make_world):
+    world = make_world(spec={"action": "control"})
+    for _ in range(40):
+        world.step(Control(acceleration=-8.0, steering=0.0))
+
+    assert world.motion.speed == 0.0
+    assert "gear" not in world.observe().ego_fields()
+
+
+def test_reverse_is_refused_by_a_vehicle_without_it(make_world):
+    with pytest.raises(WorldError, match="max_reverse_speed is 0") as refused:
+        commanded(make_world, ("reverse", 1.0, 1), max_reverse_speed=0.0)
+    assert refused.value.code == "INVALID_ACTION"
+
+
+def test_noise_of_a_plan_that_stands_does_not_change_gear(make_world, moving):
+    world = make_world(moving(speed=0.0))
+    random = np.random.default_rng(2)
+    for _ in range(20):
+        times = [world.t_us + 100_000 * k for k in range(1, 11)]
+        poses = [(x, 0.0, 0.0) for x in random.uniform(-0.02, 0.02, 10)]
+        world.step(TrajectoryPlan(times_us=times, poses=poses, frame="vehicle"))
+
+    assert not world.motion.reversing
+    assert abs(world.motion.x) < 0.1
+
+
+def test_the_length_of_the_step_does_not_matter(make_world):
+    places = []
+    for dt_us, steps in ((20_000, 250), (100_000, 50), (1_000_000, 5)):
+        world = make_world(spec={"action": "control", "dt_us": dt_us})
+        for _ in range(steps):
+            world.step(Control(acceleration=4.0, steering=0.1, gear="reverse"))
+        places.append(world.motion[:4])
+
+    assert places[0] == pytest.approx(places[1], abs=0.02)
+    assert places[2] == pytest.approx(places[1], abs=0.02)
+
+
+def test_worlds_in_batches_reverse_as_single_ones(make_scene, moving):
+    scene, spec = make_scene(moving(speed=2.0)), ResetSpec(ego={"tracker": "lqr"})
+    state = ScenarioState.of(scene)
+    single, batch = World(scene, state, spec), BatchWorld(scene, spec, 2, state=state)
+    after_us = np.arange(1, 11) * 200_000
+    backwards = False
+    for step in range(50):
+        sign = -1.0 if 5 <= step < 35 else 1.0
+        poses = np.stack([sign * 0.3 * np.arange(1, 11)] + [np.zeros(10)] * 2, axis=1)
+        times = (single.t_us + after_us).tolist()
+        single.step(TrajectoryPlan(times_us=times, poses=poses.tolist(), frame="vehicle"))
+        batch.step(np.stack([poses, np.abs(poses)]), plan_us=after_us)
+        backwards |= single.motion.reversing
+        assert single.motion.numbers == tuple(batch.motions[0])
+        assert batch.motions[1, 3] > 0
+    assert backwards
+    assert not single.motion.reversing
+
+
+def test_egos_of_the_versions_before_have_no_reverse_gear():
+    assert stored_spec({"ego": {}}).ego.max_reverse_speed == 0.0
+    assert stored_spec({}).ego.max_reverse_speed == 0.0
+    assert EgoSpec().max_reverse_speed == 5.0
