@@ -38,7 +38,7 @@ NAMES = {
     "meet_bodies": "resolve_body_contact",
     "meet_colliders": "resolve_collider_contact",
     "rubbed": "friction_work",
-    "SOFTER": "STIFFNESS_SCALE",
+    "SOFTER": "stiffness scale",
     "RINGS": "SETTLING_TIME",
     "TICK": "SAMPLE_DT",
     # world

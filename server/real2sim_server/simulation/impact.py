@@ -31,10 +31,6 @@ PARTICLES = 1000
 difference to the impulse. A step of a closed loop waits for it."""
 FINEST = 0.1
 """Spacing of particles that is the smallest taken [m]."""
-STIFFNESS_SCALE = 0.12
-"""Stiffness of the ends against the vehicle preset, which is fitted to the front of one modern car.
-With it two mean cars together crush as their mutual stiffness of 405 kN/m has it (Bonugli et al.
-2017)."""
 HOOD, UNDER, CABIN = 0.95, 0.2, (0.22, 0.84)
 """Height of a plain vehicle's hood and of its underside [m]; its cabin from and to, as fractions of
 the length from the rear."""
@@ -139,15 +135,17 @@ def object_body(
     above = -np.inf
     if category in VEHICLES:
         above = -size[2] / 2 + preset_of("vehicle").clearance
-    return _body(filling.lattice(above=above), category, size[0], spacing, friction)
+    return _body(filling.lattice(above=above), category, spacing, friction)
 
 
-def vehicle_body(size: Sequence[float], *, mass: float, friction: float) -> CrashBody:
+def vehicle_body(
+    size: Sequence[float], *, mass: float, friction: float, spacing: float | None = None
+) -> CrashBody:
     """A vehicle of which only the box is known: hood, cabin and boot of a plain car.
 
-    Origin of its frame: the centre of the box.
+    Origin of its frame: the centre of the box. ``spacing``: of particles [m].
     """
-    spacing = _spacing(size)
+    spacing = _spacing(size) if spacing is None else spacing
     block = box_particles(tuple(size), spacing=spacing, density=1.0)
     fraction = block.positions[:, 0] / size[0] + 0.5
     height = block.positions[:, 2] + size[2] / 2
@@ -156,19 +154,16 @@ def vehicle_body(size: Sequence[float], *, mass: float, friction: float) -> Cras
     cut = Particles(
         block.positions[kept], block.volumes[kept], block.masses[kept], block.source[kept]
     )
-    return _body(cut.with_mass(mass), "car", size[0], spacing, friction)
+    return _body(cut.with_mass(mass), "car", spacing, friction)
 
 
 def _spacing(size: Sequence[float]) -> float:
     return max(FINEST, float(np.cbrt(np.prod(size) / PARTICLES)))
 
 
-def _body(
-    rest: Particles, category: str, length: float, spacing: float, friction: float
-) -> CrashBody:
-    materials, regions_of = preset_of("vehicle").build(category, length)
-    softer = tuple(replace(m, young=STIFFNESS_SCALE * m.young) for m in materials)
-    return CrashBody(rest, softer, regions_of(rest.positions[:, 0]), friction, spacing)
+def _body(rest: Particles, category: str, spacing: float, friction: float) -> CrashBody:
+    materials, regions, rest = preset_of("vehicle").build(category, rest, spacing)
+    return CrashBody(rest, tuple(materials), regions, friction, spacing)
 
 
 def simulate_impact(

@@ -9,17 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
-from ..physics.materials import FixedCorotated, Foam, Material, Snow
+from ..physics.materials import FixedCorotated, Foam, Material
+from ..physics.particles import Particles
+from .structure import VEHICLES, vehicle_structure
 
-Regions = Callable[[Float], NDArray[np.int64]]
-"""From places along the length [m] to indices of materials."""
-VEHICLES = ("car", "vehicle", "van", "truck", "bus")
-CRUMPLE_FRACTION = 0.26
-"""Fraction of the length that is crumple zone, at each end."""
-BUMPER = 0.35
-"""Its outermost part [m]."""
+Build = tuple[Sequence[Material], NDArray[np.int64], Particles]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,7 +70,8 @@ class Preset:
         wheels: whether vehicles stand on tyres.
         clearance: height under vehicles on tyres that is wheels, not body [m].
         by_density: whether mass is the material's density times volume, not kilograms per class.
-        build: (category, length) -> materials, and a rule for regions along the length.
+        build: (category, particles in the object's frame, their spacing) -> materials, index of
+            the material of each particle, and the particles with their masses.
     """
 
     name: str
@@ -84,59 +80,22 @@ class Preset:
     wheels: bool
     clearance: float
     by_density: bool
-    build: Callable[[str, float], tuple[Sequence[Material], Regions]]
+    build: Callable[[str, Particles, float], Build]
 
 
-def _paper(category: str, length: float) -> tuple[Sequence[Material], Regions]:
+def _paper(category: str, particles: Particles, spacing: float) -> Build:
     """Table II of the paper: E 2e6 Pa, nu 0.4, rho 200 kg/m^3, fixed corotated, all through."""
     soft = FixedCorotated(young=2e6, poisson=0.4, density=200.0)
-    return (soft,), lambda x: np.zeros(len(x), dtype=np.int64)
+    return (soft,), np.zeros(len(particles), dtype=np.int64), particles
 
 
-def _vehicle(category: str, length: float) -> tuple[Sequence[Material], Regions]:
-    """Bumpers and crumple zones at both ends of a stiff cabin; other things are soft foam."""
-    if category not in VEHICLES:
-        foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
-        return (foam,), lambda x: np.zeros(len(x), dtype=np.int64)
-    cabin, crumple = (0.5 - CRUMPLE_FRACTION) * length, length / 2 - BUMPER
+def _vehicle(category: str, particles: Particles, spacing: float) -> Build:
+    """Vehicles have zones that give way; other things are soft foam."""
+    if category in VEHICLES:
+        return vehicle_structure(category, particles, spacing=spacing)
+    foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
+    return (foam,), np.zeros(len(particles), dtype=np.int64), particles
 
-    def regions(x: Float) -> NDArray[np.int64]:
-        return np.searchsorted([cabin, crumple], np.abs(x))
-
-    return (CABIN, CRUMPLE, BUMPER_FOAM), regions
-
-
-BUMPER_FOAM = Snow(
-    young=2e6,
-    poisson=0.0,
-    density=150.0,
-    critical_compression=0.015,
-    critical_stretch=0.05,
-    hardening=7.0,
-    viscosity=1e3,
-)
-"""Gives way first, so that even a slow contact costs energy; what it stores before it yields is
-what cars of published tests jump back with at walking pace."""
-CRUMPLE = Snow(
-    young=2.4e7,
-    poisson=0.1,
-    density=150.0,
-    critical_compression=0.0055,
-    critical_stretch=0.05,
-    hardening=4.0,
-    viscosity=6e3,
-)
-"""Crushes at a stress that grows as it packs, like the fitted force over crush of real fronts."""
-CABIN = Snow(
-    young=1.2e8,
-    poisson=0.2,
-    density=150.0,
-    critical_compression=0.03,
-    critical_stretch=0.06,
-    hardening=4.0,
-    viscosity=1e4,
-)
-"""Five times as stiff, and strong enough to stay whole while the ends give way."""
 
 PRESETS = {
     "paper": Preset(

@@ -172,9 +172,9 @@ def _spawn_body(
     gravity: Float,
 ) -> DeformableBody:
     particles = object_particles(scene, subject, preset, start_us, mass=physics.mass)
-    materials, regions_of = preset.build(subject.category, subject.scaled_size[0])
-    regions = regions_of(particles.positions[:, 0])
-    if physics.material is not None:
+    if physics.material is None:
+        materials, regions, particles = preset.build(subject.category, particles, preset.spacing)
+    else:
         materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
     if preset.by_density and physics.mass is None:
         particles = particles.with_mass(materials[0].density * float(particles.volumes.sum()))

@@ -15,6 +15,7 @@ from real2sim_server.physics.constitutive.material_row import LAW, MATERIAL_ROW,
 from real2sim_server.physics.materials import (
     MATERIALS,
     Material,
+    Structure,
     named_material,
     register_material,
 )
@@ -42,10 +43,11 @@ class Clay(Material):
         self._require("shear_strength", self.shear_strength > 0, "must be positive")
 
 
-@pytest.fixture(params=[*MATERIALS, "clay"])
+@pytest.fixture(params=[*MATERIALS, "clay", "structure"])
 def material(request, monkeypatch) -> Material:
     monkeypatch.setattr(registry, "MATERIALS", dict(MATERIALS))
     register_material("clay", young=5e6, density=1800.0)(Clay)
+    register_material("structure", young=5e6, critical_compression=0.02)(Structure)
     return named_material(request.param)
 
 

@@ -94,7 +94,7 @@ def test_an_impacted_car_is_drawn_deformed_where_it_was_hit(crash_scene, moving)
     pushed = (after - before)[:, 0]
     rear, front = before[:, 0] < -SIZE[0] / 2 + 0.1, before[:, 0] > 0.5
     low = before[:, 2] < 0.0
-    assert pushed[rear & low].mean() > 0.05
+    assert pushed[rear & low].mean() > 0.04
     assert pushed[front].abs().max() < 0.02
     assert torch.equal(cloud_of(world, "other").means, before)
 

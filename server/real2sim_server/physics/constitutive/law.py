@@ -50,9 +50,15 @@ SNOW = ConstitutiveLaw(
     plastic=True,
     parameters=("critical_compression", "critical_stretch", "hardening"),
 )
+CRUSH = ConstitutiveLaw(
+    "crush",
+    material_row.CRUSH,
+    plastic=True,
+    parameters=("critical_compression", "critical_stretch", "hardening"),
+)
 CONSTITUTIVE_LAWS = {
     law.code: law
-    for law in (FIXED_COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW)
+    for law in (FIXED_COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW, CRUSH)
 }
 """All laws that kernels know, by code."""
 

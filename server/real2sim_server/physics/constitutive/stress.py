@@ -22,6 +22,7 @@ from ..numerics.matrices import (
 )
 from .material_row import (
     COROTATED,
+    CRUSH,
     DRUCKER_PRAGER,
     LAMBDA,
     LAW,
@@ -38,6 +39,10 @@ from .material_row import (
 SQRT_TWO_THIRDS = F32(math.sqrt(2 / 3))
 STRETCH_MIN = F32(0.05)
 """Principal stretches are taken as no smaller than this, so that logarithms stay finite."""
+SLACK = F32(1e-5)
+"""Stretch at which crushed structure unfolds: beyond what rounding makes, and next to no stress."""
+UNFOLDED = F32(20.0)
+"""It holds again from where it is shorter by one part in so many."""
 VOLUME_MIN = F32(1e-3)
 """A particle squeezed below this fraction of its volume has turned inside out or is about to."""
 
@@ -61,7 +66,7 @@ def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
         return F, tau, energy, history
     squares, vectors = eigen_symmetric(gram(F))
     stretch = (stretch_of(squares[0]), stretch_of(squares[1]), stretch_of(squares[2]))
-    if law == SNOW:
+    if SNOW <= law <= CRUSH:
         left, tau, energy, history = snow(stretch, history, row)
     else:
         left, tau, energy, history = hencky(stretch, history, row, dt)
@@ -230,8 +235,11 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
 
     Columns: A critical compression, B critical stretch, C hardening exponent; history: ln of the
     plastic volume ratio. Hardening is held within exp(+-3), as loose and as hard as snow gets.
+    What is crushed rather than packed pulls apart again at next to no stress, up to where it began.
     """
     low, high = ONE - row[A], ONE + row[B]
+    if row[LAW] == CRUSH and history < ZERO:
+        high = ONE + max(SLACK, row[B] * (ONE + UNFOLDED * history))
     s = (
         min(max(stretch[0], low), high),
         min(max(stretch[1], low), high),
@@ -258,7 +266,7 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
 @device_function
 def wave_hardening(history: Any, row: Any) -> Any:
     """By how much plastic flow has stiffened a particle; its waves run so much faster, squared."""
-    if row[LAW] != SNOW:
+    if not SNOW <= row[LAW] <= CRUSH:
         return 1.0
     hardening = row[C] * (1.0 - math.exp(float(history)))
     return math.exp(min(max(hardening, -3.0), 3.0))

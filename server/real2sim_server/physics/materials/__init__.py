@@ -6,7 +6,7 @@ themselves with :func:`register_material`; a module of this package must be impo
 
 from .elastic import FixedCorotated, NearRigid, NeoHookean
 from .material import MATERIALS, Material, named_material, register_material
-from .plastic import Foam, Metal, Sand, Snow
+from .plastic import Foam, Metal, Sand, Snow, Structure
 
 __all__ = [
     "MATERIALS",
@@ -18,6 +18,7 @@ __all__ = [
     "NeoHookean",
     "Sand",
     "Snow",
+    "Structure",
     "named_material",
     "register_material",
 ]

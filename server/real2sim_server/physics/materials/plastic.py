@@ -6,7 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..constitutive.law import DRUCKER_PRAGER, SNOW, VISCOPLASTIC, VON_MISES, ConstitutiveLaw
+from ..constitutive.law import (
+    CRUSH,
+    DRUCKER_PRAGER,
+    SNOW,
+    VISCOPLASTIC,
+    VON_MISES,
+    ConstitutiveLaw,
+)
 from .material import Material, register_material
 
 
@@ -110,3 +117,17 @@ class Snow(Material):
         self._require("critical_compression", inside, "must be in (0, 1)")
         self._require("critical_stretch", self.critical_stretch > 0, "must be positive")
         self._require("hardening", self.hardening >= 0, "must not be negative")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure(Snow):
+    """Thin-walled structure that folds: packs as snow does, and unfolds as easily as paper.
+
+    Up to the length that it had it resists no pull, so that what is springy beside it straightens
+    it again; beyond that it holds up to ``critical_stretch``.
+    """
+
+    constitutive_law: ClassVar[ConstitutiveLaw] = CRUSH
+
+    critical_stretch: float = 0.1
+    hardening: float = 3.5

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from ...constitutive import material_row
 from ...constitutive.law import law_of_code
-from ...constitutive.stress import STRETCH_MIN, VOLUME_MIN
+from ...constitutive.stress import SLACK, STRETCH_MIN, UNFOLDED, VOLUME_MIN
 from ...errors import MaterialError
 
+PACKED = (material_row.SNOW, material_row.CRUSH)
 NEWTON_STEPS = 8
 SQUARE_ROOTS = 3
 SERIES_TERMS = 12
@@ -51,7 +52,7 @@ def _stress_of_law(
         return F, *_corotated(F, rows), history
     if code == material_row.NEO_HOOKEAN:
         return F, *_neo_hookean(F, rows), history
-    if code == material_row.SNOW:
+    if code in PACKED:
         return _snow(F, history, rows)
     return _hencky(code, F, history, rows, dt)
 
@@ -185,6 +186,9 @@ def _snow(F: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Ten
         1 - rows[:, material_row.A : material_row.A + 1],
         1 + rows[:, material_row.B : material_row.B + 1],
     )
+    crushed = (rows[:, material_row.LAW] == material_row.CRUSH) & (history < 0)
+    holds = (rows[:, material_row.B] * (1 + float(UNFOLDED) * history)).clamp(min=float(SLACK))
+    high = torch.where(crushed[:, None], 1 + holds[:, None], high)
     s = torch.minimum(torch.maximum(S, low), high)
     history = history + (S.prod(1) / s.prod(1)).log()
     hard = (rows[:, material_row.C] * (1 - history.exp())).clamp(-3, 3).exp()
@@ -197,9 +201,10 @@ def _snow(F: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Ten
 
 def wave_hardening(history: Tensor, rows: Tensor) -> Tensor:
     """[N] by how much plastic flow has stiffened particles; see ``constitutive.stress``."""
-    snow = rows[:, material_row.LAW] == material_row.SNOW
+    codes = rows[:, material_row.LAW]
+    packed = (codes == material_row.SNOW) | (codes == material_row.CRUSH)
     hardening = (rows[:, material_row.C] * (1 - history.exp())).clamp(-3, 3).exp()
-    return torch.where(snow, hardening, torch.ones_like(hardening))
+    return torch.where(packed, hardening, torch.ones_like(hardening))
 
 
 def _trace(a: Tensor) -> Tensor:
