@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from ..geometry.rotation import Float
 from .body import Body
-from .colliders import Plane
+from .colliders import Collider, Plane
 from .errors import SolverError
 from .solver import Solver, SolverOptions
 
@@ -60,6 +60,7 @@ def fit_restitution(
     speed: float,
     normal: ArrayLike = (0.0, 0.0, 1.0),
     wall: Plane | None = None,
+    collider: Collider | None = None,
     options: SolverOptions | None = None,
 ) -> RestitutionFit:
     """Fit viscosity so that ``body`` bounces off a rigid wall with ``requested``.
@@ -70,6 +71,7 @@ def fit_restitution(
         speed: approach of the canned impacts [m/s]; restitution depends on it.
         normal: [3] out of the wall, where no ``wall`` is given; it then lies just below the body.
         wall: the one the body will hit; the body is put in front of it.
+        collider: what acts in place of the wall, whose face ``wall`` then is; at rest.
         options: of the solver the body is meant for; cells and precision matter.
 
     Returns:
@@ -85,7 +87,9 @@ def fit_restitution(
 
     def rebound(viscosity: float) -> float:
         trial = with_viscosity(body, viscosity)
-        return impact(trial, speed=speed, normal=normal, wall=wall, options=options)
+        return impact(
+            trial, speed=speed, normal=normal, wall=wall, collider=collider, options=options
+        )
 
     elastic = rebound(0.0)
     low, high = 0.0, math.inf
@@ -114,6 +118,7 @@ def impact(
     speed: float,
     normal: ArrayLike = (0.0, 0.0, 1.0),
     wall: Plane | None = None,
+    collider: Collider | None = None,
     options: SolverOptions | None = None,
 ) -> float:
     """Coefficient of restitution of one impact on a rigid wall, without gravity.
@@ -132,7 +137,7 @@ def impact(
     particles = body.particles.moved(pose)
     thrown = replace(body, particles=particles, velocity=-speed * n, angular_velocity=np.zeros(3))
     options = replace(options or SolverOptions(), gravity=(0.0, 0.0, 0.0))
-    solver = Solver([thrown], [wall], options)
+    solver = Solver([thrown], [wall if collider is None else collider], options)
     crossing = _length(body, n) / body.materials[0].wave_speed
     limit = 60 * (crossing + solver.dx / speed)
     while solver.time < limit:

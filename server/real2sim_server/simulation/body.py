@@ -22,6 +22,7 @@ from ..physics.colliders import Box, Collider
 from ..physics.materials import Material
 from ..physics.particles import Particles
 from ..physics.solver import BodyState
+from .result import Rebound
 from .rigid import RigidMotion, best_rotation, cross_matrix, inertia_about
 from .rolling import advance_on_wheels
 from .surroundings import closest, packed
@@ -132,6 +133,7 @@ class DeformableBody:
         self.hit = False
         self.supports: frozenset[str] = frozenset()
         self.state: BodyState | None = None
+        self.rebound: Rebound | None = None
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
         self._centre_of: DeformedShape | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,31 @@ class ContactRecord:
     heat: float
 
 
+@dataclass(frozen=True)
+class Rebound:
+    """What was asked of a body's rebound, and what canned impacts reached.
+
+    Attributes:
+        requested, achieved: separation over approach speed.
+        elastic: without added viscosity; no more can be reached.
+        other: name of what it was fitted on; None where the body will meet nothing, and a wall
+            across its way stood for it.
+        speed: of the impacts [m/s].
+        viscosity: added [Pa s].
+    """
+
+    requested: float
+    achieved: float
+    elastic: float
+    other: str | None
+    speed: float
+    viscosity: float
+
+    def figures(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {k: round(v, 6) if isinstance(v, float) else v for k, v in asdict(self).items()}
+
+
 @dataclass(frozen=True, eq=False)
 class SimulationResult:
     """A rollout.
@@ -98,7 +123,8 @@ class SimulationResult:
         contacts: at the end.
         impulses: [F, C, 3] of each contact up to each frame [N s].
         stopped: ``done`` or ``cancelled``; then there are the frames made until then.
-        figures: preset, gravity, cells, steps, rollbacks (JSON values only).
+        figures: preset, gravity, cells, steps, rollbacks, and ``restitution``: of each object that
+            was given one, the members of a Rebound (JSON values only).
     """
 
     objects: Mapping[str, ObjectResult]

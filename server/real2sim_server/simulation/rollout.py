@@ -158,4 +158,7 @@ def _figures(options: SimulateOptions, simulator: HybridSimulator) -> dict[str, 
         "particles": sum(len(b.rest) for b in simulator.bodies),
         "substeps": simulator.substeps,
         "rollbacks": simulator.rollbacks,
+        "restitution": {
+            b.name: b.rebound.figures() for b in simulator.bodies if b.rebound is not None
+        },
     }

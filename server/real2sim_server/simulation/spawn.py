@@ -13,14 +13,13 @@ from ..geometry.transform import apply_transform, is_rigid
 from ..physics.colliders import Box, Collider
 from ..physics.errors import PhysicsError
 from ..physics.particles import Particles
-from ..physics.restitution import fit_restitution
-from ..physics.solver import SolverOptions
 from ..scene import Scene
 from .body import DeformableBody
 from .embedding import stretched
 from .fill import fill_object
 from .playback import PlacedObject, PlacedObjects
 from .presets import VEHICLES, ObjectPhysics, Preset
+from .rebound import fit_rebound
 from .surroundings import clearance
 from .tyres import Tyres
 
@@ -34,8 +33,6 @@ PENETRATION_MAX = 0.3
 """Deeper inside something else than this a body was placed by mistake [m]."""
 OVERLAP_FRACTION = 0.01
 """Bodies overlap when this fraction of one's particles is among the other's."""
-RESTITUTION_SPEED = 2.0
-"""Approach at which a wanted restitution is fitted when the object itself stands [m/s]."""
 
 
 def spawn_bodies(
@@ -58,9 +55,17 @@ def spawn_bodies(
     """
     subjects = _subjects(state, wanted, start_us)
     preset = _limit_particles(preset, subjects, max_particles)
-    carrying = [c for c in colliders if c.name in road]
     bodies = [
-        _spawn_body(scene, subject, physics, preset, start_us, colliders=carrying, gravity=gravity)
+        _spawn_body(
+            scene,
+            subject,
+            physics,
+            preset,
+            start_us,
+            colliders=colliders,
+            road=road,
+            gravity=gravity,
+        )
         for subject, physics in zip(subjects, wanted.values(), strict=True)
     ]
     boxes = [(a.T_world_object, s.scaled_size) for a, s in zip(bodies, subjects, strict=True)]
@@ -169,6 +174,7 @@ def _spawn_body(
     start_us: int,
     *,
     colliders: Sequence[Collider],
+    road: Sequence[str],
     gravity: Float,
 ) -> DeformableBody:
     particles = object_particles(scene, subject, preset, start_us, mass=physics.mass)
@@ -184,7 +190,7 @@ def _spawn_body(
     if preset.wheels and subject.category in VEHICLES:
         moving = float(np.linalg.norm(velocity)) >= 0.1
         tyres = _tyres(subject, particles, gravity, brake=_brake(physics, moving))
-        tyres = tyres.standing(pose, colliders)
+        tyres = tyres.standing(pose, [c for c in colliders if c.name in road])
     body = DeformableBody(
         subject.object_id,
         particles,
@@ -198,7 +204,10 @@ def _spawn_body(
         tyres=tyres,
     )
     if physics.restitution is not None:
-        _fit_restitution(body, physics.restitution)
+        met = [c for c in colliders if tyres is None or c.name not in road]
+        # On its wheels a body rolls, whatever gravity wants.
+        pull = gravity if tyres is None else np.zeros(3)
+        body.rebound = fit_rebound(body, physics.restitution, met, pull)
     return body
 
 
@@ -257,17 +266,3 @@ def _vector(given: object, otherwise: Float | None, name: str, most: float) -> F
             f"{name} is {vector.tolist()} {unit}; at most {most:g} {unit} is allowed"
         )
     return vector
-
-
-def _fit_restitution(body: DeformableBody, restitution: float) -> None:
-    """Add the viscosity that lets the body bounce as wanted, along its own way."""
-    speed = float(np.linalg.norm(body.motion.velocity))
-    along = body.motion.velocity / speed if speed > 0.1 else body.motion.rotation[:, 0]
-    fitted = fit_restitution(
-        replace(body.solver_body(), particle_velocities=None, particle_gradients=None),
-        restitution,
-        speed=speed if speed > 0.1 else RESTITUTION_SPEED,
-        normal=-along,
-        options=SolverOptions(dx=body.cell, gravity=(0.0, 0.0, 0.0)),
-    )
-    body.materials = fitted.body.materials

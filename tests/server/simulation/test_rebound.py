@@ -1,0 +1,109 @@
+"""A wanted restitution is reached where the body hits, and what was reached is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_server.physics.colliders import Box, Collider, Plane
+from real2sim_server.physics.materials import FixedCorotated
+from real2sim_server.physics.particles import Particles
+from real2sim_server.simulation import ObjectPhysics, SimulateOptions
+from real2sim_server.simulation.body import DeformableBody
+from real2sim_server.simulation.rebound import first_touch, fit_rebound
+from real2sim_server.simulation.result import Rebound
+from real2sim_server.simulation.rigid import rotation_of
+from real2sim_server.simulation.rollout import simulate_bodies
+
+SIDE, SPACING, CELL, SPEED = 6, 0.1, 0.2, 2.0
+TURNS = [(0, 0, 0), (0, 0.524, 0), (0.3, 0.2, 0.4), (0, 0.785, 0), (0.9, 0, 0.3)]
+
+
+def block(turn: np.ndarray, *, ahead: float) -> DeformableBody:
+    """An elastic cube of 0.6 m that flies against its own third axis, ``ahead`` m from zero."""
+    steps = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1) - (SIDE - 1) / 2
+    positions = steps.reshape(-1, 3) * SPACING
+    n, volume = len(positions), SPACING**3
+    particles = Particles(positions, np.full(n, volume), np.full(n, 200 * volume), np.full(n, -1))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, turn[:, 2] * (ahead + SIDE * SPACING / 2)
+    return DeformableBody(
+        "block",
+        particles,
+        (FixedCorotated(young=2e6, poisson=0.3, density=200.0),),
+        np.zeros(n, np.int64),
+        friction=0.3,
+        cell=CELL,
+        T_world_object=pose,
+        velocity=-SPEED * turn[:, 2],
+        angular_velocity=np.zeros(3),
+    )
+
+
+def wall(kind: str, turn: np.ndarray, phase: float) -> Collider:
+    point = turn[:, 2] * phase * CELL
+    if kind == "plane":
+        return Plane(name="wall", point=point, normal=turn[:, 2])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, point - 0.15 * turn[:, 2]
+    return Box(name="wall", T_world_box=pose, size=(4.0, 4.0, 0.3))
+
+
+def bounced(requested: float, phase: float, turn: np.ndarray, kind: str) -> tuple[Rebound, float]:
+    """What the fit says, and separation over approach speed in a simulation."""
+    body, met = block(turn, ahead=0.5 + phase * CELL), wall(kind, turn, phase)
+    body.rebound = fit_rebound(body, requested, [met], np.zeros(3))
+    options = SimulateOptions(
+        objects={"block": ObjectPhysics()},
+        colliders=[met],
+        gravity=(0.0, 0.0, 0.0),
+        duration=1.0,
+        frame_rate=5,
+    )
+    result = simulate_bodies([body], options)
+    told = result.figures["restitution"]["block"]
+    assert told == body.rebound.figures()
+    return body.rebound, float(body.motion.velocity @ turn[:, 2]) / SPEED
+
+
+@pytest.mark.parametrize(("kind", "phase", "turn"), [("plane", 0.35, 1), ("box", 0.7, 0)])
+def test_it_is_reached_wherever_the_wall_is_and_however_it_is_turned(kind, phase, turn):
+    fit, seen = bounced(0.3, phase, rotation_of(np.array(TURNS[turn])), kind)
+    assert seen == pytest.approx(0.3, abs=0.05)
+    assert fit.achieved == pytest.approx(seen, abs=0.03)
+    assert fit.other == "wall"
+    assert fit.speed == pytest.approx(SPEED)
+
+
+def test_what_cannot_be_reached_is_told():
+    fit, seen = bounced(0.9, 0.35, rotation_of(np.array(TURNS[1])), "plane")
+    assert fit.achieved == fit.elastic < 0.85
+    assert seen == pytest.approx(fit.achieved, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("requested", [0.1, 0.3, 0.5, 0.7])
+@pytest.mark.parametrize("turn", TURNS)
+def test_it_is_reached_at_any_phase_or_told(requested, turn):
+    for phase in np.arange(20) / 20:
+        fit, seen = bounced(requested, phase, rotation_of(np.array(turn)), "plane")
+        assert fit.achieved == pytest.approx(seen, abs=0.03)
+        assert seen == pytest.approx(min(requested, fit.elastic), abs=0.05)
+
+
+def test_a_falling_body_is_followed_to_the_ground():
+    body = block(np.eye(3), ahead=1.0)
+    floor = Plane(name="floor")
+    touch = first_touch(body, [floor, wall("plane", np.eye(3), -50.0)], np.array([0, 0, -9.81]))
+    assert touch is not None
+    assert touch.collider is floor
+    assert touch.speed == pytest.approx((SPEED**2 + 2 * 9.81 * 1.0) ** 0.5, rel=0.05)
+    assert touch.point[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_who_meets_nothing_is_fitted_on_a_wall_across_its_way():
+    body = block(np.eye(3), ahead=1.0)
+    fit = fit_rebound(body, 0.2, [], np.zeros(3))
+    assert fit.other is None
+    assert fit.speed == pytest.approx(SPEED)
+    assert fit.achieved == pytest.approx(0.2, abs=0.02)
