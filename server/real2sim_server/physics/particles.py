@@ -12,6 +12,8 @@ from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, is_rigid
 from .errors import ParticleError
 
+BISECTIONS = 40
+
 
 @dataclass(frozen=True, eq=False)
 class Particles:
@@ -93,6 +95,26 @@ class Particles:
         if not (np.isfinite(mass) and mass > 0):
             raise ParticleError(f"mass of a body must be positive [kg], not {mass!r}")
         return replace(self, masses=self.masses * (mass / self.masses.sum()))
+
+    def with_centre_height(self, height: float) -> Particles:
+        """The particles with mass moved between layers, so that the centre of mass has that z [m].
+
+        Each layer weighs by exp(-k z) times what it did: lower parts become denser, none empty. A
+        height outside of the particles is held to what leaves every layer a tenth of a percent.
+        """
+        z = self.positions[:, 2] - self.centre_of_mass[2]
+        most = np.log(1e3) / max(float(np.ptp(z)), 1e-9)
+        low, high = -most, most
+        wanted = height - self.centre_of_mass[2]
+        for _ in range(BISECTIONS):
+            k = (low + high) / 2
+            weights = self.masses * np.exp(-k * z)
+            if float(weights @ z) / float(weights.sum()) > wanted:
+                low = k
+            else:
+                high = k
+        mass = self.masses.sum()
+        return replace(self, masses=weights * (mass / weights.sum()))
 
 
 def box_particles(size: ArrayLike, *, spacing: float, density: float) -> Particles:

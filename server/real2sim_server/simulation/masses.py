@@ -17,20 +17,34 @@ class ClassMass:
     Attributes:
         per_volume: mass per volume of the object's box [kg/m^3].
         source: where the figure comes from.
+        stability: static stability factor, half the track over the height of the centre of mass;
+            None where it lies where the filled shape has it.
+        stability_source: where that comes from.
     """
 
     per_volume: float
     source: str
+    stability: float | None = None
+    stability_source: str = ""
 
 
+NHTSA_SSF = "mean of model year 2003, Trends in the Static Stability Factor, NHTSA DOT HS 809 868"
 CAR = ClassMass(
-    125.0, "2015 Chevrolet Malibu as tested, 3639 lb in 4.87 x 1.85 x 1.47 m (NHTSA frontal test)"
+    125.0,
+    "2015 Chevrolet Malibu as tested, 3639 lb in 4.87 x 1.85 x 1.47 m (NHTSA frontal test)",
+    stability=1.41,
+    stability_source=NHTSA_SSF + ": passenger cars",
 )
 PERSON = ClassMass(270.0, "Hybrid III 50th percentile dummy, 78 kg in 1.75 x 0.50 x 0.33 m")
 CLASS_MASSES = {
     "car": CAR,
     "vehicle": CAR,
-    "van": ClassMass(115.0, "large panel van, about 2000 kg kerb in 5.9 x 2.0 x 1.45 m of box"),
+    "van": ClassMass(
+        115.0,
+        "large panel van, about 2000 kg kerb in 5.9 x 2.0 x 1.45 m of box",
+        stability=1.12,
+        stability_source=NHTSA_SSF + ": full-size vans",
+    ),
     "truck": ClassMass(130.0, "two-axle lorry, half laden: about 11 t in 8.5 x 2.5 x 4.0 m"),
     "bus": ClassMass(125.0, "12 m city bus, about 12 t kerb in 12 x 2.55 x 3.1 m"),
     "pedestrian": PERSON,
@@ -51,3 +65,10 @@ def default_mass(category: str, size: Sequence[float]) -> float:
     if edges.shape != (3,) or not (edges > 0).all():
         raise ParticleError(f"size must be three positive lengths [m], not {size!r}")
     return CLASS_MASSES.get(category, OTHER).per_volume * float(edges.prod())
+
+
+def centre_height(category: str, track: float) -> float | None:
+    """Height of the centre of mass above the road [m] of a vehicle with that track [m], by the
+    published stability of its class; None for classes without one."""
+    stability = CLASS_MASSES.get(category, OTHER).stability
+    return None if stability is None else track / (2 * stability)

@@ -17,11 +17,12 @@ from ..scene import Scene
 from .body import DeformableBody
 from .embedding import stretched
 from .fill import fill_object
+from .masses import centre_height
 from .playback import PlacedObject, PlacedObjects
 from .presets import VEHICLES, ObjectPhysics, Preset
 from .rebound import fit_rebound
 from .surroundings import clearance
-from .tyres import Tyres
+from .tyres import Tyres, track_of
 
 SPEED_MAX = 200.0
 """Faster things are no traffic, and would cross bodies within a step [m/s]."""
@@ -31,6 +32,8 @@ COARSEST = 4.0
 """Bodies of fewer particles than this across their shortest side no longer deform."""
 PENETRATION_MAX = 0.3
 """Deeper inside something else than this a body was placed by mistake [m]."""
+VOLUME_SPACING, VOXELS_MAX = 0.05, 1_000_000
+"""Edge of the voxels that volume is measured by [m], and how many of them a box may have."""
 OVERLAP_FRACTION = 0.01
 """Bodies overlap when this fraction of one's particles is among the other's."""
 
@@ -183,7 +186,8 @@ def _spawn_body(
     else:
         materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
     if preset.by_density and physics.mass is None:
-        particles = particles.with_mass(materials[0].density * float(particles.volumes.sum()))
+        volume = object_volume(scene, subject, start_us)
+        particles = particles.with_mass(materials[0].density * volume)
     pose = _pose(subject, physics, start_us)
     velocity, spin = _velocities(subject, physics, start_us)
     tyres = None
@@ -216,14 +220,34 @@ def object_particles(
 ) -> Particles:
     """What an object is filled with, object frame; without the space between wheels.
 
+    The centre of mass of a vehicle on wheels is as high as its class has it.
+
     Raises:
         ParticleError: as ``fill_object``.
     """
     size = subject.scaled_size
     cloud = stretched(scene.object(subject.source_id).cloud_at(start_us), subject.scale)
     filling = fill_object(cloud, size, spacing=preset.spacing, mass=mass, category=subject.category)
-    wheels = preset.wheels and subject.category in VEHICLES
-    return filling.lattice(above=-size[2] / 2 + preset.clearance if wheels else -np.inf)
+    if not (preset.wheels and subject.category in VEHICLES):
+        return filling.lattice()
+    particles = filling.lattice(above=-size[2] / 2 + preset.clearance)
+    height = centre_height(subject.category, track_of(size))
+    return particles if height is None else particles.with_centre_height(height - size[2] / 2)
+
+
+def object_volume(scene: Scene, subject: PlacedObject, start_us: int) -> float:
+    """Volume of what an object is filled with [m^3], by voxels that only its own size sets.
+
+    Voxels on the surface stick out by half of one, so that coarser particles have more volume.
+
+    Raises:
+        ParticleError: as ``fill_object``.
+    """
+    size = subject.scaled_size
+    spacing = max(VOLUME_SPACING, float(np.cbrt(np.prod(size) / VOXELS_MAX)))
+    cloud = stretched(scene.object(subject.source_id).cloud_at(start_us), subject.scale)
+    filling = fill_object(cloud, size, spacing=spacing, category=subject.category)
+    return float(filling.lattice().volumes.sum())
 
 
 def _pose(subject: PlacedObject, physics: ObjectPhysics, start_us: int) -> Float:

@@ -16,6 +16,8 @@ from .surroundings import clearance, nearest, packed
 
 ABOVE_MAX = 0.1
 """Tracked boxes of standing vehicles are at most this high above the road [m]."""
+TRACK = 0.84
+"""Over the width of the box."""
 LIFT_MAX = 0.3
 """Wheels never go further into their arches than this [m]."""
 
@@ -75,8 +77,8 @@ class Tyres:
             weight: mass times gravity [N].
             friction, brake: see the class.
         """
-        length, width, height = size
-        x, y = 0.3 * length, 0.42 * width
+        length, _, height = size
+        x, y = 0.3 * length, track_of(size) / 2
         patches = np.array([[a * x, b * y, -height / 2] for a in (1, -1) for b in (1, -1)])
         front = np.clip((centre[0] + x) / (2 * x), 0.2, 0.8)
         left = np.clip((centre[1] + y) / (2 * y), 0.2, 0.8)
@@ -165,3 +167,8 @@ class Tyres:
 
     def _points(self, T_world_object: Float) -> Float:
         return self.patches @ T_world_object[:3, :3].T + T_world_object[:3, 3]
+
+
+def track_of(size: Sequence[float]) -> float:
+    """Distance between left and right wheels under a box of ``size`` [m]."""
+    return TRACK * size[1]

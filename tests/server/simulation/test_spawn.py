@@ -10,8 +10,10 @@ import pytest
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.physics import PhysicsError, Plane
 from real2sim_server.physics.validation.check import placed as at
-from real2sim_server.simulation.presets import ObjectPhysics
+from real2sim_server.simulation.presets import ObjectPhysics, preset_of
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
+from real2sim_server.simulation.spawn import object_particles
+from real2sim_server.simulation.tyres import track_of
 
 GROUND = Plane(name="ground", friction=0.7)
 
@@ -98,3 +100,21 @@ def test_a_thing_of_ten_million_particles_is_filled_more_coarsely(rollout, tiny_
     scene = replace(scene, objects=dict(scene.objects) | {"car_red": huge})
     result = rollout(scene=scene, duration=0.01, preset="paper", colliders=[], max_particles=20_000)
     assert result.figures["particles"] <= 20_000
+
+
+def test_mass_by_density_does_not_depend_on_the_particles(rollout):
+    masses = [
+        rollout(preset="paper", colliders=[], max_particles=most).objects["car_red"].mass
+        for most in (100_000, 4_000, 1_000)
+    ]
+    assert masses == pytest.approx([masses[0]] * 3)
+
+
+@pytest.mark.parametrize(("category", "stability"), [("car", 1.41), ("van", 1.12)])
+def test_the_centre_of_mass_of_vehicles_is_as_high_as_published(tiny_scene, category, stability):
+    red = next(o for o in ScenarioState.of(tiny_scene).visible if o.object_id == "car_red")
+    subject = replace(red, category=category)
+    particles = object_particles(tiny_scene, subject, preset_of("vehicle"), 0)
+    above_road = particles.centre_of_mass[2] + subject.scaled_size[2] / 2
+    assert track_of(subject.scaled_size) / 2 / above_road == pytest.approx(stability, rel=1e-3)
+    assert particles.masses.min() > 0
