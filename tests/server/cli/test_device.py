@@ -84,16 +84,26 @@ def test_doctor_asks_what_to_build_for_where_there_is_no_gpu() -> None:
     assert "'hopper'" in output
 
 
-def test_doctor_compiles_the_serving_kernels_without_a_gpu(tmp_path: Path) -> None:
+def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("cuda.core")
+    from real2sim_server.render.backends.nvrtc import compile as compiling
+    from real2sim_server.render.backends.nvrtc.usage import Usage
+
+    taken = {"blend": Usage(64, 0, 0, 0), "find_seen": Usage(32, 0, 0, 0)}
+    monkeypatch.setattr(compiling, "compile_kernels", lambda name: (b"", taken))
     report = tmp_path / "report.json"
     code, output = doctor("--serving-kernels", "--arch", "9.0", "--json", str(report))
     assert code == 0, output
     rows = json.loads(report.read_text())["kernels"]
-    assert {row["architecture"] for row in rows} == {"sm_90"}
-    assert "blend" in {row["kernel"] for row in rows}
-    assert all(row["spilled"] == 0 and 0 < row["occupancy"] <= 1 for row in rows)
+    found = [(row["architecture"], row["kernel"], row["occupancy"]) for row in rows]
+    assert found == [("sm_90", "blend", 0.5), ("sm_90", "find_seen", 1.0)]
     assert "blend" in output
+    taken["blend"] = Usage(255, 0, 0, 64)
+    code, output = doctor("--serving-kernels", "--arch", "9.0")
+    assert code == 1
+    assert "blend on sm_90" in output
 
 
 def test_the_serving_backend_is_refused_without_a_gpu() -> None:

@@ -97,7 +97,7 @@ def test_pictures_of_the_device_are_those_of_the_reference(serving: NvrtcBackend
 
 def test_frames_are_those_of_the_cpu(serving: NvrtcBackend) -> None:
     given, expected = (
-        render_cameras(world(5, 0.2), cameras(), np.eye(4), sky=SKY, backend=backend)
+        render_cameras(world(5, 0.2), cameras()[:2], np.eye(4), sky=SKY, backend=backend)
         for backend in (serving, "reference")
     )
     for one, other in zip(given, expected, strict=True):

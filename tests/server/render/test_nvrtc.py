@@ -12,7 +12,13 @@ import pytest
 import torch
 
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.render import Instance, RasterOptions, RenderError, RenderOutput, rasterize
+from real2sim_server.render import (
+    Instance,
+    RasterOptions,
+    RenderError,
+    RenderOutput,
+    rasterize,
+)
 from real2sim_server.render.backends import RasterRequest
 from real2sim_server.render.backends.nvrtc import backend as backend_module
 from real2sim_server.render.backends.nvrtc import records
@@ -192,12 +198,14 @@ def test_the_first_of_two_at_one_depth_is_in_front(serving: NvrtcBackend) -> Non
 
 
 def test_a_frame_for_which_there_is_no_room_is_drawn_again(serving: NvrtcBackend) -> None:
-    large = Instance(sheet(np.linspace(3, 9, 1500).tolist(), 0.02, 50.0))
-    given, expected = (
-        draw(b, [large], RasterOptions(), np.zeros(3)) for b in (serving, "reference")
-    )
-    assert serving._memory.pair_capacity > 2 * 1500 * 9
-    torch.testing.assert_close(given.rgb, expected.rgb, rtol=0, atol=1e-4)
+    large = Instance(sheet(np.linspace(3, 9, 1100).tolist(), 0.02, 50.0))
+    output = draw(serving, [large], RasterOptions(), np.zeros(3))
+    assert serving._launcher.launches["blend"] > 1
+    assert serving._memory.pair_capacity >= 2 * 1100 * 9
+    # The 456th would leave less than 1e-4 of the light.
+    assert float(output.alpha[0, 19, 22]) == pytest.approx(1 - 0.98**455, abs=1e-5)
+    drawn_once = draw(serving, [large], RasterOptions(), np.zeros(3))
+    assert torch.equal(output.rgb, drawn_once.rgb)
 
 
 def test_nothing_to_draw_shows_the_background(serving: NvrtcBackend) -> None:
@@ -212,9 +220,12 @@ def test_more_cameras_than_a_frame_has_are_drawn_in_several(
 ) -> None:
     requests = requests_of([(16, 16), (20, 18), (16, 16)], everything())
     whole = serving.frames(requests, ["rgb"])
-    monkeypatch.setattr(backend_module, "MAX_CAMERAS", 1)
-    for one, other in zip(whole, serving.frames(requests, ["rgb"]), strict=True):
-        np.testing.assert_array_equal(one["rgb"], other["rgb"])
+    for name, limit in (("MAX_CAMERAS", 1), ("MAX_PIXELS", 700)):
+        with monkeypatch.context() as changed:
+            changed.setattr(backend_module, name, limit)
+            parts = serving.frames(requests, ["rgb"])
+        for one, other in zip(whole, parts, strict=True):
+            np.testing.assert_array_equal(one["rgb"], other["rgb"])
 
 
 def test_median_depth_and_class_are_of_the_gaussian_that_halves_the_light(
@@ -228,9 +239,10 @@ def test_median_depth_and_class_are_of_the_gaussian_that_halves_the_light(
     monkeypatch.setattr(backend_module, "tables_of", with_classes)
     world = [Instance(sheet([4.0], 0.3, 9.0), None, 1), Instance(sheet([8.0], 0.8, 9.0), None, 2)]
     [request] = requests_of([(45, 37)], world)
-    images, tables = serving._draw([request], ["median", "semantic"])
+    images = serving._draw([request], ["median", "semantic"])
+    shape = (2, HEIGHT, WIDTH)
     median, semantic = (
-        backend_module._tensor(images, name, tables, request) for name in ("median", "semantic")
+        backend_module._tensor(images, name, shape) for name in ("median", "semantic")
     )
     assert float(median[0, 19, 22]) == 8.0
     assert int(semantic[0, 19, 22]) == 9

@@ -43,7 +43,7 @@ def test_what_was_compiled_is_kept_by_source_and_architecture(
         made.append(architecture)
         return architecture.encode(), ""
 
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     monkeypatch.setattr(compiling, "_compile", compile_one)
     for name in ("sm_90", "sm_80", "sm_90"):
         assert compiling.compiled_kernels(name) == name.encode()

@@ -29,6 +29,8 @@ from .tables import Tables, tables_of
 BY_TILE = 16
 """Added to the number of a pass that sorts pairs by tile."""
 DEPTH_PASSES = 4
+MAX_PIXELS = 1 << 30
+"""Of a frame: the kernels count them by 32 bits, and memory is limited."""
 SEEN_SHARE = 4
 """At first one in so many Gaussians of each camera is thought to be seen."""
 FINISHED = {"rgb": "bytes", "depth": "solid", "instance": "instance"}
@@ -65,20 +67,16 @@ class NvrtcBackend:
         """
         start = time.perf_counter()
         options = request.options
-        names = [
-            "rgb",
-            "alpha",
-            *(name for name in ("depth", "instance") if getattr(options, name)),
-        ]
-        parts: list[dict[str, Tensor]] = []
+        asked = (name for name in ("depth", "instance") if getattr(options, name))
+        names = ["rgb", "alpha", *asked]
+        parts: dict[str, list[Tensor]] = {name: [] for name in names}
         for piece in _pieces(request):
             with self._lock:
-                images, tables = self._draw([piece], names)
-            parts.append({name: _tensor(images, name, tables, piece) for name in names})
-        whole = {
-            name: torch.cat([part[name] for part in parts]) if len(parts) > 1 else parts[0][name]
-            for name in names
-        }
+                images = self._draw([piece], names)
+            for name in names:
+                shape = (piece.cameras, piece.height, piece.width)
+                parts[name].append(_tensor(images, name, shape))
+        whole = {n: torch.cat(held) if len(held) > 1 else held[0] for n, held in parts.items()}
         return RenderOutput(
             rgb=whole["rgb"],
             alpha=whole["alpha"],
@@ -109,7 +107,7 @@ class NvrtcBackend:
     ) -> list[dict[str, NDArray[Any]]]:
         names = [FINISHED[name] for name in modalities]
         with self._lock:
-            images, _ = self._draw(requests, names, keeps_images=True)
+            images = self._draw(requests, names, keeps_images=True)
         memory = images.memory.numpy()
         results, first = [], 0
         for request in requests:
@@ -128,7 +126,7 @@ class NvrtcBackend:
 
     def _draw(
         self, requests: Sequence[RasterRequest], names: Sequence[str], *, keeps_images: bool = False
-    ) -> tuple[Images, Tables]:
+    ) -> Images:
         """Images on the device, or with ``keeps_images`` on the host, when they are whole.
 
         Space is what frames before have needed; a frame that needs more is drawn again.
@@ -160,7 +158,7 @@ class NvrtcBackend:
             if not tables.pieces or (
                 seen <= memory.seen_capacity and pairs <= memory.pair_capacity
             ):
-                return replace(images, memory=host) if keeps_images else images, tables
+                return replace(images, memory=host) if keeps_images else images
             memory.reserve(seen + seen // 4, pairs + pairs // 4)
 
     def _launch(self, frame: int, tables: Tables) -> None:
@@ -184,22 +182,28 @@ class NvrtcBackend:
 
 
 def _pieces(request: RasterRequest) -> Iterator[RasterRequest]:
-    """The request in parts of at most MAX_CAMERAS."""
-    for first in range(0, request.cameras, MAX_CAMERAS):
-        last = min(first + MAX_CAMERAS, request.cameras)
+    """The request in parts of at most MAX_CAMERAS and, but for a single image, MAX_PIXELS."""
+    step = max(1, min(MAX_CAMERAS, MAX_PIXELS // (request.width * request.height)))
+    for first in range(0, request.cameras, step):
+        last = min(first + step, request.cameras)
         yield replace(request, viewmats=request.viewmats[first:last], Ks=request.Ks[first:last])
 
 
 def _batches(
     pieces: Sequence[tuple[int, RasterRequest]],
 ) -> Iterator[list[tuple[int, RasterRequest]]]:
-    """Requests that are drawn together: of the same options, at most MAX_CAMERAS."""
+    """Requests that are drawn together: of the same options, within the limits of a frame."""
     batch: list[tuple[int, RasterRequest]] = []
+    cameras = pixels = 0
     for item in pieces:
-        cameras = item[1].cameras + sum(piece.cameras for _, piece in batch)
-        if batch and (cameras > MAX_CAMERAS or not _alike(item[1].options, batch[0][1].options)):
+        request = item[1]
+        cameras += request.cameras
+        pixels += request.cameras * request.width * request.height
+        full = cameras > MAX_CAMERAS or pixels > MAX_PIXELS
+        if batch and (full or not _alike(request.options, batch[0][1].options)):
             yield batch
-            batch = []
+            batch, cameras = [], request.cameras
+            pixels = request.cameras * request.width * request.height
         batch.append(item)
     if batch:
         yield batch
@@ -210,13 +214,12 @@ def _alike(a: RasterOptions, b: RasterOptions) -> bool:
     return replace(a, background=b.background) == b
 
 
-def _tensor(images: Images, name: str, tables: Tables, request: RasterRequest) -> Tensor:
-    """An image [C, H, W, ...] of a frame of one request, on the device."""
+def _tensor(images: Images, name: str, shape: tuple[int, int, int]) -> Tensor:
+    """An image [C, H, W, ...] of all cameras of a frame, on the device."""
     start, nbytes = images.places[name]
     dtype, channels = IMAGES[name]
-    shape = (request.cameras, request.height, request.width, *channels)
     flat = images.memory[start : start + nbytes]
-    return flat.view(getattr(torch, np.dtype(dtype).name)).reshape(shape)
+    return flat.view(getattr(torch, np.dtype(dtype).name)).reshape(*shape, *channels)
 
 
 def _section(

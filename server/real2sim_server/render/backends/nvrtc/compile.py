@@ -8,13 +8,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
-import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ...._files import atomic_file
 from ...types import RenderError
+from ..cuda.gsplat_build import kernels_folder
 from .usage import Usage, usage_of
 
 FOLDER = Path(__file__).parent / "kernels"
@@ -86,8 +86,7 @@ def cubin_path(architecture: str) -> Path:
     for path in sorted(FOLDER.iterdir()):
         digest.update(path.name.encode() + path.read_bytes())
     digest.update(Path(__file__).read_bytes())  # Its options.
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return cache / "real2sim" / f"serving-{architecture}-{digest.hexdigest()[:16]}.cubin"
+    return kernels_folder() / f"serving-{architecture}-{digest.hexdigest()[:16]}.cubin"
 
 
 @functools.cache

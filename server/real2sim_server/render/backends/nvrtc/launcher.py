@@ -85,9 +85,11 @@ class CudaLauncher:
         torch.cuda.current_stream(self.device).synchronize()
 
     def _stream(self) -> Any:
-        from cuda.core import Stream
+        from cuda.core import LEGACY_DEFAULT_STREAM, Stream
 
         handle = torch.cuda.current_stream(self.device).cuda_stream
         if handle not in self._streams:
-            self._streams[handle] = Stream.from_handle(handle)
+            # torch calls the default stream 0, which is no handle.
+            known = Stream.from_handle(handle) if handle else LEGACY_DEFAULT_STREAM
+            self._streams[handle] = known
         return self._streams[handle]

@@ -13,7 +13,7 @@ __device__ __forceinline__ float exp_negative(float x) {
     p = fmaf(p, f, 2.4022651e-1f);
     p = fmaf(p, f, 6.9314718e-1f);
     p = fmaf(p, f, 1.0f);
-    return __int_as_float(__float_as_int(p) + (int(n) << 23));
+    return __uint_as_float(__float_as_uint(p) + (uint32(int(n)) << 23));
 }
 
 // Natural logarithm of x in [1, 1e6], within 2e-7 of its value: exponent, and the series of atanh.

@@ -111,7 +111,7 @@ __device__ __forceinline__ bool project(
         ((row[0] * double(g.mean[0]) + row[1] * double(g.mean[1])) + row[2] * double(g.mean[2])) +
         row[3];
     const float z = float(depth);
-    if (!(z >= frame.near_plane && z <= frame.far_plane) || g.opacity < ALPHA_MIN) return false;
+    if (!(z >= frame.near_plane && z <= frame.far_plane && g.opacity >= ALPHA_MIN)) return false;
     float offset[3];
     offset_from_eye(at, g.mean, offset);
     const float tx = dot3(at.linear, offset) / z, ty = dot3(at.linear + 3, offset) / z;
@@ -131,7 +131,7 @@ __device__ __forceinline__ bool project(
     if (!(determinant > 0.0f)) return false;
     out.opacity = g.opacity;
     if (frame.antialiased) out.opacity *= sqrtf(fmaxf(flat[3] / determinant, 1e-30f));
-    if (out.opacity < ALPHA_MIN) return false;
+    if (!(out.opacity >= ALPHA_MIN)) return false;
     out.limit = log_of(fmaxf(out.opacity / ALPHA_MIN, 1.0f));
     const float reach = sqrtf(2.0f * out.limit);
     const float ex = reach * sqrtf(xx), ey = reach * sqrtf(yy);
