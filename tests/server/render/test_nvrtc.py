@@ -17,7 +17,9 @@ from real2sim_server.render import (
     RasterOptions,
     RenderError,
     RenderOutput,
+    WorldViews,
     rasterize,
+    rasterize_worlds,
 )
 from real2sim_server.render.backends import RasterRequest
 from real2sim_server.render.backends.nvrtc import backend as backend_module
@@ -25,7 +27,7 @@ from real2sim_server.render.backends.nvrtc import records
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.render.backends.nvrtc.memory import tile_passes
 from real2sim_server.render.backends.nvrtc.tables import Tables, tables_of
-from real2sim_server.render.rasterize import checked_request
+from real2sim_server.render.rasterize import checked_request, views_of
 from real2sim_server.scene import GaussianCloud, Sky, TimeColour
 
 from .kernel_twin import COMPILER, NEEDS_COMPILER, TwinLauncher, twin
@@ -226,6 +228,28 @@ def test_more_cameras_than_a_frame_has_are_drawn_in_several(
             parts = serving.frames(requests, ["rgb"])
         for one, other in zip(whole, parts, strict=True):
             np.testing.assert_array_equal(one["rgb"], other["rgb"])
+
+
+def test_small_images_of_many_worlds_are_drawn_together() -> None:
+    launcher = TwinLauncher()
+    street, car = Instance(cloud(0, bands=4)), Instance(cloud(3, bands=4), POSE, 3)
+    poses = np.stack([np.stack([np.eye(4), POSE]), np.stack([np.eye(4), POSE @ POSE])])
+    worlds = WorldViews(
+        things=(street, car),
+        poses=np.concatenate([poses, poses[:1]]),
+        shown=np.array([[True, True], [True, True], [True, False]]),
+        viewmats=np.repeat(np.stack([np.eye(4), SECOND])[None], 3, 0),
+        Ks=np.repeat(K[None], 2, 0),
+        times_us=np.zeros(3, np.int64),
+    )
+    serving = NvrtcBackend(launcher)
+    together = rasterize_worlds(worlds, 30, 20, sky=SKY, backend=serving)
+    assert launcher.launches["find_seen"] == launcher.launches["blend"] == 1
+    for k, view in enumerate(views_of(worlds)):
+        alone = rasterize(
+            view.instances, view.viewmat[None], view.K[None], 30, 20, sky=SKY, backend=serving
+        )
+        assert torch.equal(together.rgb[k], alone.rgb[0])
 
 
 def test_median_depth_and_class_are_of_the_gaussian_that_halves_the_light(

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...types import RasterOptions, RenderError, RenderOutput
+from ...types import RasterOptions, RenderError, RenderOutput, WorldViews
 from ..base import RasterRequest, needs_gradients
 from ..warm_up import warm_up_requests
 from .launcher import CudaLauncher, Launcher
@@ -65,16 +65,23 @@ class NvrtcBackend:
         Raises:
             RenderError: the request needs gradients.
         """
+        return self.rasterize_batch([request])
+
+    def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:
+        """Draw requests of one size and the same options together, see BatchBackend."""
         start = time.perf_counter()
-        options = request.options
+        options = requests[0].options
         asked = (name for name in ("depth", "instance") if getattr(options, name))
         names = ["rgb", "alpha", *asked]
         parts: dict[str, list[Tensor]] = {name: [] for name in names}
-        for piece in _pieces(request):
+        pieces = [(k, piece) for k, request in enumerate(requests) for piece in _pieces(request)]
+        for batch in _batches(pieces):
+            drawn = [piece for _, piece in batch]
             with self._lock:
-                images = self._draw([piece], names)
+                images = self._draw(drawn, names)
+            cameras = sum(piece.cameras for piece in drawn)
             for name in names:
-                shape = (piece.cameras, piece.height, piece.width)
+                shape = (cameras, drawn[0].height, drawn[0].width)
                 parts[name].append(_tensor(images, name, shape))
         whole = {n: torch.cat(held) if len(held) > 1 else held[0] for n, held in parts.items()}
         return RenderOutput(
@@ -84,6 +91,25 @@ class NvrtcBackend:
             instance=whole.get("instance"),
             timing_ms={"total": (time.perf_counter() - start) * 1e3},
         )
+
+    def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
+        """Draw worlds of the same things together, see BatchBackend."""
+        Ks = torch.from_numpy(worlds.Ks)
+        requests = [
+            replace(
+                like,
+                instances=tuple(
+                    replace(worlds.things[k], T_world_object=poses[k], t_us=int(t_us))
+                    for k in np.flatnonzero(shown).tolist()
+                ),
+                viewmats=torch.from_numpy(viewmats),
+                Ks=Ks,
+            )
+            for viewmats, poses, shown, t_us in zip(
+                worlds.viewmats, worlds.poses, worlds.shown, worlds.times_us, strict=True
+            )
+        ]
+        return self.rasterize_batch(requests)
 
     def frames(
         self, requests: Sequence[RasterRequest], modalities: Sequence[str]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,11 +64,16 @@ class CudaLauncher:
         code = ObjectCode.from_cubin(compiled_kernels(f"sm_{major}{minor}"))
         self._kernels = {name: code.get_kernel(name) for name in KERNELS}
         self._streams: dict[int, Any] = {}
+        self._threads = threading.local()
 
     def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
         """See Launcher."""
-        from cuda.core import LaunchConfig, launch
+        from cuda.core import Device, LaunchConfig, launch
 
+        if not getattr(self._threads, "ready", False):
+            # A driver's context is one of a thread.
+            Device(self.device.index).set_current()
+            self._threads.ready = True
         config = LaunchConfig(grid=blocks, block=THREADS)
         launch(self._stream(), config, self._kernels[kernel], frame, np.uint32(argument))
 

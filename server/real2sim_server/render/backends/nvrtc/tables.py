@@ -107,13 +107,20 @@ def _shared(first: Sequence[Instance], second: Sequence[Instance]) -> int:
 
 
 def _is_same(a: Instance, b: Instance) -> bool:
-    """Whether two instances look the same, as far as that can be told without looking at poses."""
+    """Whether two instances look the same, as far as that can be told on the host."""
     if a is b:
         return True
-    fixed = a.T_world_object is None and b.T_world_object is None
     timeless = a.colour is b.colour and (a.colour is None or a.t_us == b.t_us)
     plain = a.covars is b.covars and a.scale == b.scale and a.instance_id == b.instance_id
-    return a.cloud is b.cloud and fixed and timeless and plain
+    return a.cloud is b.cloud and timeless and plain and _is_same_pose(a, b)
+
+
+def _is_same_pose(a: Instance, b: Instance) -> bool:
+    here, there = a.T_world_object, b.T_world_object
+    if here is there:
+        return True
+    known = isinstance(here, np.ndarray) and isinstance(there, np.ndarray)
+    return known and bool(np.array_equal(here, there))
 
 
 def _cameras(
