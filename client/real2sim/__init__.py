@@ -27,9 +27,12 @@ if TYPE_CHECKING:
     from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 
     from ._async.client import AsyncClient, connect_async
+    from ._async.drive_batch import AsyncDriveBatch
     from ._async.drive_session import AsyncDriveSession
     from ._sync.client import Client, connect
+    from ._sync.drive_batch import DriveBatch
     from ._sync.drive_session import DriveSession
+    from .batch_observation import BatchObservation
     from .env import DriveEnv
     from .errors import (
         BadStepError,
@@ -64,14 +67,17 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AsyncClient",
+    "AsyncDriveBatch",
     "AsyncDriveSession",
     "BadStepError",
+    "BatchObservation",
     "CapacityError",
     "Client",
     "ConflictError",
     "ConnectionLostError",
     "Control",
     "ControllerTakenError",
+    "DriveBatch",
     "DriveSession",
     "EpisodeOverError",
     "Frame",
@@ -108,9 +114,12 @@ __all__ = [
 
 _ELSEWHERE = {
     "AsyncClient": "real2sim._async.client",
+    "AsyncDriveBatch": "real2sim._async.drive_batch",
     "AsyncDriveSession": "real2sim._async.drive_session",
+    "BatchObservation": "real2sim.batch_observation",
     "Client": "real2sim._sync.client",
     "Control": "real2sim_proto.plans",
+    "DriveBatch": "real2sim._sync.drive_batch",
     "DriveSession": "real2sim._sync.drive_session",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from real2sim_proto import (
     HTTP_STATUS,
@@ -47,6 +47,7 @@ from real2sim_proto.drive import (
     View,
     Welcome,
 )
+from real2sim_proto.drive_batch import WorldError
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 from real2sim_proto.plans import PLAN, Plan
@@ -62,6 +63,7 @@ from .errors import (
 )
 
 A = TypeVar("A", bound=Envelope)
+M = TypeVar("M")
 
 MAX_UNSOLICITED = 16
 """Unsolicited observations kept until they are taken; older ones are dropped."""
@@ -205,7 +207,7 @@ class ProtocolState:
             ProtocolMismatchError: the worker speaks another version.
             MalformedReplyError: something else than a valid message came.
         """
-        message = _server_message(data)
+        message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
             if message.id not in {0, request.id} and not message.fatal:
                 return None
@@ -213,7 +215,7 @@ class ProtocolState:
             if superseded and (newest := self.take_unsolicited(newest=True)) is not None:
                 # The planner was late and the worker went on without it.
                 return newest  # type: ignore[return-value]
-            raise _error_of(message)
+            raise error_of(message)
         if isinstance(message, Obs) and message.id == 0:
             self._unsolicited.append(message)
             return None
@@ -243,9 +245,9 @@ class ProtocolState:
         Raises:
             StatusError: the worker ends the connection, and why.
         """
-        message = _server_message(data)
+        message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
-            raise _error_of(message)
+            raise error_of(message)
         if isinstance(message, Obs):
             self._unsolicited.append(message)
 
@@ -281,7 +283,13 @@ def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:
         raise ValueError(f"plan: {describe(error)}") from error
 
 
-def _server_message(data: bytes | str) -> Any:
+def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:
+    """The message of a worker, one of ``messages``.
+
+    Raises:
+        ProtocolMismatchError: the worker speaks another version.
+        MalformedReplyError: something else than a valid message came.
+    """
     if isinstance(data, str):
         raise MalformedReplyError("the worker sent text where binary messages are spoken")
     try:
@@ -296,14 +304,15 @@ def _server_message(data: bytes | str) -> Any:
             hint="install a client and a worker of the same major version",
         )
     try:
-        return SERVER_MESSAGE.validate_python(fields)
+        return messages.validate_python(fields)
     except ValidationError as error:
         raise MalformedReplyError(
             f"the worker's message is not valid: {describe(error)}"
         ) from error
 
 
-def _error_of(message: Error) -> Exception:
+def error_of(message: Error | WorldError) -> Exception:
+    """What an error of the worker raises."""
     return error_for(
         ErrorDetails(
             status=_STATUS.get(message.code, 500),

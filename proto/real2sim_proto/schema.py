@@ -13,7 +13,18 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from . import assets, drive, errors, jobs, operations, scenarios, scenes, sessions, views
+from . import (
+    assets,
+    drive,
+    drive_batch,
+    errors,
+    jobs,
+    operations,
+    scenarios,
+    scenes,
+    sessions,
+    views,
+)
 
 MODELS: dict[str, type[BaseModel]] = {
     model.__name__: model
@@ -38,6 +49,13 @@ MODELS: dict[str, type[BaseModel]] = {
         drive.Progress,
         drive.Error,
         drive.Result,
+        drive_batch.BatchHello,
+        drive_batch.BatchReset,
+        drive_batch.BatchAction,
+        drive_batch.BatchBye,
+        drive_batch.BatchWelcome,
+        drive_batch.BatchObs,
+        drive_batch.BatchResult,
         errors.Problem,
         scenes.ServerInfo,
         scenes.Readiness,
@@ -75,6 +93,8 @@ UNIONS: dict[str, TypeAdapter[Any]] = {
     "Operation": operations.OPERATION,
     "ClientMessage": drive.CLIENT_MESSAGE,
     "ServerMessage": drive.SERVER_MESSAGE,
+    "BatchClientMessage": drive_batch.BATCH_CLIENT_MESSAGE,
+    "BatchServerMessage": drive_batch.BATCH_SERVER_MESSAGE,
 }
 
 

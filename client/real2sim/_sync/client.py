@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from real2sim_proto import PROTOCOL_VERSION
+from real2sim_proto.drive_batch import MAX_WORLDS
 from real2sim_proto.scenes import Readiness, ServerInfo
 
 from .. import _requests
@@ -17,6 +18,7 @@ from .._target import Target, resolve_target
 from ..errors import ProtocolMismatchError, ReplyTimeoutError, UnreachableError
 from .assets import Assets
 from .concurrency import sleep
+from .drive_batch import DriveBatch
 from .drive_session import DriveSession
 from .jobs import Jobs
 from .scenarios import Scenarios
@@ -166,6 +168,42 @@ class Client:
             reconnect=reconnect,
         )
         return DriveSession(self._transport, plan)
+
+    def batch(
+        self,
+        *,
+        scene: SceneRef | None = None,
+        scenario: ScenarioRef | None = None,
+        worlds: int,
+        reconnect: float = 60.0,
+    ) -> DriveBatch:
+        """New sessions on a scene or a scenario that are stepped together, by one message a step.
+
+        Args:
+            scene: a scene or its name; or
+            scenario: a scenario or its id.
+            worlds: how many sessions, 1 to 256; the worker has to have as many free.
+            reconnect: seconds for which a lost connection is tried again; 0 gives up.
+
+        Raises:
+            TypeError: something else than a scene or a scenario.
+            ValueError: no such number of worlds.
+
+        Examples:
+            >>> with client.batch(scene="street", worlds=2) as batch:
+            ...     obs = batch.reset(action="control")
+            ...     obs = batch.step({"kind": "control", "values": [[0.5, 0.0], [1.0, 0.0]]})
+            >>> obs.step.tolist()
+            [1, 1]
+        """
+        if not 1 <= worlds <= MAX_WORLDS:
+            raise ValueError(f"worlds is {worlds!r}; give 1 to {MAX_WORLDS}")
+        plan = SessionPlan(
+            scene=optional_scene_name(scene),
+            scenario=optional_scenario_id(scenario),
+            reconnect=reconnect,
+        )
+        return DriveBatch(self._transport, plan, worlds)
 
     def join(
         self, session_id: str, *, token: str, role: str = "controller", codec: str = "auto"

@@ -33,6 +33,7 @@ from ..scene import Scene
 from ..scene.io import read_packed
 from ..world import World
 from ..world.batch import BatchWorld
+from .batch_probe import BatchProbe
 from .drive_probe import DriveProbe, action
 
 Figures = dict[str, Any]
@@ -182,7 +183,8 @@ def _small_image(scene: Scene, seconds: float, repetitions: int) -> dict[str, fl
 
 
 def sessions_over_sockets(_scene: Scene, options: LearnBenchOptions) -> Figures:
-    """Steps a second of sessions without cameras, of one and of many at once, in sum."""
+    """Steps a second of sessions without cameras: of one, and in sum of many at once, on a socket
+    each and by one message a step."""
     with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder:
         root = Path(folder)
         unpack_street(root / "scenes", "street.r2s")
@@ -190,12 +192,34 @@ def sessions_over_sockets(_scene: Scene, options: LearnBenchOptions) -> Figures:
         with worker_process(scenes=root / "scenes", data=root, log_file=log_file) as worker:
             one = _sessions(worker.url, 1, options.socket_steps)
             many = _sessions(worker.url, options.sessions, options.socket_steps)
+            batch = _sessions_by_one_message(worker.url, options.sessions, options.socket_steps)
     return {
         "sessions": options.sessions,
         "steps_per_s": many,
         "one_session_steps_per_s": one,
         "ratio": many / one,
+        "by_one_message_steps_per_s": batch,
+        "by_one_message_ratio": batch / many,
     }
+
+
+def _sessions_by_one_message(url: str, count: int, steps: int) -> float:
+    with real2sim.connect(url) as client:
+        client.wait_ready()
+        infos = [client.sessions.create(scene="street") for _ in range(count)]
+        with BatchProbe(infos) as probe:
+            obs = probe.reset(dt_us=SHORT_STEP_US)
+
+            def step() -> int:
+                nonlocal obs
+                obs = probe.act(obs)
+                return count
+
+            step()
+            rate = _rate(step, steps)
+        for info in infos:
+            client.sessions.delete(info.session_id)
+    return rate
 
 
 def _sessions(url: str, count: int, steps: int) -> float:

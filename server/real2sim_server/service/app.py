@@ -25,6 +25,7 @@ from .routes import (
     assets,
     docs,
     drive,
+    drive_batch,
     exports,
     health,
     jobs,
@@ -52,6 +53,7 @@ PROTECTED: tuple[APIRouter, ...] = (
 OPEN: tuple[APIRouter, ...] = (
     health.router,
     sessions.router,
+    drive_batch.router,  # before that of drive, whose path has any id
     drive.router,
     view.router,
     ui.router,

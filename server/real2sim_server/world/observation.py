@@ -59,6 +59,11 @@ class Observation:
         """The wire's EgoState as a plain map."""
         return ego_fields(self.motion, self.T_world_vehicle, self.ego_size)
 
+    def truth_fields(self) -> dict[str, Any]:
+        """The wire's EgoState of the ego where it is, as a plain map; there has to be a truth."""
+        assert self.truth is not None
+        return ego_fields(*self.truth, self.ego_size)
+
     def obs_fields(self) -> dict[str, Any]:
         """The wire's Obs as a plain map, without ``frames`` and ``timing``; what few episodes have
         is there where it is more than its default."""
@@ -68,7 +73,7 @@ class Observation:
         if self.drawn:
             extra["drawn"] = dict(self.drawn)
         if self.truth is not None:
-            extra["ego_truth"] = ego_fields(*self.truth, self.ego_size)
+            extra["ego_truth"] = self.truth_fields()
         return {
             "step": self.step,
             "t_us": self.t_us,

@@ -28,6 +28,7 @@ import pytest
 import real2sim
 import real2sim.env
 import real2sim.planners
+import real2sim.vector_env
 import real2sim_proto
 from real2sim._async import assets as async_assets
 from real2sim._async import jobs as async_jobs
@@ -54,6 +55,7 @@ SDK_CLASSES: tuple[type, ...] = (
     jobs.Job,
     sessions.Sessions,
     real2sim.DriveSession,
+    real2sim.DriveBatch,
     real2sim.AsyncClient,
     async_scenes.AsyncScenes,
     async_scenarios.AsyncScenarios,
@@ -64,11 +66,14 @@ SDK_CLASSES: tuple[type, ...] = (
     async_jobs.AsyncJob,
     async_sessions.AsyncSessions,
     real2sim.AsyncDriveSession,
+    real2sim.AsyncDriveBatch,
     real2sim.Image,
     real2sim.Frame,
     real2sim.View,
     real2sim.Observation,
+    real2sim.BatchObservation,
     real2sim.env.DriveEnv,
+    real2sim.vector_env.DriveVectorEnv,
 )
 TOKEN = "opens-every-session"
 PLANNERS = ("DepthSampling", "FollowRoute", "Idm", "LearnedPolicy", "PidFollowRoute")
@@ -198,7 +203,7 @@ async def run_examples(texts: list[str], names: dict[str, Any]) -> None:
         for example in itertools.chain.from_iterable(map(parser.get_examples, texts)):
             await run_example(example, names)
     finally:
-        for value in [v for k, v in names.items() if k in {"session", "env", "client"}]:
+        for value in [v for k, v in names.items() if k in {"session", "batch", "env", "client"}]:
             if inspect.isawaitable(closing := value.close()):
                 await closing
 

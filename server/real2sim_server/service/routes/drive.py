@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
+from collections.abc import Iterator
 from functools import partial
+from typing import Protocol
 
 import structlog
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
@@ -15,7 +18,7 @@ from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
 from ..accounts import Account, RevokedError
 from ..http.accounting import begin_paying
 from ..http.auth import bearer_token, unauthorized
-from ..http.problems import REQUEST_ID_KEY, problem_response, service_error
+from ..http.problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
 from ..sessions.connection import Connection
 from ..sessions.handshake import FatalError, close_with_error, receive_hello, with_progress
 from ..sessions.messages import unsupported_protocol
@@ -33,8 +36,8 @@ log = structlog.get_logger(__name__)
 async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
     """Drive a session in lock step, or look on; see docs of the drive socket."""
     try:
-        protocol = _common_protocol(socket)
-        account = _account_of_handshake(socket, worker)
+        protocol = common_protocol(socket)
+        account = account_of_handshake(socket, worker)
         row = check_not_closed(await worker.sessions.row(session_id))
     except Exception as error:
         failure = service_error(error, log_unexpected=True)
@@ -63,12 +66,12 @@ async def _serve(
         socket,
         row,
         authorised=account is not None,
-        opens_worker=lambda token: _account_of_token(worker, token) is not None,
+        opens_worker=lambda token: account_of_token(worker, token) is not None,
         resume_token=worker.sessions.resume_token(row),
     )
     try:
         # Who has the session's token alone drives for whoever made it.
-        account = account or _account_of_token(worker, hello.token)
+        account = account or account_of_token(worker, hello.token)
         account = account or worker.accounts.of_owner(row.owner)
         begin_paying(socket, account)
         session = await with_progress(
@@ -82,12 +85,10 @@ async def _serve(
     log.info("drive socket opened", role=hello.role)
     ws_base = str(socket.base_url).rstrip("/")
     connection = Connection(socket, session, worker.sessions, ws_base=ws_base)
-    revoked = partial(_end, connection, account)
-    account.on_revoked.add(revoked)
     try:
-        await connection.serve(hello)
+        with ended_when_revoked(connection, account):
+            await connection.serve(hello)
     finally:
-        account.on_revoked.discard(revoked)
         log.info(
             "drive socket closed",
             role=hello.role,
@@ -102,7 +103,8 @@ def _steps(session: Session) -> int:
     return session.world.steps if session.world else 0
 
 
-def _common_protocol(socket: WebSocket) -> str:
+def common_protocol(socket: WebSocket) -> str:
+    """The subprotocol that both sides speak. Raises ServiceError: UNSUPPORTED_PROTOCOL."""
     offered = list(socket.scope.get("subprotocols", []))
     for protocol in SUPPORTED_SUBPROTOCOLS:
         if protocol in offered:
@@ -110,7 +112,7 @@ def _common_protocol(socket: WebSocket) -> str:
     raise unsupported_protocol(offered)
 
 
-def _account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
+def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
     """Whose token of the worker the handshake has; hello may carry one instead.
 
     Raises:
@@ -126,12 +128,30 @@ def _account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
     return account
 
 
-def _account_of_token(worker: Worker, token: str | None) -> Account | None:
+def account_of_token(worker: Worker, token: str | None) -> Account | None:
     """Whose token of the worker it is; None where the worker has none."""
     return worker.accounts.of_token(token) if worker.accounts.wants_token else None
 
 
-def _end(connection: Connection, account: Account) -> None:
+class Endable(Protocol):
+    """A connection that can be told to end."""
+
+    async def end(self, error: ServiceError) -> None:
+        """Tell the client why, and leave it."""
+
+
+@contextlib.contextmanager
+def ended_when_revoked(connection: Endable, account: Account) -> Iterator[None]:
+    """The connection ends when the token of its account is no more."""
+    revoked = partial(_end, connection, account)
+    account.on_revoked.add(revoked)
+    try:
+        yield
+    finally:
+        account.on_revoked.discard(revoked)
+
+
+def _end(connection: Endable, account: Account) -> None:
     """Leave a client whose token is no more; not awaited, for it may be slow to read."""
     ending = asyncio.ensure_future(connection.end(service_error(RevokedError(account.name))))
     _ending.add(ending)

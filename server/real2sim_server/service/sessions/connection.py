@@ -35,7 +35,7 @@ from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import send_parts, try_send_parts
 from .deadline_timer import DeadlineTimer
-from .describe import welcome_fields
+from .describe import result_fields, welcome_fields
 from .handshake import (
     FatalError,
     close_with_error,
@@ -313,15 +313,7 @@ class Connection:
             self._deadline_timer.cancel()
             session.close_callbacks.discard(self._close_with_error)
             await self._sessions.close(session, reason="its controller said bye")
-        world = session.world
-        fields = {
-            "steps": world.steps if world else 0,
-            "t_us": world.t_us if world else None,
-            "reason": world.reason if world else None,
-            "metrics": world.metrics() if world else {},
-            "scores": [score.fields() for score in scores],
-        }
-        return pack_message("result", fields)
+        return pack_message("result", result_fields(session.world, scores))
 
     # --- bytes ------------------------------------------------------------------------------
 

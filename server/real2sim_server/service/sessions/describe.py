@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
 
 from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
+from real2sim_proto.drive_batch import MAX_WORLDS
 from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
 
 from ...edit import EditOutcome
-from ...world import Event, World, agent_fields, ego_fields, metrics_version
+from ...world import Event, Score, World, agent_fields, ego_fields, metrics_version
 from ..library.views import camera_infos, edited_objects
 from .session import Session
 
@@ -89,6 +90,7 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
             "max_message_bytes": MAX_CLIENT_MESSAGE_BYTES,
             "max_operations_per_request": MAX_OPERATIONS_PER_REQUEST,
             "max_cameras_per_step": MAX_SENSORS,
+            "max_sessions_per_socket": MAX_WORLDS,
         },
         "cameras": [c.model_dump(mode="json") for c in camera_infos(tuple(start.scene.rig))],
         "objects": [o.model_dump(mode="json", exclude_none=True) for o in infos],
@@ -97,4 +99,15 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
         "step": world.steps if world else None,
         "revision": world.revision if world else 0,
         "resume_token": session.resume_token if role == "controller" else None,
+    }
+
+
+def result_fields(world: World | None, scores: Sequence[Score]) -> dict[str, Any]:
+    """Of the wire's Result, without envelope; ``world``: the last instant, if an episode began."""
+    return {
+        "steps": world.steps if world else 0,
+        "t_us": world.t_us if world else None,
+        "reason": world.reason if world else None,
+        "metrics": world.metrics() if world else {},
+        "scores": [score.fields() for score in scores],
     }

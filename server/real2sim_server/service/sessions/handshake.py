@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
-from real2sim_proto.drive import Hello
+from real2sim_proto.drive import Envelope, Hello
 
 from ..http.auth import secrets_equal, unauthorized
 from ..http.problems import ServiceError
@@ -104,6 +104,11 @@ async def receive(socket: WebSocket) -> ReceivedMessage:
         WebSocketDisconnect: the client has left.
         BadMessageError: what came is no message.
     """
+    return await receive_as(read_message, socket)
+
+
+async def receive_as(read: Callable[[bytes], T], socket: WebSocket) -> T:
+    """The next message, as ``read`` understands it. Raises as :func:`receive` does."""
     event = await socket.receive()
     if event["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(event.get("code", 1005))
@@ -111,12 +116,12 @@ async def receive(socket: WebSocket) -> ReceivedMessage:
     if data is None:
         raise BadMessageError(bad_message("text was sent where messages are binary"))
     if len(data) <= SMALL_BYTES:
-        return read_message(data)
-    return await asyncio.to_thread(read_message, data)
+        return read(data)
+    return await asyncio.to_thread(read, data)
 
 
 async def with_progress(
-    socket: WebSocket, work: Coroutine[Any, Any, T], hello: Hello, *, phase: str
+    socket: WebSocket, work: Coroutine[Any, Any, T], hello: Envelope, *, phase: str
 ) -> T:
     """The result of ``work``; the client is told of a ``phase`` meanwhile."""
     task = asyncio.create_task(work)
@@ -143,13 +148,16 @@ def error_message(
     error: ServiceError, *, fatal: bool = False, step: int | None = None
 ) -> EncodedMessage:
     """An error as a message; ``step``: the one that is due."""
-    fields: dict[str, Any] = {
+    return pack_message("error", error_fields(error, step=step) | {"fatal": fatal})
+
+
+def error_fields(error: ServiceError, *, step: int | None) -> dict[str, Any]:
+    """What an error says; ``step``: the one that is due."""
+    return {
         "code": error.code.value,
         "detail": error.detail,
         "hint": error.hint,
         "retryable": error.code in RETRYABLE,
-        "fatal": fatal,
         "step": step,
         "retry_after_s": int(error.headers.get("Retry-After", 0)) or None,
     }
-    return pack_message("error", fields)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from real2sim_proto import (
     PROTOCOL_VERSION,
@@ -20,8 +20,13 @@ from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage
 from ...world.recording.replay import plan_payload
 from ..http.problems import ServiceError
 
+M = TypeVar("M")
+
 MAX_PROBLEMS = 4
-TYPES = "hello, reset, action, edit, render, agent, snapshot, restore, fork, bye"
+TYPES = (
+    "hello, reset, action, edit, render, agent, snapshot, restore, fork, bye; on a batch socket "
+    "batch_hello, batch_reset, batch_action, batch_bye"
+)
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,13 @@ def read_message(data: bytes) -> ReceivedMessage:
     Raises:
         BadMessageError: not a message; one of another protocol version is fatal.
     """
+    message = read_as(CLIENT_MESSAGE, data)
+    content = plan_payload(message.plan) if isinstance(message, Action) else b""
+    return ReceivedMessage(message, content)
+
+
+def read_as(messages: TypeAdapter[M], data: bytes) -> M:
+    """The message in ``data``, one of ``messages``. Raises as :func:`read_message` does."""
     try:
         fields = decode(data, max_bytes=MAX_CLIENT_MESSAGE_BYTES)
     except CodecError as error:
@@ -74,13 +86,11 @@ def read_message(data: bytes) -> ReceivedMessage:
         mismatch = ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, detail)
         raise BadMessageError(mismatch, message_id=message_id, fatal=True)
     try:
-        message = CLIENT_MESSAGE.validate_python(fields)
+        return messages.validate_python(fields)
     except ValidationError as error:
         raise BadMessageError(
-            bad_message(_validation_summary(error)), message_id=message_id
+            bad_message(validation_summary(error)), message_id=message_id
         ) from error
-    content = plan_payload(message.plan) if isinstance(message, Action) else b""
-    return ReceivedMessage(message, content)
 
 
 def bad_message(detail: str) -> ServiceError:
@@ -100,7 +110,7 @@ def _id_of(fields: dict[str, Any]) -> int:
     return given if type(given) is int and 0 <= given <= 2**53 else 0
 
 
-def _validation_summary(error: ValidationError) -> str:
+def validation_summary(error: ValidationError) -> str:
     """What is wrong and where: ``action/plan/poses/0/1: input should be a finite number``."""
     found = error.errors(include_url=False, include_context=False)
     texts = []

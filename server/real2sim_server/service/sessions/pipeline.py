@@ -30,7 +30,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from prometheus_client import Histogram
 
@@ -42,7 +42,7 @@ from ...edit import ScenarioState, instances_at, things_at_start
 from ...geometry.transform import invert_transform
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
-from ...world import World
+from ...world import Observation, World
 from ..accounts import Account, computing_account, counted_world_time
 from ..engine import Engine
 from ..http.metrics import Metrics
@@ -97,6 +97,13 @@ class Transition:
     sent: bool = False
     account: Account | None = None
     moved: World | None = None
+
+
+class Seen(NamedTuple):
+    """A world, and what the policy gets of it."""
+
+    world: World
+    observation: Observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,18 +245,39 @@ class StepPipeline:
         """All phases of steps without images; where one fails, the others go on."""
         if len(transitions) == 1:
             return [_counted(self._compute_blind, transitions[0])]
+        return [
+            world
+            if isinstance(world, Exception)
+            else _counted(self._encode_blind, transition, world)
+            for transition, world in zip(transitions, self._worlds_of(transitions), strict=True)
+        ]
+
+    async def run_together(self, transitions: Sequence[Transition]) -> list[Seen | Exception]:
+        """Advance, evaluate and record, in one go: the new worlds and what is seen of them, or what
+        each has failed by.
+
+        For worlds without sensors, whose observations somebody else encodes.
+
+        Raises:
+            OverLimitError: the account of the running task has had its time on the engine.
+        """
+        account = await computing_account()
+        for transition in transitions:
+            transition.account = account
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._worlds, self._see_together, transitions)
+
+    def _see_together(self, transitions: Sequence[Transition]) -> list[Seen | Exception]:
+        return [
+            world if isinstance(world, Exception) else _counted(_seen, transition, world)
+            for transition, world in zip(transitions, self._worlds_of(transitions), strict=True)
+        ]
+
+    def _worlds_of(self, transitions: Sequence[Transition]) -> list[World | Exception]:
         worlds = [_counted(self._advance_and_evaluate, transition) for transition in transitions]
         moved = [t for t, w in zip(transitions, worlds, strict=True) if isinstance(w, World)]
         unrecorded = self._record(moved)
-        results: list[EncodedObservation | Exception] = []
-        for transition, world in zip(transitions, worlds, strict=True):
-            if isinstance(world, Exception):
-                results.append(world)
-            elif (error := unrecorded.get(transition)) is not None:
-                results.append(error)
-            else:
-                results.append(_counted(self._encode_blind, transition, world))
-        return results
+        return [unrecorded.get(t, w) for t, w in zip(transitions, worlds, strict=True)]
 
     def _compute_blind(self, transition: Transition) -> EncodedObservation:
         observation = self._compute(transition)
@@ -492,6 +520,16 @@ def _counted(fn: Callable[..., T], transition: Transition, *args: Any) -> T | Ex
     """A part of a step on the thread of worlds, its time counted for whoever asked for it; the
     transaction of several steps counts for nobody."""
     return attempt(counted_world_time, transition.account, fn, transition, *args)
+
+
+def _seen(_transition: Transition, world: World) -> Seen:
+    return Seen(world, world.observe())
+
+
+def message_of(world: World) -> EncodedMessage:
+    """The observation of an instant without images, as a message."""
+    members = pack_members(world.observe().obs_fields())
+    return pack_with_frames("obs", members, (), PhaseTimer())
 
 
 def _record_one(transition: Transition) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import NamedTuple
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Agent
@@ -33,9 +34,9 @@ from ..storage.errors import StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
 from .log_write import LogWrite
-from .pipeline import EncodedObservation, StepPipeline, Transition
+from .pipeline import EncodedObservation, Seen, StepPipeline, Transition, message_of
 from .session import Session
-from .wire import EncodedMessage
+from .wire import DeferredMessage, EncodedMessage
 
 LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
@@ -50,6 +51,20 @@ MAX_SNAPSHOTS = 32
 
 STEPS_AT_ONCE = 20
 """Steps of a REST request that are computed in one go; other sessions get their turn between."""
+
+
+class DueAction(NamedTuple):
+    """The action that the lock step of a session wants now.
+
+    Attributes:
+        session: whose world moves.
+        plan: what the ego does.
+        payload: canonical bytes of the plan.
+    """
+
+    session: Session
+    plan: Plan | None
+    payload: bytes
 
 
 class Stepper:
@@ -142,6 +157,36 @@ class Stepper:
         observation, written = await self._step(session, change, entry, write=write)
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
         return None if written else observation.message
+
+    async def act_together(self, actions: Sequence[DueAction]) -> list[Seen | Exception]:
+        """Take the due actions of sessions without sensors, in one go; what fails in one leaves the
+        others alone. The caller holds the lock of each.
+
+        Raises:
+            OverLimitError: the account of the running task has had its time on the engine.
+        """
+        transitions = [
+            Transition(
+                partial(_moved, session.running_world(), plan, 0, session.late),
+                {},
+                record=LogWrite(
+                    self._store,
+                    session.session_id,
+                    _entries(session, [_action_record(session, plan, payload)]),
+                    session.log_unsure,
+                ),
+            )
+            for session, plan, payload in actions
+        ]
+        found = await self._pipeline.run_together(transitions)
+        for action, transition, outcome in zip(actions, transitions, found, strict=True):
+            if isinstance(outcome, Seen):
+                _commit(action, outcome.world)
+            elif isinstance(outcome, StoreUnavailableError):
+                action.session.log_unsure = True
+            elif transition.recorded:
+                await self._withdraw(action.session)
+        return found
 
     async def step_without_action(self, session: Session) -> EncodedMessage:
         """Go on without the action that is due, by the episode's fallback; the observation.
@@ -336,6 +381,21 @@ class Stepper:
                 session.unsure_replies += (reply.key,)
             raise
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
+
+
+def _action_record(session: Session, plan: Plan | None, payload: bytes) -> LogRecord:
+    entry = action_payload(plan, missed=True) if session.late else payload
+    return ("action", session.running_world().steps, entry)
+
+
+def _commit(action: DueAction, world: World) -> None:
+    """A step without images takes effect; it is on record."""
+    session, _, payload = action
+    session.next_seq, session.log_unsure = session.next_seq + 1, False
+    session.world, session.late = world, False
+    message = DeferredMessage(partial(message_of, world))
+    session.lockstep.advance(payload, message, over=world.over)
+    session.publish(message)
 
 
 def _entries(session: Session, records: Sequence[LogRecord]) -> list[SessionEntry]:

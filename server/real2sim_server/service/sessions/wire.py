@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,6 +63,27 @@ class EncodedMessage:
     def joined(self, message_id: int = 0) -> bytes:
         """The whole message in one piece, a copy of all its images."""
         return b"".join(self.parts(message_id))
+
+
+class DeferredMessage(EncodedMessage):
+    """A message that is encoded when it is first sent; most of those that are kept for a client
+    that may come back never are.
+
+    Args:
+        encode: makes the message, on any thread, always the same.
+    """
+
+    def __init__(self, encode: Callable[[], EncodedMessage]) -> None:
+        object.__setattr__(self, "_encode", encode)
+
+    def parts(self, message_id: int = 0) -> list[Part]:
+        """The whole message, to be sent one part after the other."""
+        return self._encoded.parts(message_id)
+
+    @functools.cached_property
+    def _encoded(self) -> EncodedMessage:
+        encode: Callable[[], EncodedMessage] = self.__dict__["_encode"]
+        return encode()
 
 
 def pack_members(fields: Mapping[str, Any]) -> EncodedMembers:

@@ -1,0 +1,258 @@
+"""The batch socket: one message steps the worlds of many sessions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from real2sim_proto import DRIVE_SUBPROTOCOL
+from real2sim_proto.drive_batch import BATCH_SERVER_MESSAGE, COMMANDS, EGO_COLUMNS, MAX_WORLDS
+
+from .conftest import Planner
+
+pytestmark = pytest.mark.network
+
+SPEC: dict[str, Any] = {"action": "control", "privileged": True, "agents": {"default": "idm"}}
+MOTION = ("yaw", "speed", "lateral_speed", "acceleration", "steering", "yaw_rate")
+
+
+class Batch(Planner):
+    """One end of a batch socket."""
+
+    def __init__(self, infos: list[dict[str, Any]]) -> None:
+        base = infos[0]["ws_url"].rsplit("/", 2)[0]
+        super().__init__({"ws_url": f"{base}/batch/drive"})
+        self.infos = infos
+
+    def ask(self, type_: str, **fields: Any) -> dict[str, Any]:
+        answer = super().ask(type_, **fields)
+        BATCH_SERVER_MESSAGE.validate_python(answer)
+        return answer
+
+    def hello(self, **fields: Any) -> dict[str, Any]:
+        named = [{k: info[k] for k in ("session_id", "token")} for info in self.infos]
+        fields = {"sessions": named, "protocols": [DRIVE_SUBPROTOCOL], **fields}
+        self.welcome = self.ask("batch_hello", **fields)
+        return self.welcome
+
+    def reset(self, spec: dict[str, Any] = SPEC, **fields: Any) -> dict[str, Any]:
+        return self.ask("batch_reset", spec=spec, **fields)
+
+    def act(self, steps: Any, values: Any, **fields: Any) -> dict[str, Any]:
+        plans = {"kind": "control", "values": np.asarray(values, np.float64)}
+        return self.ask("batch_action", steps=np.asarray(steps), plans=plans, **fields)
+
+
+@pytest.fixture
+def batch(site):
+    """Opens batch sockets of new sessions."""
+    opened: list[Batch] = []
+
+    def open_batch(count: int, **create: Any) -> Batch:
+        opened.append(Batch([site.create(**create) for _ in range(count)]))
+        opened[-1].hello()
+        return opened[-1]
+
+    yield open_batch
+    for one in opened:
+        one.stack.close()
+
+
+def row_of(obs: dict[str, Any], world: int) -> dict[str, Any]:
+    """A world's part of a batch_obs, as its own obs has it."""
+    k = obs["worlds"].tolist().index(world)
+    detail = next((d for d in obs["details"] if d["world"] == world), {})
+    ego = obs["ego"][k].tolist()
+    return {
+        "step": obs["step"][k],
+        "t_us": obs["t_us"][k],
+        "revision": obs["revision"][k],
+        "position": ego[:3],
+        "quaternion": ego[3:7],
+        "motion": ego[7:],
+        "command": COMMANDS[obs["command"][k]],
+        "route": obs["route"][k].tobytes(),
+        "metrics": {n: v[k] for n, v in obs["metrics"].items() if not np.isnan(v[k])},
+        "ends": [bool(obs[name][k]) for name in ("terminated", "truncated", "warming_up")],
+        "reason": detail.get("reason"),
+        "agents": detail.get("agents", []),
+        "events": [
+            {n: v for n, v in event.items() if n != "world"}
+            for event in obs["events"]
+            if event["world"] == world
+        ],
+    }
+
+
+def row_of_single(obs: dict[str, Any]) -> dict[str, Any]:
+    """An obs, as :func:`row_of` tells it."""
+    ego = obs["ego"]
+    return {
+        **{name: obs[name] for name in ("step", "t_us", "revision", "command", "metrics")},
+        **{name: obs[name] for name in ("reason", "agents", "events")},
+        "position": ego["position"],
+        "quaternion": ego["quaternion"],
+        "motion": [ego[name] for name in MOTION],
+        "route": obs["route"].tobytes(),
+        "ends": [obs[name] for name in ("terminated", "truncated", "warming_up")],
+    }
+
+
+def test_worlds_of_a_batch_do_what_single_sessions_do_bit_for_bit(site, batch, join):
+    worlds, many = 3, batch(3)
+    singles = [join(site.create()) for _ in range(worlds)]
+    together = many.reset(seeds=[5, 6, 7])
+    alone = [p.reset(**SPEC, seed=5 + k) for k, p in enumerate(singles)]
+    assert EGO_COLUMNS[7:] == MOTION
+    for step in range(12):
+        for k, obs in enumerate(alone):
+            assert row_of(together, k) == row_of_single(obs), (step, k)
+        values = [[1.0 + k, 0.01 * k] for k in range(worlds)]
+        together = many.act([step] * worlds, values)
+        alone = [
+            p.act(step, acceleration=a, steering=s)
+            for p, (a, s) in zip(singles, values, strict=True)
+        ]
+    for info, single in zip(many.infos, singles, strict=True):
+        states = [site.call("GET", i, "/state").json() for i in (info, single.info)]
+        assert states[0] | {"session_id": ""} == states[1] | {"session_id": ""}
+
+
+def test_what_is_wrong_with_one_world_is_said_in_its_place(batch):
+    many = batch(4)
+    many.reset()
+    values = np.array([[1.0, 0.0], [np.nan, 0.0], [1.0, 0.0], [500.0, 0.0]])
+    obs = many.act([0, 0, 7, 0], values)
+    assert obs["worlds"].tolist() == [0]
+    codes = {e["world"]: (e["code"], e["step"]) for e in obs["errors"]}
+    assert codes == {1: ("BAD_MESSAGE", 0), 2: ("BAD_STEP", 0), 3: ("BAD_MESSAGE", 0)}
+    # The refused have not moved, and go on with what is right.
+    after = many.act([0, 0, 0], [[1.0, 0.0]] * 3, worlds=[3, 2, 1])
+    assert after["worlds"].tolist() == [3, 2, 1]
+    assert after["step"].tolist() == [1, 1, 1]
+    assert after["ego"].tobytes() == np.tile(obs["ego"], (3, 1)).tobytes()
+
+
+def test_an_action_that_is_sent_again_is_answered_again_and_moves_nothing(batch):
+    many = batch(2)
+    many.reset()
+    first = many.act([0, 0], [[1.0, 0.0], [2.0, 0.0]])
+    again = many.act([0, 0], [[1.0, 0.0], [2.0, 0.0]])
+    assert again["ego"].tobytes() == first["ego"].tobytes()
+    assert again["step"].tolist() == [1, 1]
+    other = many.act([0, 1], [[3.0, 0.0], [2.0, 0.0]])
+    assert [(e["world"], e["code"]) for e in other["errors"]] == [(0, "STEP_CONFLICT")]
+    assert other["step"].tolist() == [2]
+
+
+def test_episodes_that_are_over_are_reset_alone(batch):
+    many = batch(2)
+    many.reset(SPEC | {"horizon": 2})
+    for step in range(2):
+        obs = many.act([step, step], [[0.0, 0.0]] * 2)
+    assert obs["truncated"].tolist() == [True, True]
+    assert {d["reason"] for d in obs["details"]} == {"horizon"}
+    begun = many.reset(SPEC | {"horizon": 9}, worlds=[1])
+    assert (begun["worlds"].tolist(), begun["step"].tolist()) == ([1], [0])
+    obs = many.act([2, 0], [[0.0, 0.0]] * 2)
+    assert [e["code"] for e in obs["errors"]] == ["EPISODE_OVER"]
+    assert obs["step"].tolist() == [1]
+
+
+def test_trajectories_and_poses_go_as_arrays(batch, site, join):
+    many, single = batch(1), join(site.create())
+    many.reset({"action": "trajectory"})
+    alone = single.reset(action="trajectory")
+    times = alone["t_us"] + np.array([[500_000, 1_000_000]])
+    poses = np.array([[[3.0, 0.1, 0.02], [7.0, 0.2, 0.0]]])
+    plans = {"kind": "trajectory", "times_us": times, "poses": poses}
+    together = many.ask("batch_action", steps=[0], plans=plans)
+    alone = single.ask(
+        "action",
+        step=0,
+        plan={"kind": "trajectory", "times_us": times[0].tolist(), "poses": poses[0].tolist()},
+    )
+    assert row_of(together, 0) == row_of_single(alone)
+    many.reset({"action": "pose"})
+    moved = many.ask("batch_action", steps=[0], plans={"kind": "pose", "values": [[1.0, 2.0, 0.5]]})
+    assert moved["ego"][0, :2].tolist() == [1.0, 2.0]
+
+
+def test_what_a_batch_has_not_is_refused_as_a_whole(batch):
+    many = batch(2)
+    refused = many.reset(SPEC | {"sensors": [{"camera": "front"}], "deadline_ms": 50})
+    assert refused["code"] == "INVALID_REQUEST"
+    assert "sensors, deadline_ms" in refused["detail"]
+    many.reset()
+    for worlds in ([0, 0], [0, 2]):
+        assert many.act([0, 0], [[0, 0]] * 2, worlds=worlds)["code"] == "BAD_MESSAGE"
+    assert many.act([0, 0], [[0, 0]])["code"] == "BAD_MESSAGE"
+    assert many.ask("batch_action", steps=[0.5, 0], plans={})["code"] == "BAD_MESSAGE"
+    assert many.reset(seeds=[1])["code"] == "BAD_MESSAGE"
+    assert many.act([0, 0], [[0, 0]] * 2)["step"].tolist() == [1, 1]
+
+
+def test_a_hello_opens_all_sessions_or_none(site):
+    infos = [site.create(), site.create()]
+    wrong = [dict(infos[0]), infos[1] | {"token": "wrong"}]
+    with Batch(wrong) as refused:
+        answer = refused.hello()
+        assert (answer["code"], answer["fatal"]) == ("UNAUTHORIZED", True)
+        assert refused.wait_closed() == 1008
+    with Batch([infos[0], infos[0]]) as twice:
+        assert twice.hello()["code"] == "BAD_MESSAGE"
+    with Batch(infos) as first, Batch(infos) as second:
+        welcome = first.hello()
+        assert [w["session_id"] for w in welcome["worlds"]] == [i["session_id"] for i in infos]
+        assert welcome["limits"]["max_sessions_per_socket"] == MAX_WORLDS
+        first.reset()
+        assert second.hello()["code"] == "CONTROLLER_TAKEN"
+        assert first.act([0, 0], [[0, 0]] * 2)["step"].tolist() == [1, 1]
+
+
+def test_a_controller_that_comes_back_takes_the_place_of_the_old_one(batch):
+    many = batch(2)
+    many.reset()
+    many.act([0, 0], [[1.0, 0.0]] * 2)
+    with Batch(many.infos) as again:
+        tokens = [
+            {"session_id": w["session_id"], "resume_token": w["resume_token"]}
+            for w in many.welcome["worlds"]
+        ]
+        welcome = again.hello(sessions=tokens)
+        assert [w["step"] for w in welcome["worlds"]] == [1, 1]
+        assert again.act([0, 0], [[1.0, 0.0]] * 2)["step"].tolist() == [1, 1]
+        old = many.act([1, 1], [[1.0, 0.0]] * 2)
+        assert {e["code"] for e in old["errors"]} == {"CONTROLLER_TAKEN"}
+        assert again.act([1, 1], [[1.0, 0.0]] * 2)["step"].tolist() == [2, 2]
+
+
+def test_a_session_that_is_deleted_leaves_the_others_alone(site, batch):
+    many = batch(2)
+    many.reset()
+    site.call("DELETE", many.infos[0])
+    obs = many.act([0, 0], [[1.0, 0.0]] * 2)
+    assert [(e["world"], e["code"]) for e in obs["errors"]] == [(0, "SESSION_CLOSED")]
+    assert obs["worlds"].tolist() == [1]
+    result = many.ask("batch_bye")
+    assert [r["world"] for r in result["results"]] == [1]
+    assert result["results"][0]["steps"] == 1
+    assert [e["code"] for e in result["errors"]] == ["SESSION_CLOSED"]
+
+
+def test_sessions_keep_their_log_and_are_rebuilt_and_recorded_from_it(site, batch, join):
+    many = batch(2)
+    many.reset()
+    for step in range(3):
+        obs = many.act([step, step], [[1.0, 0.02], [0.5, -0.02]])
+    many.stack.close()
+    info = many.infos[1]
+    # A client of its own finds the observation of the last step, and may go on.
+    single = join(info)
+    again = single.act(2, acceleration=0.5, steering=-0.02)
+    assert row_of(obs, 1) == row_of_single(again)
+    assert single.act(3)["step"] == 4
+    recording = site.call("GET", info, "/recording")
+    assert recording.status_code == 200, recording.text
