@@ -33,7 +33,7 @@ class BatchObservation:
         route: [M, R, 2] float64, x and y of the route ahead in the vehicle frame [m].
         command: ``straight``, ``left`` or ``right`` of each.
         metrics: [M] float64 by name; nan where a world has none.
-        terminated, truncated, warming_up: [M] bool.
+        terminated, truncated, warming_up, reverse: [M] bool; ``reverse``: in reverse gear.
         lap: [M] int64.
         events: what happened in this step; ``world`` says where.
         details: why episodes ended, what was drawn, road users of privileged episodes.
@@ -60,6 +60,7 @@ class BatchObservation:
     truncated: NDArray[np.bool_]
     warming_up: NDArray[np.bool_]
     lap: NDArray[np.int64]
+    reverse: NDArray[np.bool_]
     events: Sequence[WorldEvent] = ()
     details: Sequence[WorldDetail] = ()
     errors: Sequence[WorldError] = ()
@@ -96,7 +97,7 @@ def batch_observation_from_wire(obs: BatchObs) -> BatchObservation:
     """
     rows = len(obs.worlds)
     flat = (obs.step, obs.t_us, obs.revision, obs.command, obs.terminated, obs.truncated)
-    flat += (obs.warming_up, obs.lap, *obs.metrics.values())
+    flat += (obs.warming_up, obs.lap, obs.reverse, *obs.metrics.values())
     shapes = {np.shape(values) for values in flat} | {(rows,)}
     if len(shapes) > 1 or np.shape(obs.ego) != (rows, len(EGO_COLUMNS)):
         raise MalformedReplyError(f"arrays of a batch of {rows} worlds have shapes {shapes}")
@@ -115,6 +116,7 @@ def batch_observation_from_wire(obs: BatchObs) -> BatchObservation:
         truncated=obs.truncated,
         warming_up=obs.warming_up,
         lap=obs.lap,
+        reverse=obs.reverse,
         events=obs.events,
         details=obs.details,
         errors=obs.errors,

@@ -47,7 +47,8 @@ EGO_COLUMNS = (
     "steering",
     "yaw_rate",
 )
-"""Columns of ``ego``: the members of :class:`EgoState` but ``size``, one after the other."""
+"""Columns of ``ego``: the members of :class:`EgoState` but ``gear`` and ``size``, one after the
+other."""
 
 BatchCommand = Literal["straight", "left", "right"]
 COMMANDS: tuple[str, ...] = get_args(BatchCommand)
@@ -70,6 +71,17 @@ def _array(value: Any) -> Any:
 
 
 NumberArray = Annotated[Array, BeforeValidator(_array)]
+
+
+def _flags(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        value = np.asarray(value)
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "b":
+        raise ValueError("an array of booleans is expected")
+    return value
+
+
+Flags = Annotated[Array, BeforeValidator(_flags)]
 
 
 # --- client to server -------------------------------------------------------------------------
@@ -120,6 +132,7 @@ class ControlPlans(Model):
     values: NumberArray = Field(
         description="[M, 2] float64, acceleration [m/s^2] and road-wheel angle [rad]"
     )
+    reverse: Flags | None = Field(default=None, description="[M] bool, in reverse gear; none")
 
 
 class TrajectoryPlans(Model):
@@ -171,6 +184,9 @@ class BatchAction(Envelope):
                     f"are [{rows}, K] and [{rows}, K, 3]"
                 )
             return self
+        reverse = plans.reverse if isinstance(plans, ControlPlans) else None
+        if reverse is not None and reverse.shape != (rows,):
+            raise ValueError(f"reverse is {_form(reverse)}; [{rows}] is expected")
         columns = 2 if isinstance(plans, ControlPlans) else 3
         if plans.values.shape != (rows, columns):
             raise ValueError(
@@ -262,6 +278,7 @@ class BatchObs(ServerEnvelope):
     truncated: Array = Field(description="[M] bool")
     warming_up: Array = Field(description="[M] bool, the ego still moves as recorded")
     lap: Array = Field(description="[M] int64")
+    reverse: Array = Field(description="[M] bool, the ego is in reverse gear")
     events: list[WorldEvent] = Field(default_factory=list)
     details: list[WorldDetail] = Field(default_factory=list)
     errors: list[WorldError] = Field(default_factory=list)

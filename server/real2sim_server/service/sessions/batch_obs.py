@@ -47,6 +47,7 @@ def pack_batch_obs(
         "truncated": np.array([o.truncated for o in found], np.bool_),
         "warming_up": np.array([o.warming_up for o in found], np.bool_),
         "lap": np.array([o.lap for o in found], np.int64),
+        "reverse": np.array([o.motion.reversing for o in found], np.bool_),
         "events": [{"world": w, **e.fields()} for w, o in seen.items() for e in o.events],
         "details": [detail for w, o in seen.items() if (detail := _detail(w, o))],
         "errors": pack_errors(errors),

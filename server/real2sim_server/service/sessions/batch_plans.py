@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive_batch import BatchAction, Plans, TrajectoryPlans
+from real2sim_proto.drive_batch import BatchAction, ControlPlans, Plans, TrajectoryPlans
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import PLAN, Plan
 
@@ -45,10 +45,14 @@ def plan_rows(plans: Plans) -> list[dict[str, Any]]:
             for times_us, poses in rows
         ]
     names = COLUMNS[plans.kind]
-    return [
+    rows = [
         {"kind": plans.kind, **dict(zip(names, values, strict=True))}
         for values in plans.values.tolist()
     ]
+    if isinstance(plans, ControlPlans) and plans.reverse is not None:
+        for row, reverse in zip(rows, plans.reverse.tolist(), strict=True):
+            row["gear"] = "reverse" if reverse else "drive"
+    return rows
 
 
 def checked_plan(fields: dict[str, Any]) -> Plan:

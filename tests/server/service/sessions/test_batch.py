@@ -180,6 +180,20 @@ def test_trajectories_and_poses_go_as_arrays(batch, site, join):
     assert moved["ego"][0, :2].tolist() == [1.0, 2.0]
 
 
+def test_the_gear_of_a_batch_is_that_of_its_plans(batch, site, join):
+    many, single = batch(2), join(site.create())
+    many.reset()
+    single.reset(**SPEC)
+    for step in range(4):
+        plans = {"kind": "control", "values": [[2.0, 0.0]] * 2, "reverse": [True, False]}
+        obs = many.ask("batch_action", steps=[step] * 2, plans=plans)
+        alone = single.act(step, acceleration=2.0, steering=0.0, gear="reverse")
+    assert row_of(obs, 0) == row_of_single(alone)
+    ahead, reversing = obs["ego"][1, 8], obs["ego"][0, 8]
+    assert ahead > reversing
+    assert bool(obs["reverse"][0]) == (alone["ego"].get("gear") == "reverse")
+
+
 def test_what_a_batch_has_not_is_refused_as_a_whole(batch):
     many = batch(2)
     refused = many.reset(SPEC | {"sensors": [{"camera": "front"}], "deadline_ms": 50})
