@@ -17,6 +17,7 @@ from ..settings import Settings
 from .http.accounting import Accounting
 from .http.auth import require_token
 from .http.hosts import LoopbackOnly
+from .http.idempotency import install_replay_handler
 from .http.openapi import published
 from .http.origins import OwnPagesOnly
 from .http.problems import install_problem_handlers
@@ -97,6 +98,7 @@ def create_app(settings: Settings) -> FastAPI:
     upload_paths = (*scene_imports.UPLOAD_PATHS, assets.UPLOAD_PATH)
     uploads = dict.fromkeys(upload_paths, settings.max_upload_bytes)
     install_problem_handlers(app)
+    install_replay_handler(app, worker.replayed)
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
     if not settings.wants_token:
         app.add_middleware(LoopbackOnly)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import random
-from contextlib import ExitStack
+import sqlite3
+import threading
+from contextlib import ExitStack, closing
 
 import httpx2
 import pytest
 
 from ..worker_processes import KillableWorker
+from .test_trouble import wait_until
 
 pytestmark = pytest.mark.network
 
@@ -69,6 +72,33 @@ def test_nothing_acknowledged_is_lost_between_any_two_requests(start):
                 done = {"revision": revision, "url": target, "json": json, "key": key}
                 acknowledged.append(done)
         client = start()
+
+
+@pytest.mark.slow
+def test_an_asset_whose_answer_was_not_stored_yet_is_answered_after_the_kill(start, tmp_path):
+    client = start()
+    cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "cut"}
+    request = {"url": "/v1/assets", "json": cut, "headers": {"Idempotency-Key": "once"}}
+    bundle = tmp_path / "data/assets/cut.r2a"
+    wait_until(lambda: client.get("/readyz").status_code == 200, 60)
+    with closing(sqlite3.connect(tmp_path / "data/real2sim.db")) as store:
+        store.execute("BEGIN IMMEDIATE")  # Whoever writes waits.
+        asking = threading.Thread(target=_without_answer, args=(client, request))
+        asking.start()
+        wait_until(bundle.exists)
+        client = start()
+        asking.join()
+        store.rollback()
+    again = client.post(**request)
+    assert again.status_code == 201, again.text
+    assert client.get("/v1/assets/cut").json() == again.json()
+    other = client.post(**request | {"headers": {"Idempotency-Key": "twice"}})
+    assert other.json()["code"] == "ALREADY_EXISTS"
+
+
+def _without_answer(client: httpx2.Client, request: dict) -> None:
+    with pytest.raises(httpx2.HTTPError):
+        client.post(**request)
 
 
 @pytest.mark.slow

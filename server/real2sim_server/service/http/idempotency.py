@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
-from fastapi import Header, Response
+from fastapi import FastAPI, Header, Response
 from pydantic import BaseModel
 from starlette.datastructures import FormData
 from starlette.requests import Request
 
 from real2sim_proto import ErrorCode
 
-from ..storage.store import Store, StoredReply
+from ..storage.store import Store, StoredReply, StoreError
 from ..storage.tokens import sealed, unsealed
 from ..token_file import DEFAULT_NAME
 from .accounting import usage_of
@@ -50,6 +52,11 @@ class IdempotentRequest:
     secret: str = ""
     replay: Response | None = None
 
+    @property
+    def claim(self) -> str | None:
+        """Names this request and no other; None without a key."""
+        return None if self.key is None else f"{self.key} {self.fingerprint}"
+
     def reply(
         self, body: BaseModel, *, status: int, headers: Mapping[str, str] | None = None
     ) -> StoredReply | None:
@@ -68,12 +75,25 @@ class IdempotentRequest:
         return StoredReply(self.key, self.fingerprint, status, dict(headers or {}), body)
 
 
+class AnsweredElsewhereError(Exception):
+    """Another worker has answered the same request meanwhile; what was begun here came too late.
+
+    Args:
+        answer: that of the other worker.
+    """
+
+    def __init__(self, answer: Response) -> None:
+        super().__init__("answered by another worker")
+        self.answer = answer
+
+
 class Idempotency:
     """Answers given under keys, shared by all routes of a worker.
 
     The answer is stored in the transaction of the effect, so that a crash leaves both or neither.
     Refusals are not stored: the same request may succeed later. A request that comes while the
-    first one under its key is still under way waits for that one's answer.
+    first one under its key is still under way waits for that one's answer; one that is under way at
+    another worker with the same store is refused by it, and gets that worker's answer.
     """
 
     def __init__(self, store: Store) -> None:
@@ -94,6 +114,7 @@ class Idempotency:
 
         Raises:
             ServiceError: IDEMPOTENCY_CONFLICT when the key was used for another request.
+            AnsweredElsewhereError: another worker was faster.
         """
         if key is None:
             yield IdempotentRequest()
@@ -105,21 +126,35 @@ class Idempotency:
         content = await request.body() if content is None else content
         fingerprint = _fingerprint(request, content)
         async with self._exclusive(full_key):
-            stored = await self._store.reply(full_key)
-            if stored is not None and stored.fingerprint != fingerprint:
-                raise ServiceError(
-                    ErrorCode.IDEMPOTENCY_CONFLICT,
-                    f"Idempotency-Key {key!r} was used for another request to this call",
-                    hint="make a new key for every new request",
-                )
-            replay = _response(stored, scoped) if stored else None
-            yield IdempotentRequest(full_key, fingerprint, scoped, replay)
+            given = partial(self._given, full_key, fingerprint, scoped, key)
+            replay = await given()
+            try:
+                yield IdempotentRequest(full_key, fingerprint, scoped, replay)
+            except Exception as error:
+                with contextlib.suppress(StoreError):
+                    if replay is None and (elsewhere := await given()) is not None:
+                        raise AnsweredElsewhereError(elsewhere) from error
+                raise
+
+    async def _given(
+        self, full_key: str, fingerprint: str, secret: str, key: str
+    ) -> Response | None:
+        """The answer given under a key. Raises ServiceError: IDEMPOTENCY_CONFLICT."""
+        stored = await self._store.reply(full_key)
+        if stored is None:
+            return None
+        if stored.fingerprint != fingerprint:
+            raise ServiceError(
+                ErrorCode.IDEMPOTENCY_CONFLICT,
+                f"Idempotency-Key {key!r} was used for another request to this call",
+                hint="make a new key for every new request",
+            )
+        return _response(stored, secret)
 
     async def store(self, reply: StoredReply | None) -> None:
         """Store an answer whose effect is not in the store, once it is there.
 
-        A crash in between leaves the effect alone; the same request is then refused, because what
-        it names exists.
+        A crash in between leaves the effect alone, which therefore bears the claim of its request.
         """
         if reply is not None:
             await self._store.write(reply=reply)
@@ -137,6 +172,16 @@ class Idempotency:
                 del self._locks[key]
             else:
                 self._locks[key] = (lock, users - 1)
+
+
+def install_replay_handler(app: FastAPI, replayed: Callable[[Response], Response]) -> None:
+    """Answer what another worker was faster with by its answer, which passes ``replayed``."""
+
+    async def respond(_request: Request, error: Exception) -> Response:
+        assert isinstance(error, AnsweredElsewhereError)
+        return replayed(error.answer)
+
+    app.add_exception_handler(AnsweredElsewhereError, respond)
 
 
 async def form_digest(form: FormData) -> bytes:

@@ -30,7 +30,8 @@ from ...scene.io import (
     stage_asset,
 )
 from ..http.problems import ServiceError
-from .imports import import_errors
+from .claims import bears_claim, put_claim
+from .imports import import_errors, staging_folder
 from .memory import IdleItem, MemoryBudget
 from .quotas import Quota, folder_usage
 
@@ -183,26 +184,32 @@ class AssetLibrary:
                 for asset_id, used_at in self._kept.items()
             ]
 
-    def add(self, asset: Asset) -> AssetInfo:
-        """Keep an asset.
+    def add(self, asset: Asset, *, claim: str | None = None) -> AssetInfo:
+        """Keep an asset; ``claim`` as in :mod:`.claims`.
 
         Raises:
             ServiceError: ALREADY_EXISTS: assets never change, because scenarios rely on them.
         """
         self.check_free(asset.asset_id)
-        save_asset(asset, self.bundle(asset.asset_id))
-        return self.info(asset.asset_id)
+        with staging_folder(self.folder) as staging:
+            save_asset(asset, staging / "bundle")
+            return self.adopt(staging / "bundle", asset.asset_id, claim=claim)
 
-    def adopt(self, folder: Path, asset_id: str) -> AssetInfo:
+    def adopt(self, folder: Path, asset_id: str, *, claim: str | None = None) -> AssetInfo:
         """Take in a whole bundle of that id, which lies on the disk of the library.
 
         Raises:
             ServiceError: ALREADY_EXISTS.
         """
+        put_claim(folder, claim)
         with self._lock:
             self.check_free(asset_id)
             folder.rename(self.bundle(asset_id))
         return self.info(asset_id)
+
+    def made_by(self, claim: str | None, asset_id: str) -> AssetInfo | None:
+        """The asset, if that request has made it already."""
+        return self.info(asset_id) if bears_claim(self.bundle(asset_id), claim) else None
 
     def check_free(self, asset_id: str) -> None:
         """Raises ServiceError: ALREADY_EXISTS where the id is taken."""
@@ -357,6 +364,7 @@ def import_asset(
     asset_id: str,
     limits: StagingLimits,
     quota: Quota,
+    claim: str | None = None,
 ) -> AssetInfo:
     """Add the asset in a splat file, upright, centred and at a real size.
 
@@ -367,11 +375,14 @@ def import_asset(
         asset_id: of the asset.
         limits: of the process that reads the file.
         quota: of the library.
+        claim: of the request, see :mod:`.claims`.
 
     Raises:
         ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for what comes out of the
             file, ALREADY_EXISTS, QUOTA_EXCEEDED.
     """
+    if (made := library.made_by(claim, asset_id)) is not None:
+        return made
     library.check_free(asset_id)
     quota.check()
     staged = source.parent / "bundle"
@@ -384,4 +395,4 @@ def import_asset(
     with import_errors(source, setting="MAX_ASSET_BYTES"):
         stage_asset(source, staged, asset_id=asset_id, options=options, limits=limits)
     quota.check(added_bytes=folder_usage(staged)[1])
-    return library.adopt(staged, asset_id)
+    return library.adopt(staged, asset_id, claim=claim)

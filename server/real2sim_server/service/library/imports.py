@@ -18,6 +18,7 @@ from ...scene import BundleTooLargeError, SceneError
 from ...scene.io import StagingError, StagingLimits, stage_scene
 from ..http.problems import ServiceError
 from ..storage.errors import FULL_ERRNOS, REFUSED_ERRNOS, is_full, is_refused
+from .claims import bears_claim, put_claim
 from .quotas import Quota, folder_usage
 from .scene_catalog import SCENE_DOCUMENT, bundle_folder
 
@@ -47,7 +48,13 @@ def resolve_import(root: Path, given: str) -> Path:
 
 
 def import_scene(
-    source: Path, *, scenes: Path, name: str, limits: StagingLimits, quota: Quota
+    source: Path,
+    *,
+    scenes: Path,
+    name: str,
+    limits: StagingLimits,
+    quota: Quota,
+    claim: str | None = None,
 ) -> None:
     """Read ``source`` whole, check it, and make it bundle ``name`` below ``scenes``.
 
@@ -57,18 +64,22 @@ def import_scene(
         name: of the new scene.
         limits: of the process that reads.
         quota: of the scene folder.
+        claim: of the request, see :mod:`.claims`; what it has made already stays as it is.
 
     Raises:
         ServiceError: IMPORT_FAILED when it cannot be read or written, PAYLOAD_TOO_LARGE for what
             comes out of it, ALREADY_EXISTS when the name is taken, QUOTA_EXCEEDED.
     """
     folder = bundle_folder(scenes, name)
+    if bears_claim(folder, claim):
+        return
     _check_name(folder, name)
     quota.check()
     with import_errors(source, setting="MAX_SCENE_BYTES"), staging_folder(scenes) as staging:
         staged = staging / folder.name
         stage_scene(source, staged, name=name, limits=limits)
         quota.check(added_bytes=folder_usage(staged)[1])
+        put_claim(staged, claim)
         _check_name(folder, name)
         staged.rename(folder)
 

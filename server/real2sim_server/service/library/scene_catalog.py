@@ -115,9 +115,10 @@ def bundle_folder(folder: Path, name: str) -> Path:
 
 
 def _fingerprint(path: Path) -> Fingerprint:
-    """Names, sizes and times of the files: any change of the bundle changes it."""
+    """Names, sizes and times of the files: any change of the bundle changes it. What is hidden is
+    no part of it."""
     try:
-        entries = sorted(path.iterdir())
+        entries = sorted(p for p in path.iterdir() if not p.name.startswith("."))
         stats = [(p.name, p.stat()) for p in entries]
     except OSError:
         return ()

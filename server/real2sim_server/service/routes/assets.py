@@ -23,6 +23,7 @@ from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError
 from ..http.responses import info_response
 from ..library.assets import extract_object, import_asset
+from ..library.claims import drop_claim
 from ..library.imports import import_errors, scene_name, staging_folder
 from ..library.thumbnails import draw_thumbnail
 from ..worker import Worker, WorkerOf
@@ -86,16 +87,18 @@ async def _added(
     worker: Worker,
     request: Request,
     key: str | None,
-    add_asset: Callable[[], Awaitable[AssetInfo]],
+    add_asset: Callable[[str | None], Awaitable[AssetInfo]],
     *,
     content: bytes | None = None,
 ) -> Response:
     async with worker.idempotency.guard(request, key, content=content) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
-        info = await add_asset()
+        info = await add_asset(idempotent.claim)
         headers = {"Location": f"/v1/assets/{info.asset_id}"}
         await worker.idempotency.store(idempotent.reply(info, status=201, headers=headers))
+        if idempotent.claim is not None:
+            await asyncio.to_thread(drop_claim, worker.assets.bundle(info.asset_id))
         return info_response(info, status=201, headers=headers)
 
 
@@ -161,21 +164,23 @@ async def _check_unused(worker: Worker, asset_id: str) -> None:
         )
 
 
-async def _extract(worker: Worker, body: bytes) -> AssetInfo:
+async def _extract(worker: Worker, body: bytes, claim: str | None) -> AssetInfo:
     cut = _parsed(AssetCut, body)
     scene = await worker.scene_cache.get(cut.scene)
     asset_id = cut.asset_id or cut.object_id
 
     def work() -> AssetInfo:
+        if (made := worker.assets.made_by(claim, asset_id)) is not None:
+            return made
         asset = extract_object(scene, cut.object_id, asset_id=asset_id, category=cut.category)
         worker.assets.check_free(asset_id)
         worker.assets_quota.check(added_bytes=asset.nbytes)
-        return worker.assets.add(asset)
+        return worker.assets.add(asset, claim=claim)
 
     return await worker.imports.run(work)
 
 
-async def _upload(worker: Worker, form: FormData) -> AssetInfo:
+async def _upload(worker: Worker, form: FormData, claim: str | None) -> AssetInfo:
     file = form.get("file")
     if not isinstance(file, UploadFile):
         raise ServiceError(
@@ -199,6 +204,7 @@ async def _upload(worker: Worker, form: FormData) -> AssetInfo:
                 asset_id=asset_id,
                 limits=worker.asset_limits,
                 quota=worker.assets_quota,
+                claim=claim,
             )
 
     return await worker.imports.run(work)

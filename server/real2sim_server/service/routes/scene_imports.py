@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -20,6 +21,7 @@ from ...scene.io.formats import suffixes
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError
+from ..library.claims import drop_claim
 from ..library.imports import (
     import_errors,
     import_scene,
@@ -27,6 +29,7 @@ from ..library.imports import (
     scene_name,
     staging_folder,
 )
+from ..library.scene_catalog import bundle_folder
 from ..worker import Worker, WorkerOf
 from .scenes import scene_response
 
@@ -79,36 +82,38 @@ async def _imported(
     worker: Worker,
     request: Request,
     key: str | None,
-    add_scene: Callable[[], Awaitable[str]],
+    add_scene: Callable[[str | None], Awaitable[str]],
     *,
     content: bytes | None = None,
 ) -> Response:
     async with worker.idempotency.guard(request, key, content=content) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
-        name = await add_scene()
+        name = await add_scene(idempotent.claim)
         await worker.scene_cache.refresh()
         headers = {"Location": f"/v1/scenes/{name}"}
         response = await scene_response(worker, name, status=201, headers=headers)
         reply = idempotent.reply_bytes(bytes(response.body), status=201, headers=headers)
         await worker.idempotency.store(reply)
+        if idempotent.claim is not None:
+            await asyncio.to_thread(drop_claim, bundle_folder(worker.settings.scenes_path, name))
         return response
 
 
-async def _import_path(worker: Worker, body: bytes) -> str:
+async def _import_path(worker: Worker, body: bytes, claim: str | None) -> str:
     request = _parse(body)
     settings = worker.settings
 
     def work() -> str:
         source = resolve_import(settings.import_path, request.path)
         name = scene_name(source, request.scene)
-        _import(worker, source, name)
+        _import(worker, source, name, claim)
         return name
 
     return await worker.imports.run(work)
 
 
-async def _import_upload(worker: Worker, form: FormData) -> str:
+async def _import_upload(worker: Worker, form: FormData, claim: str | None) -> str:
     file, given = form.get("file"), form.get("scene")
     if not isinstance(file, UploadFile) or not isinstance(given, str | None):
         raise ServiceError(
@@ -122,19 +127,20 @@ async def _import_upload(worker: Worker, form: FormData) -> str:
             import_errors(Path("upload"), setting="MAX_SCENE_BYTES"),
             staging_folder(worker.settings.scenes_path) as staging,
         ):
-            _import(worker, stored_upload(file, staging), name)
+            _import(worker, stored_upload(file, staging), name, claim)
         return name
 
     return await worker.imports.run(work)
 
 
-def _import(worker: Worker, source: Path, name: str) -> None:
+def _import(worker: Worker, source: Path, name: str, claim: str | None) -> None:
     import_scene(
         source,
         scenes=worker.settings.scenes_path,
         name=name,
         limits=worker.scene_limits,
         quota=worker.scenes_quota,
+        claim=claim,
     )
 
 

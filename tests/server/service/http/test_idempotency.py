@@ -188,3 +188,37 @@ def test_an_upload_sent_twice_with_other_boundaries_takes_effect_once(
     assert len(client.get(path).json()[name]) == before + 1
     other = client.post(path, files={"file": ("car.ply", content + b"\0")}, headers=KEY)
     assert other.json()["code"] == ErrorCode.IDEMPOTENCY_CONFLICT
+
+
+# --- a crash between files and their answer -------------------------------------------------------
+
+
+def test_what_a_crash_left_without_its_answer_is_known_by_its_request(
+    client, tmp_path, tiny_scene, monkeypatch
+):
+    (tmp_path / "import").mkdir()
+    file = tmp_path / "import" / "car.ply"
+    write_ply(tiny_scene.objects["car_red"].cloud, file)
+    cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "cut"}
+    for key, path, request in (
+        ("cut", "/v1/assets", {"json": cut}),
+        ("upload", "/v1/assets", {"files": {"file": ("car.ply", file.read_bytes())}}),
+        ("import", "/v1/scenes", {"json": {"path": "car.ply"}}),
+    ):
+        headers = {"Idempotency-Key": key}
+        before = len(client.get(path).json()[path[4:]])
+        with monkeypatch.context() as patch:
+            patch.setattr(client.app.state.worker.store, "write", _fail)
+            assert client.post(path, headers=headers, **request).status_code >= 500
+        again = client.post(path, headers=headers, **request)
+        assert again.status_code == 201, again.text
+        assert client.get(again.headers["Location"]).status_code == 200
+        assert len(client.get(path).json()[path[4:]]) == before + 1
+        # Whoever comes with another key finds the name taken.
+        other = client.post(path, headers={"Idempotency-Key": f"{key} 2"}, **request)
+        assert other.json()["code"] == ErrorCode.ALREADY_EXISTS
+    assert not list(tmp_path.rglob(".made_by"))
+
+
+async def _fail(*_args, **_options):
+    raise OSError("the machine goes down")

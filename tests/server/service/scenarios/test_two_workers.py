@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
+from fastapi.testclient import TestClient
+
+from real2sim_server.scene.io import save_scene
+from real2sim_server.service.app import create_app
+from real2sim_server.settings import Settings
 
 from ..postgres import Postgres
 
@@ -12,17 +20,35 @@ MOVE = {"op": "translate", "object_id": "post", "x": 0.5}
 DELETE = {"op": "delete", "object_id": "car_red"}
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def workers(request, start_worker, tmp_path):
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def workers(request, tmp_path_factory, tiny_scene) -> Iterator[list[TestClient]]:
+    folder = tmp_path_factory.mktemp("shared")
+    save_scene(tiny_scene, folder / "scenes" / "tiny.r2s")
     if request.param == "sqlite":
-        url = f"sqlite:///{tmp_path / 'shared.db'}"
+        url = f"sqlite:///{folder / 'shared.db'}"
     else:
         server: Postgres = request.getfixturevalue("postgres")
         url = server.new_database()
-    return [
-        start_worker(worker_id=name, data_dir=tmp_path / name, store_url=url)
-        for name in ("w0", "w1")
-    ]
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(
+                TestClient(create_app(_settings(folder, name, url)), base_url="http://127.0.0.1")
+            )
+            for name in ("w0", "w1")
+        ]
+
+
+def _settings(folder: Path, name: str, url: str) -> Settings:
+    return Settings(
+        worker_id=name,
+        data_dir=folder / name,
+        scenes_dir=folder / "scenes",
+        store_url=url,
+        port=0,
+        backend="cpu",
+        log_level="error",
+        drain_seconds=0,
+    )
 
 
 @pytest.fixture
@@ -73,6 +99,47 @@ def test_a_scenario_that_the_other_worker_has_deleted_is_gone(workers, scenario)
     assert workers[0].delete(scenario).status_code == 204
     assert workers[1].get(scenario).json()["code"] == "UNKNOWN_SCENARIO"
     assert edit(workers[1], scenario, MOVE).json()["code"] == "UNKNOWN_SCENARIO"
+
+
+def looking_too_early(worker, monkeypatch) -> None:
+    """The worker's next look for an answer happens before the other worker has stored it."""
+    store = worker.app.state.worker.store
+    given, looks = store.reply, []
+
+    async def reply(key: str):
+        looks.append(key)
+        return None if len(looks) == 1 else await given(key)
+
+    monkeypatch.setattr(store, "reply", reply)
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("{scenario}/operations", {"operations": [MOVE]}),
+        ("/v1/scenarios", {"scene": "tiny"}),
+        ("/v1/sessions?scene=tiny", None),
+        ("/v1/exports", {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}),
+    ],
+    ids=["edit", "scenario", "session", "job"],
+)
+def test_a_request_sent_to_both_workers_at_once_takes_effect_once(
+    workers, scenario, monkeypatch, path, body
+):
+    path, key = path.format(scenario=scenario), {"Idempotency-Key": scenario}
+    first = workers[0].post(path, json=body, headers=key)
+    before = all_there_is(workers[1], scenario)
+    looking_too_early(workers[1], monkeypatch)
+    second = workers[1].post(path, json=body, headers=key)
+    assert (second.status_code, second.json()) == (first.status_code, first.json())
+    assert second.headers["Idempotent-Replayed"] == "true"
+    assert all_there_is(workers[1], scenario) == before
+
+
+def all_there_is(worker, scenario) -> tuple[int, ...]:
+    """Revisions of the scenario; numbers of scenarios, sessions and jobs of a worker."""
+    lists = (worker.get(f"/v1/{name}").json()[name] for name in ("scenarios", "sessions", "jobs"))
+    return worker.get(scenario).json()["revision"], *map(len, lists)
 
 
 def test_edits_at_both_workers_at_once_are_all_kept_in_one_order(workers, scenario):
