@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
+import shutil
+import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -66,6 +69,22 @@ def start_worker(run_worker) -> Iterator[Callable[..., TestClient]]:
 @pytest.fixture
 def client(start_worker) -> TestClient:
     return start_worker()
+
+
+@pytest.fixture
+def small_disk() -> Iterator[Path]:
+    """A file system of 4 MiB."""
+    if os.getuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("needs root, to mount a small file system")
+    with tempfile.TemporaryDirectory(prefix="real2sim-disk-") as folder:
+        mounted = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder]
+        done = subprocess.run(mounted, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+        try:
+            yield Path(folder)
+        finally:
+            subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @pytest.fixture(scope="session")

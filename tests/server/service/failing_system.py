@@ -27,6 +27,7 @@ SOURCE = r"""
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <sys/statvfs.h>
 #include <sys/types.h>
 #include <time.h>
 #include <unistd.h>
@@ -91,14 +92,19 @@ int rename(const char *from, const char *to) {
     NEXT(int, rename, const char *, const char *);
     return fails_at(to) ? -1 : next(from, to);
 }
-static int opens_to_write(int flags) {
-    return flags & (O_CREAT | O_TRUNC) || (flags & O_ACCMODE) != O_RDONLY;
+static int fails_to_open(const char *path, int flags) {
+    int writes = flags & (O_CREAT | O_TRUNC) || (flags & O_ACCMODE) != O_RDONLY;
+    if (!writes || !fails_at(path)) return 0;
+    /* On a full disk files that are there can be opened. */
+    if (errno == ENOSPC && access(path, F_OK) == 0) return 0;
+    if (errno == ENOENT) errno = ENOSPC;
+    return 1;
 }
 #define OPEN(name) \
 int name(const char *path, int flags, ...) { \
     va_list more; va_start(more, flags); mode_t mode = va_arg(more, mode_t); va_end(more); \
     NEXT(int, name, const char *, int, ...); \
-    return opens_to_write(flags) && fails_at(path) ? -1 : next(path, flags, mode); \
+    return fails_to_open(path, flags) ? -1 : next(path, flags, mode); \
 }
 OPEN(open)
 OPEN(open64)
@@ -106,10 +112,20 @@ OPEN(open64)
 int name(int at, const char *path, int flags, ...) { \
     va_list more; va_start(more, flags); mode_t mode = va_arg(more, mode_t); va_end(more); \
     NEXT(int, name, int, const char *, int, ...); \
-    return opens_to_write(flags) && fails_at(path) ? -1 : next(at, path, flags, mode); \
+    return fails_to_open(path, flags) ? -1 : next(at, path, flags, mode); \
 }
 OPENAT(openat)
 OPENAT(openat64)
+
+#define STATVFS(name) \
+int name(const char *path, struct name *found) { \
+    NEXT(int, name, const char *, struct name *); \
+    int done = next(path, found); \
+    if (!done && fails_at(path) == ENOSPC) found->f_bfree = found->f_bavail = 0; \
+    return done; \
+}
+STATVFS(statvfs)
+STATVFS(statvfs64)
 
 int clock_gettime(clockid_t which, struct timespec *now) {
     NEXT(int, clock_gettime, clockid_t, struct timespec *);

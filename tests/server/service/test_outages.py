@@ -1,4 +1,4 @@
-"""A state folder that cannot be written to, a clock that goes back, a database that is away for
+"""A disk that is full or cannot be written to, a clock that goes back, a database that is away for
 half a minute: each has an answer of its own, nothing is lost, and all goes on by itself."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from real2sim_server.scene.io import save_scene, write_splats
 
 from .failing_system import BROKEN, NO_SPACE, READ_ONLY, FailingSystem, failing_system
 from .postgres import Postgres, running_postgres
-from .test_trouble import Site, assert_told, is_ready, stopped, wait_until
+from .test_trouble import Site, assert_told, filled, is_ready, stopped, wait_until
 
 pytestmark = [
     pytest.mark.network,
@@ -204,18 +204,86 @@ def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_folder_that_is_read_only_for_half_a_minute_costs_nothing_but_the_time(apart, system):
+@pytest.mark.parametrize(
+    ("number", "code", "status"),
+    [(READ_ONLY, "STORAGE_UNAVAILABLE", 503), (NO_SPACE, "STORAGE_FULL", 507)],
+    ids=["read-only", "full"],
+)
+def test_a_folder_that_takes_nothing_for_half_a_minute_costs_nothing_but_the_time(
+    apart, system, number, code, status
+):
     site = Site(apart)
     assert site.edit().status_code == 200
     assert site.step().status_code == 200
-    with system.refusing_writes(READ_ONLY):
+    cut = CUT | {"asset_id": f"car_{code.lower()}"}
+    with system.refusing_writes(number):
         ended = time.monotonic() + OUTAGE_S
         while time.monotonic() < ended:
-            assert_told(site.edit("edit"), "STORAGE_UNAVAILABLE", 503)
-            assert_told(site.step("step"), "STORAGE_UNAVAILABLE", 503)
+            assert_told(site.edit("edit"), code, status)
+            assert_told(site.step("step"), code, status)
+            assert_told(apart.post("/v1/assets", json=cut), code, status)
             assert not is_ready(apart)
+            assert apart.get("/livez").status_code == 200
             time.sleep(0.5)
+        site.check_nothing_is_lost()
     wait_until(lambda: is_ready(apart))
     assert site.edit("edit").status_code == 200
     assert site.step("step").status_code == 200
+    assert apart.post("/v1/assets", json=cut).status_code == 201
+    site.check_nothing_is_lost()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_disk_that_is_full_for_half_a_minute_costs_nothing_but_the_time(small_disk, start_worker):
+    """A real one, where there is leave to mount one."""
+    client = start_worker(data_dir=small_disk / "data")
+    site = Site(client)
+    assert site.edit().status_code == 200
+    told = 0
+    with filled(small_disk):
+        ended = time.monotonic() + OUTAGE_S
+        while time.monotonic() < ended:
+            # An episode has but few steps.
+            steps = [site.step()] if site.steps < 10 else []
+            for answer in (site.edit(), *steps):
+                if answer.status_code != 200:  # There may be some pages left in the journal.
+                    assert_told(answer, "STORAGE_FULL", 507)
+                    told += 1
+            assert client.get("/livez").status_code == 200
+            time.sleep(0.05)
+        assert told > 20
+        assert not is_ready(client)
+        site.check_nothing_is_lost()
+    wait_until(lambda: is_ready(client))
+    assert site.edit().status_code == 200
+    assert site.step().status_code == 200
+    site.check_nothing_is_lost()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_clock_that_is_an_hour_behind_for_half_a_minute_changes_nothing(apart, system):
+    site = Site(apart)
+    assert site.edit("before").status_code == 200
+    made = []
+    system.set_clock(-3600)
+    try:
+        ended = time.monotonic() + OUTAGE_S
+        while time.monotonic() < ended:
+            assert site.edit("before").headers["Idempotent-Replayed"] == "true"
+            site.edits -= 1
+            assert site.edit().status_code == 200
+            if site.steps < 10:  # An episode has but few.
+                assert site.step().status_code == 200
+            made.append(apart.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"])
+            assert is_ready(apart)
+            time.sleep(0.5)
+    finally:
+        system.set_clock(0)
+    assert site.edit("before").headers["Idempotent-Replayed"] == "true"
+    site.edits -= 1
+    assert site.step().status_code == 200
+    listed = [s["scenario_id"] for s in apart.get("/v1/scenarios").json()["scenarios"]]
+    assert [f"/v1/scenarios/{i}" for i in listed[-len(made) :]] == made
     site.check_nothing_is_lost()

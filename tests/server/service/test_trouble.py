@@ -4,9 +4,6 @@ meanwhile, and that nothing acknowledged is lost and all goes on by itself."""
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -74,22 +71,6 @@ def assert_told(answer, code: str, status: int) -> None:
     problem = answer.json()
     assert (problem["code"], problem["retryable"]) == (code, True)
     assert float(answer.headers["Retry-After"]) > 0
-
-
-@pytest.fixture
-def small_disk() -> Iterator[Path]:
-    """A file system of 4 MiB."""
-    if os.getuid() != 0 or shutil.which("mount") is None:
-        pytest.skip("needs root, to mount a small file system")
-    with tempfile.TemporaryDirectory(prefix="real2sim-disk-") as folder:
-        mounted = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder]
-        done = subprocess.run(mounted, capture_output=True, text=True, check=False)
-        if done.returncode:
-            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
-        try:
-            yield Path(folder)
-        finally:
-            subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @contextlib.contextmanager

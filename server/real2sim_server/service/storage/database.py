@@ -24,6 +24,7 @@ from .connection import connect, file_of, shown_url
 from .errors import (
     StoreBusyError,
     StoreError,
+    StoreFullError,
     StoreTroubleError,
     StoreUnavailableError,
     sorted_error,
@@ -354,7 +355,9 @@ class Database:
         try:
             if self._name_on_server is not None:
                 self._name_on_server.hold()
-            if self._trouble is not None and self._file is not None:
+            # On a full disk connections stay good, and new ones might not get their journal.
+            full = isinstance(self._trouble, StoreFullError)
+            if self._trouble is not None and self._file is not None and not full:
                 self._reconnect()
             with self._connected().connect() as connection:
                 connection.execute(sa.select(version)).all()

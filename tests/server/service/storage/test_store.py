@@ -187,6 +187,38 @@ def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
     assert run(sqlite_url, work)
 
 
+NORMAL, FULL = 1, 2
+"""How SQLite names what it waits for: nothing at a commit, or the disk."""
+
+
+@pytest.mark.parametrize(
+    ("durability", "edit", "step", "answered_step"),
+    [("all", FULL, FULL, FULL), ("edits", FULL, NORMAL, FULL), ("process", NORMAL, NORMAL, NORMAL)],
+)
+def test_what_is_promised_is_on_the_disk_before_it_is_acknowledged(
+    sqlite_url, durability, edit, step, answered_step
+):
+    async def work(store):
+        def waits_for() -> int:
+            writer = store.database._writer.connection.dbapi_connection
+            return writer.execute("PRAGMA synchronous").fetchone()[0]
+
+        seen = []
+        for write in (
+            store.create_scenario(SCENARIO),
+            store.create_session(SESSION),
+            store.append_session_entries("w0.1", [SessionEntry(0, "action", 0, b"", 1)]),
+            store.append_session_entries(
+                "w0.1", [SessionEntry(1, "action", 1, b"", 1)], reply=REPLY
+            ),
+        ):
+            await write
+            seen.append(await store.database.on_thread(waits_for))
+        return seen
+
+    assert run(sqlite_url, work, durability=durability) == [edit, edit, step, answered_step]
+
+
 def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
     async def nothing(store):
         pass
