@@ -246,6 +246,11 @@ class Welcome(ServerEnvelope):
     limits: dict[str, int]
     cameras: list[CameraInfo]
     objects: list[ObjectInfo]
+    route: Array | None = Field(
+        default=None,
+        description="[R, 4] float64 x, y, z [m], heading [rad] along the recorded drive, world, a "
+        "point every metre (4096 at most); None: of a worker that does not say",
+    )
     start_us: Microseconds
     end_us: Microseconds
     step: int | None = Field(description="of the running episode; None before reset")

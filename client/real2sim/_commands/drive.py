@@ -33,7 +33,7 @@ def drive(
         str,
         typer.Option(
             help="follow_route, pid, idm, depth_sampling, learned=FILE, neuroncap=URL, "
-            "alpasim=HOST:PORT, or 'module:Class'."
+            "alpasim=HOST:PORT, carla=FILE, or 'module:Class'."
         ),
     ] = "follow_route",
     steps: Annotated[int, typer.Option(min=1, help="Clock steps; fewer when it ends.")] = 100,

@@ -112,6 +112,9 @@ def run_episode(
         >>> sorted(summary.stages)[:3]
         ['loop', 'plan', 'step']
     """
+    begin = getattr(planner, "begin", None)
+    if begin is not None:
+        begin(session.welcome)
     obs = session.reset(sensors=sensors, **options)
     planner.reset(obs)
     log = _EpisodeLog(obs)

@@ -23,6 +23,7 @@ BUILT_IN = {
     "learned": "real2sim.planners.learned:LearnedPolicy",
     "neuroncap": "real2sim.planners.neuroncap:NeuroNcap",
     "alpasim": "real2sim.planners.alpasim:AlpasimDriver",
+    "carla": "real2sim.planners.carla_agent:CarlaAgent",
 }
 
 
@@ -31,6 +32,8 @@ class Planner(Protocol):
     """Drives: sees observations, answers with plans.
 
     One that must see more than the ego and its route has an attribute ``needs``: :class:`Needs`.
+    One that must know the session's cameras or its whole route has a method ``begin(welcome)``,
+    which is called before ``reset``.
     """
 
     def reset(self, obs: Observation) -> None:

@@ -156,6 +156,12 @@ class _IsolatedPlanner:
         self._planner, self._session, self._case = planner, session, case
         self.error: str | None = None
 
+    def begin(self, welcome: Any) -> None:
+        begin = getattr(self._planner, "begin", None)
+        if begin is not None:
+            with self._catching_errors():
+                begin(welcome)
+
     def reset(self, obs: Observation) -> None:
         if self._case.operations:
             self._session.edit(self._case.operations)

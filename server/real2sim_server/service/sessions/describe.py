@@ -15,7 +15,8 @@ from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
 
 from ...edit import EditOutcome
-from ...world import Event, Score, World, agent_fields, ego_fields, metrics_version
+from ...world import Event, LoggedPath, Score, World, agent_fields, ego_fields, metrics_version
+from ...world.ego.route import whole_route
 from ..library.views import camera_infos, edited_objects
 from .session import Session
 
@@ -94,6 +95,7 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
         },
         "cameras": [c.model_dump(mode="json") for c in camera_infos(tuple(start.scene.rig))],
         "objects": [o.model_dump(mode="json", exclude_none=True) for o in infos],
+        "route": whole_route(LoggedPath(start.scene.ego)),
         "start_us": start.scene.start_us,
         "end_us": start.scene.end_us,
         "step": world.steps if world else None,

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+
 from ..path import Float, LoggedPath
 from ..path_kernels import turn_between, waypoints
+
+ROUTE_SPACING, ROUTE_POINTS = 1.0, 4096
+"""Of a whole route: way from point to point [m], and how many points it has at most."""
 
 Command = Literal["straight", "left", "right"]
 
@@ -32,6 +37,12 @@ def route_ahead(path: LoggedPath, s: float, x: float, y: float, yaw: float) -> F
     """
     found: Float = waypoints(path.knots, s, (x, y, yaw), WAYPOINTS, WAYPOINT_SPACING)
     return found
+
+
+def whole_route(path: LoggedPath) -> Float:
+    """[N, 4] float64, x, y, z [m] and heading [rad] along a path from its start to its end."""
+    count = min(max(round(path.length / ROUTE_SPACING), 1), ROUTE_POINTS - 1) + 1
+    return np.array([path.at(s) for s in np.linspace(0.0, path.length, count).tolist()])
 
 
 def command_ahead(path: LoggedPath, s: float) -> Command:

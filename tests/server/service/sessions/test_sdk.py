@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import real2sim
+from real2sim.planners import load_planner, run_episode
 
 pytestmark = pytest.mark.network
 
@@ -25,6 +26,48 @@ def test_a_drive_from_reset_to_result(client):
     assert session.result.steps == 20
     assert session.result.reason == "horizon"
     assert client.sessions.list() == []
+
+
+AGENT = """
+import carla
+
+def get_entry_point():
+    return "Cruise"
+
+class Cruise:
+    def setup(self, path_to_conf_file):
+        pass
+
+    def sensors(self):
+        return [{"type": "sensor.camera.rgb", "x": 0.7, "y": 0.0, "z": 1.6, "roll": 0, "pitch": 0,
+                 "yaw": 10, "width": 32, "height": 24, "fov": 40, "id": "Middle"},
+                {"type": "sensor.speedometer", "reading_frequency": 20, "id": "Speed"}]
+
+    def set_global_plan(self, gps, world):
+        self.points = len(gps)
+
+    def run_step(self, input_data, timestamp):
+        assert input_data["Middle"][1].any() and self.points > 5
+        return carla.VehicleControl(throttle=float(input_data["Speed"][1]["speed"] < 5))
+
+    def destroy(self):
+        pass
+"""
+
+
+def test_an_agent_of_the_carla_leaderboard_drives(client, tmp_path):
+    (tmp_path / "cruise.py").write_text(AGENT)
+    planner = load_planner(f"carla={tmp_path / 'cruise.py'}")
+    with client.session(scene="tiny") as session:
+        sensors = planner.needs.sensors(session.welcome.cameras)
+        summary = run_episode(session, planner, sensors=sensors, action="control")
+        route = session.welcome.route
+    planner.close()
+
+    assert summary.reason == "horizon"
+    assert summary.metrics["feasible"] == 1.0
+    assert route.shape[1] == 4
+    assert np.diff(route[:, 0]) == pytest.approx(1.0, abs=0.1)
 
 
 def test_edits_and_views_on_the_way(client):
