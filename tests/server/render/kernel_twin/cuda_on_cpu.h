@@ -38,6 +38,7 @@ static inline unsigned __float_as_uint(float x) { return same_bits<unsigned>(x);
 static inline float __int_as_float(int x) { return same_bits<float>(x); }
 static inline float __uint_as_float(unsigned x) { return same_bits<float>(x); }
 static inline int __popc(unsigned x) { return __builtin_popcount(x); }
+static inline int __ffs(unsigned x) { return __builtin_ffs(int(x)); }
 static inline void __threadfence() {}
 template <class T> static inline T __ldcg(const T* at) { return *at; }
 static inline unsigned atomicAdd(unsigned* at, unsigned value) {

@@ -8,6 +8,7 @@
 
 constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;
+constexpr uint32 WARP_LINES = WARP / TILE;  // of pixels
 
 struct Pixel {
     float rgb[3];
@@ -79,6 +80,40 @@ __device__ __forceinline__ void write_pixel(
     if (frame.semantic) frame.semantic[at] = uint16(pixel.ids >> 16);
 }
 
+// Whether a splat can show on the pixels of a warp, of which the centres lie from (x_low, y_low) to
+// TILE - 1 further right and WARP_LINES - 1 further down. Takes some too many, for rounding.
+__device__ __forceinline__ bool may_touch(float4 a, float4 b, float x_low, float y_low) {
+    const float product = 4.0f * a.z * b.x;
+    const float determinant = product - a.w * a.w - 1e-6f * product;  // of the conic; not above it
+    const float dx = fmaxf(fmaxf(x_low - a.x, a.x - (x_low + float(TILE - 1))), 0.0f);
+    const float dy = fmaxf(fmaxf(y_low - a.y, a.y - (y_low + float(WARP_LINES - 1))), 0.0f);
+    const float reach = 4.0f * b.z;
+    return !(dx * dx * determinant > reach * b.x || dy * dy * determinant > reach * a.z);
+}
+
+// Blends a splat into a pixel; false where the pixel takes no more.
+__device__ __forceinline__ bool add_splat(
+    float4 a, float4 b, const float4& c, float px, float py, Pixel& pixel) {
+    const float dx = px - a.x, dy = py - a.y;
+    const float sigma = fmaf(dx, fmaf(a.z, dx, a.w * dy), b.x * dy * dy);
+    if (sigma < 0.0f || sigma > b.z) return true;
+    const float alpha = fminf(b.y * exp_negative(sigma), ALPHA_MAX);
+    if (alpha < ALPHA_MIN) return true;
+    const float after = pixel.transmittance * (1.0f - alpha);
+    if (after <= TRANSMITTANCE_MIN) return false;
+    const float weight = alpha * pixel.transmittance;
+    pixel.rgb[0] = fmaf(weight, c.x, pixel.rgb[0]);
+    pixel.rgb[1] = fmaf(weight, c.y, pixel.rgb[1]);
+    pixel.rgb[2] = fmaf(weight, c.z, pixel.rgb[2]);
+    pixel.weighted_depth = fmaf(weight, b.w, pixel.weighted_depth);
+    if (pixel.transmittance > 0.5f && after <= 0.5f) {
+        pixel.median = b.w;
+        pixel.ids = __float_as_uint(c.w);
+    }
+    pixel.transmittance = after;
+    return true;
+}
+
 // One block a tile of any camera, one thread a pixel.
 extern "C" __global__ void __launch_bounds__(THREADS) blend(const Frame* given, uint32) {
     __shared__ float4 first[THREADS], second[THREADS], third[THREADS];
@@ -91,6 +126,9 @@ extern "C" __global__ void __launch_bounds__(THREADS) blend(const Frame* given, 
     const uint32 y = tile / camera.tiles_x * TILE + threadIdx.x / TILE;
     const bool inside = x < camera.width && y < camera.height;
     const float px = float(x) + 0.5f, py = float(y) + 0.5f;
+    const uint32 lane = threadIdx.x % WARP;
+    const float x_low = float(x - threadIdx.x % TILE) + 0.5f;
+    const float y_low = float(y - threadIdx.x / TILE % WARP_LINES) + 0.5f;
     const uint32* members = frame.members[frame.tile_passes & 1u];
     const uint2 range = frame.tile_ranges[blockIdx.x];
     Pixel pixel = {{0.0f, 0.0f, 0.0f}, 1.0f, 0.0f, 0.0f, 0};
@@ -106,29 +144,15 @@ extern "C" __global__ void __launch_bounds__(THREADS) blend(const Frame* given, 
         }
         __syncthreads();
         const uint32 count = min(THREADS, range.y - start);
-        for (uint32 j = 0; j < count && !done; ++j) {
-            const float4 a = first[j], b = second[j];
-            const float dx = px - a.x, dy = py - a.y;
-            const float sigma = fmaf(dx, fmaf(a.z, dx, a.w * dy), b.x * dy * dy);
-            if (sigma < 0.0f || sigma > b.z) continue;
-            const float alpha = fminf(b.y * exp_negative(sigma), ALPHA_MAX);
-            if (alpha < ALPHA_MIN) continue;
-            const float after = pixel.transmittance * (1.0f - alpha);
-            if (after <= TRANSMITTANCE_MIN) {
-                done = true;
-                continue;
+        for (uint32 group = 0; group < count; group += WARP) {
+            if (!__ballot_sync(ALL_LANES, !done)) break;
+            const uint32 mine = group + lane;
+            const bool near = mine < count && may_touch(first[mine], second[mine], x_low, y_low);
+            // Each lane has looked at one splat for the whole warp.
+            for (uint32 left = __ballot_sync(ALL_LANES, near); left && !done; left &= left - 1) {
+                const uint32 j = group + __ffs(left) - 1;
+                done = !add_splat(first[j], second[j], third[j], px, py, pixel);
             }
-            const float4 c = third[j];
-            const float weight = alpha * pixel.transmittance;
-            pixel.rgb[0] = fmaf(weight, c.x, pixel.rgb[0]);
-            pixel.rgb[1] = fmaf(weight, c.y, pixel.rgb[1]);
-            pixel.rgb[2] = fmaf(weight, c.z, pixel.rgb[2]);
-            pixel.weighted_depth = fmaf(weight, b.w, pixel.weighted_depth);
-            if (pixel.transmittance > 0.5f && after <= 0.5f) {
-                pixel.median = b.w;
-                pixel.ids = __float_as_uint(c.w);
-            }
-            pixel.transmittance = after;
         }
     }
     if (inside) write_pixel(frame, camera, pixel, x, y);
