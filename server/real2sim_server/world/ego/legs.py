@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..path import Float
 from .motion import Motion
-from .reference import PlannedTrajectory
+from .reference import PlannedTrajectory, ways_along
 
 CUSP, ON_AGAIN = 0.05, 0.02
 """A plan turns back where it goes the other way for this far, and goes on forwards again for this;
@@ -43,10 +43,9 @@ def legs_of(trajectory: PlannedTrajectory, motion: Motion) -> tuple[Leg, ...]:
     poses = trajectory.poses
     if len(poses) == 1:
         return (Leg(_is_behind(poses[0], motion), trajectory),)
-    along = _ways(poses)
-    if not motion.reversing and float(along.min()) >= 0.0:
+    if not motion.reversing and trajectory.leads_forwards:
         return (Leg(False, trajectory),)
-    turns = _turns(along, backwards=motion.reversing)
+    turns = _turns(ways_along(poses), backwards=motion.reversing)
     legs = []
     for k, (begin, backwards) in enumerate(turns):
         end = turns[k + 1][0] if k + 1 < len(turns) else len(poses) - 1
@@ -71,17 +70,8 @@ def may_lead_backwards(plans: Float) -> NDArray[np.bool_]:
         x, y, yaw = plans[:, 0].T
         behind: NDArray[np.bool_] = np.less(x * (1 + np.cos(yaw)) + y * np.sin(yaw), 0.0)
         return behind
-    against: NDArray[np.bool_] = np.any(_ways(plans) < 0, axis=1)
+    against: NDArray[np.bool_] = np.any(ways_along(plans) < 0, axis=1)
     return against
-
-
-def _ways(poses: Float) -> Float:
-    """Way from each pose to the next along their mean heading [m]."""
-    x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    dx, dy = x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1]
-    ways: Float = (dx * (cos[..., 1:] + cos[..., :-1]) + dy * (sin[..., 1:] + sin[..., :-1])) / 2
-    return ways
 
 
 def _turns(along: Float, *, backwards: bool) -> list[tuple[int, bool]]:

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,11 @@ class PlannedTrajectory:
             numbers = world_poses(numbers, frame)
         return PlannedTrajectory(np.array(times_us, np.int64), numbers)
 
+    @cached_property
+    def leads_forwards(self) -> bool:
+        """Whether no pose lies behind the one before, as both head."""
+        return len(self.poses) > 1 and float(ways_along(self.poses).min()) >= 0.0
+
     def after(self, t_us: int) -> PlannedTrajectory:
         """What of it is still to come: its end, at once, where all of it is over."""
         if t_us < self.times_us.item(0):
@@ -51,6 +57,15 @@ class PlannedTrajectory:
         if over == len(self.times_us):
             return PlannedTrajectory(np.array([t_us + 1]), self.poses[-1:])
         return PlannedTrajectory(self.times_us[over:], self.poses[over:])
+
+
+def ways_along(poses: Float) -> Float:
+    """[..., N - 1] way from each of poses [..., N, 3] to the next along their mean heading [m]."""
+    x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    dx, dy = x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1]
+    ways: Float = (dx * (cos[..., 1:] + cos[..., :-1]) + dy * (sin[..., 1:] + sin[..., :-1])) / 2
+    return ways
 
 
 class ReferenceTrajectory:

@@ -165,7 +165,8 @@ def tracker_of(
 
 
 def _geared(leg: Leg, motion: Motion, start_us: int, spec: EgoSpec) -> GearedLeg:
-    begin_us, trajectory = leg.begin_us or start_us, leg.trajectory
+    begin_us = start_us if leg.begin_us is None else leg.begin_us
+    trajectory = leg.trajectory
     if leg.cusp is not None:
         x, y, yaw = leg.cusp
         motion = Motion(x, y, yaw)
