@@ -10,11 +10,13 @@ from real2sim_server.render.backends.select import BACKENDS
 
 from .backend_contract import check_contract
 
+ON_GPU = ("cuda", "nvrtc")
+
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(status.name, marks=[pytest.mark.gpu] if status.name == "cuda" else [])
+        pytest.param(status.name, marks=[pytest.mark.gpu] if status.name in ON_GPU else [])
         for status in describe_backends()
         if status.usable
     ],
@@ -54,5 +56,5 @@ def test_a_name_that_is_taken_is_refused(single):
 
 
 def test_an_unknown_backend_is_refused_with_those_there_are(single):
-    with pytest.raises(RenderError, match=r"\['cpu', 'cuda', 'reference', 'single'\]"):
+    with pytest.raises(RenderError, match=r"\['cpu', 'cuda', 'nvrtc', 'reference', 'single'\]"):
         select_backend("vulkan")

@@ -26,6 +26,7 @@ from real2sim_server.render.backends.nvrtc import backend as backend_module
 from real2sim_server.render.backends.nvrtc import records
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.render.backends.nvrtc.memory import tile_passes
+from real2sim_server.render.backends.nvrtc.needs import unmet_need
 from real2sim_server.render.backends.nvrtc.tables import Tables, tables_of
 from real2sim_server.render.rasterize import checked_request, views_of
 from real2sim_server.scene import GaussianCloud, Sky, TimeColour
@@ -116,6 +117,19 @@ def test_pictures_are_those_of_the_reference(
     assert expected.instance is not None
     assert torch.equal(given.instance, expected.instance)
     assert len(set(expected.instance.int().unique().tolist())) > 1
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(unmet_need() is not None, reason="no GPU that the kernels can be compiled for")
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_a_gpu_gives_the_bits_of_the_cpu(serving: NvrtcBackend, mode: str) -> None:
+    options = RasterOptions(rasterize_mode=mode)
+    instances = [Instance(cloud(7, count=2500, bands=1)), *everything()]
+    on_gpu, on_cpu = (
+        draw(backend, instances, options, np.zeros(3)) for backend in (NvrtcBackend(), serving)
+    )
+    for name in ("rgb", "alpha", "depth", "instance"):
+        assert torch.equal(getattr(on_gpu, name).cpu(), getattr(on_cpu, name))
 
 
 def requests_of(

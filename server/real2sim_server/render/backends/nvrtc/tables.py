@@ -117,10 +117,9 @@ def _is_same(a: Instance, b: Instance) -> bool:
 
 def _is_same_pose(a: Instance, b: Instance) -> bool:
     here, there = a.T_world_object, b.T_world_object
-    if here is there:
-        return True
-    known = isinstance(here, np.ndarray) and isinstance(there, np.ndarray)
-    return known and bool(np.array_equal(here, there))
+    if isinstance(here, np.ndarray) and isinstance(there, np.ndarray):
+        return np.array_equal(here, there)
+    return here is there
 
 
 def _cameras(
