@@ -39,13 +39,13 @@ def numbers_of(worlds: list[int] | None, rows: int | None, members: int) -> list
 def plan_rows(plans: Plans) -> list[dict[str, Any]]:
     """The fields of each world's plan, not checked yet."""
     if isinstance(plans, TrajectoryPlans):
-        rows = zip(plans.times_us.tolist(), plans.poses.tolist(), strict=True)
+        given = zip(plans.times_us.tolist(), plans.poses.tolist(), strict=True)
         return [
             {"kind": plans.kind, "times_us": times_us, "poses": poses, "frame": plans.frame}
-            for times_us, poses in rows
+            for times_us, poses in given
         ]
     names = COLUMNS[plans.kind]
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"kind": plans.kind, **dict(zip(names, values, strict=True))}
         for values in plans.values.tolist()
     ]

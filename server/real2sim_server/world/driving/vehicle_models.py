@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from real2sim_proto.episode import EgoSpec
 
+from ..per_object import per_object
 from .dispatch import choice
 from .dynamic_bicycle import step_slipping, understeer_steering
 from .kinematic_bicycle import rolling_steering, step_rolling
@@ -47,6 +48,7 @@ step_vehicle = choice([model.step for model in VEHICLE_MODELS.values()])
 steady_steering = choice([model.steady_steering for model in VEHICLE_MODELS.values()])
 
 
+@per_object
 @lru_cache(maxsize=256)
 def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
     """The constants of a spec."""

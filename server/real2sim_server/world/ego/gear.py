@@ -15,6 +15,7 @@ from typing import Any
 from real2sim_proto.episode import EgoSpec
 
 from ..driving import GRAVITY, HOLD, VEHICLE_MODELS, Command
+from ..per_object import per_object
 from .motion import ControlLaw, Motion, advance_motion, commanded, constant_law
 
 SHIFT_BRAKING = 6.0
@@ -30,6 +31,7 @@ def can_reverse(spec: EgoSpec) -> bool:
     return spec.max_reverse_speed > 0 and VEHICLE_MODELS[spec.dynamics].backwards is not None
 
 
+@per_object
 @lru_cache(maxsize=256)
 def backwards_spec(spec: EgoSpec) -> EgoSpec:
     """The mirror image of a vehicle with a reverse gear."""

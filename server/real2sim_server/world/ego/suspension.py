@@ -20,6 +20,7 @@ from real2sim_proto.episode import EgoSpec, SuspensionSpec
 
 from ..driving import GRAVITY, PlanarState, VehicleParameters, vehicle_parameters, wheel_load
 from ..path import Float
+from ..per_object import per_object
 from .motion import Motion
 
 
@@ -153,6 +154,7 @@ def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Floa
     return T_world_body
 
 
+@per_object
 @lru_cache(maxsize=256)
 def suspension_of(ego: EgoSpec) -> Suspension:
     """The springs of a vehicle that has some."""
