@@ -58,7 +58,7 @@ class CudaLauncher:
 
         index = torch.cuda.current_device()
         self.device = torch.device("cuda", index)
-        torch.zeros(1, device=self.device)  # torch makes the context that all share.
+        torch.cuda.synchronize(self.device)  # torch makes the context that all share.
         Device(index).set_current()
         major, minor = torch.cuda.get_device_capability(index)
         code = ObjectCode.from_cubin(compiled_kernels(f"sm_{major}{minor}"))
@@ -75,7 +75,11 @@ class CudaLauncher:
             Device(self.device.index).set_current()
             self._threads.ready = True
         config = LaunchConfig(grid=blocks, block=THREADS)
-        launch(self._stream(), config, self._kernels[kernel], frame, np.uint32(argument))
+        try:
+            launch(self._stream(), config, self._kernels[kernel], frame, np.uint32(argument))
+        except Exception as error:
+            # In the words of torch, by which a worker knows that its device is lost.
+            raise RuntimeError(f"CUDA error at the launch of {kernel}: {error}") from error
 
     def pointer(self, tensor: Tensor) -> int:
         """See Launcher."""

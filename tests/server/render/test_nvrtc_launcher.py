@@ -1,0 +1,72 @@
+"""How kernels are launched on a GPU: a stand-in for cuda-core takes down what it is given."""
+
+from __future__ import annotations
+
+import sys
+import types
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.render.backends.nvrtc import launcher as launcher_module
+from real2sim_server.render.backends.nvrtc.launcher import CudaLauncher
+from real2sim_server.service.engine import _loses_device
+
+
+@pytest.fixture
+def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Arguments of cuda.core.launch, on a machine with one GPU."""
+    taken: list[tuple[Any, ...]] = []
+    code = SimpleNamespace(get_kernel=lambda name: f"kernel {name}")
+    core: Any = types.ModuleType("cuda.core")
+    core.Device = lambda index: SimpleNamespace(set_current=lambda: taken.append(("device", index)))
+    core.ObjectCode = SimpleNamespace(from_cubin=lambda cubin: code)
+    core.Stream = SimpleNamespace(from_handle=lambda handle: f"stream {handle}")
+    core.LEGACY_DEFAULT_STREAM = "default stream"
+    core.LaunchConfig = lambda grid, block: (grid, block)
+    core.launch = lambda *arguments: taken.append(arguments)
+    monkeypatch.setitem(sys.modules, "cuda", types.ModuleType("cuda"))
+    monkeypatch.setitem(sys.modules, "cuda.core", core)
+    monkeypatch.setattr(launcher_module, "compiled_kernels", lambda name: name.encode())
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
+    stream = SimpleNamespace(cuda_stream=0)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
+    return taken
+
+
+def test_a_launch_names_stream_blocks_kernel_and_arguments(
+    launches: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    launcher = CudaLauncher()
+    launches.clear()
+    launcher.launch("blend", 12, 0x7000, 17)
+    assert launches == [
+        ("device", 0),
+        ("default stream", (12, 256), "kernel blend", 0x7000, np.uint32(17)),
+    ]
+    # The kernel takes an address of 64 bits and a number of 32.
+    assert type(launches[1][3]) is int
+    assert type(launches[1][4]) is np.uint32
+    other = SimpleNamespace(cuda_stream=5)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: other)
+    launcher.launch("find_ranges", 1, 0x7000)
+    assert launches[2][0] == "stream 5"
+
+
+def test_a_launch_that_fails_is_known_as_the_loss_of_the_device(
+    launches: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    launcher = CudaLauncher()
+
+    def fail(*_: Any) -> None:
+        raise Exception("CUDA_ERROR_ILLEGAL_ADDRESS")
+
+    monkeypatch.setattr(sys.modules["cuda.core"], "launch", fail)
+    with pytest.raises(RuntimeError, match="blend: CUDA_ERROR_ILLEGAL_ADDRESS") as raised:
+        launcher.launch("blend", 1, 0)
+    assert _loses_device(raised.value)
