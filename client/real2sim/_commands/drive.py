@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import DEFAULT_URL, JsonFile, Timeout, Token, Url, connected, console, write_json
+from .options import (
+    DEFAULT_URL,
+    JsonFile,
+    Timeout,
+    Token,
+    Url,
+    connected,
+    console,
+    json_object,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -132,27 +141,17 @@ def _reset_options(
     Raises:
         typer.BadParameter: no JSON object.
     """
-    options = _json_object("--reset", reset)
+    options = json_object("--reset", reset)
     if beyond_log != "end":
         options["beyond_log"] = beyond_log
     if spawn is not None:
         options["agents"] = {
             **options.get("agents", {}),
-            "spawn": _json_object("--spawn", spawn),
+            "spawn": json_object("--spawn", spawn),
         }
     if randomization is not None:
-        options["randomization"] = _json_object("--randomization", randomization)
+        options["randomization"] = json_object("--randomization", randomization)
     return options
-
-
-def _json_object(flag: str, text: str | None) -> dict[str, Any]:
-    try:
-        found = json.loads(text or "{}")
-    except json.JSONDecodeError as error:
-        raise typer.BadParameter(f"{flag} is no JSON: {error}") from error
-    if not isinstance(found, dict):
-        raise typer.BadParameter(f"{flag} is no JSON object, as {{}} is")
-    return found
 
 
 def _sensors(

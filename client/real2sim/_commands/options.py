@@ -40,6 +40,21 @@ def connected(url: str, token: str | None, timeout: float = 30.0) -> Client:
     return real2sim.connect(url, token=token, timeout=timeout)
 
 
+def json_object(flag: str, text: str | None) -> dict[str, Any]:
+    """The JSON object that a flag has; empty where it was not given.
+
+    Raises:
+        typer.BadParameter: it has none.
+    """
+    try:
+        found = json.loads(text or "{}")
+    except json.JSONDecodeError as error:
+        raise typer.BadParameter(f"{flag} is no JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise typer.BadParameter(f"{flag} is no JSON object, as {{}} is")
+    return found
+
+
 def console() -> Console:
     """Where tables go; not used with ``--json -``, which owns standard output."""
     from rich.console import Console

@@ -1,0 +1,150 @@
+"""The loop of the bridge: publish an observation, wait for a command, step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from .commands import CommandError, of_ackermann, of_path, of_twist, standing
+from .messages import MessageBuilder, MessageTypes
+
+if TYPE_CHECKING:
+    from real2sim_proto.plans import Plan
+
+    from .._sensors import Sensor
+    from .._sync.drive_session import DriveSession
+    from ..observation import Observation
+
+COMMANDS: dict[str, tuple[str, str, Callable[[Any, Observation], Plan]]] = {
+    "ackermann": ("/ackermann_cmd", "ackermann_msgs/msg/AckermannDriveStamped", of_ackermann),
+    "twist": ("/cmd_vel", "geometry_msgs/msg/Twist", of_twist),
+    "path": ("/plan", "nav_msgs/msg/Path", of_path),
+}
+"""Topic, type and meaning of each kind of command."""
+
+STANDS_STILL = frozenset({"/tf_static"})
+"""Topics whose last message newcomers get."""
+
+
+class Node(Protocol):
+    """What the bridge needs of ROS."""
+
+    types: MessageTypes
+
+    def publish(self, topic: str, type_name: str, message: Any) -> None:
+        """Send a message."""
+
+    def subscribe(self, topic: str, type_name: str, receive: Callable[[Any], None]) -> None:
+        """Call ``receive`` with every message, while the node spins."""
+
+    def spin(self, seconds: float) -> bool:
+        """Receive for at most so long, or until a message has come; whether ROS still runs."""
+
+
+@dataclass
+class Ros2Bridge:
+    """A session driven by messages.
+
+    In lock-step, which is the default, every observation waits for a command that comes after it.
+    With ``real_time`` the clock goes on at that multiple of wall-clock time under the newest
+    command, and the vehicle stands before the first.
+
+    Attributes:
+        session: open.
+        node: of ROS.
+        commands: kind of commands, of :data:`COMMANDS`.
+        real_time: multiple of wall-clock time; None: lock-step.
+        report: told of commands that are none.
+    """
+
+    session: DriveSession
+    node: Node
+    commands: str = "ackermann"
+    real_time: float | None = None
+    report: Callable[[str], None] = print
+    _newest: Any = field(default=None, init=False)
+    _is_fresh: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        if self.commands not in COMMANDS:
+            raise ValueError(f"commands {self.commands!r} are none of {', '.join(COMMANDS)}")
+
+    @property
+    def action(self) -> Literal["control", "trajectory"]:
+        """Kind of the plans that commands become."""
+        return "trajectory" if self.commands == "path" else "control"
+
+    def run(
+        self, *, sensors: Sequence[Sensor] = (), steps: int | None = None, **options: Any
+    ) -> Observation:
+        """Reset the session and drive until the episode, the steps or ROS end; the last
+        observation.
+
+        Args:
+            sensors: what is published.
+            steps: stop after so many; None: when the episode is over.
+            options: of reset.
+        """
+        topic, type_name, _ = COMMANDS[self.commands]
+        self.node.subscribe(topic, type_name, self._receive)
+        builder = MessageBuilder(self.node.types)
+        obs = self.session.reset(sensors=sensors, action=self.action, **options)
+        cameras = builder.camera_transforms(obs.t_us, self.session.welcome.cameras)
+        self.node.publish("/tf_static", "tf2_msgs/msg/TFMessage", cameras)
+        self._publish(builder, obs)
+        due, made = time.monotonic(), 0
+        while not obs.over and (steps is None or made < steps):
+            plan = self._wait_for_plan(obs, due)
+            if plan is None:
+                break
+            before_us, made = obs.t_us, made + 1
+            obs = self.session.step(plan)
+            if self.real_time:
+                due = max(due + (obs.t_us - before_us) * 1e-6 / self.real_time, time.monotonic())
+            self._publish(builder, obs)
+        return obs
+
+    def _receive(self, message: Any) -> None:
+        self._newest, self._is_fresh = message, True
+
+    def _wait_for_plan(self, obs: Observation, due: float) -> Plan | None:
+        """The plan for an observation; None where ROS has ended."""
+        self._is_fresh = self._is_fresh and self.real_time is not None
+        while True:
+            left = due - time.monotonic() if self.real_time else 0.2
+            if self.real_time and left <= 0:
+                return self._plan(obs) or standing(self.action, obs)
+            if not self.node.spin(min(left, 0.2)):
+                return None
+            if not self.real_time and self._is_fresh:
+                self._is_fresh = False
+                plan = self._plan(obs)
+                if plan is not None:
+                    return plan
+
+    def _plan(self, obs: Observation) -> Plan | None:
+        """Of the newest command; None where there is none, or it is no plan."""
+        if self._newest is None:
+            return None
+        try:
+            return COMMANDS[self.commands][2](self._newest, obs)
+        except CommandError as error:
+            self.report(f"{COMMANDS[self.commands][0]}: {error}")
+            self._newest = None
+            return None
+
+    def _publish(self, builder: MessageBuilder, obs: Observation) -> None:
+        # The clock comes first, so that nothing else is from the future.
+        publish = self.node.publish
+        publish("/clock", "rosgraph_msgs/msg/Clock", builder.clock(obs.t_us))
+        publish("/tf", "tf2_msgs/msg/TFMessage", builder.ego_transform(obs))
+        publish("/odom", "nav_msgs/msg/Odometry", builder.odometry(obs))
+        for camera, frames in obs.frames.items():
+            for modality, frame in frames.items():
+                where = "image_raw" if modality == "rgb" else modality
+                image = builder.image(frame)
+                publish(f"/camera/{camera}/{where}", "sensor_msgs/msg/Image", image)
+            info = builder.camera_info(next(iter(frames.values())))
+            publish(f"/camera/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", info)

@@ -1,0 +1,175 @@
+"""Observations as ROS 2 messages.
+
+Frames are those of REP 103 and REP 105, which are ours: ``map`` is the world (z up), ``base_link``
+the rear axle's centre on the ground (x forward, y left, z up), and ``CAMERA_optical`` a camera (x
+right, y down, z forward). Times are simulation times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._poses import Matrix, quaternion_of
+
+if TYPE_CHECKING:
+    from real2sim_proto.drive import EgoState
+    from real2sim_proto.scenes import CameraInfo
+
+    from ..images import Frame
+    from ..observation import Observation
+
+MAP, BASE = "map", "base_link"
+ENCODINGS = {"rgb": "rgb8", "depth": "32FC1", "instance": "16UC1"}
+"""Of images, by modality."""
+
+
+@dataclass(frozen=True)
+class MessageTypes:
+    """The message classes of whoever serialises them.
+
+    Attributes:
+        of: the class of a type such as ``sensor_msgs/msg/Image``; made with its fields by keyword.
+        octets: what its arrays of uint8 are made of bytes by.
+        numbers: what its arrays of float64 are made of numbers by.
+    """
+
+    of: Callable[[str], Any]
+    octets: Callable[[bytes], Any]
+    numbers: Callable[[Iterable[float]], Any]
+
+
+@dataclass(frozen=True)
+class MessageBuilder:
+    """Makes messages of one kind of classes.
+
+    Attributes:
+        types: the classes.
+    """
+
+    types: MessageTypes
+
+    def clock(self, t_us: int) -> Any:
+        """rosgraph_msgs/Clock."""
+        return self._make("rosgraph_msgs/msg/Clock", clock=self._time(t_us))
+
+    def odometry(self, obs: Observation) -> Any:
+        """nav_msgs/Odometry: pose of ``base_link`` in ``map``, velocity in ``base_link``."""
+        ego, none = obs.ego, self.types.numbers([0.0] * 36)
+        twist = self._make(
+            "geometry_msgs/msg/Twist",
+            linear=self._vector((ego.speed, ego.lateral_speed, 0.0)),
+            angular=self._vector((0.0, 0.0, ego.yaw_rate)),
+        )
+        make, covariance = self._make, {"covariance": none}
+        return make(
+            "nav_msgs/msg/Odometry",
+            header=self._header(obs.t_us, MAP),
+            child_frame_id=BASE,
+            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(ego), **covariance),
+            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, **covariance),
+        )
+
+    def ego_transform(self, obs: Observation) -> Any:
+        """tf2_msgs/TFMessage: ``base_link`` in ``map``."""
+        ego = obs.ego
+        return self._transforms([(obs.t_us, MAP, BASE, ego.position, ego.quaternion)])
+
+    def camera_transforms(self, t_us: int, cameras: Sequence[CameraInfo]) -> Any:
+        """tf2_msgs/TFMessage: every camera on ``base_link``; they do not move there."""
+        poses = [np.asarray(camera.T_vehicle_camera, np.float64) for camera in cameras]
+        return self._transforms(
+            [
+                (t_us, BASE, optical(c.name), pose[:3, 3].tolist(), quaternion_of(pose[:3, :3]))
+                for c, pose in zip(cameras, poses, strict=True)
+            ]
+        )
+
+    def image(self, frame: Frame) -> Any:
+        """sensor_msgs/Image: rgb8, depth in metres as 32FC1, instances as 16UC1."""
+        pixels = np.ascontiguousarray(frame.array)
+        height, width = pixels.shape[:2]
+        return self._make(
+            "sensor_msgs/msg/Image",
+            header=self._header(frame.t_us, optical(frame.sensor)),
+            height=height,
+            width=width,
+            encoding=ENCODINGS[frame.modality],
+            is_bigendian=0,
+            step=pixels.strides[0],
+            data=self.types.octets(pixels.tobytes()),
+        )
+
+    def camera_info(self, frame: Frame) -> Any:
+        """sensor_msgs/CameraInfo of an image: a pinhole without distortion."""
+        height, width = frame.shape[:2]
+        K: Matrix = np.asarray(frame.K, np.float64)
+        numbers = self.types.numbers
+        window = self._make(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+        )  # fmt: skip
+        return self._make(
+            "sensor_msgs/msg/CameraInfo",
+            header=self._header(frame.t_us, optical(frame.sensor)),
+            height=height,
+            width=width,
+            distortion_model="plumb_bob",
+            d=numbers([0.0] * 5),
+            k=numbers(K.ravel().tolist()),
+            r=numbers(np.eye(3).ravel().tolist()),
+            p=numbers(np.column_stack([K, np.zeros(3)]).ravel().tolist()),
+            binning_x=0,
+            binning_y=0,
+            roi=window,
+        )
+
+    def _transforms(self, rows: Sequence[tuple[int, str, str, Any, Any]]) -> Any:
+        stamped = [
+            self._make(
+                "geometry_msgs/msg/TransformStamped",
+                header=self._header(t_us, parent),
+                child_frame_id=child,
+                transform=self._make(
+                    "geometry_msgs/msg/Transform",
+                    translation=self._vector(position),
+                    rotation=self._quaternion(quaternion),
+                ),
+            )
+            for t_us, parent, child, position, quaternion in rows
+        ]
+        return self._make("tf2_msgs/msg/TFMessage", transforms=stamped)
+
+    def _pose(self, ego: EgoState) -> Any:
+        x, y, z = ego.position
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=float(z)),
+            orientation=self._quaternion(ego.quaternion),
+        )
+
+    def _quaternion(self, quaternion: Sequence[float]) -> Any:
+        w, x, y, z = map(float, quaternion)
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def _vector(self, vector: Sequence[float]) -> Any:
+        x, y, z = map(float, vector)
+        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def _header(self, t_us: int, frame_id: str) -> Any:
+        return self._make("std_msgs/msg/Header", stamp=self._time(t_us), frame_id=frame_id)
+
+    def _time(self, t_us: int) -> Any:
+        seconds, rest_us = divmod(t_us, 1_000_000)
+        return self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest_us * 1000)
+
+    def _make(self, name: str, **fields: Any) -> Any:
+        return self.types.of(name)(**fields)
+
+
+def optical(camera: str) -> str:
+    """Name of a camera's frame."""
+    return f"{camera}_optical"
