@@ -415,6 +415,11 @@ class ContactSpec(Model):
     masses: dict[Identifier, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         default_factory=dict, description="[kg] by object; default: by category and box"
     )
+    pulse: bool = Field(
+        default=True,
+        description="impacts take the time that masses and structures need, about a tenth of a "
+        "second; false: all at once, as in episodes recorded before this option was there",
+    )
     dents: bool = Field(
         default=True,
         description="images show struck objects deformed, by the material point method",

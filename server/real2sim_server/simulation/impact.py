@@ -24,7 +24,8 @@ from ..physics.solver import Solver, SolverOptions
 from ..scene import GaussianCloud
 from .body import DeformableBody, DeformedShape
 from .fill import fill_object
-from .presets import VEHICLES, preset_of
+from .presets import preset_of
+from .structure import VEHICLES
 
 PARTICLES = 1000
 """Of one body, about: half the time of twice as many, with residual crush within a fifth and less

@@ -19,8 +19,9 @@ from .embedding import stretched
 from .fill import fill_object
 from .masses import centre_height
 from .playback import PlacedObject, PlacedObjects
-from .presets import VEHICLES, ObjectPhysics, Preset
+from .presets import ObjectPhysics, Preset
 from .rebound import fit_rebound
+from .structure import VEHICLES
 from .surroundings import clearance
 from .tyres import Tyres, track_of
 

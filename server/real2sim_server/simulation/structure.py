@@ -50,7 +50,7 @@ class VehicleStructure:
 CAR = VehicleStructure(
     front=474e3,
     rear=430e3,
-    side=620e3,
+    side=870e3,
     roof=3.0,
     source="front: load cells of the 2015 Malibu barrier test, 60127 lb/ft over 1.85 m (NHTSA); "
     "rear: that of a pair of 405 kN/m with such a front (Bonugli et al. 2017); "
@@ -61,11 +61,23 @@ STRUCTURES = {
     "vehicle": CAR,
     "van": replace(CAR, source="as a car: vans of this mass pass the same barrier tests"),
     "truck": replace(
-        CAR, front=1.5e6, rear=1.5e6, side=1.2e6, roof=1.5, source="frame rails; no test"
+        CAR, front=1.5e6, rear=1.5e6, side=1.7e6, roof=1.5, source="frame rails; no test"
     ),
-    "bus": replace(CAR, front=9e5, rear=9e5, side=7e5, roof=1.5, source="roof: ECE R66; no test"),
+    "bus": replace(CAR, front=9e5, rear=9e5, side=1e6, roof=1.5, source="roof: ECE R66; no test"),
 }
 """By category."""
+PERSON_STIFFNESS, OTHER_STIFFNESS = 6e4, 3e5
+"""The same, alike on all sides, of people and of what no class is known of; no tests [N/m^2]."""
+
+
+def stiffness_of(category: str) -> tuple[float, float, float]:
+    """Force of front, rear and sides of a category per width and deflection [N/m^2]."""
+    if category in STRUCTURES:
+        found = STRUCTURES[category]
+        return found.front, found.rear, found.side
+    person = category in {"pedestrian", "person", "cyclist", "animal"}
+    return (PERSON_STIFFNESS if person else OTHER_STIFFNESS,) * 3
+
 
 END, OUTER = 0.2875, 0.1745
 """Fractions of the length, at each end, that give way, and that are straightened again."""
@@ -119,7 +131,7 @@ SPRINGS_MATERIAL = NeoHookean(young=4e4, poisson=0.0, density=150.0, viscosity=2
 """Half of the outer part, particle by particle beside what folds. Its viscosity takes the energy
 that low-speed restitution does not give back."""
 END_MATERIALS: tuple[Material, ...] = (RAILS_MATERIAL, FOLDS_MATERIAL, SPRINGS_MATERIAL)
-SIDE_STRESS = 0.12
+SIDE_STRESS = 0.0855
 """Stress of a side against that of the ends for the same force per width and deflection: it is
 shallower, and carries along what is beside the place that is struck."""
 

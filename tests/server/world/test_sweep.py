@@ -292,7 +292,8 @@ def test_delta_v_at_a_wall_is_what_the_wall_takes_however_long_the_engine_pushes
 
     found = {s.name: s for s in world.scores()}["delta_v"]
     assert found.terms["impulse"] / world.context.ego_mass > fastest
-    assert found.value == pytest.approx(max(impacts), abs=0.6)
+    # A pulse takes as long as the engine needs for 0.8 m/s, which the wall takes as well.
+    assert found.value == pytest.approx(max(impacts), abs=0.8)
 
 
 # --- warm-up and recordings -------------------------------------------------------------------

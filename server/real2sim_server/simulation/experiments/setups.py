@@ -13,9 +13,10 @@ from ...physics.materials import FixedCorotated
 from ...scene import Scene
 from ..ground import ground_collider
 from ..playback import PlacedObject, PlacedObjects
-from ..presets import VEHICLES, ObjectPhysics, preset_of
+from ..presets import ObjectPhysics, preset_of
 from ..rollout import SimulateOptions
 from ..spawn import object_particles
+from ..structure import VEHICLES
 from .viewing import in_view, visibility_of
 
 WALL_GAP = 0.5

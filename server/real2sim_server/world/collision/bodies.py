@@ -10,6 +10,7 @@ from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ...edit import ObjectState
 from ...simulation.masses import default_mass
+from ...simulation.structure import stiffness_of
 from ..driving import vehicle_parameters
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
@@ -44,9 +45,9 @@ class ImpactedObject:
         """Itself: the collision step moves it together with all bodies that it may hit."""
         return self
 
-    def at(self, body: BodyState, pose: AgentPose) -> Self:
-        """The object at another place."""
-        return replace(self, body=body, pose=pose)
+    def at(self, body: BodyState, pose: AgentPose, properties: BodyProperties) -> Self:
+        """The object at another place, and as short as it is by now."""
+        return replace(self, body=body, pose=pose, properties=properties)
 
 
 def object_properties(
@@ -69,6 +70,7 @@ def object_properties(
         axles=(0.3 * length, 0.3 * length) if rolls else None,
         friction=friction,
         drag=IMPACTED_DRAG if rolls else 0.0,
+        stiffness=stiffness_of(subject.category),
     )
 
 
@@ -84,6 +86,7 @@ def ego_properties(spec: EgoSpec, size: tuple[float, float, float]) -> BodyPrope
         axles=(vehicle.front, vehicle.rear),
         friction=vehicle.friction,
         drag=0.015,
+        stiffness=stiffness_of("car"),
     )
 
 

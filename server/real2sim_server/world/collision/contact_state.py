@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from real2sim_proto.episode import EgoSpec, ResetSpec
@@ -21,6 +21,7 @@ from .bodies import ImpactedObject
 from .impact import Impact
 from .obstacles import ObstacleGrid
 from .overlaps import EgoContacts, ego_contacts
+from .pulse import Pulse
 from .solver import CollisionStep, solve_collisions
 from .sweep import StepStart, swept_contacts
 
@@ -60,6 +61,8 @@ class ContactState:
         ignored_pairs: pairs that overlapped when the episode began; they pass through each other
             until they have parted.
         sliding: whether the ego has been pushed and no longer rolls as it is steered.
+        pulses: impacts under way, by the names of the two.
+        ego_crush: by how much the ego's front and rear are shorter than they were [m].
     """
 
     spec: ResetSpec
@@ -68,6 +71,8 @@ class ContactState:
     touching: frozenset[str] = frozenset()
     ignored_pairs: frozenset[frozenset[str]] = frozenset()
     sliding: bool = False
+    pulses: Mapping[tuple[str, str], Pulse] = field(default_factory=dict)
+    ego_crush: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def begin(
@@ -139,7 +144,8 @@ class ContactState:
         if not self.exchanges_momentum or not self._may_collide(motion, before, traffic):
             controller, motion = controller.advance(motion, t_us, self.spec.dt_us)
             impacts = () if self.exchanges_momentum else None
-            return StepMotion(controller, motion, traffic, self, impacts)
+            contacts = replace(self, pulses={}) if self.pulses else self
+            return StepMotion(controller, motion, traffic, contacts, impacts)
         steered = _SteppedController(controller, t_us)
         result = solve_collisions(
             CollisionStep(
@@ -156,11 +162,19 @@ class ContactState:
                 after=traffic.agents,
                 impacted=_impacted_objects(traffic),
                 ignored_pairs=self.ignored_pairs,
-                background=self.obstacles.manifold if self.obstacles is not None else None,
+                background=self.obstacles,
+                pulses=self.pulses,
+                ego_crush=self.ego_crush,
                 height=height,
             )
         )
-        contacts = replace(self, sliding=result.sliding, ignored_pairs=result.ignored_pairs)
+        contacts = replace(
+            self,
+            sliding=result.sliding,
+            ignored_pairs=result.ignored_pairs,
+            pulses=result.pulses,
+            ego_crush=result.ego_crush,
+        )
         collided = traffic.with_drivers(result.impacted, traffic.agents)
         return StepMotion(steered.controller, result.motion, collided, contacts, result.impacts)
 

@@ -10,7 +10,7 @@ from ..scoring.instant import Side
 from .rigid_body import BodyProperties, BodyState
 
 MUTUAL_STIFFNESS = 405e3
-"""Of two cars in series, for the estimate of crush: 405 +- 139 kN/m (Bonugli et al. 2017) [N/m]."""
+"""Of two cars in series, where impacts are sudden: 405 +- 139 kN/m (Bonugli et al. 2017) [N/m]."""
 
 
 class ImpactParticipant(NamedTuple):
@@ -38,6 +38,10 @@ class Impact:
         delta_v, object_delta_v: length of the change of velocity of the ego (or ``other_id``) and
             of the object [m/s].
         energy: kinetic energy lost [J].
+        whole: length of the impulse of the whole impact [N s], and ``delta_v``,
+            ``object_delta_v`` and ``energy`` those of it, as the mechanics of a sudden impulse
+            have them; None where the impact was sudden, or had begun before.
+        stiffness: of what was crushed [N/m].
         side: of the ego on which the contact began.
         speeds: of the first body and of the object when it began [m/s].
         began_us: when it began in this step [us].
@@ -62,18 +66,20 @@ class Impact:
     began_us: int = 0
     since: float = 1.0
     participants: tuple[ImpactParticipant, ImpactParticipant | None] | None = None
+    whole: float | None = None
+    stiffness: float = MUTUAL_STIFFNESS
 
     @property
     def crush(self) -> float:
         """Depth of both deformations together [m], if all energy lost went into a linear spring."""
-        return math.sqrt(2 * max(self.energy, 0.0) / MUTUAL_STIFFNESS)
+        return math.sqrt(2 * max(self.energy, 0.0) / self.stiffness)
 
     def event_data(self) -> dict[str, float]:
         """Data of its event on the wire."""
         return {
             "relative_speed": self.relative_speed,
             "approach_speed": self.approach_speed,
-            "impulse": math.hypot(*self.impulse),
+            "impulse": math.hypot(*self.impulse) if self.whole is None else self.whole,
             "delta_v": self.delta_v,
             "object_delta_v": self.object_delta_v,
             "energy": self.energy,

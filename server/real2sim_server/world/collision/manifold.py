@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -35,6 +36,80 @@ class ContactImpulse(NamedTuple):
     jx: float
     jy: float
     approach: float
+
+
+Body = tuple[BodyState, BodyProperties]
+Bodies = tuple[Body, Body | None]
+"""Two bodies in contact; None for what cannot move."""
+
+
+class RelativeMotion(NamedTuple):
+    """How two bodies move against each other at a place, and what impulses there change of it.
+
+    Attributes:
+        nx, ny: unit normal, out of the second body into the first.
+        normal, tangent: velocity of the first against the second [m/s].
+        knn, knt, ktt: change of these per impulse [1/kg].
+    """
+
+    nx: float
+    ny: float
+    normal: float
+    tangent: float
+    knn: float
+    knt: float
+    ktt: float
+
+    def limited(self, push: float, friction: float) -> ContactImpulse:
+        """An impulse with the normal part ``push`` [N s], and across it as much as ends sliding,
+        at most friction times that."""
+        jt = -(self.tangent + self.knt * push) / self.ktt
+        jt = min(max(jt, -friction * push), friction * push)
+        nx, ny = self.nx, self.ny
+        return ContactImpulse(push * nx - jt * ny, push * ny + jt * nx, -self.normal)
+
+    def normal_part(self, impulse: ContactImpulse) -> float:
+        """Of an impulse along the normal [N s]."""
+        return impulse.jx * self.nx + impulse.jy * self.ny
+
+
+def relative_motion(bodies: Bodies, manifold: ContactManifold) -> RelativeMotion:
+    """Of two bodies at a contact."""
+    nx, ny, tx, ty = manifold.nx, manifold.ny, -manifold.ny, manifold.nx
+    vx = vy = knn = knt = ktt = 0.0
+    for sign, pair in zip((1.0, -1.0), bodies, strict=True):
+        if pair is None:
+            continue
+        body, properties = pair
+        wx, wy = body.velocity_at(manifold.x, manifold.y)
+        vx, vy = vx + sign * wx, vy + sign * wy
+        rx, ry = manifold.x - body.x, manifold.y - body.y
+        rn, rt = rx * ny - ry * nx, rx * ty - ry * tx
+        knn += 1 / properties.mass + rn * rn / properties.inertia
+        ktt += 1 / properties.mass + rt * rt / properties.inertia
+        knt += rn * rt / properties.inertia
+    return RelativeMotion(nx, ny, vx * nx + vy * ny, vx * tx + vy * ty, knn, knt, ktt)
+
+
+def overlap_patch(
+    first: list[Corner], second: list[Corner], nx: float, ny: float
+) -> tuple[float, float, float, float] | None:
+    """Centroid x, y of the overlap of two convex quadrilaterals, its mean depth along the normal
+    and its width across it [m]; None where there is none."""
+    shape = _clipped(first, second)
+    if len(shape) < 3:
+        return None
+    x0, y0 = shape[0]
+    double = mx = my = 0.0
+    for (ax, ay), (bx, by) in itertools.pairwise(shape[1:]):
+        part = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
+        double += part
+        mx, my = mx + part * (ax + bx - 2 * x0), my + part * (ay + by - 2 * y0)
+    across = [y * nx - x * ny for x, y in shape]
+    width = max(across) - min(across)
+    if double <= 1e-12 or width <= 0.0:
+        return None
+    return x0 + mx / (3 * double), y0 + my / (3 * double), double / 2 / width, width
 
 
 def corners(body: BodyState, properties: BodyProperties) -> list[Corner]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...scene import Scene
 from ..path import Float, LoggedPath
 from .manifold import ContactManifold
+from .pulse import Patch
 from .rigid_body import BodyProperties, BodyState
 
 CELL = 0.25
@@ -64,6 +65,19 @@ class ObstacleGrid:
             return None
         x, y = points[hit].mean(axis=0).tolist()
         return _nearest_side(body, properties, x, y)
+
+    def patch(self, body: BodyState, properties: BodyProperties, nx: float, ny: float) -> Patch:
+        """How far occupied cells reach into a body, from its face against the unit normal ``n``,
+        which points out of them; only where :meth:`manifold` finds any."""
+        points = footprint(body, properties)
+        cells = np.floor((points - self.origin) / CELL).astype(np.int64)
+        inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)
+        hit = np.zeros(len(points), dtype=bool)
+        hit[inside] = self.occupied[cells[inside, 0], cells[inside, 1]]
+        x, y = points[hit].mean(axis=0).tolist()
+        along, across = points @ [nx, ny], points[hit] @ [-ny, nx]
+        width = float(np.ptp(across)) + CELL / 2
+        return Patch(x, y, float(along[hit].max() - along.min()), width)
 
     def count(self, body: BodyState, properties: BodyProperties) -> int:
         """Number of occupied cells under a body."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from ..driving import GRAVITY
@@ -31,6 +31,7 @@ class BodyProperties:
             without wheels, which slide alike in all directions.
         friction: of tyres or body on the ground.
         drag: deceleration per gravity along rolling wheels.
+        stiffness: of its front, rear and sides, per width of what is crushed [N/m^2].
     """
 
     mass: float
@@ -41,6 +42,12 @@ class BodyProperties:
     axles: tuple[float, float] | None = None
     friction: float = 0.7
     drag: float = 0.0
+    stiffness: tuple[float, float, float] = (474e3, 430e3, 870e3)
+
+    def shortened(self, front: float, rear: float) -> BodyProperties:
+        """With its ends so much nearer to its middle [m]."""
+        length, ahead = self.length - front - rear, self.box_ahead + (rear - front) / 2
+        return replace(self, length=length, box_ahead=ahead)
 
 
 class BodyState(NamedTuple):

@@ -27,8 +27,19 @@ from .bodies import (
     object_properties,
 )
 from .crossing import between, crossing, drifted
-from .impact import Impact, ImpactParticipant
-from .manifold import ContactManifold, contact_impulse, contact_manifold, corners
+from .impact import MUTUAL_STIFFNESS, Impact, ImpactParticipant
+from .manifold import (
+    SLOW,
+    Bodies,
+    ContactImpulse,
+    ContactManifold,
+    contact_impulse,
+    contact_manifold,
+    corners,
+    overlap_patch,
+)
+from .obstacles import ObstacleGrid
+from .pulse import Patch, Pulse, advance_pulse, contact_width, mutual_stiffness, shortened
 from .rigid_body import BodyProperties, BodyState, integrate_sliding
 
 SUBSTEP_US = 10_000
@@ -53,8 +64,10 @@ class CollisionStep:
         before, after: objects as their drivers move them; impacted ones among them.
         impacted: objects that physics moves, by id.
         ignored_pairs: bodies that overlapped without an impact; they do not collide.
-        background: manifold of a body and the background; None where that is left out.
+        background: obstacles of the background; None where they are left out.
         height: ground height [m] at x, y.
+        pulses: impacts under way, by the names of the two.
+        ego_crush: by how much the ego's front and rear are shorter than they were [m].
     """
 
     t_us: int
@@ -70,8 +83,10 @@ class CollisionStep:
     after: Agents
     impacted: Mapping[str, ImpactedObject]
     ignored_pairs: frozenset[frozenset[str]]
-    background: Callable[[BodyState, BodyProperties], ContactManifold | None] | None
+    background: ObstacleGrid | None
     height: Callable[[float, float], float]
+    pulses: Mapping[tuple[str, str], Pulse] = field(default_factory=dict)
+    ego_crush: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +98,8 @@ class CollisionResult:
     impacted: dict[str, ImpactedObject]
     impacts: tuple[Impact, ...]
     ignored_pairs: frozenset[frozenset[str]]
+    pulses: dict[tuple[str, str], Pulse]
+    ego_crush: tuple[float, float]
 
 
 @dataclass(eq=False)
@@ -100,6 +117,9 @@ class _PairImpulse:
     jy: float = 0.0
     energy: float = 0.0
     masses: tuple[float, float] = (math.inf, math.inf)
+    whole: float | None = None
+    lost: float = 0.0
+    stiffness: float = MUTUAL_STIFFNESS
 
 
 class _PrescribedMotion(NamedTuple):
@@ -136,6 +156,8 @@ class _SolverState:
     ignored_pairs: set[frozenset[str]] = field(default_factory=set)
     earlier: dict[str, BodyState] = field(default_factory=dict)
     now_us: int = 0
+    pulses: dict[tuple[str, str], Pulse] = field(default_factory=dict)
+    ego_crush: tuple[float, float] = (0.0, 0.0)
 
 
 def solve_collisions(step: CollisionStep) -> CollisionResult:
@@ -162,12 +184,19 @@ def solve_collisions(step: CollisionStep) -> CollisionResult:
             motion = ego_motion(state.bodies[EGO], motion, step.spec)
             sliding = not is_rolling(motion, step.spec)
     return CollisionResult(
-        motion, sliding, _impacted(state), _impacts(state), frozenset(state.ignored_pairs)
+        motion,
+        sliding,
+        _impacted(state),
+        _impacts(state),
+        frozenset(state.ignored_pairs),
+        state.pulses,
+        state.ego_crush,
     )
 
 
 def _begin(step: CollisionStep) -> _SolverState:
-    properties, bodies, heights = {EGO: ego_properties(step.spec, step.ego_size)}, {}, {}
+    own = ego_properties(step.spec, step.ego_size)
+    properties, bodies, heights = {EGO: own.shortened(*step.ego_crush)}, {}, {}
     bodies[EGO] = ego_body(step.motion, step.spec)
     bottom = step.height(step.motion.x, step.motion.y)
     heights[EGO] = (bottom, bottom + step.ego_size[2])
@@ -197,6 +226,8 @@ def _begin(step: CollisionStep) -> _SolverState:
         heights,
         reaches,
         ignored_pairs=set(step.ignored_pairs),
+        pulses=dict(step.pulses),
+        ego_crush=step.ego_crush,
     )
 
 
@@ -257,17 +288,129 @@ def _resolve_contacts(state: _SolverState, h: float) -> bool:
             state.ignored_pairs.discard(pair)
             continue
         if manifold is None:
+            _end_pulse(state, a, b)
             ego_pushed |= _resolve_crossing(state, a, b, h) and a == EGO
             continue
         if pair in state.ignored_pairs:
             continue
-        ego_pushed |= _apply_impulse(state, a, b, manifold) and a == EGO
+        ego_pushed |= _exchange(state, a, b, manifold, h) and a == EGO
     if state.step.background is not None:
         for i in sorted(state.dynamic):
-            manifold = state.step.background(state.bodies[i], state.properties[i])
+            manifold = state.step.background.manifold(state.bodies[i], state.properties[i])
             if manifold is not None:
-                ego_pushed |= _apply_impulse(state, i, BACKGROUND, manifold) and i == EGO
+                ego_pushed |= _exchange(state, i, BACKGROUND, manifold, h) and i == EGO
+            else:
+                _end_pulse(state, i, BACKGROUND)
     return ego_pushed
+
+
+def _exchange(state: _SolverState, a: str, b: str, manifold: ContactManifold, h: float) -> bool:
+    """Exchange momentum for ``h`` seconds, or at once where impacts are sudden; whether there was
+    any to exchange."""
+    if not state.step.contact.pulse:
+        return _apply_impulse(state, a, b, manifold)
+    pulse = state.pulses.get((a, b)) or _begin_pulse(state, a, b, manifold)
+    if pulse is None:
+        return False
+    bodies = _bodies(state, a, b)
+    angle = pulse.normal + (bodies[1][0].yaw if bodies[1] is not None else 0.0)
+    patch = _patch(state, a, b, math.cos(angle), math.sin(angle))
+    if patch is None:
+        return False
+    friction = state.step.contact.friction
+    pulse, impulse = advance_pulse(bodies, pulse, patch, h, friction=friction)
+    if pulse.over and pulse.depth > pulse.kept:
+        _shorten(state, a, b, pulse)
+        pulse = pulse._replace(kept=pulse.depth)
+    state.pulses[a, b] = pulse
+    exchanged = _pair_impulse(state, (a, b), manifold, approach=0.0)
+    if impulse is None:
+        return False
+    after, dissipated = _pushed(bodies, (patch.x, patch.y), impulse)
+    state.bodies[a] = after[0]
+    if after[1] is not None:
+        state.bodies[b] = after[1]
+    exchanged.jx, exchanged.jy = exchanged.jx + impulse.jx, exchanged.jy + impulse.jy
+    exchanged.energy, exchanged.masses = exchanged.energy + dissipated, _masses(bodies)
+    return True
+
+
+def _begin_pulse(state: _SolverState, a: str, b: str, manifold: ContactManifold) -> Pulse | None:
+    """The pulse of two bodies that have just met; None where they part already."""
+    bodies, contact = _bodies(state, a, b), state.step.contact
+    whole = contact_impulse(
+        *bodies, manifold, restitution=contact.restitution, friction=contact.friction
+    )
+    if whole is None:
+        _pair_impulse(state, (a, b), manifold, approach=0.0)
+        return None
+    nx, ny = manifold.nx, manifold.ny
+    exchanged = _pair_impulse(state, (a, b), manifold, approach=whole.approach)
+    exchanged.whole, exchanged.masses = math.hypot(whole.jx, whole.jy), _masses(bodies)
+    exchanged.lost = _pushed(bodies, (manifold.x, manifold.y), whole)[1]
+    patch = _patch(state, a, b, nx, ny)
+    width = contact_width(bodies, patch.width if patch is not None else 0.0, nx, ny)
+    exchanged.stiffness = mutual_stiffness(bodies, nx, ny) * width
+    _make_dynamic(state, {a, b} - {BACKGROUND} - state.dynamic)
+    yaw = bodies[1][0].yaw if bodies[1] is not None else 0.0
+    restitution = contact.restitution if whole.approach > SLOW else 0.0
+    return Pulse(math.atan2(ny, nx) - yaw, restitution)
+
+
+def _end_pulse(state: _SolverState, a: str, b: str) -> None:
+    """Two bodies have parted."""
+    pulse = state.pulses.pop((a, b), None)
+    if pulse is not None:
+        _shorten(state, a, b, pulse)
+
+
+def _shorten(state: _SolverState, a: str, b: str, pulse: Pulse) -> None:
+    """The ends of two bodies stay shorter by what was crushed for good."""
+    bodies = _bodies(state, a, b)
+    angle = pulse.normal + (bodies[1][0].yaw if bodies[1] is not None else 0.0)
+    nx, ny = math.cos(angle), math.sin(angle)
+    stiffness = mutual_stiffness(bodies, nx, ny)
+    for i, body, sign in ((a, bodies[0], -1.0), (b, bodies[1], 1.0)):
+        if body is None:
+            continue
+        front, rear = shortened(body, pulse, sign * nx, sign * ny, stiffness)
+        state.properties[i] = body[1].shortened(front, rear)
+        if i == EGO:
+            state.ego_crush = state.ego_crush[0] + front, state.ego_crush[1] + rear
+
+
+def _bodies(state: _SolverState, a: str, b: str) -> Bodies:
+    second = None if b == BACKGROUND else (state.bodies[b], state.properties[b])
+    return (state.bodies[a], state.properties[a]), second
+
+
+def _patch(state: _SolverState, a: str, b: str, nx: float, ny: float) -> Patch | None:
+    """Where two bodies reach into one another, seen along a normal."""
+    first, second = _bodies(state, a, b)
+    if second is None:
+        assert state.step.background is not None
+        return state.step.background.patch(*first, nx, ny)
+    found = overlap_patch(corners(*first), corners(*second), nx, ny)
+    return None if found is None else Patch(*found)
+
+
+def _masses(bodies: Bodies) -> tuple[float, float]:
+    first, second = bodies
+    return first[1].mass, math.inf if second is None else second[1].mass
+
+
+def _pushed(
+    bodies: Bodies, at: tuple[float, float], impulse: ContactImpulse
+) -> tuple[tuple[BodyState, BodyState | None], float]:
+    """Two bodies after an impulse on the first at a place, and the energy that was lost [J]."""
+    (first, properties), second = bodies
+    after = first.pushed(properties, *at, impulse.jx, impulse.jy)
+    lost = first.energy(properties) - after.energy(properties)
+    if second is None:
+        return (after, None), lost
+    other = second[0].pushed(second[1], *at, -impulse.jx, -impulse.jy)
+    lost += second[0].energy(second[1]) - other.energy(second[1])
+    return (after, other), lost
 
 
 def _resolve_crossing(state: _SolverState, a: str, b: str, h: float) -> bool:
@@ -429,7 +572,7 @@ def _impacted(state: _SolverState) -> dict[str, ImpactedObject]:
             (body.vx, body.vy, 0.0),
         )
         impacted[i] = (
-            old.at(body, pose)
+            old.at(body, pose, state.properties[i])
             if old
             else ImpactedObject(subject, state.properties[i], body, height, pose)
         )
@@ -440,6 +583,9 @@ def _impacts(state: _SolverState) -> tuple[Impact, ...]:
     impacts = []
     for (a, b), exchanged in state.impulses.items():
         strength = math.hypot(exchanged.jx, exchanged.jy)
+        energy = exchanged.energy
+        if exchanged.whole is not None:
+            strength, energy = exchanged.whole, exchanged.lost
         impacts.append(
             Impact(
                 object_id=None if b == BACKGROUND else b,
@@ -452,12 +598,14 @@ def _impacts(state: _SolverState) -> tuple[Impact, ...]:
                 impulse=(exchanged.jx, exchanged.jy),
                 delta_v=strength / exchanged.masses[0],
                 object_delta_v=strength / exchanged.masses[1],
-                energy=exchanged.energy,
+                energy=energy,
                 side=exchanged.side,
                 speeds=exchanged.speeds,
                 began_us=exchanged.began_us,
                 since=(exchanged.began_us - state.step.t_us) / state.step.dt_us,
                 participants=exchanged.participants,
+                whole=exchanged.whole,
+                stiffness=exchanged.stiffness,
             )
         )
     return tuple(impacts)

@@ -13,7 +13,7 @@ BEFORE: Mapping[str, Any] = {
         "suspension": None,
         "max_reverse_speed": 0.0,
     },
-    "contact": {"swept": False},
+    "contact": {"swept": False, "pulse": False},
 }
 """How episodes ran before members had their present defaults, or before there were such members.
 
