@@ -140,7 +140,7 @@ class DeformableBody:
         self._radius_of: Float | None = None
         self._radius_m = 0.0
         self._stored_energy = 0.0
-        self._deforming_time = self._settle_time = self._sleep_time = 0.0
+        self._deforming_time = self._settle_time = self._sleep_time = self._stood = 0.0
 
     @property
     def T_world_object(self) -> Float:
@@ -332,10 +332,17 @@ class DeformableBody:
         m = self.motion = replace(
             m, rotation=rotation, centre=moved[0], velocity=moved[1], angular_velocity=moved[2]
         )
-        slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < SLEEP_SPEED / 2
-        standing = slow and self.tyres is not None
-        self._settle_time = self._settle_time + duration if standing else 0.0
+        self._stood = self._settle_time
+        if self.tyres is not None:
+            self.note_standing(duration)
         return None if self.tyres is None else TyreReaction(impulse, friction_work)
+
+    def note_standing(self, duration: float) -> None:
+        """Count how long a rigid body has hardly moved while something carries it; it has moved for
+        ``duration`` [s]."""
+        m = self.motion
+        slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < SLEEP_SPEED / 2
+        self._settle_time = self._stood + duration if slow else 0.0
 
     def activate(self) -> None:
         """Begin to deform; the next ``solver_body`` goes into a solver."""
@@ -440,7 +447,7 @@ class DeformableBody:
 
     @property
     def has_parked(self) -> bool:
-        """Whether a rigid body has stood on its wheels for long enough to be put to sleep."""
+        """Whether a rigid body has stood or lain for long enough to be put to sleep."""
         return self._settle_time > WHEELS_SLEEP_TIME
 
     def put_to_sleep(self, supports: Sequence[str] = ()) -> None:

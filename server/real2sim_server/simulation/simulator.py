@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,7 @@ from ..physics.colliders import Collider
 from ..physics.solver import Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody
 from .contacts import ContactLog
+from .resting import GENTLE, Resting, touches_any
 from .support import supports_of
 from .tyres import TyreReaction
 
@@ -72,6 +73,7 @@ class HybridSimulator:
         self._names = {b.name for b in bodies}
         self._solver: Solver | None = None
         self._solved: list[str] = []
+        self._resting = Resting()
         for body in self.bodies:
             if not (np.any(body.motion.velocity) or np.any(body.motion.angular_velocity)):
                 self._put_to_sleep(body)
@@ -93,14 +95,18 @@ class HybridSimulator:
                 reaction = body.advance_rigid(duration, self.gravity, self.road)
                 if reaction is not None:
                     self._log_tyres(body, [reaction])
-                if body.has_parked:
-                    self._put_to_sleep(body)
+        self._touch_more()
+        for r in self._resting.solve(duration):
+            self.contact_log.add(r.body, r.other, r.impulse, r.heat, self.time)
+        self._lay_to_rest(duration)
         if self._solver is None:
             self.colliders = [c.after(duration) for c in self.colliders]
         self.time += duration
         for body in deforming:
             self._brake_if_hit(body)
-            self._settle(body, duration)
+            body.update_timers(duration)
+        for body in deforming:
+            self._settle(body)
 
     def _activate(self, duration: float) -> None:
         """Let all bodies deform that something comes near to, and those that these come near to."""
@@ -110,6 +116,7 @@ class HybridSimulator:
             for body in self.bodies:
                 if body.mode != BodyMode.DEFORMING and self._is_near_anything(body, duration):
                     body.activate()
+                    self._resting.end(body)
                     self._solver = None
                     changed = True
 
@@ -143,13 +150,12 @@ class HybridSimulator:
         for r in reactions:
             self.contact_log.add(body.name, TYRES, r.impulse, r.friction_work, self.time)
 
-    def _settle(self, body: DeformableBody, duration: float) -> None:
+    def _settle(self, body: DeformableBody) -> None:
         """A body that has settled becomes rigid, or falls asleep."""
-        body.update_timers(duration)
-        if body.may_sleep and self._put_to_sleep(body):
-            pass
-        elif body.may_rigidify and self._is_free(body):
+        if body.may_rigidify and self._may_be_rigid(body):
             body.rigidify()
+        elif body.may_sleep and not self._is_loaded(body) and self._put_to_sleep(body):
+            pass
         else:
             return
         self._solver = None
@@ -184,6 +190,9 @@ class HybridSimulator:
     def _is_near_anything(self, body: DeformableBody, duration: float) -> bool:
         """Whether something will be near within ``duration`` [s]."""
         asleep = body.mode == BodyMode.SLEEPING
+        held = self._resting.partners(body)
+        if held:
+            return self._is_struck(body, held, duration)
         others = [
             b for b in self.bodies if not (asleep and b.mode == BodyMode.SLEEPING) and b is not body
         ]
@@ -194,10 +203,91 @@ class HybridSimulator:
             walls = [c for c in walls if c.moving]
         if body.meets(walls, within=NEAR_CELLS * body.cell, ahead=duration):
             return True
-        if asleep or body.tyres is None:
+        return not asleep and self._strikes_through(body, duration)
+
+    def _is_struck(self, body: DeformableBody, held: Set[str], duration: float) -> bool:
+        """Whether a body that lies on something deforms again: with what it touches, or because
+        something comes near that is faster than what contacts bear."""
+        others = [b for b in self.bodies if b is not body]
+        if any(b.name in held and b.mode == BodyMode.DEFORMING for b in others):
+            return True
+        beside = self._resting.island(body)
+        fast = [b for b in others if b.name not in beside and _closing(body, b) > GENTLE]
+        if self._is_near_bodies(body, fast, duration):
+            return True
+        for collider in self._walls(body):
+            gap, approach = body.gap_to_colliders([collider])
+            hard = approach > GENTLE and (collider.moving or collider.name not in held)
+            if hard and gap < NEAR_CELLS * body.cell + approach * duration:
+                return True
+        return self._strikes_through(body, duration)
+
+    def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
+        """Whether springs of a body on wheels no longer keep its floor off the road."""
+        if body.tyres is None:
             return False
         gap, approach = body.gap_to_colliders(self.road)
         return gap < ROAD_CELLS * body.cell + max(approach, 0) * duration
+
+    def _may_be_rigid(self, body: DeformableBody) -> bool:
+        """Whether a deforming body that has settled is free, or lies on what does not deform any
+        more; then rigid contacts carry it from now on."""
+        fixed = [c for c in self._walls(body) if not c.moving]
+        others = [b for b in self.bodies if b is not body and _near(body, b)]
+        if not all(b.may_rigidify for b in self._deforming_with(body)):
+            return not touches_any(body, [], others) and self._is_free(body)
+        found = self._resting.begin(body, fixed, others)
+        return self._is_free(body) if found is None else found
+
+    def _deforming_with(self, body: DeformableBody) -> list[DeformableBody]:
+        """Deforming bodies near it, those near these, and so on."""
+        left = [b for b in self.bodies if b.mode == BodyMode.DEFORMING and b is not body]
+        found = [body]
+        for at in found:
+            beside = [b for b in left if _near(at, b)]
+            found += beside
+            left = [b for b in left if b not in beside]
+        return found[1:]
+
+    def _touch_more(self) -> None:
+        """Let bodies that lie on something be carried by what else they have come to touch."""
+        for body in self.bodies:
+            held = self._resting.partners(body)
+            if body.mode != BodyMode.RIGID or not held:
+                continue
+            near = body.spacing / 2
+            walls = [
+                c
+                for c in self._walls(body)
+                if not c.moving and c.name not in held and body.gap_to_colliders([c])[0] < near
+            ]
+            others = [
+                b
+                for b in self.bodies
+                if b is not body
+                and b.mode != BodyMode.DEFORMING
+                and b.name not in held
+                and body.gap_to(b) < near
+            ]
+            if walls or others:
+                self._resting.begin(body, walls, others)
+
+    def _is_loaded(self, body: DeformableBody) -> bool:
+        """Whether something that deforms may touch it."""
+        return any(
+            b is not body and b.mode == BodyMode.DEFORMING and _near(body, b) for b in self.bodies
+        )
+
+    def _lay_to_rest(self, duration: float) -> None:
+        """Put rigid bodies to sleep that have stood or lain still, all that touch together."""
+        for body in self.bodies:
+            if body.mode == BodyMode.RIGID and self._resting.partners(body):
+                body.note_standing(duration)
+        for body in self.bodies:
+            if body.mode == BodyMode.RIGID and body.has_parked:
+                beside = [b for b in self.bodies if b.name in self._resting.partners(body)]
+                if all(b.mode == BodyMode.SLEEPING or b.has_parked for b in beside):
+                    self._put_to_sleep(body)
 
     def _is_free(self, body: DeformableBody) -> bool:
         """Whether a deforming body may go its way as a rigid one."""
@@ -234,6 +324,18 @@ def _moves(body: DeformableBody) -> bool:
     m = body.motion
     speed = float(np.linalg.norm(m.velocity)) + float(np.linalg.norm(m.angular_velocity))
     return body.mode != BodyMode.SLEEPING and speed > SLEEP_SPEED
+
+
+def _near(a: DeformableBody, b: DeformableBody) -> bool:
+    """Whether two bodies may touch."""
+    return a.gap_to(b) < NEAR_CELLS * a.cell
+
+
+def _closing(a: DeformableBody, b: DeformableBody) -> float:
+    """Speed at which two bodies approach each other [m/s]."""
+    along = b.motion.centre - a.motion.centre
+    away = float(np.linalg.norm(along))
+    return float((a.motion.velocity - b.motion.velocity) @ along) / max(away, 1e-9)
 
 
 def _approach(a: DeformableBody, b: DeformableBody) -> bool:

@@ -67,9 +67,9 @@ def supports_of(
     """
     if not np.any(gravity):
         return ()
-    contacts = [*_wheel_contacts(body, road), *_collider_contacts(body, colliders)]
+    contacts = [*_wheel_contacts(body, road), *collider_contacts(body, colliders)]
     if not _balanced(body, contacts, gravity):
-        contacts += _body_contacts(body, others)
+        contacts += body_contacts(body, others)
         if not _balanced(body, contacts, gravity):
             return None
     return tuple(sorted({c.other for c in contacts}))
@@ -89,7 +89,8 @@ def _wheel_contacts(body: DeformableBody, road: Sequence[Collider]) -> Iterable[
         yield Contacts(collider.name, point[None], normal[None], friction)
 
 
-def _collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> Iterable[Contacts]:
+def collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> Iterable[Contacts]:
+    """Where corners of a body's particles touch colliders, the outermost of each."""
     shell = body.shell_points()
     turn = body.T_world_object[:3, :3]
     for collider in colliders:
@@ -104,7 +105,7 @@ def _collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> I
         yield from _by_normal(collider.name, corners[touching], normals[touching], mu)
 
 
-def _body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> list[Contacts]:
+def body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> list[Contacts]:
     """Particles beside those of another body; the normal is the mean way from them."""
     from scipy.spatial import cKDTree
 
@@ -141,13 +142,13 @@ def _by_normal(name: str, points: Float, normals: Float, mu: float) -> Iterable[
 
 
 def _outermost(points: Float, normal: Float) -> Float:
-    first, second = _tangents(normal, np.array([1.0, 0.3, 0.2]))
+    first, second = tangents(normal, np.array([1.0, 0.3, 0.2]))
     angle = 2 * np.pi * np.arange(CORNERS) / CORNERS
     directions = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     return np.unique((points @ directions.T).argmax(axis=0))
 
 
-def _tangents(normal: Float, pull: Float) -> tuple[Float, Float]:
+def tangents(normal: Float, pull: Float) -> tuple[Float, Float]:
     """Two unit vectors along the surface: against ``pull``, and across it."""
     along = (pull @ normal) * normal - pull
     length = float(np.linalg.norm(along))
@@ -168,7 +169,7 @@ def _balanced(body: DeformableBody, contacts: Sequence[Contacts], gravity: Float
     columns = []
     for c in contacts:
         for point, normal in zip(c.points, c.normals, strict=True):
-            first, second = _tangents(normal, gravity)
+            first, second = tangents(normal, gravity)
             lever = (point - body.motion.centre) / arm
             for k in range(DIRECTIONS):
                 angle = 2 * np.pi * k / DIRECTIONS

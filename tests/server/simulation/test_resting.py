@@ -1,0 +1,103 @@
+"""What has settled is carried by rigid contacts: it neither sinks nor creeps nor flips."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_server.physics import Foam, Plane, box_particles
+from real2sim_server.physics.validation.check import placed as at
+from real2sim_server.simulation.body import BodyMode, DeformableBody
+from real2sim_server.simulation.simulator import STEP, HybridSimulator
+
+SIDE = 0.6
+FOAM = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
+MU = 0.5
+
+
+def box(name: str, pose, velocity=(0.0, 0.0, 0.0)) -> DeformableBody:
+    particles = box_particles((SIDE, SIDE, SIDE), spacing=0.1, density=200.0)
+    return DeformableBody(
+        name,
+        particles,
+        [FOAM],
+        np.zeros(len(particles), dtype=np.int64),
+        friction=MU,
+        cell=0.2,
+        T_world_object=pose,
+        velocity=np.array(velocity),
+        angular_velocity=np.zeros(3),
+    )
+
+
+def simulator(*bodies: DeformableBody) -> HybridSimulator:
+    return HybridSimulator(
+        bodies,
+        [Plane(name="ground")],
+        road=["ground"],
+        gravity=(0.0, 0.0, -9.81),
+        backend="cpu",
+        brake_after_hit=1.0,
+    )
+
+
+def run(world: HybridSimulator, seconds: float) -> int:
+    """Go on, and count how often bodies begin to deform."""
+    begun, modes = 0, [b.mode for b in world.bodies]
+    for _ in range(round(seconds / STEP)):
+        world.advance(STEP)
+        now = [b.mode for b in world.bodies]
+        begun += sum(m == BodyMode.DEFORMING != k for m, k in zip(now, modes, strict=True))
+        modes = now
+    return begun
+
+
+def places(world: HybridSimulator) -> np.ndarray:
+    return np.stack([b.motion.centre for b in world.bodies])
+
+
+def dropped(offset: float) -> HybridSimulator:
+    """Three boxes above each other, each 6 cm above the next, the second to a side."""
+    aside = {"a": 0.0, "b": offset, "c": 0.0}
+    return simulator(*(box(n, at(x, 0, 0.36 + 0.66 * k)) for k, (n, x) in enumerate(aside.items())))
+
+
+def test_a_stack_that_falls_onto_itself_comes_to_rest():
+    world = dropped(0.02)
+    assert run(world, 0.5) == 3
+    settled = places(world)
+    assert run(world, 0.5) == 0
+    assert all(b.mode == BodyMode.SLEEPING for b in world.bodies)
+    assert places(world) == pytest.approx(settled, abs=5e-4)
+    assert np.abs(places(world)[:, :2]).max() < 0.04
+    assert np.diff(places(world)[:, 2]).min() > 0.9 * SIDE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", [0.0, 0.02, 0.05])
+def test_stacks_stay_for_five_seconds(offset):
+    world = dropped(offset)
+    run(world, 1.0)
+    settled = places(world)
+    assert run(world, 4.0) == 0
+    assert places(world) == pytest.approx(settled, abs=1e-3)
+
+
+def test_the_ground_and_each_box_carry_what_is_above():
+    world = dropped(0.02)
+    run(world, 0.45)
+    before = world.contact_log.totals()
+    assert all(b.mode == BodyMode.RIGID for b in world.bodies)
+    run(world, 0.1)
+    after = world.contact_log.totals()
+    weight = 9.81 * world.bodies[0].motion.mass
+    for pair, carried in ((("a", "ground"), 3), (("b", "a"), 2), (("c", "b"), 1)):
+        force = (after[pair] - before[pair])[2] / 0.1
+        assert force == pytest.approx(carried * weight, rel=0.1)
+
+
+def test_a_box_slides_as_far_as_friction_lets_it():
+    world = simulator(box("box", at(0, 0, SIDE / 2), (3.0, 0.0, 0.0)))
+    run(world, 1.0)
+    assert places(world)[0, 0] == pytest.approx(3.0**2 / (2 * MU * 9.81), rel=0.08)
+    assert world.bodies[0].mode == BodyMode.SLEEPING
