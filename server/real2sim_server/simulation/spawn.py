@@ -186,6 +186,8 @@ def _spawn_body(
         materials, regions, particles = preset.build(subject.category, particles, preset.spacing)
     else:
         materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
+    # A structure has moved mass between its zones.
+    particles = _with_centre(particles, subject, preset)
     if preset.by_density and physics.mass is None:
         volume = object_volume(scene, subject, start_us)
         particles = particles.with_mass(materials[0].density * volume)
@@ -232,6 +234,14 @@ def object_particles(
     if not (preset.wheels and subject.category in VEHICLES):
         return filling.lattice()
     particles = filling.lattice(above=-size[2] / 2 + preset.clearance)
+    return _with_centre(particles, subject, preset)
+
+
+def _with_centre(particles: Particles, subject: PlacedObject, preset: Preset) -> Particles:
+    """With the centre of mass of a vehicle on wheels as high as its class has it."""
+    size = subject.scaled_size
+    if not (preset.wheels and subject.category in VEHICLES):
+        return particles
     height = centre_height(subject.category, track_of(size))
     return particles if height is None else particles.with_centre_height(height - size[2] / 2)
 

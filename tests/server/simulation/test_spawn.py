@@ -12,7 +12,7 @@ from real2sim_server.physics import PhysicsError, Plane
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.presets import ObjectPhysics, preset_of
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
-from real2sim_server.simulation.spawn import object_particles
+from real2sim_server.simulation.spawn import object_particles, spawn_bodies
 from real2sim_server.simulation.tyres import track_of
 
 GROUND = Plane(name="ground", friction=0.7)
@@ -118,3 +118,21 @@ def test_the_centre_of_mass_of_vehicles_is_as_high_as_published(tiny_scene, cate
     above_road = particles.centre_of_mass[2] + subject.scaled_size[2] / 2
     assert track_of(subject.scaled_size) / 2 / above_road == pytest.approx(stability, rel=1e-3)
     assert particles.masses.min() > 0
+
+
+def test_its_structure_does_not_move_the_centre_of_mass_of_a_vehicle(tiny_scene):
+    state, preset = ScenarioState.of(tiny_scene), preset_of("vehicle")
+    red = next(o for o in state.visible if o.object_id == "car_red")
+    (body,) = spawn_bodies(
+        tiny_scene,
+        state,
+        {"car_red": ObjectPhysics()},
+        preset=preset,
+        start_us=0,
+        colliders=[],
+        road=[],
+        gravity=np.zeros(3),
+        max_particles=400_000,
+    )
+    height = object_particles(tiny_scene, red, preset, 0).centre_of_mass[2]
+    assert body.rest.centre_of_mass[2] == pytest.approx(height, abs=1e-3)
