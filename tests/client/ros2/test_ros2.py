@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import builtins
 import math
 import time
@@ -16,7 +17,7 @@ from real2sim.images import Frame
 from real2sim.ros2.bridge import Ros2Bridge
 from real2sim.ros2.commands import CommandError, of_ackermann, of_path, of_twist
 from real2sim.ros2.messages import MessageBuilder, MessageTypes
-from real2sim.ros2.node import NoRosError, RosNode
+from real2sim.ros2.node import NoRosError, RosNode, message_class
 from real2sim_proto.drive import EgoState
 from real2sim_proto.scenes import CameraInfo
 
@@ -293,3 +294,86 @@ def test_without_ros_it_says_what_to_install(monkeypatch):
     with pytest.raises(NoRosError, match="needs rclpy") as refused:
         RosNode()
     assert "setup.bash" in str(refused.value.hint)
+
+
+# --- the node -------------------------------------------------------------------------------------
+
+
+class PlayedRos:
+    """``rclpy`` and message packages, as far as the node uses them."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, Any]] = []
+        self.profiles: dict[str, Any] = {}
+        self.receive: dict[str, Callable[[Any], None]] = {}
+        self.running, self.ended = True, []
+        classes = type("Classes", (), {"__getattr__": lambda _self, name: _field_holder(name)})()
+        packages = ("sensor_msgs", "nav_msgs", "geometry_msgs", "tf2_msgs", "rosgraph_msgs")
+        headers = ("std_msgs", "builtin_interfaces", "ackermann_msgs")
+        self.modules = {f"{name}.msg": classes for name in (*packages, *headers)}
+        durability = SimpleNamespace(TRANSIENT_LOCAL="kept", VOLATILE="gone")
+        self.modules["rclpy.qos"] = SimpleNamespace(
+            DurabilityPolicy=durability, QoSProfile=lambda **fields: fields
+        )
+        self.modules["rclpy"] = SimpleNamespace(
+            init=lambda: None,
+            create_node=lambda _name: self,
+            ok=lambda: self.running,
+            spin_once=lambda _node, timeout_sec: None,
+            try_shutdown=lambda: self.ended.append("rclpy"),
+        )
+
+    def create_publisher(self, _kind: Any, topic: str, profile: Any) -> Any:
+        self.profiles[topic] = profile
+        return SimpleNamespace(publish=lambda message: self.sent.append((topic, message)))
+
+    def create_subscription(
+        self, _kind: Any, topic: str, receive: Callable[[Any], None], _depth: int
+    ) -> None:
+        self.receive[topic] = receive
+
+    def destroy_node(self) -> None:
+        self.ended.append("node")
+
+
+def _field_holder(name: str) -> type:
+    return type(name, (SimpleNamespace,), {})
+
+
+@pytest.fixture
+def ros(monkeypatch) -> PlayedRos:
+    played = PlayedRos()
+    monkeypatch.setattr("importlib.import_module", played.modules.__getitem__)
+    message_class.cache_clear()
+    yield played
+    message_class.cache_clear()
+
+
+def test_the_node_publishes_by_ros_and_keeps_what_stands_still(ros):
+    node = RosNode()
+    builder = MessageBuilder(node.types)
+    cameras = builder.camera_transforms(0, [])
+    node.publish("/tf_static", "tf2_msgs/msg/TFMessage", cameras)
+    image = builder.image(frame("rgb", np.ones((32, 48, 3), np.uint8)))
+    for _ in range(2):
+        node.publish("/camera/front/image_raw", "sensor_msgs/msg/Image", image)
+    node.close()
+
+    assert [topic for topic, _ in ros.sent] == ["/tf_static", *["/camera/front/image_raw"] * 2]
+    assert ros.profiles["/tf_static"] == {"depth": 1, "durability": "kept"}
+    assert ros.profiles["/camera/front/image_raw"]["durability"] == "gone"
+    # What rclpy takes without looking at every number.
+    assert isinstance(image.data, array.array)
+    assert image.data.tobytes() == b"\x01" * (32 * 48 * 3)
+    assert ros.ended == ["node", "rclpy"]
+
+
+def test_the_node_receives_until_ros_ends(ros):
+    node, found = RosNode(), []
+    node.subscribe("/cmd_vel", "geometry_msgs/msg/Twist", found.append)
+    ros.receive["/cmd_vel"]("go")
+
+    assert found == ["go"]
+    assert node.spin(0.1)
+    ros.running = False
+    assert not node.spin(0.1)
