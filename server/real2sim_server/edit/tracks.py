@@ -62,6 +62,7 @@ class PackedTracks(Generic[T]):
     def __init__(self, objects: tuple[T, ...]) -> None:
         trajectories = [o.trajectory for o in objects]
         self.objects = objects
+        self._newest: tuple[bytes, tuple[T, ...], Float] | None = None
         self.sizes = _stacked([np.array([o.scaled_size]) for o in objects], 3)
         self.lower = _stacked([t.positions.min(axis=0)[None] for t in trajectories], 3)
         self.upper = _stacked([t.positions.max(axis=0)[None] for t in trajectories], 3)
@@ -88,7 +89,7 @@ class PackedTracks(Generic[T]):
         )
         objects, sizes = self.objects, self.sizes
         if len(known) < len(objects):
-            objects, sizes = tuple([objects[i] for i in known.tolist()]), sizes[known]
+            objects, sizes = self._some(known)
         return PlacedObjects(
             objects=objects,
             sizes=sizes,
@@ -97,6 +98,16 @@ class PackedTracks(Generic[T]):
             velocities=velocities,
             transforms=transforms,
         )
+
+    def _some(self, known: NDArray[np.int64]) -> tuple[tuple[T, ...], Float]:
+        """Objects by their places, and their sizes; the same tuple as long as they are the same."""
+        places = known.tobytes()
+        newest = self._newest
+        if newest is None or newest[0] != places:
+            objects = tuple([self.objects[i] for i in known.tolist()])
+            # One assignment, for worlds on other threads may look here too.
+            self._newest = newest = (places, objects, self.sizes[known])
+        return newest[1], newest[2]
 
 
 def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, NDArray[np.bool_]]:

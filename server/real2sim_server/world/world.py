@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -378,7 +377,7 @@ class World:
 
     def fork(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""
-        return copy.copy(self)
+        return evolved(self)
 
     # --- phases of a step -------------------------------------------------------------------
 

@@ -29,12 +29,11 @@ from real2sim_proto.drive_batch import (
 )
 
 from ...world import Observation, metrics_version
-from ...world.recording.replay import plan_payload
 from ..accounts import admit_message
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import send_parts
 from .batch_obs import pack_batch_obs, pack_errors
-from .batch_plans import check_for_batch, checked_plan, numbers_of, plan_rows, steps_of
+from .batch_plans import ReadPlan, check_for_batch, numbers_of, read_plans, steps_of
 from .connection import NORMAL_CLOSURE, Connection
 from .describe import result_fields
 from .gathered_calls import MOST_TOGETHER
@@ -173,13 +172,14 @@ class BatchConnection:
         arrived, timer = time.perf_counter(), PhaseTimer()
         steps = steps_of(message)
         numbers = numbers_of(message.worlds, len(steps), len(self._members))
+        plans = await read_plans(message.plans)
         async with self._held(numbers):
             due: dict[int, DueAction] = {}
             again: list[int] = []
             errors: Errors = {}
-            for number, step, fields in zip(numbers, steps, plan_rows(message.plans), strict=True):
+            for number, step, given in zip(numbers, steps, plans, strict=True):
                 try:
-                    action = self._due(number, step, fields)
+                    action = self._due(number, step, given)
                 except Exception as error:
                     errors[number] = self._error(number, error)
                 else:
@@ -193,7 +193,7 @@ class BatchConnection:
             self._sessions.metrics.steps.observe(seconds)
         return await self._packed(numbers, seen, errors, timer)
 
-    def _due(self, number: int, step: int, fields: dict[str, Any]) -> DueAction | None:
+    def _due(self, number: int, step: int, given: ReadPlan | ServiceError) -> DueAction | None:
         """The action of a world; None where it was taken already, and is asked for again.
 
         Raises:
@@ -201,11 +201,11 @@ class BatchConnection:
         """
         session = self._controlled(number)
         check_for_batch(session.spec)
-        plan = checked_plan(fields)
-        payload = plan_payload(plan)
-        if session.lockstep.cached_answer(step, payload) is not None:
+        if isinstance(given, ServiceError):
+            raise given
+        if session.lockstep.cached_answer(step, given.payload) is not None:
             return None
-        return DueAction(session, plan, payload)
+        return DueAction(session, given.plan, given.payload)
 
     async def _taken(self, due: Mapping[int, DueAction], errors: Errors) -> dict[int, Observation]:
         """Take due actions, a few at once; other sessions get their turn between."""

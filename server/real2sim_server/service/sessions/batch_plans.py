@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
@@ -11,10 +12,26 @@ from real2sim_proto.drive_batch import BatchAction, ControlPlans, Plans, Traject
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import PLAN, Plan
 
+from ...world.recording.replay import plan_payload
 from ..http.problems import ServiceError
 from .messages import bad_message, validation_summary
 
+FEW_POSES = 256
+"""Plans of so many poses in sum are checked on the event loop, within half a millisecond."""
+
 COLUMNS = {"control": ("acceleration", "steering"), "pose": ("x", "y", "yaw")}
+
+
+class ReadPlan(NamedTuple):
+    """A plan of one world.
+
+    Attributes:
+        plan: checked.
+        payload: its canonical bytes.
+    """
+
+    plan: Plan
+    payload: bytes
 
 
 def numbers_of(worlds: list[int] | None, rows: int | None, members: int) -> list[int]:
@@ -55,12 +72,24 @@ def plan_rows(plans: Plans) -> list[dict[str, Any]]:
     return rows
 
 
-def checked_plan(fields: dict[str, Any]) -> Plan:
-    """The plan of one world. Raises ServiceError: BAD_MESSAGE."""
+async def read_plans(plans: Plans) -> list[ReadPlan | ServiceError]:
+    """The plan of each world, or what is wrong with it; of many poses beside the event loop."""
+    poses = plans.times_us.size if isinstance(plans, TrajectoryPlans) else len(plans.values)
+    if poses <= FEW_POSES:
+        return _read_plans(plans)
+    return await asyncio.to_thread(_read_plans, plans)
+
+
+def _read_plans(plans: Plans) -> list[ReadPlan | ServiceError]:
+    return [_read_plan(fields) for fields in plan_rows(plans)]
+
+
+def _read_plan(fields: dict[str, Any]) -> ReadPlan | ServiceError:
     try:
-        return PLAN.validate_python(fields)
+        plan = PLAN.validate_python(fields)
     except ValidationError as error:
-        raise bad_message(validation_summary(error)) from error
+        return bad_message(validation_summary(error))
+    return ReadPlan(plan, plan_payload(plan))
 
 
 def steps_of(action: BatchAction) -> list[int]:

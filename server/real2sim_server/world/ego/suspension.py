@@ -142,14 +142,15 @@ def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Floa
         return T_world_vehicle
     cos_p, sin_p = math.cos(attitude.pitch), math.sin(attitude.pitch)
     cos_r, sin_r = math.cos(attitude.roll), math.sin(attitude.roll)
+    # Of one flat tuple: nested lists take twice as long.
     T_vehicle_body = np.array(
-        [
-            [cos_p, sin_p * sin_r, sin_p * cos_r, 0.0],
-            [0.0, cos_r, -sin_r, 0.0],
-            [-sin_p, cos_p * sin_r, cos_p * cos_r, suspension_of(ego).lift * attitude.pitch],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+        (
+            *(cos_p, sin_p * sin_r, sin_p * cos_r, 0.0),
+            *(0.0, cos_r, -sin_r, 0.0),
+            *(-sin_p, cos_p * sin_r, cos_p * cos_r, suspension_of(ego).lift * attitude.pitch),
+            *(0.0, 0.0, 0.0, 1.0),
+        )
+    ).reshape(4, 4)
     T_world_body: Float = T_world_vehicle @ T_vehicle_body
     return T_world_body
 

@@ -94,7 +94,9 @@ class ComfortAccumulator:
         if len(samples) < window:
             return ComfortAccumulator(samples, self.comfortable, self.worst)
         sample = comfort_sample(samples, dt)
-        worst = tuple(max(w, abs(f)) for w, f in zip(self.worst, sample, strict=True))
+        worst = tuple(
+            [a if a > w else w for w, a in zip(self.worst, map(abs, sample), strict=True)]
+        )
         comfortable = self.comfortable and sample.comfortable
         return ComfortAccumulator(samples, comfortable, worst, sample)
 
