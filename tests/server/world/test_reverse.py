@@ -12,6 +12,7 @@ from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.world import World, WorldError
 from real2sim_server.world.batch import BatchWorld
+from real2sim_server.world.driving import VEHICLE_MODELS
 from real2sim_server.world.ego.controller import EgoController
 from real2sim_server.world.ego.motion import Motion
 from real2sim_server.world.recording.stored_spec import stored_spec
@@ -138,6 +139,15 @@ def test_reverse_is_refused_by_a_vehicle_without_it(make_world):
     with pytest.raises(WorldError, match="max_reverse_speed is 0") as refused:
         commanded(make_world, ("reverse", 1.0, 1), max_reverse_speed=0.0)
     assert refused.value.code == "INVALID_ACTION"
+
+
+def test_a_model_that_cannot_go_backwards_says_so(make_world, make_scene, monkeypatch):
+    forwards = VEHICLE_MODELS["kinematic_bicycle"]._replace(backwards=None)
+    monkeypatch.setitem(VEHICLE_MODELS, "kinematic_bicycle", forwards)
+
+    with pytest.raises(WorldError, match="cannot go backwards"):
+        commanded(make_world, ("reverse", 1.0, 1))
+    assert parked(make_scene)[0].speed >= 0.0
 
 
 def test_noise_of_a_plan_that_stands_does_not_change_gear(make_world, moving):

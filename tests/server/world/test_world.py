@@ -324,3 +324,9 @@ def test_a_copy_goes_on_alike_and_on_its_own(make_world, moving):
 
     assert (world.steps, world.revision, len(world.agents.objects)) == (1, 0, 1)
     assert drive_somewhere(world.fork()) == drive_somewhere(world)
+
+
+def test_a_level_ego_has_no_minus_zeros_on_the_wire(make_world):
+    fields = make_world().observe().ego_fields()
+
+    assert "-0.0" not in str(fields["quaternion"])
