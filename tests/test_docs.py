@@ -69,3 +69,12 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "site" / "api" / "sdk.html").exists()
+
+
+def test_the_walkthrough_is_written_and_names_files_that_there_are() -> None:
+    page = (REPOSITORY / "docs/walkthrough.md").read_text("utf-8")
+    assert re.findall(r"^[A-Z]+$", page, re.M) == []
+    sources = [f"/{path.as_posix()}" for path in REPOSITORY.glob("[pcs]*/**/*.py")]
+    named = set(re.findall(r"`([\w/]+\.py)`", page))
+    assert len(named) > 20
+    assert [name for name in named if not any(s.endswith(f"/{name}") for s in sources)] == []

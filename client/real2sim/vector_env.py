@@ -27,11 +27,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.drive_batch import ControlPlans
 
+from ._protocol import error_of
 from ._references import ScenarioRef, SceneRef
 from ._sync.client import connect
 from .batch_observation import BatchObservation
 from .env import ACCELERATION, BRAKING, FAR, STEERING, WAYPOINTS
-from .errors import Real2SimError
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -206,8 +206,7 @@ class DriveVectorEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
     def _take(self, obs: BatchObservation) -> None:
         """Keep the rows of an observation."""
         if obs.errors:
-            first = obs.errors[0]
-            raise Real2SimError(f"world {first.world}: {first.detail}", hint=first.hint)
+            raise error_of(obs.errors[0])
         rows = obs.worlds
         state = np.stack([obs.of_ego(name) for name in STATE], axis=1)
         self._seen["state"][rows] = np.clip(state, -FAR, FAR)

@@ -12,6 +12,7 @@ import time
 from typing import Any
 
 import mutation
+import numpy as np
 from attacked_site import DEAD_S, SENSOR, TOKEN, Site
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
@@ -140,6 +141,9 @@ class Client:
 class Drive:
     """A controller who says what is nearly right, on one socket as long as it lasts."""
 
+    KINDS = ("hello", "reset", "action", "edit", "render", "agent", "snapshot", "restore")
+    LAST = ("fork", "bye")
+
     def __init__(self, site: Site) -> None:
         self._site = site
         self._client: Client | None = None
@@ -169,27 +173,31 @@ class Drive:
             self._client.close(hard=rng.random() < 0.3)
             self._site.settle()
         self._site.restore()
-        known = self._site.known
-        path = f"/v1/sessions/{known['session_id']}/drive"
-        self._client = Client(self._site, path, protocol=DRIVE_SUBPROTOCOL)
-        hello = encode({
-            "v": 1, "type": "hello", "id": 1, "protocols": [DRIVE_SUBPROTOCOL],
-            "token": known["token"], "role": "controller", "sdk": "fuzz",
-        })  # fmt: skip
+        self._client = Client(self._site, self._path(), protocol=DRIVE_SUBPROTOCOL)
+        hello = encode(self._hello())
         kind = BINARY
         if damaged:
             kind, hello = _damaged(hello, rng)
         self._client.send(frame(kind, hello))
         said = self._answer()
         if not damaged:
-            assert said == "welcome" or "CONTROLLER" in said, said
+            assert said.endswith("welcome") or "CONTROLLER" in said, said
         return said
 
+    def _path(self) -> str:
+        return f"/v1/sessions/{self._site.known['session_id']}/drive"
+
+    def _hello(self) -> dict[str, Any]:
+        return {
+            "v": 1, "type": "hello", "id": 1, "protocols": [DRIVE_SUBPROTOCOL],
+            "token": self._site.known["token"], "role": "controller", "sdk": "fuzz",
+        }  # fmt: skip
+
     def _message(self, rng: random.Random) -> tuple[int, bytes]:
+        reset, action = self.KINDS[1:3]
         if rng.random() < 0.25:  # What is right, so that the next damage goes deeper.
-            return BINARY, encode(self._right("reset" if rng.random() < 0.3 else "action", rng))
-        kinds = ("hello", "reset", "action", "edit", "render", "agent", "snapshot", "restore")
-        kind = rng.choice((*kinds, *kinds, *kinds, "fork", "bye"))
+            return BINARY, encode(self._right(reset if rng.random() < 0.3 else action, rng))
+        kind = rng.choice((*self.KINDS, *self.KINDS, *self.KINDS, *self.LAST))
         return _damaged(encode(self._right(kind, rng)), rng)
 
     def _right(self, kind: str, rng: random.Random) -> dict[str, Any]:
@@ -245,11 +253,61 @@ class Drive:
             said = decode(data)
             if said["type"] == "obs":
                 self._step, self._now = said["step"], said["t_us"]
+            if said["type"] == "batch_obs":
+                for error in said["errors"]:
+                    assert error["code"] not in ("INTERNAL", "OUT_OF_MEMORY"), error
+                if len(said["step"]):
+                    self._step, self._now = int(said["step"][0]), int(said["t_us"][0])
             if said["type"] == "error":
                 assert said["code"] not in ("INTERNAL", "OUT_OF_MEMORY"), said
                 return f"{said['code']} {mutation.shape_of(said['detail'])}"
             if said["type"] != "progress":
                 return str(said["type"])
+
+
+class Batch(Drive):
+    """The same on a batch socket, of one session."""
+
+    KINDS = ("batch_hello", "batch_reset", "batch_action")
+    LAST = ("batch_bye",)
+
+    def _path(self) -> str:
+        return "/v1/sessions/batch/drive"
+
+    def _hello(self) -> dict[str, Any]:
+        return {
+            "v": 1, "type": "batch_hello", "id": 1, "protocols": [DRIVE_SUBPROTOCOL],
+            "sessions": [self._member()], "sdk": "fuzz",
+        }  # fmt: skip
+
+    def _member(self) -> dict[str, Any]:
+        """A session that nobody else attacks; made anew where it is no more."""
+        site, known = self._site, self._site.known
+        there = known.get("batch_session_id")
+        if there is None or site.ask("GET", f"/v1/sessions/{there}") is None:
+            made = site.ask("POST", "/v1/sessions?scene=tiny")
+            known |= {"batch_session_id": made["session_id"], "batch_token": made["token"]}
+        return {"session_id": known["batch_session_id"], "token": known["batch_token"]}
+
+    def _right(self, kind: str, rng: random.Random) -> dict[str, Any]:
+        if kind == "batch_hello":
+            return self._hello() | {"id": rng.randrange(99)}
+        times = self._now + 100_000 * np.arange(1, 4)[None]
+        plans = (
+            {"kind": "trajectory", "times_us": times, "poses": np.ones((1, 3, 3))},
+            {"kind": "control", "values": np.ones((1, 2)), "reverse": np.array([False])},
+            {"kind": "pose", "values": np.zeros((1, 3))},
+        )
+        spec = {
+            "seed": 3, "dt_us": 100_000, "horizon": 8, "privileged": True,
+            "action": rng.choice(("trajectory", "control", "pose")),
+            "agents": {"default": rng.choice(("log", "idm"))}, "on_collision": "continue",
+        }  # fmt: skip
+        content: dict[str, Any] = {
+            "batch_reset": {"spec": spec, "worlds": [0], "seeds": [7]},
+            "batch_action": {"steps": np.array([self._step]), "plans": rng.choice(plans)},
+        }
+        return {"v": 1, **content.get(kind, {}), "type": kind, "id": rng.randrange(99)}
 
 
 def _damaged(data: bytes, rng: random.Random) -> tuple[int, bytes]:

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parent
-WAYS = ("routes", "requests", "uploads", "drive", "view", "frames")
-"""Damaged calls, damaged bytes of requests, forms with files, messages of both sockets, and bytes
+WAYS = ("routes", "requests", "uploads", "drive", "batch", "view", "frames")
+"""Damaged calls, damaged bytes of requests, forms with files, messages of the sockets, and bytes
 of handshakes and frames."""
 
 pytestmark = [pytest.mark.network, pytest.mark.usefixtures("worker_kernels")]

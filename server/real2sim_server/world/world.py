@@ -73,6 +73,7 @@ class World:
         state: objects after all edits.
         spec: how the episode runs.
         steps: clock steps done since the reset; ``step`` of the observation.
+        t_us: simulation time of this instant [us].
         revision: edits of this session so far.
         motion: planar state of the ego.
         T_world_vehicle: [4, 4] float64, the ego standing level on the ground; that touches others.
@@ -114,6 +115,9 @@ class World:
         self.reason: str | None = None
         self.lap = 0
         self._clock = episode_clock(scene, spec)
+        self.t_us = self._clock.at(self.steps)
+        # Until then the ego moves as recorded.
+        self._warm_up_end_us = self._clock.start_us + spec.warmup_us
         self._draws = Draws(spec.seed)
         self._episode_route = EpisodeRoute.of(scene, spec, self._clock)
         self._path = self._episode_route.route
@@ -140,11 +144,6 @@ class World:
         self._seam: Seam | None = None
         self.instant = self._instant(StepContacts())
         self.accumulator: MetricAccumulator = scoring.begin_accumulator(self.instant, self._context)
-
-    @property
-    def t_us(self) -> int:
-        """Simulation time of this instant [us]."""
-        return self._clock.at(self.steps)
 
     @property
     def horizon(self) -> int:
@@ -180,11 +179,6 @@ class World:
     def warming_up(self) -> bool:
         """Whether the ego still moves as recorded."""
         return self.t_us < self._warm_up_end_us
-
-    @property
-    def _warm_up_end_us(self) -> int:
-        """End of the time in which the ego moves as recorded."""
-        return self._clock.start_us + self.spec.warmup_us
 
     @property
     def drawn(self) -> dict[str, float]:
@@ -457,6 +451,7 @@ class World:
         seconds = self._clock.dt_us * 1e-6
         acceleration = (moved.motion.speed - self.motion.speed) / seconds
         self.steps += 1
+        self.t_us = self._clock.at(self.steps)
         self._controller, self.traffic = moved.controller, moved.traffic
         self._contacts, self.impacts = moved.contacts, moved.impacts or ()
         before = self.motion

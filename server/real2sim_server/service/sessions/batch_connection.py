@@ -105,12 +105,12 @@ class BatchConnection:
         for session, resuming in zip(self._members, self._resuming, strict=True):
             if session.controller is not None and not resuming:
                 raise FatalError(controller_taken(session.session_id), message_id=hello.id)
-        for session in self._members:
-            old, session.controller = session.controller, self
-            session.close_callbacks.add(self._session_closed)
-            if isinstance(old, Connection):
-                await old.yield_control()
         try:
+            for session in self._members:
+                old, session.controller = session.controller, self
+                session.close_callbacks.add(self._session_closed)
+                if isinstance(old, Connection):
+                    await old.yield_control()
             yield
         finally:
             for session in self._members:
@@ -182,9 +182,11 @@ class BatchConnection:
                     action = self._due(number, step, given)
                 except Exception as error:
                     errors[number] = self._error(number, error)
+                    continue
+                if action is None:
+                    again.append(number)
                 else:
-                    due |= {} if action is None else {number: action}
-                    again += [number] if action is None else []
+                    due[number] = action
             timer.stage("check")
             seen = await self._taken(due, errors) | await self._present(again)
             timer.stage("world")

@@ -261,16 +261,12 @@ class StepPipeline:
         Raises:
             OverLimitError: the account of the running task has had its time on the engine.
         """
-        account = await computing_account()
-        for transition in transitions:
-            transition.account = account
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._worlds, self._see_together, transitions)
+        return await self.on_world_thread(self._see_together, transitions)
 
     def _see_together(self, transitions: Sequence[Transition]) -> list[Seen | Exception]:
         return [
-            world if isinstance(world, Exception) else _counted(_seen, transition, world)
-            for transition, world in zip(transitions, self._worlds_of(transitions), strict=True)
+            world if isinstance(world, Exception) else attempt(_seen, world)
+            for world in self._worlds_of(transitions)
         ]
 
     def _worlds_of(self, transitions: Sequence[Transition]) -> list[World | Exception]:
@@ -522,7 +518,7 @@ def _counted(fn: Callable[..., T], transition: Transition, *args: Any) -> T | Ex
     return attempt(counted_world_time, transition.account, fn, transition, *args)
 
 
-def _seen(_transition: Transition, world: World) -> Seen:
+def _seen(world: World) -> Seen:
     return Seen(world, world.observe())
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.drive_batch import BATCH_SERVER_MESSAGE, COMMANDS, EGO_COLUMNS, MAX_WORLDS
+from real2sim_server.service.storage.errors import StoreUnavailableError
 
 from .conftest import Planner
 
@@ -241,6 +242,43 @@ def test_a_controller_that_comes_back_takes_the_place_of_the_old_one(batch):
         old = many.act([1, 1], [[1.0, 0.0]] * 2)
         assert {e["code"] for e in old["errors"]} == {"CONTROLLER_TAKEN"}
         assert again.act([1, 1], [[1.0, 0.0]] * 2)["step"].tolist() == [2, 2]
+
+
+def test_a_step_that_is_not_on_record_has_not_happened(site, batch, monkeypatch):
+    many = batch(3)
+    many.reset()
+    store, bad = site.worker.store, many.infos[1]["session_id"]
+    record = store.record
+
+    def fail_together(_logs: Any) -> None:
+        raise StoreUnavailableError("no disk")
+
+    def fail_for_one(session_id: str, *args: Any, **options: Any) -> None:
+        if session_id == bad:
+            raise StoreUnavailableError("no disk")
+        record(session_id, *args, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "record_together", fail_together)
+        patch.setattr(store, "record", fail_for_one)
+        obs = many.act([0, 0, 0], [[1.0, 0.0]] * 3)
+    assert [(e["world"], e["code"], e["step"]) for e in obs["errors"]] == [
+        (1, "STORAGE_UNAVAILABLE", 0)
+    ]
+    assert obs["worlds"].tolist() == [0, 2]
+    again = many.act([1, 0, 1], [[1.0, 0.0]] * 3)
+    assert again["step"].tolist() == [2, 1, 2]
+    assert again["ego"][1].tobytes() == obs["ego"][0].tobytes()
+
+
+def test_observers_of_a_session_see_what_a_batch_does(batch, join):
+    many = batch(2)
+    many.reset()
+    watcher = join(many.infos[1], role="observer")
+    obs = many.act([0, 0], [[1.0, 0.0], [2.0, 0.0]])
+    seen = watcher.receive()
+    assert (seen["type"], seen["id"]) == ("obs", 0)
+    assert row_of(obs, 1) == row_of_single(seen)
 
 
 def test_a_session_that_is_deleted_leaves_the_others_alone(site, batch):
