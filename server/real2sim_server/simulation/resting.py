@@ -104,7 +104,9 @@ class Resting:
 
     def island(self, body: DeformableBody) -> set[str]:
         """Bodies that are connected with a body by contacts, itself among them."""
-        bodies = {a for a, _ in self._touches}
+        first = [touches[0] for touches in self._touches.values()]
+        bodies = {t.body.name for t in first}
+        bodies |= {t.other.name for t in first if isinstance(t.other, DeformableBody)}
         found, more = {body.name}, [body.name]
         while more:
             at = more.pop()
@@ -165,7 +167,8 @@ class Resting:
         return [reaction for row in rows for reaction in row.reactions()]
 
     def _look_again(self) -> None:
-        """Find pairs anew whose points have slid or opened; forget those that are apart."""
+        """Find pairs anew whose points have slid or opened; forget those that are apart, and those
+        that strike."""
         for pair, touches in list(self._touches.items()):
             body, other = touches[0].body, touches[0].other
             reach = DRIFT * body.spacing
@@ -179,7 +182,8 @@ class Resting:
             for touch in known:
                 nearest = min(touches, key=lambda t: float(np.abs(t.local - touch.local).sum()))
                 touch.impulse = nearest.impulse * (len(touches) / len(known))
-            if known:
+            # What falls over strikes with its far edge: that is an impact.
+            if known and all(_closing(t) <= GENTLE for t in known):
                 self._touches[pair] = known
             else:
                 del self._touches[pair]

@@ -91,7 +91,8 @@ class Rebound:
     """What was asked of a body's rebound, and what canned impacts reached.
 
     Attributes:
-        requested, achieved: separation over approach speed.
+        requested: separation over approach speed.
+        achieved: the same in canned impacts; what really happened is in a Bounce each.
         elastic: without added viscosity; no more can be reached.
         other: name of what it was fitted on; None where the body will meet nothing, and a wall
             across its way stood for it.
@@ -124,7 +125,7 @@ class SimulationResult:
         impulses: [F, C, 3] of each contact up to each frame [N s].
         stopped: ``done`` or ``cancelled``; then there are the frames made until then.
         figures: preset, gravity, cells, steps, rollbacks, and ``restitution``: of each object that
-            was given one, the members of a Rebound (JSON values only).
+            was given one, the members of a Rebound and its ``bounces`` (JSON values only).
     """
 
     objects: Mapping[str, ObjectResult]

@@ -159,6 +159,8 @@ def _figures(options: SimulateOptions, simulator: HybridSimulator) -> dict[str, 
         "substeps": simulator.substeps,
         "rollbacks": simulator.rollbacks,
         "restitution": {
-            b.name: b.rebound.figures() for b in simulator.bodies if b.rebound is not None
+            b.name: b.rebound.figures() | {"bounces": simulator.bounces.figures(b.name)}
+            for b in simulator.bodies
+            if b.rebound is not None
         },
     }

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ..physics.colliders import Collider
 from ..physics.solver import Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody
+from .bounces import Bounces
 from .contacts import ContactLog
 from .resting import GENTLE, Resting, touches_any
 from .support import supports_of
@@ -22,7 +23,7 @@ NEAR_CELLS = 3.0
 ROAD_CELLS = 0.4
 """On its wheels a body is near the road all the time; contact begins when springs are through."""
 APPROACH_MIN = 1e-3
-"""Bodies approach each other when speed times distance is beyond this [m^2/s]."""
+"""Bodies approach each other when speed times distance is beyond this [m^2/s], or a speed [m/s]."""
 HIT_DELTA_V = 0.3
 """A vehicle was hit when something has changed its velocity by more [m/s]."""
 TYRES = "tyres"
@@ -47,6 +48,7 @@ class HybridSimulator:
     Attributes:
         bodies, colliders: as they are now.
         contact_log: impulses and energies since the start.
+        bounces: impacts of bodies that were given a restitution.
         time: since the start [s].
         substeps, rollbacks: of all solvers so far.
     """
@@ -65,6 +67,7 @@ class HybridSimulator:
         self.colliders = list(colliders)
         self.gravity = np.array(gravity, dtype=np.float64)
         self.contact_log = ContactLog()
+        self.bounces = Bounces()
         self.time = 0.0
         self.substeps = self.rollbacks = 0
         self._road = frozenset(road)
@@ -125,17 +128,24 @@ class HybridSimulator:
         if self._solver is None or self._solved != names:
             self._start_solver(deforming)
         assert self._solver is not None
+        before = {b.name: b.motion for b in deforming}
         report = self._solver.step(duration)
         self.substeps += report.substeps
         self.rollbacks += report.rollbacks
         self.colliders = list(self._solver.colliders)
-        self.contact_log.add_solver_contacts(self._solver.contacts, self.time, self._names)
+        contacts = self._solver.contacts
+        self.contact_log.add_solver_contacts(contacts, self.time, self._names)
         for body, state in zip(deforming, self._solver.states(), strict=True):
             body.update_from_solver(state)
             reaction = body.apply_road(self.road, duration)
             if reaction is not None:
                 self._log_tyres(body, [reaction])
                 self._solver = None
+        step = (self.time + duration, duration, self.gravity)
+        for c in self.bounces.follow(contacts, deforming, self.colliders, before, step):
+            c.body.apply_impulse(c.after)
+            self.contact_log.add(c.body.name, c.other, c.impulse, 0.0, self.time)
+            self._solver = None
 
     def _start_solver(self, deforming: list[DeformableBody]) -> None:
         self._solver = Solver(
@@ -145,6 +155,7 @@ class HybridSimulator:
         )
         self._solved = [b.name for b in deforming]
         self.contact_log.start_solver()
+        self.bounces.start_solver()
 
     def _log_tyres(self, body: DeformableBody, reactions: Iterable[TyreReaction]) -> None:
         for r in reactions:
@@ -158,6 +169,7 @@ class HybridSimulator:
             pass
         else:
             return
+        self.bounces.forget(body)
         self._solver = None
 
     def _brake_if_hit(self, body: DeformableBody) -> None:
@@ -215,12 +227,16 @@ class HybridSimulator:
         fast = [b for b in others if b.name not in beside and _closing(body, b) > GENTLE]
         if self._is_near_bodies(body, fast, duration):
             return True
+        asleep = body.mode == BodyMode.SLEEPING
         for collider in self._walls(body):
+            if not collider.moving and (asleep or collider.name in held):
+                continue
             gap, approach = body.gap_to_colliders([collider])
-            hard = approach > GENTLE and (collider.moving or collider.name not in held)
-            if hard and gap < NEAR_CELLS * body.cell + approach * duration:
+            # Nothing here carries a collider that moves, however slowly.
+            least = APPROACH_MIN if collider.moving else GENTLE
+            if approach > least and gap < NEAR_CELLS * body.cell + approach * duration:
                 return True
-        return self._strikes_through(body, duration)
+        return not asleep and self._strikes_through(body, duration)
 
     def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
         """Whether springs of a body on wheels no longer keep its floor off the road."""
@@ -234,6 +250,9 @@ class HybridSimulator:
         more; then rigid contacts carry it from now on."""
         fixed = [c for c in self._walls(body) if not c.moving]
         others = [b for b in self.bodies if b is not body and _near(body, b)]
+        moving = [c for c in self._walls(body) if c.moving]
+        if body.meets(moving, within=NEAR_CELLS * body.cell, ahead=STEP):
+            return False
         if not all(b.may_rigidify for b in self._deforming_with(body)):
             return not touches_any(body, [], others) and self._is_free(body)
         found = self._resting.begin(body, fixed, others)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.physics import Foam, Plane, box_particles
+from real2sim_server.physics import Box, Foam, Plane, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
+from real2sim_server.simulation.presets import preset_of
+from real2sim_server.simulation.rigid import rotation_of
 from real2sim_server.simulation.simulator import STEP, HybridSimulator
+from real2sim_server.simulation.tyres import Tyres
 
 SIDE = 0.6
 FOAM = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
@@ -101,3 +104,55 @@ def test_a_box_slides_as_far_as_friction_lets_it():
     run(world, 1.0)
     assert places(world)[0, 0] == pytest.approx(3.0**2 / (2 * MU * 9.81), rel=0.08)
     assert world.bodies[0].mode == BodyMode.SLEEPING
+
+
+def test_what_topples_over_ends_flat_on_the_ground():
+    leant = np.eye(4)
+    leant[:3, :3] = rotation_of(np.array([0.0, np.radians(65), 0.0]))
+    leant[2, 3] = SIDE * np.sqrt(0.5) * np.cos(np.radians(20))
+    world = simulator(box("box", leant))
+    run(world, 2.0)
+    assert world.bodies[0].mode == BodyMode.SLEEPING
+    axes = world.bodies[0].T_world_object[:3, :3]
+    assert np.abs(axes).max(axis=0) == pytest.approx(np.ones(3), abs=0.02)
+    assert places(world)[0, 2] == pytest.approx(SIDE / 2, abs=0.02)
+
+
+def test_a_collider_that_comes_slowly_moves_what_rests():
+    """A wall that is slower than what contacts bear pushes a box that sleeps."""
+    world = simulator(box("box", at(0, 0, SIDE / 2)))
+    run(world, 0.05)
+    wall = Box(name="wall", T_world_box=at(-0.45, 0, 0.3), size=(0.2, 2, 0.6), velocity=(0.1, 0, 0))
+    world.colliders.append(wall)
+    run(world, 0.9)
+    face = float(np.asarray(world.colliders[1].T_world_box)[0, 3]) + 0.1
+    assert places(world)[0, 0] > face + 0.85 * SIDE / 2
+
+
+@pytest.mark.slow
+def test_a_car_on_a_car_comes_to_rest():
+    """One vehicle dropped onto the roof of another: five seconds, less than 1 mm/s at their end."""
+    world = simulator(car("under", 0.0, 0.75), car("over", 0.3, 2.2))
+    run(world, 4.0)
+    settled = places(world)
+    assert run(world, 1.0) == 0
+    assert places(world) == pytest.approx(settled, abs=1e-3)
+
+
+def car(name: str, x: float, height: float) -> DeformableBody:
+    size = (4.4, 1.8, 1.5)
+    filled = box_particles((4.4, 1.8, 1.3), spacing=0.1, density=120.0).moved(at(0, 0, 0.1))
+    materials, regions, particles = preset_of("vehicle").build("car", filled, 0.1)
+    weight = 9.81 * particles.mass
+    return DeformableBody(
+        name,
+        particles,
+        materials,
+        regions,
+        friction=0.4,
+        cell=0.2,
+        T_world_object=at(x, 0, height),
+        velocity=np.zeros(3),
+        angular_velocity=np.zeros(3),
+        tyres=Tyres.of(size, particles.centre_of_mass, weight, brake=1.0),
+    )
