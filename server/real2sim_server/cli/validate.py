@@ -24,7 +24,8 @@ def validate(
     cases: Annotated[
         str | None,
         typer.Option(
-            help="Names with commas between them; all but the published crash figures by default."
+            help="Names with commas between them, or 'simulation' or 'published' for a group; all "
+            "but the published crash figures by default."
         ),
     ] = None,
     page: Annotated[
@@ -53,15 +54,20 @@ def validate(
 
 
 def _run(backend: str, cases: str | None, report: Callable[[int, int], None]) -> list[CaseResult]:
-    """The cases asked for; ``published`` stands for all of the published crash figures."""
+    """The cases asked for; ``published`` stands for all of the published crash figures, and
+    ``simulation`` for all of bodies that roll, hand over and hit thin things."""
     from ..physics.validation import table
     from ..simulation.experiments.published import PUBLISHED
+    from ..simulation.experiments.theory import THEORY
 
-    names = None if cases is None else [name.strip() for name in cases.split(",")]
-    if names is not None and "published" in names:
-        at = names.index("published")
-        names[at : at + 1] = PUBLISHED
-    available = {**table.CASES, **PUBLISHED}
+    names = [*table.CASES, *THEORY]
+    if cases is not None:
+        names = [name.strip() for name in cases.split(",")]
+    for group, members in (("published", PUBLISHED), ("simulation", THEORY)):
+        if group in names:
+            at = names.index(group)
+            names[at : at + 1] = members
+    available = {**table.CASES, **THEORY, **PUBLISHED}
     return table.run_table(backend=backend, cases=names, available=available, on_progress=report)
 
 

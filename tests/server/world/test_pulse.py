@@ -17,6 +17,7 @@ from real2sim_server.world.collision.manifold import (
     corners,
     overlap_patch,
 )
+from real2sim_server.world.collision.obstacles import ObstacleGrid
 from real2sim_server.world.collision.pulse import (
     Patch,
     Pulse,
@@ -25,7 +26,7 @@ from real2sim_server.world.collision.pulse import (
     mutual_stiffness,
 )
 from real2sim_server.world.collision.rigid_body import BodyProperties, BodyState
-from real2sim_server.world.recording.replay import reset_payload
+from real2sim_server.world.recording.replay import Entry, recorded_spec, reset_payload
 from real2sim_server.world.recording.stored_spec import stored_spec
 
 COAST = Control(acceleration=0.0, steering=0.0)
@@ -91,8 +92,6 @@ def test_a_fork_amid_an_impact_goes_on_as_the_world_does(make_world, moving):
 
 
 def test_specs_of_older_logs_keep_their_sudden_impacts(make_world, moving):
-    from real2sim_server.world.recording.replay import Entry, recorded_spec
-
     spec = rear_end(make_world, moving).spec
     fields = spec.model_dump(mode="json")
     del fields["contact"]["pulse"]
@@ -117,6 +116,20 @@ def test_crush_is_that_of_who_meets():
     # A pole takes along what is beside it, a wall no more than the face that it meets.
     assert contact_width((car, None), 0.25, -1, 0) == pytest.approx(0.75)
     assert contact_width((car, None), 4.0, -1, 0) == WIDTH
+
+
+def test_a_pole_is_narrow_and_a_wall_is_broad():
+    occupied = np.zeros((40, 40), dtype=bool)
+    occupied[20, 10] = True
+    occupied[30, :] = True
+    grid = ObstacleGrid(np.zeros(2), occupied)
+    pole, wall = ((20.5 * 0.25, 10.5 * 0.25), (30.5 * 0.25, 5.0))
+    assert sum(grid.breadth(*pole, -1.0, 0.0)) <= 0.25
+    assert grid.breadth(*wall, -1.0, 0.0) == (1.0, 1.0)
+    body = BodyState(wall[0] - LENGTH / 2, 5.0, 0.0, 10.0, 0.0, 0.0)
+    patch = grid.patch(body, CAR, -1.0, 0.0)
+    assert 0.0 < patch.depth < 0.4
+    assert patch.width == pytest.approx(WIDTH, abs=0.3)
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.1, 0.5, 1.0])

@@ -9,7 +9,7 @@ from .bending import cantilever, loaded_beam
 from .check import Check, ReferenceCurve
 from .contact import (
     braking,
-    collinear_cars,
+    collinear_bars,
     frictionless_slide,
     incline,
     oblique_impact,
@@ -17,7 +17,7 @@ from .contact import (
     restitution,
     rolling_ball,
 )
-from .elasticity import bar_on_wall, bulk_modulus, confined_compression, vibrating_bar
+from .elasticity import bar_on_wall, confined_compression, vibrating_bar
 from .gradients import gradients
 from .impact import hertz, stiff_discs, two_discs
 from .motion import affine_patch, free_fall, invariants, reproducibility, scale_invariance, spin
@@ -33,7 +33,6 @@ CASES: dict[str, Case] = {
         invariants,
         scale_invariance,
         reproducibility,
-        bulk_modulus,
         vibrating_bar,
         bar_on_wall,
         confined_compression,
@@ -49,7 +48,7 @@ CASES: dict[str, Case] = {
         rolling_ball,
         frictionless_slide,
         restitution,
-        collinear_cars,
+        collinear_bars,
         gradients,
     )
 }

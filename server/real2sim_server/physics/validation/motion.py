@@ -76,7 +76,7 @@ def spin(backend: str, *, edge: float = 0.48, turns: float = 1.0) -> list[Check]
 
 
 def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Check]:
-    """Two blocks that collide in space: mass, momentum, angular momentum, energy, volume."""
+    """Two blocks that collide in space: mass, momentum, angular momentum, energy."""
     material = FixedCorotated(young=2e5, poisson=0.3)
     size, away = (edge,) * 3, 0.625 * edge
     bodies = [
@@ -87,11 +87,10 @@ def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Chec
     ]
     solver = solve(bodies, backend=backend)
     start, energy = solver.measure, solver.energies().total
-    highest, smallest = energy, 1.0
+    highest = energy
     for _ in range(parts):
         solver.step(0.006)
         highest = max(highest, solver.energies().total)
-        smallest = min(smallest, solver.measure.min_volume_ratio)
     end = solver.measure
     scale = float(np.abs(start.momentum).sum())
     drift = float(np.abs(end.momentum.sum(0) - start.momentum.sum(0)).max()) / scale
@@ -102,7 +101,6 @@ def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Chec
         Check("invariants: momentum", drift, 0, 1e-12),
         Check("invariants: angular momentum", float(np.abs(spins).max()) / scale, 0, 1e-12, "m"),
         Check("invariants: energy gained", max(highest / energy - 1, 0), 0, 1e-3),
-        Check("invariants: smallest det F in (0.5, 1)", smallest, 0.75, 0.25),
         Check("invariants: they did collide", float(pushed > 0.1 * scale), 1, 0),
     ]
 

@@ -17,6 +17,7 @@ from ..presets import ObjectPhysics, preset_of
 from ..result import ObjectResult, SimulationResult
 from ..rollout import SimulateOptions, simulate_bodies
 from ..structure import GRAVITY, vehicle_structure
+from ..tyres import Tyres
 
 MALIBU_MASS = 1651.0
 MALIBU_SIZE = (4.87, 1.85, 1.35)
@@ -101,6 +102,7 @@ def whole_car(
     upside_down: bool = False,
     velocity: Sequence[float] = (0.0, 0.0, 0.0),
     spacing: float = SPACING,
+    tyres: Tyres | None = None,
 ) -> DeformableBody:
     """A plain car with hood, cabin and boot, of the Malibu's size; ``place``: of its box."""
     body = vehicle_body(CAR_SIZE, mass=mass, friction=0.4, spacing=spacing)
@@ -120,6 +122,7 @@ def whole_car(
         T_world_object=pose,
         velocity=np.array(velocity, dtype=np.float64),
         angular_velocity=np.zeros(3),
+        tyres=tyres,
     )
 
 

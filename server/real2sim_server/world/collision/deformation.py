@@ -57,7 +57,9 @@ PARTS = np.array([8, 1, 1])
 """Parts of an object along its length, width and height that follow their particles apart."""
 
 WALL = (1.0, 2.0, 2.0)
-"""Size of the part of the background that an object runs into: depth, width, height [m]."""
+"""Size of the part of the background that an object runs into: depth, width, height [m]; narrower
+where the background is, down to a POLE."""
+POLE = 0.25
 
 
 class Deformation(Protocol):
@@ -368,12 +370,19 @@ class _ImpactSolution:
         return transform_from(centre, yaw_quaternion(body.yaw))
 
     def _wall(self) -> Box:
+        """What the object ran into, as broad as the background is there."""
         nx, ny = self.impact.normal
+        depth, width, height = WALL
+        right, left = self.impact.breadth or (width / 2, width / 2)
+        middle = (left - right) / 2
         pose = transform_from(
-            np.array([-nx, -ny, 0.0]) * WALL[0] / 2 + [0.0, 0.0, WALL[2] / 2],
+            np.array([-nx, -ny, 0.0]) * depth / 2
+            + np.array([-ny, nx, 0.0]) * middle
+            + [0.0, 0.0, height / 2],
             yaw_quaternion(float(np.arctan2(ny, nx))),
         )
-        return Box(name="background", T_world_box=pose, size=WALL, friction=FRICTION)
+        size = (depth, max(left + right, POLE), height)
+        return Box(name="background", T_world_box=pose, size=size, friction=FRICTION)
 
 
 __all__ = ["DeformationTracker"]

@@ -42,6 +42,8 @@ class Impact:
             ``object_delta_v`` and ``energy`` those of it, as the mechanics of a sudden impulse
             have them; None where the impact was sudden, or had begun before.
         stiffness: of what was crushed [N/m].
+        breadth: how far the background reaches to both sides of the point, across the normal [m];
+            None where it had no part.
         side: of the ego on which the contact began.
         speeds: of the first body and of the object when it began [m/s].
         began_us: when it began in this step [us].
@@ -68,6 +70,7 @@ class Impact:
     participants: tuple[ImpactParticipant, ImpactParticipant | None] | None = None
     whole: float | None = None
     stiffness: float = MUTUAL_STIFFNESS
+    breadth: tuple[float, float] | None = None
 
     @property
     def crush(self) -> float:

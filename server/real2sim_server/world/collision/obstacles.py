@@ -31,6 +31,9 @@ FEWEST = 3
 REACH = 40.0
 """Distance from the recorded path within which cells are looked at [m]."""
 
+BREADTH = 1.0
+"""How far to the sides of a contact it is looked for how broad an obstacle is [m]."""
+
 DRIVEN_HALF_WIDTH = 1.1
 """The recorded vehicle drove through here, so there is nothing [m]."""
 
@@ -78,6 +81,25 @@ class ObstacleGrid:
         along, across = points @ [nx, ny], points[hit] @ [-ny, nx]
         width = float(np.ptp(across)) + CELL / 2
         return Patch(x, y, float(along[hit].max() - along.min()), width)
+
+    def breadth(self, x: float, y: float, nx: float, ny: float) -> tuple[float, float]:
+        """How far what stands at x, y reaches to both sides of it across the normal ``n`` [m], at
+        most BREADTH: a pole hardly, a wall as far as is looked."""
+        steps = np.arange(0.0, BREADTH + CELL / 4, CELL / 2)
+        deep = np.arange(-CELL, CELL * 1.01, CELL / 2)
+        found = []
+        for sign in (-1.0, 1.0):
+            across = sign * steps[:, None]
+            places = np.stack([x - across * ny + deep * nx, y + across * nx + deep * ny], axis=-1)
+            cells = np.floor((places - self.origin) / CELL).astype(np.int64)
+            inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=-1)
+            there = np.zeros(inside.shape, dtype=bool)
+            there[inside] = self.occupied[cells[inside, 0], cells[inside, 1]]
+            gaps = np.flatnonzero(~there.any(axis=1))
+            found.append(float(steps[gaps[0] - 1]) if len(gaps) and gaps[0] else 0.0)
+            if not len(gaps):
+                found[-1] = BREADTH
+        return found[0], found[1]
 
     def count(self, body: BodyState, properties: BodyProperties) -> int:
         """Number of occupied cells under a body."""

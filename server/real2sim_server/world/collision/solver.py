@@ -120,6 +120,7 @@ class _PairImpulse:
     whole: float | None = None
     lost: float = 0.0
     stiffness: float = MUTUAL_STIFFNESS
+    breadth: tuple[float, float] | None = None
 
 
 class _PrescribedMotion(NamedTuple):
@@ -351,6 +352,8 @@ def _begin_pulse(state: _SolverState, a: str, b: str, manifold: ContactManifold)
     patch = _patch(state, a, b, nx, ny)
     width = contact_width(bodies, patch.width if patch is not None else 0.0, nx, ny)
     exchanged.stiffness = mutual_stiffness(bodies, nx, ny) * width
+    if b == BACKGROUND and state.step.background is not None:
+        exchanged.breadth = state.step.background.breadth(manifold.x, manifold.y, nx, ny)
     _make_dynamic(state, {a, b} - {BACKGROUND} - state.dynamic)
     yaw = bodies[1][0].yaw if bodies[1] is not None else 0.0
     restitution = contact.restitution if whole.approach > SLOW else 0.0
@@ -606,6 +609,7 @@ def _impacts(state: _SolverState) -> tuple[Impact, ...]:
                 participants=exchanged.participants,
                 whole=exchanged.whole,
                 stiffness=exchanged.stiffness,
+                breadth=exchanged.breadth,
             )
         )
     return tuple(impacts)
