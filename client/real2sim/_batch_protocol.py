@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode, encode
+from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
 from real2sim_proto.drive import Envelope, Error, Progress
 from real2sim_proto.drive_batch import (
     BATCH_SERVER_MESSAGE,
@@ -148,4 +148,4 @@ def valid_plans(plans: Plans | Mapping[str, Any]) -> Plans:
 
 def _request(message: Envelope, answer: type[A], awaited: str, **how: Any) -> PendingRequest[A]:
     fields = message.model_dump(mode="python", exclude_none=True)
-    return PendingRequest(message.id, encode(fields), answer, awaited, **how)
+    return PendingRequest(message.id, fields, answer, awaited, **how)

@@ -22,10 +22,13 @@ from real2sim_proto import (
     decode,
     encode,
 )
+from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
 from real2sim_proto.drive import (
     SERVER_MESSAGE,
     Action,
     Agent,
+    Attach,
+    Attached,
     Bye,
     Driven,
     Edit,
@@ -70,7 +73,7 @@ MAX_UNSOLICITED = 16
 
 _SUPERSEDED = {ErrorCode.STALE_STEP.value, ErrorCode.EPISODE_OVER.value}
 
-MAX_MESSAGE_BYTES = 64 * 1024 * 1024
+MAX_MESSAGE_BYTES = MAX_SERVER_MESSAGE_BYTES
 _STATUS = {code.value: status for code, status in HTTP_STATUS.items()}
 
 
@@ -83,15 +86,21 @@ class PendingRequest(Generic[A]):
         idempotent: whether it may be sent again after the connection was lost; the worker moves
             only once.
         only_at_revision: revision at which alone it may be sent again.
+        has_images: whether the answer may hold images.
     """
 
     id: int
-    data: bytes
+    fields: Mapping[str, Any]
     answer: type[A]
     awaited: str
     long_timeout: bool = False
     idempotent: bool = True
     only_at_revision: int | None = None
+    has_images: bool = False
+
+    def encoded(self, slot: int | None = None) -> bytes:
+        """Its bytes; ``slot``: of shared memory, for images of the answer."""
+        return encode({**self.fields} if slot is None else {**self.fields, "slot": slot})
 
 
 class ProtocolState:
@@ -128,10 +137,19 @@ class ProtocolState:
             message, Welcome, "welcome (scene loading, first render)", long_timeout=True
         )
 
+    def attach(self, secret: bytes) -> PendingRequest[Attached]:
+        """Says that the shared memory of the welcome is open here."""
+        message = Attach(id=self._next_id(), secret=secret)
+        return self._request_for(
+            message, Attached, "confirmation of shared memory", idempotent=False
+        )
+
     def reset(self, spec: ResetSpec) -> PendingRequest[Obs]:
         """Starts an episode."""
         message = Reset(id=self._next_id(), spec=spec)
-        return self._request_for(message, Obs, "observation 0 after reset", long_timeout=True)
+        return self._request_for(
+            message, Obs, "observation 0 after reset", long_timeout=True, has_images=True
+        )
 
     def action(self, plan: Plan | Mapping[str, Any]) -> PendingRequest[Obs]:
         """Answers the newest observation.
@@ -145,7 +163,7 @@ class ProtocolState:
                 ErrorDetails(409, ErrorCode.NOT_RESET, "no episode runs", hint="call reset() first")
             )
         message = Action(id=self._next_id(), step=self._step, plan=valid_plan(plan))
-        return self._request_for(message, Obs, f"observation {self._step + 1}")
+        return self._request_for(message, Obs, f"observation {self._step + 1}", has_images=True)
 
     def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> PendingRequest[Edited]:
         """Changes the session's world, on the revision seen last."""
@@ -159,7 +177,7 @@ class ProtocolState:
     def render(self, sensors: Sequence[SensorSpec]) -> PendingRequest[View]:
         """Asks for images of the current instant."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors))
-        return self._request_for(message, View, "images")
+        return self._request_for(message, View, "images", has_images=True)
 
     def agent(
         self,
@@ -268,7 +286,7 @@ class ProtocolState:
         message: Envelope, answer: type[A], awaited: str, **how: Any
     ) -> PendingRequest[A]:
         fields = message.model_dump(mode="python", exclude_none=True)
-        return PendingRequest(message.id, encode(fields), answer, awaited, **how)
+        return PendingRequest(message.id, fields, answer, awaited, **how)
 
 
 def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from real2sim_proto.drive import Result, Welcome
+from real2sim_proto.drive import Frame, Result, Welcome
 from real2sim_proto.sessions import SessionInfo
 
 from ._protocol import PendingRequest, ProtocolState
+from ._shared_frames import SharedFrames
 from ._target import Target
 from .errors import (
     CapacityError,
@@ -42,6 +44,8 @@ class SessionPlan:
         role: ``controller`` or ``observer``.
         codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
         reconnect: seconds for which a lost connection is tried again; 0 gives up at once.
+        shared_memory: True must have it, False must not; None has it where it can, unless the
+            client says otherwise.
     """
 
     scene: str | None = None
@@ -51,6 +55,7 @@ class SessionPlan:
     role: str = "controller"
     codec: str = "auto"
     reconnect: float = 60.0
+    shared_memory: bool | None = None
 
 
 class SessionBase:
@@ -61,6 +66,7 @@ class SessionBase:
         self._plan = plan
         self._codec = target.codec(plan.codec)
         self._protocol = ProtocolState()
+        self._memory: SharedFrames | None = None
         self._welcome: Welcome | None = None
         self._result: Result | None = None
         self._token = plan.token
@@ -99,6 +105,11 @@ class SessionBase:
         return [camera.name for camera in self.welcome.cameras]
 
     @property
+    def shared_memory(self) -> bool:
+        """Whether raw images come by memory that this program shares with the worker."""
+        return self._memory is not None
+
+    @property
     def result(self) -> Result | None:
         """Final scores; known after ``close``."""
         return self._result
@@ -108,6 +119,52 @@ class SessionBase:
         return self._protocol.hello(
             sdk=SDK, role=self._plan.role, token=self._token, resume_token=resume_token
         )
+
+    def _offered_memory(self) -> SharedFrames | None:
+        """The memory that the welcome offers, open; None where it is not to be had or not wanted.
+
+        Raises:
+            UnreachableError: it is not to be had, and the session must have it.
+        """
+        offer = self.welcome.shared_memory
+        if self._wants_memory is False or self._plan.role != "controller":
+            return None
+        reason = "the worker offers none"
+        if offer is not None:
+            try:
+                return SharedFrames(offer)
+            except OSError as error:
+                reason = str(error)
+        self._without_memory(reason)
+        return None
+
+    def _without_memory(self, reason: str) -> None:
+        """Go on over the socket alone. Raises UnreachableError: the session must not."""
+        if self._wants_memory:
+            raise UnreachableError(
+                f"no shared memory with the worker at {self._target.url}: {reason}",
+                hint="worker and client need one /dev/shm and one user; in containers one IPC "
+                "namespace (ipc: host or service:...)",
+            )
+
+    @property
+    def _wants_memory(self) -> bool | None:
+        own = self._plan.shared_memory
+        return self._target.shared_memory if own is None else own
+
+    def _use_memory(self, memory: SharedFrames | None) -> None:
+        """Read images from there from now on."""
+        self._memory = memory
+        near = memory is not None and self._plan.codec == "auto"
+        self._codec = "raw" if near else self._target.codec(self._plan.codec)
+
+    def _slot_for(self, request: PendingRequest[Any]) -> int | None:
+        """Where images of the answer may be written."""
+        return self._memory.lend() if self._memory and request.has_images else None
+
+    def _pixels_of(self, frames: Sequence[Frame]) -> Sequence[memoryview | None]:
+        """What of an answer's images lies in shared memory."""
+        return () if self._memory is None else self._memory.pixels_of(frames)
 
     def _may_resend(self, request: PendingRequest[Any]) -> bool:
         """Whether it is worth connecting again for the sake of a request."""

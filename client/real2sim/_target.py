@@ -29,6 +29,7 @@ class Target:
             steps.
         name: who is calling, for the history of scenarios.
         policy: which requests are sent again.
+        shared_memory: whether sessions that do not say must have it (True) or must not (False).
     """
 
     url: str
@@ -37,6 +38,7 @@ class Target:
     long_timeout: float = 300.0
     name: str | None = None
     policy: RetryPolicy = field(default_factory=RetryPolicy, repr=False)
+    shared_memory: bool | None = None
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -89,7 +91,13 @@ class Target:
 
 
 def resolve_target(
-    url: str | None, token: str | None, *, timeout: float, name: str | None, retries: int
+    url: str | None,
+    token: str | None,
+    *,
+    timeout: float,
+    name: str | None,
+    retries: int,
+    shared_memory: bool | None = None,
 ) -> Target:
     """The target of these arguments; what is None comes from the environment, else the default.
 
@@ -101,7 +109,9 @@ def resolve_target(
         token = os.environ.get(TOKEN_VARIABLE)
     policy = RetryPolicy(retries)
     try:
-        return Target(found, token or None, timeout, name=name, policy=policy)
+        return Target(
+            found, token or None, timeout, name=name, policy=policy, shared_memory=shared_memory
+        )
     except ValueError as error:
         if url or found == DEFAULT_URL:
             raise

@@ -147,13 +147,27 @@ class Frame(Image):
     K: NDArray[np.float64] = field(repr=False)
 
 
-def frame_from_wire(wire: WireFrame) -> Frame:
+class PlacedFrame(Frame):
+    """A raw frame in shared memory. Its bytes are copied when they are asked for."""
+
+    @cached_property
+    def data(self) -> bytes:
+        """The array in C order, little-endian."""
+        return self.array.tobytes()
+
+
+def frame_from_wire(wire: WireFrame, pixels: memoryview | None = None) -> Frame:
     """The frame of a message, its matrices checked.
 
+    Args:
+        wire: the frame.
+        pixels: of a raw image in shared memory, as many bytes as its shape needs.
+
     Raises:
-        MalformedReplyError: matrices of another shape.
+        MalformedReplyError: matrices of another shape; shared memory of another codec.
     """
-    return Frame(
+    kind = Frame if pixels is None else PlacedFrame
+    frame = kind(
         data=wire.data,
         codec=wire.codec,
         modality=wire.modality,
@@ -164,13 +178,22 @@ def frame_from_wire(wire: WireFrame) -> Frame:
         T_world_sensor=_matrix(wire.T_world_sensor, (4, 4), "T_world_sensor"),
         K=_matrix(wire.K, (3, 3), "K"),
     )
+    if pixels is not None:
+        if wire.codec != "raw":
+            raise MalformedReplyError(f"an image of codec {wire.codec!r} in shared memory")
+        # In the place where the properties keep what they have found.
+        del frame.__dict__["data"]
+        frame.__dict__["array"] = _raw_array(frame, pixels)
+    return frame
 
 
-def frames_by_camera(wires: Sequence[WireFrame]) -> dict[str, Mapping[str, Frame]]:
-    """Frames by camera, then by modality."""
+def frames_by_camera(
+    wires: Sequence[WireFrame], pixels: Sequence[memoryview | None] = ()
+) -> dict[str, Mapping[str, Frame]]:
+    """Frames by camera, then by modality; ``pixels`` as of :func:`frame_from_wire`, for each."""
     frames: dict[str, dict[str, Frame]] = {}
-    for wire in wires:
-        frames.setdefault(wire.sensor, {})[wire.modality] = frame_from_wire(wire)
+    for wire, found in zip(wires, pixels or [None] * len(wires), strict=True):
+        frames.setdefault(wire.sensor, {})[wire.modality] = frame_from_wire(wire, found)
     return dict(frames)
 
 
@@ -199,12 +222,17 @@ def _matrix(value: Any, shape: tuple[int, int], name: str) -> NDArray[np.float64
 
 
 def _decode_raw(image: Image) -> NDArray[Any]:
+    return _raw_array(image, image.data)
+
+
+def _raw_array(image: Image, data: bytes | memoryview) -> NDArray[Any]:
+    """The array that lies in ``data``. Raises ImageDecodeError: it is none of the image's."""
     dtype = np.dtype(image.dtype).newbyteorder("<")
     try:
-        return np.frombuffer(image.data, dtype=dtype).reshape(image.shape)
+        return np.frombuffer(data, dtype=dtype).reshape(image.shape)
     except ValueError as error:
         raise ImageDecodeError(
-            f"raw image of {len(image.data)} bytes is not {image.dtype} {image.shape}"
+            f"raw image of {len(data)} bytes is not {image.dtype} {image.shape}"
         ) from error
 
 

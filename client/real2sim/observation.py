@@ -118,8 +118,12 @@ class Observation(View):
         return self.terminated or self.truncated
 
 
-def observation_from_wire(obs: Obs) -> Observation:
+def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) -> Observation:
     """The observation in a message.
+
+    Args:
+        obs: the message.
+        pixels: of its images in shared memory, None for each that is not there; default: none is.
 
     Raises:
         MalformedReplyError: a route or matrix of another shape.
@@ -136,7 +140,7 @@ def observation_from_wire(obs: Obs) -> Observation:
         ego=obs.ego,
         route=route,
         command=obs.command,
-        frames=frames_by_camera(obs.frames),
+        frames=frames_by_camera(obs.frames, pixels),
         agents=tuple(obs.agents),
         events=tuple(obs.events),
         metrics=obs.metrics,
@@ -152,7 +156,13 @@ def observation_from_wire(obs: Obs) -> Observation:
 
 
 def view_from_frames(
-    frames: Sequence[WireFrame], *, t_us: int, revision: int, timing: Mapping[str, float]
+    frames: Sequence[WireFrame],
+    *,
+    t_us: int,
+    revision: int,
+    timing: Mapping[str, float],
+    pixels: Sequence[memoryview | None] = (),
 ) -> View:
-    """The view in a message."""
-    return View(t_us=t_us, revision=revision, frames=frames_by_camera(frames), timing=timing)
+    """The view in a message; ``pixels`` as of :func:`observation_from_wire`."""
+    found = frames_by_camera(frames, pixels)
+    return View(t_us=t_us, revision=revision, frames=found, timing=timing)

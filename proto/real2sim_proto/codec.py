@@ -18,7 +18,10 @@ ARRAY_EXT = 1
 ARRAY_DTYPES = ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f2", "<f4", "<f8")
 MAX_DEPTH = 16
 MAX_ARRAY_NDIM = 8
-DEFAULT_MAX_BYTES = 64 * 1024 * 1024
+MAX_SERVER_MESSAGE_BYTES = 256 * 1024 * 1024
+"""A worker sends messages up to this size, and clients read them: rgb, depth and instance of five
+cameras of 1920x1280, raw, take 106 MiB."""
+DEFAULT_MAX_BYTES = MAX_SERVER_MESSAGE_BYTES
 MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
 """A worker accepts messages up to this size from a client; plans and edits are small."""
 

@@ -22,6 +22,7 @@ from .operations import Operation
 from .plans import Gear, Plan, PlanPoses, PlanTimes, check_times
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import CameraInfo, ObjectInfo
+from .shared_memory import MAX_SLOTS, NAME, SECRET_BYTES
 
 Array = Annotated[
     Any,
@@ -30,6 +31,16 @@ Array = Annotated[
     ),
 ]
 """A NumPy array on the wire."""
+
+Slot = Annotated[
+    int | None,
+    Field(
+        ge=0,
+        lt=MAX_SLOTS,
+        description="slot of the shared memory that raw images of the answer may be written to; "
+        "None, or without shared memory: they come with the answer",
+    ),
+]
 
 
 class Envelope(Model):
@@ -141,11 +152,24 @@ class Hello(Envelope):
     resume: Resume | None = Field(default=None, description="of a controller")
 
 
+class Attach(Envelope):
+    """The shared memory of the welcome is open here; answered by attached.
+
+    Only as the first message after the welcome: any other one declines it.
+    """
+
+    type: Literal["attach"] = "attach"
+    secret: bytes = Field(
+        min_length=SECRET_BYTES, max_length=SECRET_BYTES, description="read from the memory"
+    )
+
+
 class Reset(Envelope):
     """Starts an episode; answered by obs(0)."""
 
     type: Literal["reset"] = "reset"
     spec: ResetSpec = ResetSpec()
+    slot: Slot = None
 
 
 class Action(Envelope):
@@ -154,6 +178,7 @@ class Action(Envelope):
     type: Literal["action"] = "action"
     step: int = Field(ge=0)
     plan: Plan
+    slot: Slot = None
 
 
 class Edit(Envelope):
@@ -169,6 +194,7 @@ class Render(Envelope):
 
     type: Literal["render"] = "render"
     sensors: list[SensorSpec] = Field(min_length=1, max_length=MAX_SENSORS)
+    slot: Slot = None
 
 
 class Agent(Envelope):
@@ -212,7 +238,7 @@ class Bye(Envelope):
 
 
 ClientMessage = Annotated[
-    Hello | Reset | Action | Edit | Render | Agent | Snapshot | Restore | Fork | Bye,
+    Hello | Attach | Reset | Action | Edit | Render | Agent | Snapshot | Restore | Fork | Bye,
     Field(discriminator="type"),
 ]
 CLIENT_MESSAGE: TypeAdapter[ClientMessage] = TypeAdapter(ClientMessage)
@@ -232,7 +258,20 @@ class Frame(ServerModel):
     codec: Codec
     dtype: Literal["uint8", "uint16", "float32"]
     shape: list[int] = Field(description="[H, W, 3] or [H, W]")
-    data: bytes
+    offset: int | None = Field(
+        default=None,
+        ge=0,
+        description="of a raw image that lies in the shared memory, from its beginning [bytes]",
+    )
+    data: bytes = Field(description="empty where the image lies in the shared memory")
+
+
+class SharedMemory(ServerModel):
+    """Memory that a controller on the worker's machine may read raw images from."""
+
+    name: str = Field(pattern=NAME, description="of a file in /dev/shm")
+    slots: int = Field(ge=1, le=MAX_SLOTS)
+    slot_bytes: int = Field(ge=1, le=2**40, description="of each; the first begins at byte 4096")
 
 
 class Welcome(ServerEnvelope):
@@ -258,6 +297,15 @@ class Welcome(ServerEnvelope):
     resume_token: str | None = Field(
         default=None, description="of a controller: lets it come back after a lost connection"
     )
+    shared_memory: SharedMemory | None = Field(
+        default=None, description="of a controller that may be on this machine, for `attach`"
+    )
+
+
+class Attached(ServerEnvelope):
+    """Answer to attach. Messages may name slots from now on."""
+
+    type: Literal["attached"] = "attached"
 
 
 class Obs(ServerEnvelope):
@@ -371,7 +419,7 @@ class Result(ServerEnvelope):
 
 
 ServerMessage = Annotated[
-    Welcome | Obs | Edited | View | Driven | Kept | Forked | Progress | Error | Result,
+    Welcome | Attached | Obs | Edited | View | Driven | Kept | Forked | Progress | Error | Result,
     Field(discriminator="type"),
 ]
 SERVER_MESSAGE: TypeAdapter[ServerMessage] = TypeAdapter(ServerMessage)

@@ -30,6 +30,7 @@ MODELS: dict[str, type[BaseModel]] = {
     model.__name__: model
     for model in (
         drive.Hello,
+        drive.Attach,
         drive.Reset,
         drive.Action,
         drive.Edit,
@@ -40,6 +41,7 @@ MODELS: dict[str, type[BaseModel]] = {
         drive.Fork,
         drive.Bye,
         drive.Welcome,
+        drive.Attached,
         drive.Obs,
         drive.Edited,
         drive.View,

@@ -46,7 +46,9 @@ class Settings(BaseSettings):
         backend: what draws: ``auto`` chooses by the hardware at hand; ``nvrtc`` are the kernels of
             our own for a GPU, which serve and do not train.
         threads: of numba and torch; 0 for one per core.
-        scene_memory_bytes: budget of resident scenes and assets together.
+        scene_memory_bytes: budget of resident scenes and assets together, and of shared memory.
+        shared_memory_bytes: of each controller on this machine, in four slots, for raw images;
+            taken as images need it, and counted in the budget. 0 sends all over the socket.
         max_sessions: open sessions; more are refused at creation.
         session_idle_seconds: unused sessions without connections leave the memory after this time;
             they are rebuilt from their logs on demand.
@@ -99,6 +101,7 @@ class Settings(BaseSettings):
     backend: Literal["auto", "cpu", "cuda", "nvrtc", "reference"] = "auto"
     threads: int = Field(default=0, ge=0, le=1024)
     scene_memory_bytes: int = Field(default=8 * GIB, gt=0)
+    shared_memory_bytes: int = Field(default=512 * MIB, ge=0, le=64 * GIB)
     max_sessions: int = Field(default=32, ge=0)
     session_idle_seconds: float = Field(default=1800.0, gt=0)
     queue_length: int = Field(default=64, ge=1)

@@ -38,6 +38,7 @@ def connect_async(
     name: str | None = None,
     timeout: float = 30.0,
     retries: int = 2,
+    shared_memory: bool | None = None,
     transport: httpx2.AsyncBaseTransport | None = None,
 ) -> AsyncClient:
     """A client of the worker at ``url``. Nothing is sent yet.
@@ -53,6 +54,7 @@ def connect_async(
         timeout: seconds that a reply may take; calls that may load a scene or
             compile kernels have at least 300.
         retries: more tries of requests that may safely be sent again.
+        shared_memory: of sessions that do not say so themselves, see :meth:`AsyncClient.session`.
         transport: replaces the network, for tests of programs that use the SDK.
 
     Raises:
@@ -64,7 +66,9 @@ def connect_async(
         ['street']
         >>> await client.close()
     """
-    target = resolve_target(url, token, timeout=timeout, name=name, retries=retries)
+    target = resolve_target(
+        url, token, timeout=timeout, name=name, retries=retries, shared_memory=shared_memory
+    )
     return AsyncClient(AsyncTransport(target, transport=transport))
 
 
@@ -138,6 +142,7 @@ class AsyncClient:
         scenario: ScenarioRef | None = None,
         codec: str = "auto",
         reconnect: float = 60.0,
+        shared_memory: bool | None = None,
     ) -> AsyncDriveSession:
         """A new session on a scene or a scenario, to be opened by ``async with``.
 
@@ -148,6 +153,9 @@ class AsyncClient:
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
             reconnect: seconds for which a lost connection is tried again: the session goes on as
                 if nothing had happened, also after the worker was restarted. 0 gives up.
+            shared_memory: raw images come by memory shared with a worker on this machine: None,
+                where both can; True, or opening the session fails; False, never. The images are
+                the same, and are good for as long as anybody holds them.
 
         Raises:
             TypeError: something else than a scene or a scenario.
@@ -165,6 +173,7 @@ class AsyncClient:
             scenario=optional_scenario_id(scenario),
             codec=codec,
             reconnect=reconnect,
+            shared_memory=shared_memory,
         )
         return AsyncDriveSession(self._transport, plan)
 
@@ -205,7 +214,13 @@ class AsyncClient:
         return AsyncDriveBatch(self._transport, plan, worlds)
 
     def join(
-        self, session_id: str, *, token: str, role: str = "controller", codec: str = "auto"
+        self,
+        session_id: str,
+        *,
+        token: str,
+        role: str = "controller",
+        codec: str = "auto",
+        shared_memory: bool | None = None,
     ) -> AsyncDriveSession:
         """A session that exists already; closing leaves it running.
 
@@ -213,7 +228,7 @@ class AsyncClient:
             session_id: of that session.
             token: of that session.
             role: ``controller`` or ``observer``, which sees what the controller sees.
-            codec: as of :meth:`session`.
+            codec, shared_memory: as of :meth:`session`.
 
         Examples:
             >>> async with client.session(scene="street") as session:
@@ -222,7 +237,9 @@ class AsyncClient:
             ...         print(o.welcome.role)
             observer
         """
-        plan = SessionPlan(session_id=session_id, token=token, role=role, codec=codec)
+        plan = SessionPlan(
+            session_id=session_id, token=token, role=role, codec=codec, shared_memory=shared_memory
+        )
         return AsyncDriveSession(self._transport, plan)
 
     async def close(self) -> None:

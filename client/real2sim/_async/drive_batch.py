@@ -209,7 +209,7 @@ class AsyncDriveBatch:
             raise not_open()
         seconds = self._target.long_timeout if request.long_timeout else self._target.timeout
         with lost_connection(self._target, request.awaited):
-            await self._socket.send(request.data)
+            await self._socket.send(request.encoded())
             while True:
                 try:
                     data = await receive(self._socket, seconds)

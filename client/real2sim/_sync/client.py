@@ -39,6 +39,7 @@ def connect(
     name: str | None = None,
     timeout: float = 30.0,
     retries: int = 2,
+    shared_memory: bool | None = None,
     transport: httpx2.BaseTransport | None = None,
 ) -> Client:
     """A client of the worker at ``url``. Nothing is sent yet.
@@ -54,6 +55,7 @@ def connect(
         timeout: seconds that a reply may take; calls that may load a scene or
             compile kernels have at least 300.
         retries: more tries of requests that may safely be sent again.
+        shared_memory: of sessions that do not say so themselves, see :meth:`Client.session`.
         transport: replaces the network, for tests of programs that use the SDK.
 
     Raises:
@@ -65,7 +67,9 @@ def connect(
         ['street']
         >>> client.close()
     """
-    target = resolve_target(url, token, timeout=timeout, name=name, retries=retries)
+    target = resolve_target(
+        url, token, timeout=timeout, name=name, retries=retries, shared_memory=shared_memory
+    )
     return Client(Transport(target, transport=transport))
 
 
@@ -139,6 +143,7 @@ class Client:
         scenario: ScenarioRef | None = None,
         codec: str = "auto",
         reconnect: float = 60.0,
+        shared_memory: bool | None = None,
     ) -> DriveSession:
         """A new session on a scene or a scenario, to be opened by ``with``.
 
@@ -149,6 +154,9 @@ class Client:
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
             reconnect: seconds for which a lost connection is tried again: the session goes on as
                 if nothing had happened, also after the worker was restarted. 0 gives up.
+            shared_memory: raw images come by memory shared with a worker on this machine: None,
+                where both can; True, or opening the session fails; False, never. The images are
+                the same, and are good for as long as anybody holds them.
 
         Raises:
             TypeError: something else than a scene or a scenario.
@@ -166,6 +174,7 @@ class Client:
             scenario=optional_scenario_id(scenario),
             codec=codec,
             reconnect=reconnect,
+            shared_memory=shared_memory,
         )
         return DriveSession(self._transport, plan)
 
@@ -206,7 +215,13 @@ class Client:
         return DriveBatch(self._transport, plan, worlds)
 
     def join(
-        self, session_id: str, *, token: str, role: str = "controller", codec: str = "auto"
+        self,
+        session_id: str,
+        *,
+        token: str,
+        role: str = "controller",
+        codec: str = "auto",
+        shared_memory: bool | None = None,
     ) -> DriveSession:
         """A session that exists already; closing leaves it running.
 
@@ -214,7 +229,7 @@ class Client:
             session_id: of that session.
             token: of that session.
             role: ``controller`` or ``observer``, which sees what the controller sees.
-            codec: as of :meth:`session`.
+            codec, shared_memory: as of :meth:`session`.
 
         Examples:
             >>> with client.session(scene="street") as session:
@@ -223,7 +238,9 @@ class Client:
             ...         print(o.welcome.role)
             observer
         """
-        plan = SessionPlan(session_id=session_id, token=token, role=role, codec=codec)
+        plan = SessionPlan(
+            session_id=session_id, token=token, role=role, codec=codec, shared_memory=shared_memory
+        )
         return DriveSession(self._transport, plan)
 
     def close(self) -> None:

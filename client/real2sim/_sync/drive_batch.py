@@ -210,7 +210,7 @@ class DriveBatch:
             raise not_open()
         seconds = self._target.long_timeout if request.long_timeout else self._target.timeout
         with lost_connection(self._target, request.awaited):
-            self._socket.send(request.data)
+            self._socket.send(request.encoded())
             while True:
                 try:
                     data = receive(self._socket, seconds)

@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar, Unpack
 
 import websockets
 
-from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Result
+from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Obs, Result
 from real2sim_proto.operations import Operation
 from real2sim_proto.plans import Plan
 
@@ -31,7 +31,7 @@ from .._session_state import (
     backoff,
     not_open,
 )
-from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError
+from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
 from ..observation import Observation, View, observation_from_wire, view_from_frames
 from .concurrency import Socket, connect_socket, receive, run_blocking, sleep
@@ -112,7 +112,7 @@ class DriveSession(SessionBase):
             ['car_blue', 'car_red', 'post']
         """
         spec = reset_spec(sensors, self._codec, options)
-        return observation_from_wire(self._request(self._protocol.reset(spec)))
+        return self._observe(self._protocol.reset(spec))
 
     def step(self, plan: Plan | Mapping[str, Any]) -> Observation:
         """Send the plan for the newest observation; returns the next one.
@@ -133,7 +133,7 @@ class DriveSession(SessionBase):
             >>> obs.step, obs.t_us
             (1, 100000)
         """
-        return observation_from_wire(self._request(self._protocol.action(plan)))
+        return self._observe(self._protocol.action(plan))
 
     def receive(self, timeout: float | None = None) -> Observation:
         """The next unsolicited observation: what an observer sees of the controller's loop.
@@ -188,7 +188,11 @@ class DriveSession(SessionBase):
         """
         view = self._request(self._protocol.render(sensor_specs(sensors, self._codec)))
         return view_from_frames(
-            view.frames, t_us=view.t_us, revision=view.revision, timing=view.timing
+            view.frames,
+            t_us=view.t_us,
+            revision=view.revision,
+            timing=view.timing,
+            pixels=self._pixels_of(view.frames),
         )
 
     def steer(
@@ -233,7 +237,7 @@ class DriveSession(SessionBase):
             >>> (session.restore("before")).step
             0
         """
-        return observation_from_wire(self._request(self._protocol.restore(name)))
+        return self._observe(self._protocol.restore(name))
 
     def fork(self) -> Forked:
         """Another session that goes on from this instant.
@@ -292,6 +296,10 @@ class DriveSession(SessionBase):
     ) -> None:
         self.close()
 
+    def _observe(self, request: PendingRequest[Obs]) -> Observation:
+        obs = self._request(request)
+        return observation_from_wire(obs, self._pixels_of(obs.frames))
+
     def _request(self, request: PendingRequest[A]) -> A:
         """The answer to a request, over a new connection where the old one is lost."""
         try:
@@ -307,7 +315,7 @@ class DriveSession(SessionBase):
         socket = self._open_socket()
         seconds = self._timeout_of(request)
         with lost_connection(self._target, request.awaited):
-            socket.send(request.data)
+            socket.send(request.encoded(self._slot_for(request)))
             while True:
                 try:
                     data = receive(socket, seconds)
@@ -321,7 +329,21 @@ class DriveSession(SessionBase):
             connection = connect_socket(**socket_options(self._target, session_id))
             self._socket = self._socket_stack.enter_context(connection)
         check_subprotocol(self._socket.subprotocol)
+        self._use_memory(None)
         self._welcome = self._exchange(self._hello())
+        self._attach()
+
+    def _attach(self) -> None:
+        """Open the memory that the welcome offers, and prove it by its secret."""
+        memory = self._offered_memory()
+        if memory is None:
+            return
+        try:
+            self._exchange(self._protocol.attach(memory.secret))
+        except StatusError as error:
+            self._without_memory(str(error))
+        else:
+            self._use_memory(memory)
 
     def _reconnect(self) -> None:
         """Connect again, for as long as the plan says; the worker may be restarting."""
@@ -349,7 +371,7 @@ class DriveSession(SessionBase):
     def _release(self) -> None:
         """Close the socket, and end a session that has not been ended over it."""
         self._close_socket()
-        self._socket = None
+        self._socket = self._memory = None
         if self._info is not None and self._result is None:
             token = self._target.token or self._info.token
             with contextlib.suppress(Real2SimError):

@@ -11,6 +11,7 @@ from .._files import sweep_leftovers
 from ..settings import Settings
 from .jobs.jobs import Jobs
 from .sessions import Sessions
+from .sessions.segment import sweep_segments
 from .storage.backup import RESTORING
 from .storage.errors import StoreError
 from .storage.retention import DAY_US, Retention, RetentionLimits
@@ -78,6 +79,7 @@ class Upkeep:
         unused_s = 0.0 if at_start else OTHERS_UNUSED_S
         removed += sweep_leftovers(settings.data_dir, unused_s=unused_s)
         removed += sweep_leftovers(settings.data_dir, unused_s=unused_s, prefix=RESTORING)
+        removed += sweep_segments()
         if removed:
             names = [path.name for path in removed[:10]]
             log.warning("leftovers removed", count=len(removed), names=names)

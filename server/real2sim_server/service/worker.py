@@ -39,6 +39,7 @@ from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
+from .sessions.segment import Segments
 from .storage.job_log import JobLog
 from .storage.ownership import owned_folder
 from .storage.store import Store
@@ -159,6 +160,7 @@ class Worker:
                 scene_cache=scene_cache,
                 scenarios=scenarios,
                 metrics=metrics,
+                segments=Segments(budget, settings.shared_memory_bytes),
                 accounts=accounts,
             ),
             backend=backend,
@@ -298,6 +300,9 @@ class Worker:
         self.metrics.watch(
             self.metrics.scene_bytes,
             lambda: self.scene_cache.resident_bytes + levels.held_bytes,
+        )
+        self.metrics.watch(
+            self.metrics.shared_memory_bytes, lambda: self.sessions.segments.held_bytes
         )
         for state, count in self.scene_cache.counters().items():
             self.metrics.watch(self.metrics.scenes.labels(state), count)

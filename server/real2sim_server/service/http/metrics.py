@@ -61,6 +61,11 @@ class Metrics:
             "bytes of resident scenes and their levels of detail",
             registry=registry,
         )
+        self.shared_memory_bytes = Gauge(
+            "real2sim_shared_memory_bytes",
+            "bytes that controllers on this machine read images from",
+            registry=registry,
+        )
         self.scene_loads = Histogram(
             "real2sim_scene_load_duration_seconds",
             "time to load a scene",

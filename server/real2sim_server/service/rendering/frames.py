@@ -52,10 +52,12 @@ class FrameHeader:
 
     Attributes:
         fields: of the wire's Frame, in its order, without ``data``.
-        encoded: those fields, and the beginning of ``data``.
+        members: those fields, encoded, without a map's header.
+        encoded: all of it, and the beginning of ``data``.
     """
 
     fields: dict[str, Any]
+    members: bytes
     encoded: bytes
 
 
@@ -139,6 +141,14 @@ def with_pixels(header: FrameHeader, pixels: NDArray[Any]) -> EncodedFrame:
     return EncodedFrame(header, np.ascontiguousarray(pixels).data.cast("B"))
 
 
+def placed_frame(frame: EncodedFrame, offset: int) -> EncodedFrame:
+    """The frame of an image that lies in shared memory, ``offset`` bytes from its beginning."""
+    fields, members = frame.header.fields, frame.header.members
+    place = OFFSET + _UINT64 + offset.to_bytes(8, "big")
+    encoded = map_header(len(fields) + 2) + members + place + DATA + _bin_header(0)
+    return EncodedFrame(FrameHeader(fields, members, encoded), b"")
+
+
 @functools.cache
 def map_header(members: int) -> bytes:
     """Of a msgpack map."""
@@ -185,8 +195,9 @@ def _raw_header(place: dict[str, Any], size: tuple[int, ...]) -> FrameHeader:
 
 
 def _frame_header(fields: dict[str, Any], size: int) -> FrameHeader:
-    encoded = map_header(len(fields) + 1) + pack_pairs(fields) + DATA + _bin_header(size)
-    return FrameHeader(fields, encoded)
+    members = pack_pairs(fields)
+    encoded = map_header(len(fields) + 1) + members + DATA + _bin_header(size)
+    return FrameHeader(fields, members, encoded)
 
 
 def _bin_header(length: int) -> bytes:
@@ -195,3 +206,5 @@ def _bin_header(length: int) -> bytes:
 
 
 DATA: bytes = msgpack.packb("data")
+OFFSET: bytes = msgpack.packb("offset")
+_UINT64 = b"\xcf"

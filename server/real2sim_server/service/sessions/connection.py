@@ -19,6 +19,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.drive import (
     Action,
     Agent,
+    Attach,
     Bye,
     ClientMessage,
     Edit,
@@ -47,13 +48,14 @@ from .handshake import (
 from .messages import BadMessageError, ReceivedMessage, bad_message
 from .observers import ObserverQueue
 from .registry import Sessions
+from .segment import FrameSlot, Segment
 from .session import Session, controller_taken
 from .wire import EncodedMessage, pack_message
 
 CLOSE_TIMEOUT_S = 2.0
 
 ALLOWED_MESSAGES: dict[str, tuple[type, ...]] = {
-    "controller": (Hello, Reset, Action, Edit, Render, Agent, Snapshot, Restore, Fork, Bye),
+    "controller": (Hello, Attach, Reset, Action, Edit, Render, Agent, Snapshot, Restore, Fork, Bye),
     "observer": (Hello, Render, Bye),
     "agent": (Hello, Agent, Render, Bye),
 }
@@ -81,6 +83,7 @@ class Connection:
         self._sessions = sessions
         self._ws_base = ws_base
         self._sending = asyncio.Lock()
+        self._segment: Segment | None = None
         self._deadline_timer = DeadlineTimer(
             session, sessions.stepper, self._send, missed=sessions.metrics.missed_deadlines
         )
@@ -108,6 +111,7 @@ class Connection:
             await self._close_with_error(error)
         finally:
             session.close_callbacks.discard(self._close_with_error)
+            self._release_segment()
             session.touch()
 
     # --- welcome ----------------------------------------------------------------------------
@@ -125,6 +129,9 @@ class Connection:
             failure = service_error(error, log_unexpected=True)
             raise FatalError(failure, message_id=hello.id) from error
         fields = await asyncio.to_thread(welcome_fields, self._session, hello.role)
+        if hello.role == "controller":
+            self._segment = self._sessions.segments.create()
+            fields["shared_memory"] = None if self._segment is None else self._segment.offer
         await self._send(pack_message("welcome", fields), hello.id)
 
     @contextlib.asynccontextmanager
@@ -214,21 +221,25 @@ class Connection:
 
     async def _dispatch(self, received: ReceivedMessage, role: str) -> EncodedMessage | None:
         message, session = received.message, self._session
+        if self._segment is not None and not self._segment.attached:
+            self._settle_offer(message)
         match message:
             case Action():
                 return await self._act(message, received.content)
             case Reset():
+                slot = self._slot(message.slot)
                 self._deadline_timer.cancel()
                 async with session.lock:
                     session.check_open()
-                    return await self._sessions.stepper.reset(session, message.spec)
+                    return await self._sessions.stepper.reset(session, message.spec, slot=slot)
             case Edit():
                 return await self._edit(message)
             case Render():
                 session.check_open()
-                world, sensors = session.running_world(), message.sensors
-                return (await self._sessions.pipeline.view(world, sensors)).message
-            case Agent() | Snapshot() | Restore() | Fork():
+                world, slot = session.running_world(), self._slot(message.slot)
+                view = await self._sessions.pipeline.view(world, message.sensors, slot=slot)
+                return view.answer
+            case Attach() | Agent() | Snapshot() | Restore() | Fork():
                 async with session.lock:
                     session.check_open()
                     return await self._change(message)
@@ -242,7 +253,7 @@ class Connection:
     async def _act(self, action: Action, content: bytes) -> EncodedMessage | None:
         """Check an action, and let it pass the rest of the step pipeline."""
         session, waited_us = self._session, self._deadline_timer.waited_us
-        arrived = time.perf_counter()
+        arrived, slot = time.perf_counter(), self._slot(action.slot)
         if action.step == session.lockstep.step:
             self._deadline_timer.cancel()
         async with session.lock:
@@ -255,6 +266,7 @@ class Connection:
                 content,
                 latency_us=waited_us,
                 write=partial(self._write_at_once, action.id),
+                slot=slot,
             )
             self._sessions.metrics.steps.observe(time.perf_counter() - arrived)
             return answer
@@ -268,10 +280,12 @@ class Connection:
         self._session.check_open()
         return self._session.lockstep.cached_answer(action.step, content)
 
-    async def _change(self, message: Agent | Snapshot | Restore | Fork) -> EncodedMessage:
+    async def _change(self, message: Attach | Agent | Snapshot | Restore | Fork) -> EncodedMessage:
         """Changes other than steps and edits; the session's lock is held."""
         session, stepper = self._session, self._sessions.stepper
         match message:
+            case Attach():
+                return self._attached()
             case Agent():
                 await stepper.set_agent_plan(session, message)
                 fields = {"object_id": message.object_id, "step": session.running_world().steps}
@@ -314,6 +328,39 @@ class Connection:
             session.close_callbacks.discard(self._close_with_error)
             await self._sessions.close(session, reason="its controller said bye")
         return pack_message("result", result_fields(session.world, scores))
+
+    # --- shared memory ------------------------------------------------------------------------
+
+    def _settle_offer(self, message: ClientMessage) -> None:
+        """The first message after the welcome says whether the client has opened the memory.
+
+        Raises:
+            ServiceError: INVALID_REQUEST, it says so without having done it.
+        """
+        assert self._segment is not None
+        try:
+            if isinstance(message, Attach):
+                self._segment.attach(message.secret)
+        finally:
+            if not self._segment.attached:
+                self._release_segment()
+
+    def _attached(self) -> EncodedMessage:
+        if self._segment is None:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                "no shared memory is offered on this connection, or no longer",
+                hint="attach is the first message after a welcome with `shared_memory`",
+            )
+        return pack_message("attached", {})
+
+    def _slot(self, number: int | None) -> FrameSlot | None:
+        return None if self._segment is None else self._segment.slot(number)
+
+    def _release_segment(self) -> None:
+        if self._segment is not None:
+            self._segment.close()
+            self._segment = None
 
     # --- bytes ------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from ...edit import EditOutcome
 from ...world import Event, LoggedPath, Score, World, agent_fields, ego_fields, metrics_version
 from ...world.ego.route import whole_route
 from ..library.views import camera_infos, edited_objects
+from .pipeline import MAX_IMAGE_BYTES
 from .session import Session
 
 
@@ -91,6 +92,7 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
             "max_message_bytes": MAX_CLIENT_MESSAGE_BYTES,
             "max_operations_per_request": MAX_OPERATIONS_PER_REQUEST,
             "max_cameras_per_step": MAX_SENSORS,
+            "max_image_bytes": MAX_IMAGE_BYTES,
             "max_sessions_per_socket": MAX_WORLDS,
         },
         "cameras": [c.model_dump(mode="json") for c in camera_infos(tuple(start.scene.rig))],

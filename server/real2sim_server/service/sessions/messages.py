@@ -24,8 +24,8 @@ M = TypeVar("M")
 
 MAX_PROBLEMS = 4
 TYPES = (
-    "hello, reset, action, edit, render, agent, snapshot, restore, fork, bye; on a batch socket "
-    "batch_hello, batch_reset, batch_action, batch_bye"
+    "hello, attach, reset, action, edit, render, agent, snapshot, restore, fork, bye; on a batch "
+    "socket batch_hello, batch_reset, batch_action, batch_bye"
 )
 
 

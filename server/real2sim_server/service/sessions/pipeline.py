@@ -12,7 +12,8 @@ phase         runs on                what happens
 ``evaluate``  beside the rendering   metrics and events; the log entry is written; all of the
                                      observation but its images is packed, headers of raw images
                                      included
-``encode``    engine, or encoders    raw images are taken as they are on the engine; others are
+``encode``    engine, or encoders    raw images are taken as they are on the engine, or copied into
+                                     the memory that the client reads them from; others are
                                      encoded beside it; the parts become one message
 ``send``      event loop             written to the socket in the very call that ends the engine's
                                      job; what cannot be written at once goes the ordinary way
@@ -35,7 +36,7 @@ from typing import Any, NamedTuple, TypeVar
 from prometheus_client import Histogram
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.codec import DEFAULT_MAX_BYTES
+from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
 from real2sim_proto.episode import SensorSpec
 
 from ...edit import ScenarioState, instances_at, things_at_start
@@ -60,12 +61,13 @@ from ..rendering.renderer import Renderer, RenderRequest, check_sensors
 from ..warm_up import DeformationKernels
 from .gathered_calls import GatheredCalls, attempt
 from .log_write import LogWrite, write_together
+from .segment import FrameSlot
 from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
 
 T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
-MAX_IMAGE_BYTES = DEFAULT_MAX_BYTES - 1024 * 1024
+MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
 
@@ -81,6 +83,7 @@ class Transition:
             evaluated. None where it is in the log already.
         write: hands a message to the socket if nothing has to be waited for; whether it did. None
             where no action waits for it. Runs on the event loop; nothing fails after it.
+        slot: that raw images of the answer may be written to.
         timer: of the stages.
         recorded: whether ``record`` is done.
         sent: whether ``write`` is done.
@@ -92,6 +95,7 @@ class Transition:
     cameras: Mapping[str, Camera]
     record: Callable[[], object] | None = None
     write: Callable[[EncodedMessage], bool] | None = None
+    slot: FrameSlot | None = None
     timer: PhaseTimer = field(default_factory=PhaseTimer)
     recorded: bool = False
     sent: bool = False
@@ -115,6 +119,7 @@ class RenderedObservation:
         images: in the order of sensors and modalities.
         kind, members: of the message, without frames and timing.
         timer: runs on.
+        slot: that raw images of the answer may be written to.
     """
 
     world: World
@@ -122,6 +127,7 @@ class RenderedObservation:
     kind: str
     members: EncodedMembers
     timer: PhaseTimer
+    slot: FrameSlot | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +137,21 @@ class EncodedObservation:
     Attributes:
         world: at that instant; it is not committed by being shown.
         frames: the images of the message.
-        message: for all who get it.
+        message: for all who get it, whole.
         timing_ms: by stage.
+        placed: for the client that is answered, where its images lie in shared memory.
     """
 
     world: World
     frames: Sequence[EncodedFrame]
     message: EncodedMessage
     timing_ms: Mapping[str, float]
+    placed: EncodedMessage | None = None
+
+    @property
+    def answer(self) -> EncodedMessage:
+        """For the client that is answered."""
+        return self.placed or self.message
 
 
 class _KernelsMissingError(Exception):
@@ -336,7 +349,7 @@ class StepPipeline:
             members, headers = self.evaluate(transition, world, sensors, cameras)
         # Of the evaluation only what did not happen beside the rendering.
         timer.stage("settle")
-        rendered = RenderedObservation(world, images, "obs", members, timer)
+        rendered = RenderedObservation(world, images, "obs", members, timer, transition.slot)
         return rendered if headers is None else self.encode(rendered, headers)
 
     def advance(self, transition: Transition) -> World:
@@ -391,12 +404,19 @@ class StepPipeline:
     ) -> None:
         """Write the observation to the socket, if it is there already and nothing has to wait."""
         if transition.write is not None and isinstance(observation, EncodedObservation):
-            transition.sent = transition.write(observation.message)
+            transition.sent = transition.write(observation.answer)
 
     # --- a view of a world that stays as it is --------------------------------------------------
 
-    async def view(self, world: World, sensors: Sequence[SensorSpec]) -> EncodedObservation:
+    async def view(
+        self, world: World, sensors: Sequence[SensorSpec], *, slot: FrameSlot | None = None
+    ) -> EncodedObservation:
         """Images of a committed instant, from cameras of the vehicle; time does not move.
+
+        Args:
+            world: at that instant.
+            sensors: what it is seen by.
+            slot: that raw images of the answer may be written to.
 
         Raises:
             ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
@@ -412,7 +432,7 @@ class StepPipeline:
         except _KernelsMissingError:
             await self._deformation.wait()
             rendered = await self._engine.call(view, label="view")
-        return await self._finish(rendered)
+        return await self._finish(replace(rendered, slot=slot))
 
     def _compute_view(
         self,
@@ -537,7 +557,9 @@ def _record_one(transition: Transition) -> None:
 def _with_frames(
     rendered: RenderedObservation, frames: Sequence[EncodedFrame]
 ) -> EncodedObservation:
-    timer = rendered.timer
+    kind, members, timer = rendered.kind, rendered.members, rendered.timer
+    lying = rendered.slot.place(frames) if rendered.slot is not None else None
     timer.stage("encode")
-    message = pack_with_frames(rendered.kind, rendered.members, frames, timer)
-    return EncodedObservation(rendered.world, frames, message, timer.timing_ms)
+    message = pack_with_frames(kind, members, frames, timer)
+    placed = pack_with_frames(kind, members, lying, timer) if lying is not None else None
+    return EncodedObservation(rendered.world, frames, message, timer.timing_ms, placed)

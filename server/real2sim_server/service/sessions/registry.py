@@ -38,6 +38,7 @@ from .describe import session_info
 from .log import entries_of
 from .pipeline import StepPipeline
 from .recovery import check_scene, rebuild, state_at
+from .segment import Segments
 from .session import EpisodeStart, Session
 from .step import Stepper
 
@@ -77,6 +78,7 @@ class Sessions:
         scene_cache: keeps their scenes in memory.
         scenarios: what they may begin from.
         metrics: gets their number.
+        segments: in which controllers on this machine get their images.
         accounts: of those who make them, each with a limit of its own.
 
     Attributes:
@@ -93,9 +95,11 @@ class Sessions:
         scene_cache: SceneCache,
         scenarios: Scenarios,
         metrics: Metrics,
+        segments: Segments,
         accounts: Accounts | None = None,
     ) -> None:
         self.pipeline = pipeline
+        self.segments = segments
         self.stepper = Stepper(pipeline, kernels, store)
         self.metrics = metrics
         self.draining = False

@@ -35,6 +35,7 @@ from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
 from .log_write import LogWrite
 from .pipeline import EncodedObservation, Seen, StepPipeline, Transition, message_of
+from .segment import FrameSlot
 from .session import Session
 from .wire import DeferredMessage, EncodedMessage
 
@@ -81,18 +82,22 @@ class Stepper:
         self._kernels = kernels
         self._store = store
 
-    async def reset(self, session: Session, spec: ResetSpec) -> EncodedMessage:
-        """Begin an episode; its first observation.
+    async def reset(
+        self, session: Session, spec: ResetSpec, *, slot: FrameSlot | None = None
+    ) -> EncodedMessage:
+        """Begin an episode; its first observation, raw images in a slot where one is given.
 
         Raises:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
         cameras = await self._announced(session, spec)
         record = ("reset", 0, reset_payload(spec))
-        observation, _ = await self._observe(session, _beginning(session, spec), cameras, record)
+        observation, _ = await self._observe(
+            session, _beginning(session, spec), cameras, record, slot=slot
+        )
         session.begin(observation.world, cameras)
         session.publish(observation.message)
-        return observation.message
+        return observation.answer
 
     async def restart(self, session: Session, spec: ResetSpec, *, reply: MakeReply) -> None:
         """Begin an episode without rendering its first observation. Raises like reset().
@@ -133,6 +138,7 @@ class Stepper:
         *,
         latency_us: int = 0,
         write: Callable[[EncodedMessage], bool] | None = None,
+        slot: FrameSlot | None = None,
     ) -> EncodedMessage | None:
         """Take the action that is due; the next observation, None where it is written already.
 
@@ -143,6 +149,7 @@ class Stepper:
             latency_us: wall-clock time from the observation to this action.
             write: may hand the observation to the socket before this returns; see
                 :class:`~.pipeline.Transition`.
+            slot: that raw images of the observation may be written to.
 
         Raises:
             WorldError: the plan is refused.
@@ -154,9 +161,10 @@ class Stepper:
         if latency_us or missed:
             entry = action_payload(plan, latency_us=latency_us, missed=missed)
         change = partial(_moved, session.running_world(), plan, latency_us, missed)
-        observation, written = await self._step(session, change, entry, write=write)
+        observation, written = await self._step(session, change, entry, write=write, slot=slot)
+        # Given once more, its images come with it: the slot may hold others by then.
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
-        return None if written else observation.message
+        return None if written else observation.answer
 
     async def act_together(self, actions: Sequence[DueAction]) -> list[Seen | Exception]:
         """Take the due actions of sessions without sensors, in one go; what fails in one leaves the
@@ -218,10 +226,11 @@ class Stepper:
         payload: bytes,
         *,
         write: Callable[[EncodedMessage], bool] | None = None,
+        slot: FrameSlot | None = None,
     ) -> tuple[EncodedObservation, bool]:
         record = ("action", session.running_world().steps, payload)
         observation, written = await self._observe(
-            session, change, session.cameras, record, write=write
+            session, change, session.cameras, record, write=write, slot=slot
         )
         session.world, session.late = observation.world, False
         session.publish(observation.message)
@@ -332,11 +341,12 @@ class Stepper:
         record: LogRecord,
         *,
         write: Callable[[EncodedMessage], bool] | None = None,
+        slot: FrameSlot | None = None,
     ) -> tuple[EncodedObservation, bool]:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])
         store = LogWrite(self._store, session.session_id, entries, session.log_unsure)
-        transition = Transition(change, cameras, record=store, write=write)
+        transition = Transition(change, cameras, record=store, write=write, slot=slot)
         try:
             observation = await self._pipeline.run(transition)
         except StoreUnavailableError:
