@@ -40,6 +40,8 @@ RIGID_STEP = 0.0025
 SETTLED_SPEED = 0.06
 """A body has settled at a residual speed below this, or SETTLED_FRACTION of its speed [m/s]."""
 SETTLED_FRACTION = 0.03
+JOLT = 15.0
+"""And while nothing accelerates it by more: half again as much as free fall [m/s^2]."""
 SETTLE_TIME = 0.05
 """It may become rigid again once it has been settled for this long [s]."""
 SLEEP_SPEED = 0.06
@@ -134,6 +136,7 @@ class DeformableBody:
         self.supports: frozenset[str] = frozenset()
         self.state: BodyState | None = None
         self.rebound: Rebound | None = None
+        self._velocity_before = self.motion.velocity
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
         self._centre_of: DeformedShape | None = None
@@ -347,6 +350,7 @@ class DeformableBody:
     def activate(self) -> None:
         """Begin to deform; the next ``solver_body`` goes into a solver."""
         self.mode = BodyMode.DEFORMING
+        self._velocity_before = self.motion.velocity
         self._deforming_time = self._settle_time = self._sleep_time = 0.0
 
     def update_from_solver(self, state: BodyState) -> None:
@@ -412,6 +416,10 @@ class DeformableBody:
         speed = float(np.linalg.norm(self.motion.velocity))
         turning = float(np.linalg.norm(self.motion.angular_velocity))
         settled = self.residual_speed() < max(SETTLED_SPEED, SETTLED_FRACTION * speed)
+        # In the middle of an impact a stiff body hardly deforms either.
+        jolt = float(np.linalg.norm(self.motion.velocity - self._velocity_before))
+        self._velocity_before = self.motion.velocity
+        settled = settled and jolt < JOLT * duration
         slow = speed + turning < SLEEP_SPEED
         self._deforming_time += duration
         self._settle_time = self._settle_time + duration if settled else 0.0

@@ -24,7 +24,7 @@ from .surroundings import clearance
 
 QUIET = 2
 """An impact is over after so many steps without an impulse."""
-NOTHING = 1e-6
+NOTHING = 1e-3
 """Impulses below this fraction of what there was are none."""
 EXACT = 0.01
 """What parts within this fraction of the approach of what was requested is left as it is."""
