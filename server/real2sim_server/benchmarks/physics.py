@@ -13,10 +13,11 @@ import numba
 import numpy as np
 
 from ..physics.body import Body
-from ..physics.colliders import Plane
+from ..physics.colliders import Box, Plane
 from ..physics.materials import FixedCorotated, Material, NeoHookean
 from ..physics.particles import box_particles
 from ..physics.solver import Solver, SolverOptions
+from ..simulation.structure import vehicle_structure
 from .peers.block import PeerBlock
 from .peers.select import PEERS, missing_reason, start_peer
 
@@ -25,6 +26,10 @@ MATERIALS: dict[str, Material] = {
     "fixed_corotated": FixedCorotated(young=2e6, poisson=0.4),
     "neo_hookean": NeoHookean(young=2e6, poisson=0.4),
 }
+VEHICLE = "vehicle_structure"
+"""A block of what cars of the ``vehicle`` preset are made of, all zones."""
+VEHICLE_DENSITY = 150.0
+"""Of that block before its zones share mass out [kg/m^3]."""
 PARTICLES_PER_CELL = 14
 SPACING = 0.05
 REPEATS = 8
@@ -35,8 +40,12 @@ PEER_PARTICLES = 100_000
 PEER_TURNS = 3
 PEER_STEPS = 30
 """After so many substeps peers must have fallen as far."""
-TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6}
+TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6, VEHICLE: 8e6}
 """Particle-substeps per second of 100,000 particles on two cores."""
+CAR_SIZE, CAR_MASS, CAR_SPEED = (4.5, 1.8, 1.4), 1500.0, 15.7
+"""Of the car that is driven against a wall [m], [kg], [m/s]."""
+CRASH_SECONDS = 0.08
+"""While its front gives way."""
 
 
 def run(
@@ -54,8 +63,8 @@ def run(
         an otherwise idle machine would do.
     """
     report_progress = on_progress or (lambda done, parts: None)
-    cases = [(m, n) for m in MATERIALS for n in SIZES]
-    parts = len(cases) + 2 + peers
+    cases = [(m, n) for m in (*MATERIALS, VEHICLE) for n in SIZES]
+    parts = len(cases) + 3 + peers
     report: dict[str, Any] = {
         "threads": numba.get_num_threads(),
         "cores": os.cpu_count(),
@@ -70,9 +79,11 @@ def run(
     report_progress(len(cases), parts)
     report["domain"] = _domain()
     report_progress(len(cases) + 1, parts)
+    report["crash"] = _crash()
+    report_progress(len(cases) + 2, parts)
     report["reference"] = _reference()
     if peers:
-        report_progress(len(cases) + 2, parts)
+        report_progress(len(cases) + 3, parts)
         report["peers"] = _peers()
     report_progress(parts, parts)
     return report
@@ -86,6 +97,9 @@ def as_rows(figures: dict[str, Any]) -> dict[str, str]:
         rows[name] = f"{line['rate'] / 1e6:.2f} M/s, {line['substep_ms']:.2f} ms a substep"
     for line in figures["domain"]:
         rows[f"two blocks {line['distance']:,.0f} m apart"] = f"{line['rate'] / 1e6:.2f} M/s"
+    crash = figures["crash"]
+    name = f"a car against a wall, {crash['particles']:,} particles"
+    rows[name] = f"{crash['rate'] / 1e6:.2f} M/s, {crash['substeps']} substeps"
     rows["times as fast as plain torch"] = f"{figures['reference']['ratio']:.0f}"
     for line in figures.get("peers", ()):
         name = f"{line['name']}, {line.get('particles', 0):,} particles"
@@ -127,6 +141,37 @@ def _domain() -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _crash() -> dict[str, Any]:
+    """A car of the ``vehicle`` preset against a wall, checks of each step included."""
+    spacing = 0.1
+    block = box_particles(CAR_SIZE, spacing=spacing, density=VEHICLE_DENSITY).with_mass(CAR_MASS)
+    materials, regions, particles = vehicle_structure("car", block, spacing=spacing)
+    car = Body(
+        name="car",
+        particles=particles,
+        material=materials,
+        regions=regions,
+        velocity=(CAR_SPEED, 0, 0),
+    )
+    wall = np.eye(4)
+    wall[0, 3] = CAR_SIZE[0] / 2 + 0.5
+    solver = Solver(
+        [car],
+        [Box(name="wall", T_world_box=wall, size=(0.9, 4, 4))],
+        SolverOptions(dx=2 * spacing, gravity=(0, 0, 0)),
+    )
+    begin, used = time.perf_counter(), time.process_time()
+    report = solver.step(CRASH_SECONDS)
+    elapsed, processor = time.perf_counter() - begin, time.process_time() - used
+    work = len(particles) * report.substeps
+    return {
+        "particles": len(particles),
+        "substeps": report.substeps,
+        "rate": work / elapsed,
+        "cpu_rate": work / processor,
+    }
 
 
 def _reference() -> dict[str, Any]:
@@ -208,13 +253,18 @@ def _as_peer_block(body: Body, dx: float, dt: float) -> PeerBlock:
 
 def _block(material: str, particles: int, x: float = 0.0, name: str = "block") -> Body:
     edge = SPACING * round(particles ** (1 / 3))
-    kind = MATERIALS[material]
     pose = np.eye(4)
     pose[:3, 3] = x, 0.0, edge / 2 + 5.0
-    block = box_particles([edge] * 3, spacing=SPACING, density=kind.density).moved(pose)
-    return Body(
-        name=name, particles=block, material=kind, velocity=(0, 0, -2), angular_velocity=(1, 0, 0)
-    )
+    motion: dict[str, Any] = {"velocity": (0, 0, -2), "angular_velocity": (1, 0, 0)}
+    if material == VEHICLE:
+        block = box_particles([edge] * 3, spacing=SPACING, density=VEHICLE_DENSITY)
+        kinds, regions, block = vehicle_structure("car", block, spacing=SPACING)
+        return Body(
+            name=name, particles=block.moved(pose), material=kinds, regions=regions, **motion
+        )
+    kind = MATERIALS[material]
+    block = box_particles([edge] * 3, spacing=SPACING, density=kind.density)
+    return Body(name=name, particles=block.moved(pose), material=kind, **motion)
 
 
 def _options(backend: str = "cpu") -> SolverOptions:

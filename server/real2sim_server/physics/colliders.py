@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -104,12 +105,12 @@ class Box(Collider):
         if (np.asarray(self.size) <= 0).any():
             raise ColliderError(f"size of box {self.name!r} must be positive: {self.size!r}")
 
-    @property
+    @cached_property
     def moving(self) -> bool:
         """Whether it has any velocity."""
         return bool(np.any(self.velocity) or np.any(self.angular_velocity))
 
-    @property
+    @cached_property
     def fastest_point(self) -> float:
         """Speed [m/s] that no point of it exceeds."""
         reach = float(np.linalg.norm(self.size)) / 2

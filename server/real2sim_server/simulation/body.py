@@ -25,7 +25,7 @@ from ..physics.solver import BodyState
 from .result import Rebound
 from .rigid import RigidMotion, best_rotation, cross_matrix, inertia_about
 from .rolling import advance_on_wheels
-from .surroundings import closest, packed
+from .surroundings import box_gaps, closest, packed
 from .tyres import TyreReaction, Tyres
 
 NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
@@ -35,6 +35,8 @@ BESIDE = 1.3
 """Particles of a lattice that are nearer than this many spacings are side by side."""
 NEAR_MAX = 4.0
 """How far away boxes still count where the gap to the nearest collider is asked for [m]."""
+CORNER = 0.87
+"""From a particle to the corners of its cube [spacings]."""
 RIGID_STEP = 0.0025
 """Longest step of rigid motion [s]."""
 SETTLED_SPEED = 0.06
@@ -140,6 +142,9 @@ class DeformableBody:
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
         self._centre_of: DeformedShape | None = None
+        self._outlines_of: DeformedShape | None = None
+        self._bounds_of: DeformedShape | BodyState | None = None
+        self._pose_of: BodyState | None = None
         self._radius_of: Float | None = None
         self._radius_m = 0.0
         self._stored_energy = 0.0
@@ -148,15 +153,21 @@ class DeformableBody:
     @property
     def T_world_object(self) -> Float:
         """[4, 4] pose; while deforming, the rigid pose nearest to all its particles."""
+        if self.state is not None:
+            return self._nearest_pose(self.state).copy()
         pose = np.eye(4)
-        if self.state is None:
-            pose[:3, :3] = self.motion.rotation
-            pose[:3, 3] = self.motion.centre - self.motion.rotation @ self._local_centre
-            return pose
-        rotation = best_rotation(self.rest.positions, self.state.positions, self.rest.masses)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = self.state.centre - rotation @ self.rest.centre_of_mass
+        pose[:3, :3] = self.motion.rotation
+        pose[:3, 3] = self.motion.centre - self.motion.rotation @ self._local_centre
         return pose
+
+    def _nearest_pose(self, state: BodyState) -> Float:
+        """[4, 4] see above; not to be written to."""
+        if self._pose_of is not state:
+            rotation = best_rotation(self.rest.positions, state.positions, self.rest.masses)
+            self._pose_of, self._pose = state, np.eye(4)
+            self._pose[:3, :3] = rotation
+            self._pose[:3, 3] = state.centre - rotation @ self.rest.centre_of_mass
+        return self._pose
 
     def local_positions(self) -> Float:
         """[N, 3] particles in the frame of ``T_world_object`` [m]."""
@@ -167,27 +178,39 @@ class DeformableBody:
 
     def hull_points(self) -> Float:
         """[K, 3] its outermost particles, in the world [m]: what meets a half-space."""
-        return self._world(self._hull)
+        return self._world(self._hull, 0)
 
     def shell_points(self) -> Float:
         """[K, 3] all particles with nothing beside them, in the world [m]."""
-        return self._world(self._shell)
+        return self._world(self._shell, 1)
 
-    def _world(self, which: NDArray[np.int64]) -> Float:
+    def _world(self, which: NDArray[np.int64], kind: int) -> Float:
         if self.state is not None:
             return self.state.positions[which]
-        return apply_transform(self.T_world_object, self.shape.positions[which])
+        if self._outlines_of is not self.shape:
+            self._outlines_of, p = self.shape, self.shape.positions - self._local_centre
+            self._outlines = p[self._hull], p[self._shell]
+        placed: Float = self._outlines[kind] @ self.motion.rotation.T + self.motion.centre
+        return placed
 
     def box(self) -> tuple[Float, Float]:
         """Pose [4, 4] and size [3] of the box about its present shape."""
-        local = self.local_positions()
-        low, high = local.min(axis=0) - self.spacing / 2, local.max(axis=0) + self.spacing / 2
+        kept = self.shape if self.state is None else self.state
+        if self._bounds_of is not kept:
+            local, half = self.local_positions(), self.spacing / 2
+            low, high = local.min(axis=0) - half, local.max(axis=0) + half
+            self._bounds_of, self._bounds = kept, ((low + high) / 2, high - low)
+        middle, size = self._bounds
         pose = self.T_world_object
-        pose[:3, 3] += pose[:3, :3] @ ((low + high) / 2)
-        return pose, high - low
+        pose[:3, 3] += pose[:3, :3] @ middle
+        return pose, size.copy()
 
     def gap_to(self, other: DeformableBody) -> float:
         """A lower bound of the distance between the boxes of two bodies [m]; below 0 inside."""
+        apart = float(np.linalg.norm(self.motion.centre - other.motion.centre))
+        apart -= self.reach + other.reach + CORNER * (self.spacing + other.spacing)
+        if apart > NEAR_MAX:
+            return apart
         return -float(box_penetration(*self.box(), *other.box()))
 
     def gap_to_colliders(self, colliders: Sequence[Collider]) -> tuple[float, float]:
@@ -214,20 +237,22 @@ class DeformableBody:
         hull = np.inf, 0.0, False
         if smooth:
             hull = closest(self.hull_points(), self.motion, smooth, within=within, ahead=ahead)
-        boxes = [c for c in colliders if isinstance(c, Box) and self._may_meet(c, within, ahead)]
+        boxes = [c for c in colliders if isinstance(c, Box)]
+        boxes = self._within_reach(boxes, within, ahead) if boxes else boxes
         if not boxes:
             return hull
         shell = closest(self.shell_points(), self.motion, boxes, within=within, ahead=ahead)
         gap, approach, _ = min(hull, shell)
         return gap, approach, hull[2] or shell[2]
 
-    def _may_meet(self, box: Box, within: float, ahead: float) -> bool:
-        """Whether a box is so near the ball about the body that their surfaces must be compared."""
+    def _within_reach(self, boxes: Sequence[Box], within: float, ahead: float) -> list[Box]:
+        """Those so near the box about the body that their surfaces must be compared."""
+        gaps, speeds = box_gaps(*self.box(), boxes)
         m = self.motion
-        gap = closest(m.centre[None], m, [box], within=within, ahead=ahead)[0] - self.reach
-        speed = float(np.linalg.norm(m.velocity)) + box.fastest_point
+        speed = float(np.linalg.norm(m.velocity))
         speed += self.reach * float(np.linalg.norm(m.angular_velocity))
-        return gap < within + speed * ahead
+        near = gaps < within + (speed + speeds) * ahead
+        return [box for box, is_near in zip(boxes, near.tolist(), strict=True) if is_near]
 
     @property
     def _local_centre(self) -> Float:
@@ -475,6 +500,21 @@ class DeformableBody:
     def wake(self) -> None:
         """Be free to move again."""
         self.mode = BodyMode.RIGID
+
+    def push(self, impulse: Float, moment: Float) -> None:
+        """Let an impulse act on a rigid body, and wake it.
+
+        Args:
+            impulse: [3] [N s].
+            moment: [3] of it about the world origin [N m s].
+        """
+        m = self.motion
+        turn = np.linalg.solve(m.world_inertia, moment - np.cross(m.centre, impulse))
+        self.motion = replace(
+            m, velocity=m.velocity + impulse / m.mass, angular_velocity=m.angular_velocity + turn
+        )
+        if self.mode == BodyMode.SLEEPING:
+            self.wake()
 
     def translate(self, by: Float) -> None:
         """Place a rigid body elsewhere, ``by`` [3] [m]."""

@@ -7,14 +7,15 @@ from collections.abc import Iterable, Sequence, Set
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..physics.colliders import Collider
-from ..physics.solver import Solver, SolverOptions
+from ..physics.colliders import Box, Collider
+from ..physics.solver import ContactTotals, Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody
 from .bounces import Bounces
 from .contacts import ContactLog
 from .resting import GENTLE, Resting, touches_any
 from .support import supports_of
 from .tyres import TyreReaction
+from .unyielding import as_boxes, by_owner, withstands
 
 STEP = 0.005
 """Longest time between two checks of what is near what [s]."""
@@ -102,7 +103,7 @@ class HybridSimulator:
         for r in self._resting.solve(duration):
             self.contact_log.add(r.body, r.other, r.impulse, r.heat, self.time)
         self._lay_to_rest(duration)
-        if self._solver is None:
+        if not deforming:
             self.colliders = [c.after(duration) for c in self.colliders]
         self.time += duration
         for body in deforming:
@@ -124,18 +125,17 @@ class HybridSimulator:
                     changed = True
 
     def _solve(self, deforming: list[DeformableBody], duration: float) -> None:
-        names = [b.name for b in deforming]
-        if self._solver is None or self._solved != names:
-            self._start_solver(deforming)
-        assert self._solver is not None
+        rigid = self._rigid_beside(deforming)
+        solver = self._solver_of(deforming, [box for box, _ in rigid])
         before = {b.name: b.motion for b in deforming}
-        report = self._solver.step(duration)
+        report = solver.step(duration)
         self.substeps += report.substeps
         self.rollbacks += report.rollbacks
-        self.colliders = list(self._solver.colliders)
-        contacts = self._solver.contacts
+        self.colliders = list(solver.colliders)[: len(self.colliders)]
+        contacts = by_owner(solver.contacts, {box.name: body for box, body in rigid})
         self.contact_log.add_solver_contacts(contacts, self.time, self._names)
-        for body, state in zip(deforming, self._solver.states(), strict=True):
+        self._push_back(contacts, {body.name: body for _, body in rigid})
+        for body, state in zip(deforming, solver.states(), strict=True):
             body.update_from_solver(state)
             reaction = body.apply_road(self.road, duration)
             if reaction is not None:
@@ -147,15 +147,44 @@ class HybridSimulator:
             self.contact_log.add(c.body.name, c.other, c.impulse, 0.0, self.time)
             self._solver = None
 
-    def _start_solver(self, deforming: list[DeformableBody]) -> None:
+    def _rigid_beside(self, deforming: list[DeformableBody]) -> list[tuple[Box, DeformableBody]]:
+        """What stands for rigid bodies that withstand a deforming one near by."""
+        return [
+            (box, other)
+            for body in deforming
+            for other in self.bodies
+            if other.mode != BodyMode.DEFORMING
+            and _near(body, other)
+            and withstands(other, body, self.gravity)
+            for box in as_boxes(other, body)
+        ]
+
+    def _solver_of(self, deforming: list[DeformableBody], boxes: list[Box]) -> Solver:
+        """The solver of these bodies; a new one where it has to know of others, or of boxes.
+
+        Boxes cover what is beside a body now, and are others in the next step.
+        """
+        names = [b.name for b in deforming]
+        if self._solver is not None and self._solved == names and not boxes:
+            return self._solver
         self._solver = Solver(
             [b.solver_body() for b in deforming],
-            self.colliders,
+            [*self.colliders, *boxes],
             SolverOptions(dx=deforming[0].cell, gravity=tuple(self.gravity), backend=self._backend),
         )
-        self._solved = [b.name for b in deforming]
+        self._solved = names + [box.name for box in boxes]
         self.contact_log.start_solver()
         self.bounces.start_solver()
+        return self._solver
+
+    def _push_back(
+        self, contacts: Iterable[ContactTotals], rigid: dict[str, DeformableBody]
+    ) -> None:
+        """Give rigid bodies back what they have given to deforming ones in a step."""
+        for c in contacts:
+            if c.other in rigid:
+                rigid[c.other].push(-c.impulse, -c.moment)
+                self.contact_log.add(c.other, c.body, -c.impulse, 0.0, self.time)
 
     def _log_tyres(self, body: DeformableBody, reactions: Iterable[TyreReaction]) -> None:
         for r in reactions:
@@ -193,10 +222,13 @@ class HybridSimulator:
 
     def _wake(self) -> None:
         """Wake those whose supports have begun to move, and those that rest on these."""
+        asleep = [b for b in self.bodies if b.mode == BodyMode.SLEEPING]
+        if not asleep:
+            return
         moved = {c.name for c in self.colliders if c.moving}
         moved |= {b.name for b in self.bodies if _moves(b)}
-        for body in self.bodies:
-            if body.mode == BodyMode.SLEEPING and not moved.isdisjoint(body.supports):
+        for body in asleep:
+            if not moved.isdisjoint(body.supports):
                 body.wake()
 
     def _is_near_anything(self, body: DeformableBody, duration: float) -> bool:
@@ -327,7 +359,8 @@ class HybridSimulator:
             if not _approach(body, other):
                 continue
             closing = float(np.linalg.norm(body.motion.velocity - other.motion.velocity))
-            if body.gap_to(other) < NEAR_CELLS * body.cell + closing * duration:
+            near = body.gap_to(other) < NEAR_CELLS * body.cell + closing * duration
+            if near and not withstands(body, other, self.gravity):
                 return True
         return False
 

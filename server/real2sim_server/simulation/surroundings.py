@@ -87,6 +87,34 @@ def _closest(
     return least, closing, meets
 
 
+def box_gaps(pose: Float, size: Float, boxes: Sequence[Box]) -> tuple[Float, Float]:
+    """How far boxes are at least from an oriented box, and how fast they are at most.
+
+    Args:
+        pose: [4, 4] of the one box.
+        size: [3] of it [m].
+        boxes: the others, K of them.
+
+    Returns:
+        [K] lower bounds of the distance, along the faces of these; below 0 where boxes may overlap
+        [m]; and [K] speeds that no point of them exceeds [m/s].
+    """
+    centres, turns, halves, speeds = _boxes(tuple(boxes))
+    between = np.abs((turns @ (pose[:3, 3] - centres)[:, :, None])[:, :, 0])
+    reach = np.abs(turns @ pose[:3, :3]) @ (size / 2)
+    gaps: Float = (between - halves - reach).max(axis=1)
+    return gaps, speeds
+
+
+@functools.lru_cache(maxsize=64)
+def _boxes(boxes: tuple[Box, ...]) -> tuple[Float, Float, Float, Float]:
+    """Centres [K, 3], rotations box from world [K, 3, 3], halves of sizes [K, 3], speeds [K]."""
+    poses = np.array([b.T_world_box for b in boxes])
+    halves = np.array([b.size for b in boxes]) / 2
+    speeds = np.array([b.fastest_point for b in boxes])
+    return poses[:, :3, 3], poses[:, :3, :3].transpose(0, 2, 1), halves, speeds
+
+
 def clearance(collider: Collider, points: Float) -> tuple[Float, Float]:
     """Signed distances [N] [m] of points [N, 3] to a collider, and unit normals [N, 3] out of it.
 

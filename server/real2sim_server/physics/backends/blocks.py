@@ -13,6 +13,7 @@ import numpy as np
 
 from ...geometry.rotation import Float
 from ..colliders import Collider
+from ..constitutive.material_row import LAW
 from . import particle as columns
 from .base import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from .layout import BLOCK, COLLIDER_MARGIN, Int, Layout, arrange
@@ -58,6 +59,8 @@ class BlockSimulation:
             np.zeros((bodies, bodies, TOTALS)),
         )
         self._moved = 0.0
+        # Of few bits, which sort in linear time.
+        self._laws = model.table[model.material, LAW].astype(np.int16)
         self._set_params(colliders)
         self._load(model.start)
         self._arrange(colliders)
@@ -234,7 +237,8 @@ class BlockSimulation:
         xi = (at - (shift * BLOCK).astype(self._dtype)).astype(self._dtype)
         blocks = self._blocks + shift
         bodies = self._model.body[self._order]
-        order, self._layout = arrange(blocks, bodies, self._model.dx, colliders)
+        laws = self._laws[self._order]
+        order, self._layout = arrange(blocks, bodies, laws, self._model.dx, colliders)
         self._state = self._sort_state(s, xi, order)
         self._blocks, self._order = blocks[order], self._order[order]
         self._work = self._make_work(self._layout)

@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ..colliders import Collider, HeightField
-from ..contact.collider_distance import collider_distance
+from ..contact.collider_distance import (
+    AXES,
+    BOX,
+    COUNT_X,
+    COUNT_Y,
+    FIRST_HEIGHT,
+    HALF_SIZE,
+    KIND,
+    PLANE,
+    POINT,
+    SPACING,
+)
 from ..errors import ParticleError
 from .base import is_thin, pack_colliders
 
@@ -79,13 +90,14 @@ class Layout(NamedTuple):
 
 
 def arrange(
-    blocks: Int, bodies: Int, dx: float, colliders: Sequence[Collider]
+    blocks: Int, bodies: Int, laws: NDArray[np.int16], dx: float, colliders: Sequence[Collider]
 ) -> tuple[Int, Layout]:
     """Sort particles by block and body and find all neighbours.
 
     Args:
         blocks: [N, 3] block of each particle's first node.
         bodies: [N].
+        laws: [N] small numbers; within a block those of the same law stand together.
         dx: cell size [m].
         colliders: in their present poses.
 
@@ -102,7 +114,8 @@ def arrange(
             "the scene nearer to the origin or take larger cells"
         )
     keys = _pack(blocks, bodies)
-    order = np.argsort(keys, kind="stable")
+    by_law = np.argsort(laws, kind="stable")
+    order = by_law[np.argsort(keys[by_law], kind="stable")]
     found_key, first = np.unique(keys[order], return_index=True)
     block_start = np.append(first, len(keys))
     block_coordinates, block_body = _unpack(found_key)
@@ -200,14 +213,40 @@ def _near_colliders(
         # Distance to a height field is measured along one normal, which misses nearby slopes.
         slack = BLOCK_REACH if isinstance(colliders[k], HeightField) else 0.0
         far = (reach + COLLIDER_MARGIN + slack) * dx
-        near[:, k] = _distances(rows[k], heights, centres) < far
+        near[:, k] = distances(rows[k], heights, centres) < far
     start = np.append(0, np.cumsum(near.sum(axis=1)))
     # Strided, as nonzero leaves it, it would have kernels compiled once more.
     return start, np.ascontiguousarray(np.nonzero(near)[1])
 
 
-def _distances(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:
-    return np.array([collider_distance(row, heights, *p)[0] for p in points.tolist()])
+def distances(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:
+    """Signed distances [N] [m] of points [N, 3] to a collider, as ``collider_distance`` of each."""
+    kind = int(row[KIND])
+    if kind == PLANE:
+        from_plane: Float = (points - row[POINT : POINT + 3]) @ row[AXES : AXES + 3]
+        return from_plane
+    if kind == BOX:
+        local = (points - row[POINT : POINT + 3]) @ row[AXES : AXES + 9].reshape(3, 3)
+        over = np.abs(local) - row[HALF_SIZE : HALF_SIZE + 3]
+        outside = np.linalg.norm(np.maximum(over, 0.0), axis=1)
+        to_box: Float = outside + np.minimum(over.max(axis=1), 0.0)
+        return to_box
+    return _above_ground(row, heights, points)
+
+
+def _above_ground(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:
+    first, shape = int(row[FIRST_HEIGHT]), (int(row[COUNT_X]), int(row[COUNT_Y]))
+    h = heights[first : first + shape[0] * shape[1]].reshape(shape)
+    last = np.array(shape) - 1
+    place = np.clip((points[:, :2] - row[POINT : POINT + 2]) / row[SPACING], 0.0, last)
+    low = np.minimum(place.astype(np.int64), last - 1)
+    (i, j), (a, b) = low.T, (place - low).T
+    h00, h01, h10, h11 = h[i, j], h[i, j + 1], h[i + 1, j], h[i + 1, j + 1]
+    slope_x = ((h10 - h00) * (1.0 - b) + (h11 - h01) * b) / row[SPACING]
+    slope_y = ((h01 - h00) * (1.0 - a) + (h11 - h10) * a) / row[SPACING]
+    height = (h00 * (1.0 - a) + h10 * a) * (1.0 - b) + (h01 * (1.0 - a) + h11 * a) * b
+    above: Float = (points[:, 2] - height) / np.sqrt(slope_x**2 + slope_y**2 + 1.0)
+    return above
 
 
 def _chunks(block_start: Int) -> Int:

@@ -237,9 +237,7 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
     plastic volume ratio. Hardening is held within exp(+-3), as loose and as hard as snow gets.
     What is crushed rather than packed pulls apart again at next to no stress, up to where it began.
     """
-    low, high = ONE - row[A], ONE + row[B]
-    if row[LAW] == CRUSH and history < ZERO:
-        high = ONE + max(SLACK, row[B] * (ONE + UNFOLDED * history))
+    low, high = snow_bounds(history, row)
     s = (
         min(max(stretch[0], low), high),
         min(max(stretch[1], low), high),
@@ -249,7 +247,7 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
     before = stretch[0] * stretch[1] * stretch[2]
     if before != volume:
         history = history + math.log(before / volume)
-    hard = math.exp(min(max(row[C] * (ONE - math.exp(history)), -THREE), THREE))
+    hard = snow_hardening(history, row)
     mu, lam = row[MU] * hard, row[LAMBDA] * hard
     pressure = lam * volume * (volume - ONE)
     d = (s[0] - ONE, s[1] - ONE, s[2] - ONE)
@@ -261,6 +259,21 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
     square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     energy = mu * square + HALF * lam * (volume - ONE) * (volume - ONE)
     return s, tau, energy, history
+
+
+@device_function
+def snow_bounds(history: Any, row: Any) -> Any:
+    """Between which principal stretches snow and structure are elastic."""
+    high = ONE + row[B]
+    if row[LAW] == CRUSH and history < ZERO:
+        high = ONE + max(SLACK, row[B] * (ONE + UNFOLDED * history))
+    return ONE - row[A], high
+
+
+@device_function
+def snow_hardening(history: Any, row: Any) -> Any:
+    """Factor on the moduli of snow and structure, from what plastic flow has left."""
+    return math.exp(min(max(row[C] * (ONE - math.exp(history)), -THREE), THREE))
 
 
 @device_function

@@ -83,6 +83,11 @@ class Material:
         """Whether it keeps dents, so that F_elastic and F_total part ways."""
         return self.constitutive_law.plastic
 
+    @property
+    def strength(self) -> float:
+        """Stress at which pressure from one side makes it yield [Pa]; infinite: never."""
+        return math.inf
+
     def row(self) -> NDArray[np.float64]:
         """The record as kernels read it: [MATERIAL_ROW] float64, see ``constitutive.material_row``.
 

@@ -37,6 +37,10 @@ class Metal(Material):
     def law_parameters(self) -> tuple[float, ...]:  # noqa: D102
         return self.yield_stress, self.hardening
 
+    @property
+    def strength(self) -> float:  # noqa: D102
+        return self.yield_stress
+
     def _check(self) -> None:
         self._require("yield_stress", self.yield_stress > 0, "must be positive")
         self._require("hardening", self.hardening >= 0, "must not be negative")
@@ -59,6 +63,10 @@ class Foam(Material):
 
     def law_parameters(self) -> tuple[float, ...]:  # noqa: D102
         return self.yield_stress, self.plastic_viscosity
+
+    @property
+    def strength(self) -> float:  # noqa: D102
+        return self.yield_stress
 
     def _check(self) -> None:
         self._require("yield_stress", self.yield_stress > 0, "must be positive")
@@ -83,6 +91,10 @@ class Sand(Material):
     def law_parameters(self) -> tuple[float, ...]:  # noqa: D102
         sine = math.sin(self.friction_angle)
         return (math.sqrt(2 / 3) * 2 * sine / (3 - sine),)
+
+    @property
+    def strength(self) -> float:  # noqa: D102
+        return 0.0
 
     def _check(self) -> None:
         inside = 0 < self.friction_angle < math.pi / 2
@@ -111,6 +123,10 @@ class Snow(Material):
 
     def law_parameters(self) -> tuple[float, ...]:  # noqa: D102
         return self.critical_compression, self.critical_stretch, self.hardening
+
+    @property
+    def strength(self) -> float:  # noqa: D102
+        return self.young * self.critical_compression
 
     def _check(self) -> None:
         inside = 0 < self.critical_compression < 1

@@ -73,6 +73,32 @@ def symmetric_times(s: Any, a: Any) -> Any:
 
 
 @device_function
+def times_transposed(a: Any, b: Any) -> Any:
+    """a b^T where that is symmetric."""
+    return (
+        a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
+        a[3] * b[3] + a[4] * b[4] + a[5] * b[5],
+        a[6] * b[6] + a[7] * b[7] + a[8] * b[8],
+        a[0] * b[3] + a[1] * b[4] + a[2] * b[5],
+        a[0] * b[6] + a[1] * b[7] + a[2] * b[8],
+        a[3] * b[6] + a[4] * b[7] + a[5] * b[8],
+    )
+
+
+@device_function
+def least_minor(s: Any, bound: Any, sign: Any) -> Any:
+    """Least leading principal minor of sign (s - bound I) for a symmetric s.
+
+    It is above zero where all eigenvalues of that are (Sylvester).
+    """
+    xx, yy, zz = sign * (s[0] - bound), sign * (s[1] - bound), sign * (s[2] - bound)
+    xy, xz, yz = sign * s[3], sign * s[4], sign * s[5]
+    second = xx * yy - xy * xy
+    third = second * zz - xx * yz * yz - yy * xz * xz + (xy + xy) * xz * yz
+    return min(xx, second, third)
+
+
+@device_function
 def rotation_step(r: Any, determinant: Any) -> Any:
     """One of Newton's steps towards the rotation of a matrix, and how much it changed.
 
@@ -118,14 +144,48 @@ def polar_rotation(a: Any, determinant: Any) -> Any:
 @device_function
 def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
     """Tangent, cosine and sine of the rotation that makes the element ``pq`` vanish."""
-    if abs(pq) < TINY:
-        return ZERO * pq, ONE + ZERO * pq, ZERO * pq
-    theta = HALF * (qq - pp) / pq
+    # Without branches, so that it can be vector code.
+    small = abs(pq) < TINY
+    theta = HALF * (qq - pp) / (ONE + ZERO * pq if small else pq)
     t = ONE / (abs(theta) + math.sqrt(theta * theta + ONE))
-    if theta < ZERO:
-        t = -t
+    t = -t if theta < ZERO else t
+    t = ZERO * t if small else t
     c = ONE / math.sqrt(t * t + ONE)
     return t, c, t * c
+
+
+@device_function
+def jacobi_sweep(s: Any, v: Any) -> Any:
+    """A symmetric matrix turned to have less off its diagonal; and ``v`` (9) turned alike."""
+    xx, yy, zz, xy, xz, yz = s
+    v0, v1, v2, v3, v4, v5, v6, v7, v8 = v
+    zero = ZERO * xx
+    t, c, n = jacobi_angle(xx, yy, xy)
+    xx, yy, xy = xx - t * xy, yy + t * xy, zero
+    xz, yz = c * xz - n * yz, n * xz + c * yz
+    v0, v1 = c * v0 - n * v1, n * v0 + c * v1
+    v3, v4 = c * v3 - n * v4, n * v3 + c * v4
+    v6, v7 = c * v6 - n * v7, n * v6 + c * v7
+    t, c, n = jacobi_angle(xx, zz, xz)
+    xx, zz, xz = xx - t * xz, zz + t * xz, zero
+    xy, yz = c * xy - n * yz, n * xy + c * yz
+    v0, v2 = c * v0 - n * v2, n * v0 + c * v2
+    v3, v5 = c * v3 - n * v5, n * v3 + c * v5
+    v6, v8 = c * v6 - n * v8, n * v6 + c * v8
+    t, c, n = jacobi_angle(yy, zz, yz)
+    yy, zz, yz = yy - t * yz, zz + t * yz, zero
+    xy, xz = c * xy - n * xz, n * xy + c * xz
+    v1, v2 = c * v1 - n * v2, n * v1 + c * v2
+    v4, v5 = c * v4 - n * v5, n * v4 + c * v5
+    v7, v8 = c * v7 - n * v8, n * v7 + c * v8
+    return (xx, yy, zz, xy, xz, yz), (v0, v1, v2, v3, v4, v5, v6, v7, v8)
+
+
+@device_function
+def is_diagonal(s: Any) -> Any:
+    """Whether what a symmetric matrix has off its diagonal is below what the numbers resolve."""
+    scale = abs(s[0]) + abs(s[1]) + abs(s[2])
+    return scale + (abs(s[3]) + abs(s[4]) + abs(s[5])) == scale
 
 
 @device_function
@@ -134,32 +194,13 @@ def eigen_symmetric(s: Any) -> Any:
 
     Golub and Van Loan, Matrix Computations, 8.5. Not sorted.
     """
-    xx, yy, zz, xy, xz, yz = s
-    one, zero = ONE + ZERO * xx, ZERO * xx
-    v0, v1, v2, v3, v4, v5, v6, v7, v8 = one, zero, zero, zero, one, zero, zero, zero, one
+    one, zero = ONE + ZERO * s[0], ZERO * s[0]
+    v = (one, zero, zero, zero, one, zero, zero, zero, one)
     for _ in range(JACOBI_SWEEPS):
-        scale = abs(xx) + abs(yy) + abs(zz)
-        if scale + (abs(xy) + abs(xz) + abs(yz)) == scale:
+        if is_diagonal(s):
             break
-        t, c, n = jacobi_angle(xx, yy, xy)
-        xx, yy, xy = xx - t * xy, yy + t * xy, zero
-        xz, yz = c * xz - n * yz, n * xz + c * yz
-        v0, v1 = c * v0 - n * v1, n * v0 + c * v1
-        v3, v4 = c * v3 - n * v4, n * v3 + c * v4
-        v6, v7 = c * v6 - n * v7, n * v6 + c * v7
-        t, c, n = jacobi_angle(xx, zz, xz)
-        xx, zz, xz = xx - t * xz, zz + t * xz, zero
-        xy, yz = c * xy - n * yz, n * xy + c * yz
-        v0, v2 = c * v0 - n * v2, n * v0 + c * v2
-        v3, v5 = c * v3 - n * v5, n * v3 + c * v5
-        v6, v8 = c * v6 - n * v8, n * v6 + c * v8
-        t, c, n = jacobi_angle(yy, zz, yz)
-        yy, zz, yz = yy - t * yz, zz + t * yz, zero
-        xy, xz = c * xy - n * xz, n * xy + c * xz
-        v1, v2 = c * v1 - n * v2, n * v1 + c * v2
-        v4, v5 = c * v4 - n * v5, n * v4 + c * v5
-        v7, v8 = c * v7 - n * v8, n * v7 + c * v8
-    return (xx, yy, zz), (v0, v1, v2, v3, v4, v5, v6, v7, v8)
+        s, v = jacobi_sweep(s, v)
+    return (s[0], s[1], s[2]), v
 
 
 @device_function

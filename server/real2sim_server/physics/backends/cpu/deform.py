@@ -1,9 +1,11 @@
-"""Deformation and stress of a block's particles, several at a time where they are elastic.
+"""Deformation and stress of a block's particles, several at a time.
 
 Stress is written for one particle. Elastic laws have no branches worth the name, so a batch of
 particles is laid out component by component and the function called in a loop of fixed length,
-which LLVM turns into vector code. What does not converge there, and all that flows, goes one by
-one.
+which LLVM turns into vector code. What packs and breaks (snow, structure) is fixed corotated up to
+where it yields, so it goes the same way, and no stretch has to be found to see that none is out of
+bounds. What flows is turned to its principal stretches, a batch together as well where several do;
+few, and what does not converge, go one by one.
 """
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
@@ -16,23 +18,60 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ...constitutive.material_row import COROTATED, LAMBDA, LAW, MU, NEO_HOOKEAN, VISCOSITY
+from ...constitutive.material_row import (
+    COROTATED,
+    CRUSH,
+    LAMBDA,
+    LAW,
+    MU,
+    NEO_HOOKEAN,
+    SNOW,
+    VISCOSITY,
+)
 from ...constitutive.stress import (
+    STRETCH_MIN,
     VOLUME_MIN,
     add_viscosity,
     advance_gradient,
     corotated_about,
     neo_hookean_at,
+    snow,
+    snow_bounds,
+    snow_hardening,
+    stress_update,
+    stretch_of,
 )
-from ...numerics.device import ONE, ZERO
-from ...numerics.matrices import det, rotation_step
+from ...numerics.device import ONE, TWO, ZERO
+from ...numerics.matrices import (
+    det,
+    gram,
+    is_diagonal,
+    jacobi_sweep,
+    least_minor,
+    recompose,
+    rotation_step,
+    symmetric_times,
+    times_transposed,
+)
 from ..kernel import inner
 from ..particle import deform
 from .columns import BATCH, bring_back_nine, bring_back_six, lay_out
 
 _F, _L, _TAU, _ENERGY, _VOLUME, _MU, _LAMBDA, _ETA, _OFF = 0, 9, 18, 24, 25, 26, 27, 28, 29
 """Rows of the scratch space, BATCH numbers each; _OFF tells lanes that did not converge."""
-SCRATCH = 30 * BATCH
+_LOW, _HIGH, _TOTAL = 30, 31, 32
+"""Of what yields: bounds of its principal stretches, and its total deformation."""
+_SYMMETRIC, _VECTORS = 41, 47
+"""Of what flows: F F^T and its eigenvectors; later in place of the first ``_RATIO``, ``_PULL``."""
+_RATIO, _PULL = 41, 44
+"""What is left of principal stretches, and principal stresses."""
+SCRATCH = 56 * BATCH
+SWEEPS = 4
+"""Of Jacobi's method in a batch; what has not converged then goes one by one."""
+FLOWN = TWO
+"""Marks lanes in _OFF whose flow has been found."""
+FEW = 4
+"""So many lanes that flow cost less one by one than all of a batch together."""
 
 
 @inner()
@@ -49,6 +88,14 @@ def deform_all(begin: Any, end: Any, dt: Any, state: Any, table: Any, scratch: A
             load(first, count, state, table, scratch)
             neo_hookean_batch(dt, scratch)
             store(first, count, dt, state, table, scratch)
+        elif law == SNOW:
+            load(first, count, state, table, scratch)
+            load_bounds(first, count, state, table, scratch)
+            snow_batch(dt, scratch)
+            if lanes_off(count, scratch) >= FEW:
+                flow_batch(first, count, state, table, scratch)
+            store(first, count, dt, state, table, scratch)
+            store_total(first, count, state, scratch)
         else:
             for p in range(first, first + count):
                 deform(p, dt, state, table[state.material[p]])
@@ -56,10 +103,16 @@ def deform_all(begin: Any, end: Any, dt: Any, state: Any, table: Any, scratch: A
 
 @inner()
 def common_law(first: Any, count: Any, material: Any, table: Any) -> Any:
-    """Code of the law that all particles of a batch follow, or -1."""
+    """Code of the law that all particles of a batch follow, or -1.
+
+    What folds is taken for snow: it yields at other bounds.
+    """
     law = int(table[material[first], LAW])
+    if law == CRUSH:
+        law = SNOW
     for p in range(first + 1, first + count):
-        if int(table[material[p], LAW]) != law:
+        other = int(table[material[p], LAW])
+        if other != law and not (law == SNOW and other == CRUSH):
             return -1
     return law
 
@@ -84,9 +137,36 @@ def load(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 
 
 @inner()
+def load_bounds(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
+    """What depends on plastic memory: bounds, hardened moduli; and total deformation."""
+    if count == BATCH:
+        lay_out(state.F_total, first, s, _TOTAL)
+    else:
+        for lane in range(BATCH):
+            p = first + min(lane, count - 1)
+            for c in range(9):
+                s[(_TOTAL + c) * BATCH + lane] = state.F_total[p, c]
+    for lane in range(BATCH):
+        p = first + min(lane, count - 1)
+        row, history = table[state.material[p]], state.history[p]
+        low, high = snow_bounds(history, row)
+        s[_LOW * BATCH + lane] = max(low, STRETCH_MIN)
+        s[_HIGH * BATCH + lane] = high
+        if history != ZERO:
+            hard = snow_hardening(history, row)
+            s[_MU * BATCH + lane] *= hard
+            s[_LAMBDA * BATCH + lane] *= hard
+
+
+@inner()
 def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> None:
     """Bring results back; lanes that are off are done again, one by one."""
-    if count == BATCH and all_converged(s):
+    if lanes_off(count, s) > 0:
+        for lane in range(count):
+            if s[_OFF * BATCH + lane] != ZERO:
+                p = first + lane
+                do_again(p, lane, dt, state, table[state.material[p]], s)
+    if count == BATCH:
         bring_back_nine(s, _F, state.F, first)
         bring_back_six(s, _TAU, state.tau, first)
         for lane in range(BATCH):
@@ -94,9 +174,6 @@ def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> No
         return
     for lane in range(count):
         p = first + lane
-        if s[_OFF * BATCH + lane] != ZERO:
-            deform(p, dt, state, table[state.material[p]])
-            continue
         for c in range(9):
             state.F[p, c] = s[(_F + c) * BATCH + lane]
         for c in range(6):
@@ -105,12 +182,34 @@ def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> No
 
 
 @inner()
-def all_converged(s: Any) -> Any:
-    """Whether no lane of a full batch is off."""
-    off = ZERO
-    for lane in range(BATCH):
-        off = max(off, s[_OFF * BATCH + lane])
-    return off == ZERO
+def do_again(p: Any, lane: Any, dt: Any, state: Any, row: Any, s: Any) -> None:
+    """One lane by the whole of its law, from the deformation that the batch has put there."""
+    F, tau, energy, history = stress_update(lane_matrix(s, _F, lane), state.history[p], row, dt)
+    if row[VISCOSITY] > ZERO:
+        tau = add_viscosity(tau, lane_matrix(s, _L, lane), det(F), row[VISCOSITY])
+    put(s, lane, F, tau, energy)
+    state.history[p] = history
+
+
+@inner()
+def store_total(first: Any, count: Any, state: Any, s: Any) -> None:
+    """Bring total deformation back."""
+    if count == BATCH:
+        bring_back_nine(s, _TOTAL, state.F_total, first)
+        return
+    for lane in range(count):
+        for c in range(9):
+            state.F_total[first + lane, c] = s[(_TOTAL + c) * BATCH + lane]
+
+
+@inner()
+def lanes_off(count: Any, s: Any) -> Any:
+    """How many of the first ``count`` lanes are off."""
+    off = 0
+    for lane in range(count):
+        if s[_OFF * BATCH + lane] != ZERO:
+            off += 1
+    return off
 
 
 @inner()
@@ -130,6 +229,107 @@ def corotated_batch(dt: Any, s: Any) -> None:
         tau = add_viscosity(tau, L, full, s[_ETA * BATCH + lane])
         put(s, lane, F, tau, energy)
         s[_OFF * BATCH + lane] = (ONE + change * change) - ONE
+
+
+@inner()
+def snow_batch(dt: Any, s: Any) -> None:
+    """Stress of all lanes where snow and structure are elastic; lanes that yield are off.
+
+    No stretch is out of bounds where neither V - low nor high - V has a negative eigenvalue, V the
+    left stretch F R^T, by Sylvester's criterion. NaN fails it, and so stays to be seen.
+    """
+    for lane in range(BATCH):
+        L = lane_matrix(s, _L, lane)
+        F = advance_gradient(lane_matrix(s, _F, lane), L, dt)
+        total = advance_gradient(lane_matrix(s, _TOTAL, lane), L, dt)
+        for c in range(9):
+            s[(_TOTAL + c) * BATCH + lane] = total[c]
+        full = det(F)
+        volume = max(full, VOLUME_MIN)
+        R, _ = rotation_step(F, volume)
+        R, _ = rotation_step(R, det(R))
+        R, change = rotation_step(R, det(R))
+        tau, energy = corotated_about(
+            F, R, volume, s[_MU * BATCH + lane], s[_LAMBDA * BATCH + lane]
+        )
+        tau = add_viscosity(tau, L, full, s[_ETA * BATCH + lane])
+        put(s, lane, F, tau, energy)
+        V = times_transposed(F, R)
+        least = min(
+            least_minor(V, s[_LOW * BATCH + lane], ONE),
+            least_minor(V, s[_HIGH * BATCH + lane], -ONE),
+            full - VOLUME_MIN,
+        )
+        converged = (ONE + change * change) == ONE
+        s[_OFF * BATCH + lane] = ZERO if least >= ZERO and converged else ONE
+
+
+@inner()
+def flow_batch(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
+    """Snow and structure by their principal stretches, in those lanes that are off."""
+    for lane in range(BATCH):
+        b = gram(lane_matrix(s, _F, lane))
+        for c in range(6):
+            s[(_SYMMETRIC + c) * BATCH + lane] = b[c]
+        for c in range(9):
+            s[(_VECTORS + c) * BATCH + lane] = ONE if c % 4 == 0 else ZERO
+    for _ in range(SWEEPS):
+        for lane in range(BATCH):
+            b, v = jacobi_sweep(lane_symmetric(s, lane), lane_matrix(s, _VECTORS, lane))
+            for c in range(6):
+                s[(_SYMMETRIC + c) * BATCH + lane] = b[c]
+            for c in range(9):
+                s[(_VECTORS + c) * BATCH + lane] = v[c]
+    flow(first, count, state, table, s)
+    compose(s)
+
+
+@inner()
+def flow(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
+    """The flow of the lanes that are off, one by one; those that did not converge stay off."""
+    for lane in range(count):
+        b = lane_symmetric(s, lane)
+        if s[_OFF * BATCH + lane] != ZERO and is_diagonal(b):
+            p = first + lane
+            stretch = (stretch_of(b[0]), stretch_of(b[1]), stretch_of(b[2]))
+            row = table[state.material[p]]
+            left, pull, energy, history = snow(stretch, state.history[p], row)
+            for c in range(3):
+                s[(_RATIO + c) * BATCH + lane] = left[c] / stretch[c]
+                s[(_PULL + c) * BATCH + lane] = pull[c]
+            s[_ENERGY * BATCH + lane] = energy
+            s[_OFF * BATCH + lane] = FLOWN
+            state.history[p] = history
+
+
+@inner()
+def compose(s: Any) -> None:
+    """Deformation and stress of lanes that have flown; they are no longer off."""
+    for lane in range(BATCH):
+        at = _RATIO * BATCH + lane
+        F, v = lane_matrix(s, _F, lane), lane_matrix(s, _VECTORS, lane)
+        left = symmetric_times(recompose((s[at], s[at + BATCH], s[at + 2 * BATCH]), v), F)
+        at = _PULL * BATCH + lane
+        tau = recompose((s[at], s[at + BATCH], s[at + 2 * BATCH]), v)
+        tau = add_viscosity(tau, lane_matrix(s, _L, lane), det(left), s[_ETA * BATCH + lane])
+        flown = s[_OFF * BATCH + lane] == FLOWN
+        for c in range(9):
+            s[(_F + c) * BATCH + lane] = left[c] if flown else F[c]
+        for c in range(6):
+            old = s[(_TAU + c) * BATCH + lane]
+            s[(_TAU + c) * BATCH + lane] = tau[c] if flown else old
+        off = s[_OFF * BATCH + lane]
+        s[_OFF * BATCH + lane] = ZERO if flown else off
+
+
+@inner()
+def lane_symmetric(s: Any, lane: Any) -> Any:
+    """Six numbers of one lane's symmetric matrix."""
+    at = _SYMMETRIC * BATCH + lane
+    return (
+        s[at], s[at + BATCH], s[at + 2 * BATCH],
+        s[at + 3 * BATCH], s[at + 4 * BATCH], s[at + 5 * BATCH],
+    )  # fmt: skip
 
 
 @inner()
