@@ -158,7 +158,7 @@ def vehicle(category, size, mass, pose, *, name=None, velocity=REST, brake=0.0):
     )
 
 
-CAR, TRUCK = (4.5, 1.8, 1.5), (8.0, 2.5, 3.0)
+TRUCK = (8.0, 2.5, 3.0)
 GROUND, GRAVITY = (Plane(name="ground"),), (0.0, 0.0, -9.81)
 
 
@@ -167,25 +167,10 @@ def truck_and_cone():
     return vehicle("truck", TRUCK, 2e4, at(0, 0, 1.5), velocity=(8.0, 0.0, 0.0)), ahead
 
 
-def car_on_a_car():
-    lower = vehicle("car", CAR, 1500.0, at(0, 0, 0.75), name="lower", brake=1.0)
-    return lower, vehicle("car", CAR, 1500.0, at(0.1, 0, 2.14), name="upper", brake=1.0)
-
-
-def rear_end():
-    hit = vehicle("car", CAR, 1500.0, at(6, 0.3, 0.75), name="hit")
-    return vehicle("car", CAR, 1500.0, at(0, 0, 0.75), velocity=(10.0, 0.0, 0.0)), hit
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "seconds", "most"),
-    [(truck_and_cone, 1.0, 3.0), (car_on_a_car, 3.0, 10.0), (rear_end, 2.0, 8.0)],
-    ids=["a truck and a cone", "a car on a car", "two cars"],
-)
-def test_processor_time_of_what_happens(make, seconds, most):
+def test_a_truck_and_a_cone_cost_seconds():
     """Twice what is aimed at, as others may share the caches."""
-    world = simulator(*make(), colliders=GROUND, gravity=GRAVITY)
+    world = simulator(*truck_and_cone(), colliders=GROUND, gravity=GRAVITY)
     begin = time.process_time()
-    run(world, seconds)
-    assert time.process_time() - begin < 2 * most
+    run(world, 1.0)
+    assert time.process_time() - begin < 2 * 3.0
