@@ -292,9 +292,18 @@ class Database:
             with self._writer.begin():
                 yield self._writer
         except Exception as error:
-            if not isinstance(error, sa.exc.IntegrityError):
+            if not isinstance(error, sa.exc.IntegrityError) and not self._found_full(error):
                 self._drop_writer()
             raise
+
+    def _found_full(self, error: Exception) -> bool:
+        """Whether there was no space. What was written is taken back then and the connection is
+        good; were it the last one and closed, readers might not get their files any more."""
+        return isinstance(sorted_error(error, folder=self._folder), StoreFullError)
+
+    @property
+    def _folder(self) -> Path | None:
+        return self._file.parent if self._file else None
 
     def _set_durable(self, writer: sa.Connection, *, durable: bool) -> None:
         # NORMAL loses no committed transaction when the process dies, only when the machine does.
@@ -328,7 +337,7 @@ class Database:
 
     def _reraise(self, error: Exception) -> NoReturn:
         """Raise the error as callers get it; trouble is noted."""
-        found = sorted_error(error, folder=self._file.parent if self._file else None)
+        found = sorted_error(error, folder=self._folder)
         if isinstance(found, StoreTroubleError):
             self._noted(found)
         if found is None or found is error:

@@ -10,6 +10,7 @@ import sqlalchemy as sa
 
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.storage import tables
+from real2sim_server.service.storage.errors import StoreFullError
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.store import (
     ConflictError,
@@ -315,3 +316,22 @@ def test_a_scenario_is_created_with_its_log_or_not_at_all(url):
         return await store.scenario_entries("sc_1"), await store.scenario("sc_2")
 
     assert run(url, work) == (log, None)
+
+
+def test_a_write_without_space_leaves_the_connection_for_readers_and_later_writes(sqlite_url):
+    async def fill(store):
+        await store.create_scenario(SCENARIO)
+        writer = store.database._writer.connection.dbapi_connection
+        (pages,) = writer.execute("PRAGMA page_count").fetchone()
+        writer.execute(f"PRAGMA max_page_count={pages + 2}")
+        for revision in (1, 2):
+            with pytest.raises(StoreFullError):
+                store.record_revision("sc_1", revision, entry("x" * 100_000), created_us=1)
+            assert store.database._writer.connection.dbapi_connection is writer
+        entries = await store.scenario_entries("sc_1")
+        writer.execute(f"PRAGMA max_page_count={pages + 1000}")
+        store.record_revision("sc_1", 1, entry("there"), created_us=1)
+        return entries, await store.scenario_entries("sc_1")
+
+    before, after = run(sqlite_url, fill)
+    assert (len(before), len(after)) == (0, 1)
