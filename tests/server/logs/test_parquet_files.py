@@ -7,9 +7,10 @@ import struct
 import pyarrow as pa
 import pytest
 from pyarrow import feather
+from pyarrow import parquet as pq
 
 from real2sim_server.logs import LogError
-from real2sim_server.logs.readers.formats.parquet_files import read_feather
+from real2sim_server.logs.readers.formats.parquet_files import ParquetFile, read_feather
 
 
 def test_text_that_is_none_is_an_error_of_the_file(tmp_path):
@@ -42,3 +43,11 @@ def test_names_of_columns_that_are_no_text_are_an_error_of_the_file(tmp_path):
     file.write_bytes(file.read_bytes().replace(name.encode(), b"\x92" * len(name)))
     with pytest.raises(LogError, match=r"a\.feather: cannot be read as a Feather file"):
         read_feather(file, [name])
+
+
+def test_a_damaged_name_of_a_column_is_told(tmp_path):
+    path = tmp_path / "damaged.parquet"
+    pq.write_table(pa.table({"column": [1.0]}), path)
+    path.write_bytes(path.read_bytes().replace(b"column", b"co\xffumn"))
+    with pytest.raises(LogError, match="cannot be read as Parquet"):
+        ParquetFile(path)
