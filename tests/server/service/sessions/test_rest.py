@@ -250,11 +250,14 @@ def test_what_is_rendered_by_request_is_what_the_socket_shows(site, join, info):
     np.testing.assert_equal(rendered, observed)
 
 
+ALL = ["rgb", "depth", "instance"]
+
+
 @pytest.mark.parametrize(
     ("sensor", "expected"),
     [
         ({"camera": "rear"}, (404, "UNKNOWN_CAMERA")),
-        ({"camera": "front", "width": 8192, "modalities": ["rgb"]}, (422, "INVALID_REQUEST")),
+        ({"camera": "front", "width": 8192, "modalities": ALL}, (422, "INVALID_REQUEST")),
         ({"camera": "front", "modalities": ["rgb", "rgb"]}, (422, "INVALID_REQUEST")),
     ],
 )
