@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
@@ -19,10 +18,11 @@ from .._batch_protocol import BatchProtocol
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest, error_of
 from .._sensors import ResetOptions, reset_spec
-from .._session_state import MAX_RECONNECTS, TRANSIENT_ERRORS, SessionPlan, backoff, not_open
+from .._session_state import SessionPlan, not_open
 from ..batch_observation import BatchObservation, batch_observation_from_wire
 from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError
-from .concurrency import AsyncSocket, connect_socket, receive, sleep
+from .concurrency import AsyncSocket, connect_socket, receive
+from .reconnecting import reconnect
 from .transport import AsyncTransport
 
 A = TypeVar("A", bound=Envelope)
@@ -201,7 +201,7 @@ class AsyncDriveBatch:
         except ConnectionLostError:
             if self._plan.reconnect <= 0:
                 raise
-            await self._reconnect()
+            await reconnect(self._close_socket, self._connect, seconds=self._plan.reconnect)
             return await self._exchange(request)
 
     async def _exchange(self, request: PendingRequest[A]) -> A:
@@ -230,20 +230,6 @@ class AsyncDriveBatch:
             member.model_copy(update={"resume_token": world.resume_token})
             for member, world in zip(self._members, self._welcome.worlds, strict=True)
         ]
-
-    async def _reconnect(self) -> None:
-        """Connect again, for as long as the plan says; the worker may be restarting."""
-        until = time.monotonic() + self._plan.reconnect
-        for attempt in range(MAX_RECONNECTS):
-            await self._close_socket()
-            try:
-                return await self._connect()
-            except TRANSIENT_ERRORS:
-                wait = backoff(attempt)
-                if time.monotonic() + wait > until:
-                    raise
-                await sleep(wait)
-        return None
 
     async def _close_socket(self) -> None:
         with contextlib.suppress(OSError, websockets.exceptions.WebSocketException):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
@@ -20,10 +19,11 @@ from .._batch_protocol import BatchProtocol
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest, error_of
 from .._sensors import ResetOptions, reset_spec
-from .._session_state import MAX_RECONNECTS, TRANSIENT_ERRORS, SessionPlan, backoff, not_open
+from .._session_state import SessionPlan, not_open
 from ..batch_observation import BatchObservation, batch_observation_from_wire
 from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError
-from .concurrency import Socket, connect_socket, receive, sleep
+from .concurrency import Socket, connect_socket, receive
+from .reconnecting import reconnect
 from .transport import Transport
 
 A = TypeVar("A", bound=Envelope)
@@ -202,7 +202,7 @@ class DriveBatch:
         except ConnectionLostError:
             if self._plan.reconnect <= 0:
                 raise
-            self._reconnect()
+            reconnect(self._close_socket, self._connect, seconds=self._plan.reconnect)
             return self._exchange(request)
 
     def _exchange(self, request: PendingRequest[A]) -> A:
@@ -231,20 +231,6 @@ class DriveBatch:
             member.model_copy(update={"resume_token": world.resume_token})
             for member, world in zip(self._members, self._welcome.worlds, strict=True)
         ]
-
-    def _reconnect(self) -> None:
-        """Connect again, for as long as the plan says; the worker may be restarting."""
-        until = time.monotonic() + self._plan.reconnect
-        for attempt in range(MAX_RECONNECTS):
-            self._close_socket()
-            try:
-                return self._connect()
-            except TRANSIENT_ERRORS:
-                wait = backoff(attempt)
-                if time.monotonic() + wait > until:
-                    raise
-                sleep(wait)
-        return None
 
     def _close_socket(self) -> None:
         with contextlib.suppress(OSError, websockets.exceptions.WebSocketException):

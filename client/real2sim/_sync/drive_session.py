@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
@@ -23,18 +24,12 @@ from .. import _requests
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest
 from .._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
-from .._session_state import (
-    MAX_RECONNECTS,
-    TRANSIENT_ERRORS,
-    SessionBase,
-    SessionPlan,
-    backoff,
-    not_open,
-)
+from .._session_state import SessionBase, SessionPlan, not_open
 from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
 from ..observation import Observation, View, observation_from_wire, view_from_frames
-from .concurrency import Socket, connect_socket, receive, run_blocking, sleep
+from .concurrency import Socket, connect_socket, receive, run_blocking
+from .reconnecting import reconnect
 from .transport import Transport
 
 A = TypeVar("A", bound=Envelope)
@@ -307,7 +302,8 @@ class DriveSession(SessionBase):
         except ConnectionLostError:
             if not self._may_resend(request):
                 raise
-            self._reconnect()
+            connect = partial(self._connect, self.session_id)
+            reconnect(self._close_socket, connect, seconds=self._plan.reconnect)
             self._check_not_applied(request)
             return self._exchange(request)
 
@@ -344,20 +340,6 @@ class DriveSession(SessionBase):
             self._without_memory(str(error))
         else:
             self._use_memory(memory)
-
-    def _reconnect(self) -> None:
-        """Connect again, for as long as the plan says; the worker may be restarting."""
-        session_id, until = self.session_id, time.monotonic() + self._plan.reconnect
-        for attempt in range(MAX_RECONNECTS):
-            self._close_socket()
-            try:
-                return self._connect(session_id)
-            except TRANSIENT_ERRORS:
-                wait = backoff(attempt)
-                if time.monotonic() + wait > until:
-                    raise
-                sleep(wait)
-        return None
 
     def _open_socket(self) -> Socket:
         if self._socket is None:
