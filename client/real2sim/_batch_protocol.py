@@ -27,6 +27,7 @@ from real2sim_proto.drive_batch import (
 from real2sim_proto.episode import ResetSpec
 
 from ._call import checked
+from ._models import sent_fields
 from ._protocol import PendingRequest, error_of, server_message
 from ._replies import describe
 from .errors import ErrorDetails, MalformedReplyError, NotResetError
@@ -147,5 +148,4 @@ def valid_plans(plans: Plans | Mapping[str, Any]) -> Plans:
 
 
 def _request(message: Envelope, answer: type[A], awaited: str, **how: Any) -> PendingRequest[A]:
-    fields = message.model_dump(mode="python", exclude_none=True)
-    return PendingRequest(message.id, fields, answer, awaited, **how)
+    return PendingRequest(message.id, sent_fields(message), answer, awaited, **how)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from urllib.parse import quote
 
 from pydantic import BaseModel, ValidationError
 
+from ._models import sent_fields
 from ._replies import MEDIA_TYPES, Reply, describe, parse_image
 from .images import Image
 
@@ -103,8 +105,8 @@ def upload(path: str, file: Path, form: dict[str, str]) -> Request:
 
 
 def json_of(body: BaseModel) -> bytes:
-    """The model as JSON, without what is None."""
-    return body.model_dump_json(exclude_none=True).encode()
+    """What was set of the model, as JSON."""
+    return json.dumps(sent_fields(body), allow_nan=False, separators=(",", ":")).encode()
 
 
 def segment(name: str) -> str:

@@ -62,7 +62,7 @@ def require_success(info: JobInfo) -> None:
     raise error_for(
         ErrorDetails(
             status=problem.status,
-            code=problem.code.value,
+            code=str(problem.code),
             detail=f"job {info.job_id!r} is {info.state.value}: {problem.detail}",
             hint=problem.hint,
         )

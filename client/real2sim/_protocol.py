@@ -56,6 +56,7 @@ from real2sim_proto.operations import Operation
 from real2sim_proto.plans import PLAN, Plan
 
 from ._call import checked
+from ._models import read_fields, sent_fields
 from ._replies import describe
 from .errors import (
     ErrorDetails,
@@ -285,8 +286,7 @@ class ProtocolState:
     def _request_for(
         message: Envelope, answer: type[A], awaited: str, **how: Any
     ) -> PendingRequest[A]:
-        fields = message.model_dump(mode="python", exclude_none=True)
-        return PendingRequest(message.id, fields, answer, awaited, **how)
+        return PendingRequest(message.id, sent_fields(message), answer, awaited, **how)
 
 
 def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:
@@ -322,7 +322,7 @@ def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:
             hint="install a client and a worker of the same major version",
         )
     try:
-        return messages.validate_python(fields)
+        return read_fields(messages, fields)
     except ValidationError as error:
         raise MalformedReplyError(
             f"the worker's message is not valid: {describe(error)}"

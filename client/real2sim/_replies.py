@@ -13,6 +13,7 @@ from real2sim_proto import CodecError, decode
 from real2sim_proto.drive import Frame as WireFrame
 from real2sim_proto.scenarios import HistoryEntry
 
+from ._models import read_json
 from ._retry import parse_retry_after
 from .errors import ErrorDetails, InvalidValue, MalformedReplyError, Real2SimError, error_for
 from .images import Image, frame_from_wire
@@ -81,7 +82,7 @@ def _missed(values: Any) -> list[HistoryEntry]:
     entries = []
     for value in values if isinstance(values, list) else []:
         try:
-            entries.append(HistoryEntry.model_validate(value))
+            entries.append(HistoryEntry.model_validate(value, extra="ignore"))
         except ValidationError:
             # The error matters more than one entry that a newer worker writes differently.
             continue
@@ -92,10 +93,15 @@ def nothing(_reply: Reply) -> None:
     return None
 
 
-def model_of(model: type[M]) -> Callable[[Reply], M]:
+def model_of(model: type[M], *, whole: bool = False) -> Callable[[Reply], M]:
+    """Reads answers that are a model; ``whole``: one that will be given back some day, of which
+    nothing may get lost."""
+
     def parse(reply: Reply) -> M:
         try:
-            return model.model_validate_json(reply.content)
+            if whole:
+                return model.model_validate_json(reply.content)
+            return read_json(model, reply.content)
         except ValidationError as error:
             raise MalformedReplyError(
                 f"the worker's answer is not a {model.__name__}: {describe(error)}",

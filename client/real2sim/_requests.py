@@ -47,6 +47,7 @@ from ._call import (
     segment,
     upload,
 )
+from ._models import sent_fields
 from ._replies import (
     MSGPACK,
     model_of,
@@ -167,7 +168,7 @@ def fork_scenario(scenario_id: str, name: str | None, revision: int | None) -> C
 
 def export_scenario(scenario_id: str) -> Call[ScenarioDocument]:
     request = Request("GET", f"{_scenario(scenario_id)}/export", long_timeout=True)
-    return Call(request, model_of(ScenarioDocument))
+    return Call(request, model_of(ScenarioDocument, whole=True))
 
 
 def import_scenario(document: ScenarioDocument) -> Call[ScenarioInfo]:
@@ -221,7 +222,7 @@ def cut_asset(body: AssetCut) -> Call[AssetInfo]:
 
 
 def upload_asset(path: Path, asked: AssetUpload) -> Call[AssetInfo]:
-    form = {name: str(value) for name, value in asked if value is not None}
+    form = {name: str(value) for name, value in sent_fields(asked).items()}
     return Call(upload("/v1/assets", path, form), model_of(AssetInfo))
 
 

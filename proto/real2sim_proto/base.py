@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -36,6 +36,12 @@ Quaternion = Annotated[
     AfterValidator(_unit),
     Field(description="wxyz, unit length within 1e-3"),
 ]
+
+
+def one_of(values: Any) -> Any:
+    """Field of an answer that has one of a ``Literal``'s values today; newer workers may have more,
+    and readers take them as they come."""
+    return Field(json_schema_extra={"enum": list(get_args(values))})
 
 
 class Model(BaseModel):

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, Vector3
+from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, Vector3, one_of
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .operations import Operation
 from .plans import Gear, Plan, PlanPoses, PlanTimes, check_times
@@ -89,20 +89,23 @@ class AgentState(ServerModel):
     size: Vector3
 
 
+EventType = Literal[
+    "collision",
+    "left_log",
+    "off_road",
+    "agents_react",
+    "deadline_missed",
+    "horizon",
+    "edited",
+    "stopped",
+    "looped",
+]
+
+
 class Event(ServerModel):
     """Something that happened in this step."""
 
-    type: Literal[
-        "collision",
-        "left_log",
-        "off_road",
-        "agents_react",
-        "deadline_missed",
-        "horizon",
-        "edited",
-        "stopped",
-        "looped",
-    ]
+    type: str = one_of(EventType)
     t_us: Microseconds
     object_id: str | None = None
     other_id: str | None = Field(default=None, description="second object, without the ego")

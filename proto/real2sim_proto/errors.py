@@ -164,7 +164,9 @@ class Problem(BaseModel):
     type: str = Field(default="about:blank", description="URI reference of the kind of problem")
     title: str = Field(description="short sentence, the same for every problem of this code")
     status: int
-    code: ErrorCode
+    code: ErrorCode | str = Field(
+        union_mode="left_to_right", description="newer workers may have others"
+    )
     detail: str = Field(description="what was given, what is allowed")
     hint: str | None = Field(default=None, description="what to do next")
     instance: str | None = Field(default=None, description="path of the request")

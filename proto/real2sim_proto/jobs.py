@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from .base import Identifier, Microseconds, Model
+from .base import Identifier, Microseconds, Model, one_of
 from .errors import Problem
 from .scenes import Reply
 
@@ -42,7 +42,7 @@ class JobInfo(Reply):
     """A job as it is now; also the data of each of its events."""
 
     job_id: str
-    kind: JobKind
+    kind: str = one_of(JobKind)
     subject: str = Field(description="scene or scenario it works on")
     state: JobState
     progress: float = Field(default=0.0, ge=0, le=1)

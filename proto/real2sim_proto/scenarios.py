@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import Identifier, Model
+from .base import Identifier, Model, one_of
 from .operations import AddCollider, EraseRegion, Operation
 from .scenes import ObjectInfo, Reply
 
@@ -62,7 +62,7 @@ class OperationBatch(Model):
 class EditWarning(Reply):
     """Something a person should look at; the operation took effect all the same."""
 
-    code: Literal["overlap", "off_ground", "outside_map"]
+    code: str = one_of(Literal["overlap", "off_ground", "outside_map"])
     object_id: str
     message: str
 

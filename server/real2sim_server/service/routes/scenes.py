@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Request, Response
 
+from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo
 from real2sim_proto.scenes import SceneInfo, SceneList, SceneState
@@ -92,7 +93,7 @@ async def load(
     job = await worker.jobs.wait(job.job_id, _wait_seconds(prefer))
     if job.error is not None:
         raise ServiceError(
-            job.error.code,
+            ErrorCode(job.error.code),
             job.error.detail,
             hint=job.error.hint,
             extra=job.error.model_extra,

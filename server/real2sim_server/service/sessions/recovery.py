@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from real2sim_proto import ErrorCode, decode, encode
+from real2sim_proto import ErrorCode, decode
+from real2sim_proto.plans import PLAN
 
 from ...edit import LogEntry, Scenario, ScenarioState
 from ...world import World
-from ...world.recording.replay import Entry, Replayer
+from ...world.recording.replay import Entry, Replayer, plan_payload
 from ..http.problems import ServiceError
 from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store
@@ -105,5 +106,7 @@ def _world(replayer: Replayer) -> World:
 
 
 def _content(entry: Entry) -> bytes:
-    """What an action is compared by: its plan alone."""
-    return encode({"plan": decode(entry.payload)["plan"]})
+    """What an action is compared by: its plan alone, as this version writes it. The version that
+    wrote the entry may not have known all of its members."""
+    fields = decode(entry.payload)["plan"]
+    return plan_payload(None if fields is None else PLAN.validate_python(fields))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 import time
 import tracemalloc
 
@@ -66,6 +67,26 @@ def test_sessions_of_an_earlier_run_are_rebuilt_when_they_are_asked_for(own_site
     again = after.call("GET", info, "/state").json()
     assert {k: again[k] for k in ("ego", "step")} == {k: state[k] for k in ("ego", "step")}
     assert after.call("POST", info, "/step", json={}).json()["step"] == 6
+
+
+def test_an_action_of_before_an_upgrade_is_known_again_by_what_it_means(own_site, join, tmp_path):
+    store = tmp_path / "store.db"
+    before = own_site(store_url=f"sqlite:///{store}")
+    info = before.create()
+    with join(info) as planner:
+        planner.reset()
+        planner.act(0)
+    before.stop()
+    with sqlite3.connect(store) as database:
+        (stored,) = database.execute("SELECT payload FROM session_log WHERE kind = 'action'")
+        plan = decode(stored[0])["plan"]
+        assert plan.pop("gear") == "drive"
+        new = (encode({"plan": plan}),)
+        database.execute("UPDATE session_log SET payload = ? WHERE kind = 'action'", new)
+    after = own_site(store_url=f"sqlite:///{store}")
+    again = join(info | {"ws_url": info["ws_url"].replace(before.url[7:], after.url[7:])})
+    assert again.act(0)["type"] == "obs"
+    assert again.act(0, acceleration=0.1)["code"] == "STEP_CONFLICT"
 
 
 def test_the_workers_token_opens_every_session(own_site, join):
