@@ -2,7 +2,7 @@
 
 from .backends import Backend, BackendStatus, describe_backends, select_backend
 from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
-from .frame import Frame, render_cameras, warm_up
+from .frame import Frame, RigView, draws_together, render_cameras, render_rigs, warm_up
 from .levels import (
     levels_bytes,
     levels_estimate,
@@ -31,10 +31,12 @@ __all__ = [
     "RasterOptions",
     "RenderError",
     "RenderOutput",
+    "RigView",
     "ScreenStatistics",
     "View",
     "WorldViews",
     "describe_backends",
+    "draws_together",
     "encode_depth",
     "encode_image",
     "encode_instance",
@@ -46,6 +48,7 @@ __all__ = [
     "rasterize_batch",
     "rasterize_worlds",
     "render_cameras",
+    "render_rigs",
     "scene_levels_bytes",
     "select_backend",
     "uses_levels",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,6 +51,23 @@ class Frame:
         return self.images.get("instance")
 
 
+@dataclass(frozen=True, eq=False)
+class RigView:
+    """What the cameras of a vehicle look at.
+
+    Attributes:
+        instances: what is in its world.
+        cameras: on the vehicle.
+        T_world_vehicle: [4, 4] pose of the vehicle.
+        sky: behind everything.
+    """
+
+    instances: Sequence[Instance]
+    cameras: Sequence[Camera]
+    T_world_vehicle: ArrayLike
+    sky: Sky | None = None
+
+
 def render_cameras(
     instances: Sequence[Instance],
     cameras: Sequence[Camera],
@@ -80,37 +97,48 @@ def render_cameras(
         RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for a modality
             that nobody has registered.
     """
-    vehicle = np.asarray(T_world_vehicle, dtype=np.float64)
-    if vehicle.shape != (4, 4) or not np.isfinite(vehicle).all():
-        raise RenderError(f"T_world_vehicle must be [4, 4] and finite, not {vehicle.tolist()}")
+    view = RigView(instances, cameras, T_world_vehicle, sky)
+    return render_rigs(
+        [view], options=options, modalities=modalities, backend=backend, between=between
+    )[0]
+
+
+def render_rigs(
+    views: Sequence[RigView],
+    *,
+    options: RasterOptions = DEFAULT_OPTIONS,
+    modalities: Sequence[str] | None = None,
+    backend: str | Backend = "auto",
+    between: Callable[[], object] | None = None,
+) -> list[list[Frame]]:
+    """Frames of several vehicles, as :func:`render_cameras` gives each; all are drawn in one call
+    where the backend can, see :func:`draws_together`.
+
+    Args:
+        views: what the cameras of each vehicle look at.
+        options, modalities, backend, between: as of :func:`render_cameras`.
+
+    Raises:
+        RenderError: as :func:`render_cameras`, for any of them; nothing is drawn then.
+    """
     if modalities is None:
         modalities = modalities_drawn(options)
     else:
         options = options_for(modalities, options)
-    groups: dict[tuple[int, int], list[int]] = {}
-    for index, camera in enumerate(cameras):
-        groups.setdefault((camera.width, camera.height), []).append(index)
-    drawn = tuple(instances)
-    requests = [
-        checked_request(
-            drawn,
-            np.stack([cameras[index].viewmat(vehicle) for index in members]),
-            np.stack([cameras[index].K for index in members]),
-            size,
-            sky=sky,
-            options=options,
-            between=between,
-        )
-        for size, members in groups.items()
-    ]
     chosen = select_backend(backend) if isinstance(backend, str) else backend
-    frames: dict[int, Frame] = {}
-    for members, (images, timing_ms) in zip(
-        groups.values(), _drawn(requests, modalities, chosen), strict=True
-    ):
-        group = [cameras[index] for index in members]
-        frames.update(zip(members, _frames(group, vehicle, images, timing_ms), strict=True))
-    return [frames[index] for index in range(len(cameras))]
+    groups = [(v, members) for v, view in enumerate(views) for members in _by_size(view.cameras)]
+    requests = [_request(views[v], members, options, between) for v, members in groups]
+    frames: list[dict[int, Frame]] = [{} for _ in views]
+    drawn = _drawn(requests, modalities, chosen)
+    for (v, members), (images, timing_ms) in zip(groups, drawn, strict=True):
+        made = _frames(views[v], members, images, timing_ms)
+        frames[v].update(zip(members, made, strict=True))
+    return [[found[index] for index in range(len(found))] for found in frames]
+
+
+def draws_together(backend: Backend, modalities: Iterable[str]) -> bool:
+    """Whether images of these modalities are drawn in one go, whatever is in them."""
+    return isinstance(backend, FrameBackend) and backend.modalities.issuperset(modalities)
 
 
 def warm_up(backend: str | Backend = "auto") -> None:
@@ -121,11 +149,46 @@ def warm_up(backend: str | Backend = "auto") -> None:
     render_cameras([], [camera], np.eye(4), backend=chosen)
 
 
+def _by_size(cameras: Sequence[Camera]) -> list[list[int]]:
+    """Indices of cameras of one size each."""
+    groups: dict[tuple[int, int], list[int]] = {}
+    for index, camera in enumerate(cameras):
+        groups.setdefault((camera.width, camera.height), []).append(index)
+    return list(groups.values())
+
+
+def _request(
+    view: RigView,
+    members: Sequence[int],
+    options: RasterOptions,
+    between: Callable[[], object] | None,
+) -> RasterRequest:
+    """Of cameras of one size. Raises RenderError."""
+    vehicle = _vehicle_pose(view.T_world_vehicle)
+    cameras = [view.cameras[index] for index in members]
+    return checked_request(
+        view.instances,
+        np.stack([camera.viewmat(vehicle) for camera in cameras]),
+        np.stack([camera.K for camera in cameras]),
+        (cameras[0].width, cameras[0].height),
+        sky=view.sky,
+        options=options,
+        between=between,
+    )
+
+
+def _vehicle_pose(given: ArrayLike) -> NDArray[np.float64]:
+    pose = np.asarray(given, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise RenderError(f"T_world_vehicle must be [4, 4] and finite, not {pose.tolist()}")
+    return pose
+
+
 def _drawn(
     requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
 ) -> Iterator[tuple[Mapping[str, NDArray[Any]], dict[str, float]]]:
     """Images [C, H, W, ...] by modality of each request, and milliseconds by stage."""
-    if isinstance(backend, FrameBackend) and backend.modalities.issuperset(modalities):
+    if isinstance(backend, FrameBackend) and draws_together(backend, modalities):
         start = time.perf_counter()
         finished = backend.frames(requests, modalities) if requests else []
         cameras = sum(request.cameras for request in requests)
@@ -139,18 +202,19 @@ def _drawn(
 
 
 def _frames(
-    cameras: Sequence[Camera],
-    vehicle: NDArray[np.float64],
+    view: RigView,
+    members: Sequence[int],
     images: Mapping[str, NDArray[Any]],
     timing_ms: Mapping[str, float],
 ) -> list[Frame]:
-    share = {stage: value / len(cameras) for stage, value in timing_ms.items()}
+    share = {stage: value / len(members) for stage, value in timing_ms.items()}
+    vehicle = _vehicle_pose(view.T_world_vehicle)
     return [
         Frame(
-            camera=camera.name,
+            camera=view.cameras[index].name,
             images={name: pixels[c] for name, pixels in images.items()},
-            T_world_camera=camera.pose(vehicle),
+            T_world_camera=view.cameras[index].pose(vehicle),
             timing_ms=dict(share),
         )
-        for c, camera in enumerate(cameras)
+        for c, index in enumerate(members)
     ]

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -19,6 +19,7 @@ from .accounts import PAYER, Account, computing_account
 from .lanes import Lane, Lanes
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 IDLE_TICK_S = 0.25
 NICENESS = 3
@@ -102,12 +103,30 @@ class _LoopFuture:
             self.outcome.set_exception(error)
 
 
+@dataclass(frozen=True, eq=False)
+class Companions:
+    """With what a job may be done in one go: with those that have the same ``compute`` and ``key``.
+
+    Attributes:
+        compute: makes the results of several arguments, or what was raised instead, in their order.
+        argument: of this job.
+        key: compared by identity.
+        share: of what may be done in one go; that of all jobs together is at most 1.
+    """
+
+    compute: Callable[[Sequence[Any]], Sequence[Any]]
+    argument: object
+    key: object
+    share: float
+
+
 @dataclass(eq=False)
 class _EngineJob:
     run: Callable[[], Any]
     label: str
     future: Future[Any] | _LoopFuture
     account: Account | None
+    companions: Companions | None = None
     queued_at: float = field(default_factory=time.perf_counter)
 
 
@@ -117,7 +136,8 @@ class Engine:
     Everything that computes runs here, so that kernels never compete for cores and the event loop
     never waits for them. Jobs are plain functions; their exceptions travel to the caller. Jobs of a
     lane run in the order they came, lanes take turns, see :class:`.lanes.Lanes`. A long job calls
-    :meth:`give_way` between its pieces, and more urgent ones run there and then.
+    :meth:`give_way` between its pieces, and more urgent ones run there and then. Jobs that can be
+    done in one go are, where they wait together; none waits for one to come.
 
     Args:
         queue_length: jobs that may wait in each lane.
@@ -142,7 +162,7 @@ class Engine:
         self._on_job = on_job
         self._jobs: Lanes[_EngineJob] = Lanes(queue_length)
         self._began = 0.0
-        self._account: Account | None = None
+        self._payers: Sequence[Account | None] = ()
         self._changed = threading.Condition()
         self._accepting = False
         self._running: str | None = None
@@ -207,12 +227,42 @@ class Engine:
         await computing_account()
         awaited = _LoopFuture(on_result)
         job = self._submit(lambda: fn(*args, **kwargs), label, lane, awaited)
-        try:
-            result: T = await awaited.outcome
-            return result
-        except asyncio.CancelledError:
-            self._drop(job)
-            raise
+        result: T = await self._outcome(job, awaited)
+        return result
+
+    async def call_together(
+        self,
+        compute: Callable[[Sequence[T]], Sequence[R | Exception]],
+        argument: T,
+        *,
+        key: object,
+        share: float,
+        label: str,
+        lane: Lane,
+        on_result: Callable[[R], object] | None = None,
+    ) -> R:
+        """The result that ``compute`` has for ``argument``, awaited as by :meth:`call`.
+
+        What waits with it in its lane, of the same ``compute`` and ``key``, is handed over in the
+        same call; those whose turn it was before wait for it once at most. Time counts for all
+        accounts in equal parts.
+
+        Args:
+            compute: makes the results of several arguments, or what was raised instead, in order.
+            argument: of this call.
+            key: compared by identity.
+            share: of what may be done in one go, above 0; at most 1 comes together.
+            label, lane, on_result: as of :meth:`call`.
+
+        Raises:
+            OverLimitError, QueueFullError, EngineStoppedError, DeviceLostError: as :meth:`call`.
+        """
+        await computing_account()
+        awaited = _LoopFuture(on_result)
+        companions = Companions(compute, argument, key, share)
+        job = self._submit(lambda: compute([argument])[0], label, lane, awaited, companions)
+        result: R = await self._outcome(job, awaited)
+        return result
 
     def call_sync(
         self,
@@ -282,11 +332,24 @@ class Engine:
 
     # --- inside -----------------------------------------------------------------------------
 
+    async def _outcome(self, job: _EngineJob, awaited: _LoopFuture) -> Any:
+        try:
+            return await awaited.outcome
+        except asyncio.CancelledError:
+            self._drop(job)
+            raise
+
     def _submit(
-        self, run: Callable[[], Any], label: str, lane: Lane, future: Future[Any] | _LoopFuture
+        self,
+        run: Callable[[], Any],
+        label: str,
+        lane: Lane,
+        future: Future[Any] | _LoopFuture,
+        companions: Companions | None = None,
     ) -> _EngineJob:
         payer = PAYER.get()
-        job = _EngineJob(run, label, future, payer.account if payer is not None else None)
+        account = payer.account if payer is not None else None
+        job = _EngineJob(run, label, future, account, companions)
         with self._changed:
             if self._failure is not None:
                 raise DeviceLostError(f"the device was lost: {self._failure}")
@@ -339,43 +402,75 @@ class Engine:
             return self._jobs.begin_more_urgent()
 
     def _start(self, job: _EngineJob) -> None:
-        """Run a job that is wanted still, and count its time."""
+        """Run a job that is wanted still, with those that join it, and count its time."""
         self._began = time.perf_counter()
-        interrupted, self._account = self._account, job.account
+        interrupted = self._payers
         try:
-            if job.future.set_running_or_notify_cancel():
-                self._run(job)
+            jobs = [j for j in self._joined(job) if j.future.set_running_or_notify_cancel()]
+            self._payers = [j.account for j in jobs]
+            if jobs:
+                self._run(jobs)
         finally:
             self._charge()
-            self._account = interrupted
+            self._payers = interrupted
             with self._changed:
                 self._jobs.end()
 
+    def _joined(self, first: _EngineJob) -> list[_EngineJob]:
+        """A job that begins, and those that are done in one go with it."""
+        given = first.companions
+        if given is None:
+            return [first]
+        left = 1.0 - given.share
+
+        def joins(job: _EngineJob) -> bool:
+            nonlocal left
+            other = job.companions
+            if other is None or other.key is not given.key or other.compute != given.compute:
+                return False
+            left -= other.share
+            return left > -1e-9
+
+        with self._changed:
+            return [first, *self._jobs.begin_with(joins)]
+
     def _charge(self) -> None:
         now = time.perf_counter()
+        spent, self._began = now - self._began, now
         with self._changed:
-            self._jobs.charge(now - self._began)
-        if self._account is not None:
-            self._account.engine_seconds += now - self._began
-        self._began = now
+            self._jobs.charge(spent)
+        for account in self._payers:
+            if account is not None:
+                account.engine_seconds += spent / len(self._payers)
 
-    def _run(self, job: _EngineJob) -> None:
+    def _run(self, jobs: Sequence[_EngineJob]) -> None:
         started = time.perf_counter()
-        interrupted, self._running = self._running, job.label
+        interrupted, self._running = self._running, jobs[0].label
         try:
-            result = job.run()
+            results = _results(jobs)
         except BaseException as error:
             if _loses_device(error):
                 self._lose_device(error)
-            job.future.set_exception(error)
+            for job in jobs:
+                job.future.set_exception(error)
         else:
-            job.future.set_result(result)
+            for job, result in zip(jobs, results, strict=True):
+                self._hand_over(job, result)
         finally:
             self._running = interrupted
         # The awaiting thread has been woken, and gets the interpreter before metrics are updated.
         time.sleep(0)
         if self._on_job is not None:
-            self._on_job(job.label, started - job.queued_at, time.perf_counter() - started)
+            for job in jobs:
+                self._on_job(job.label, started - job.queued_at, time.perf_counter() - started)
+
+    def _hand_over(self, job: _EngineJob, result: Any) -> None:
+        if job.companions is None or not isinstance(result, Exception):
+            job.future.set_result(result)
+            return
+        if self._failure is None and _loses_device(result):
+            self._lose_device(result)
+        job.future.set_exception(result)
 
     def _lose_device(self, error: BaseException) -> None:
         log.error("device lost", error=str(error))
@@ -385,6 +480,13 @@ class Engine:
             waiting = self._jobs.take_all()
         _fail(waiting, DeviceLostError(f"the device was lost: {error}"))
         self.on_failure()
+
+
+def _results(jobs: Sequence[_EngineJob]) -> Sequence[Any]:
+    if len(jobs) == 1:
+        return [jobs[0].run()]
+    given = [job.companions for job in jobs if job.companions is not None]
+    return given[0].compute([companions.argument for companions in given])
 
 
 def set_thread_counts(threads: int) -> None:

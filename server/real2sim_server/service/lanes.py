@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 from enum import IntEnum
+from itertools import compress
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -40,6 +41,7 @@ class Lanes(Generic[T]):
         self.length = length
         self._waiting: dict[Lane, deque[T]] = {lane: deque() for lane in Lane}
         self._running: list[Lane] = []
+        self._passed_over = dict.fromkeys(Lane, 0)
         self._had = dict.fromkeys(Lane, 0.0)
 
     def __len__(self) -> int:
@@ -70,6 +72,35 @@ class Lanes(Generic[T]):
             if lane < present and self._waiting[lane] and self._had[lane] <= self._had[present]
         )
 
+    def begin_with(self, joins: Callable[[T], bool]) -> list[T]:
+        """Jobs of the lane of the job begun last that are run with it, in the order they came.
+
+        They leave others behind that came before them. A job is left behind once at most: then it
+        is run before any that came later.
+
+        Args:
+            joins: whether a job is run with it; asked for each in turn.
+        """
+        lane = self._running[-1]
+        waiting, passed_over = self._waiting[lane], self._passed_over[lane]
+        joined: list[T] = []
+        stayed: list[T] = []
+        behind = 0
+        for place, job in enumerate(waiting):
+            if joins(job):
+                joined.append(job)
+                behind = len(stayed)
+            elif place < passed_over:
+                behind = passed_over - len(joined)
+                break
+            else:
+                stayed.append(job)
+        if joined:
+            taken = set(map(id, joined))
+            self._waiting[lane] = deque(job for job in waiting if id(job) not in taken)
+            self._passed_over[lane] = behind
+        return joined
+
     def charge(self, seconds: float) -> None:
         """Count time to the lane of the job begun last."""
         lane = self._running[-1]
@@ -83,13 +114,16 @@ class Lanes(Generic[T]):
         """Drop waiting jobs."""
         for lane, jobs in self._waiting.items():
             if any(map(unwanted, jobs)):
-                self._waiting[lane] = deque(job for job in jobs if not unwanted(job))
+                kept = [not unwanted(job) for job in jobs]
+                self._passed_over[lane] = sum(kept[: self._passed_over[lane]])
+                self._waiting[lane] = deque(compress(jobs, kept))
 
     def take_all(self) -> list[T]:
         """All that wait, which wait no more."""
         jobs = [job for lane in Lane for job in self._waiting[lane]]
-        for waiting in self._waiting.values():
+        for lane, waiting in self._waiting.items():
             waiting.clear()
+            self._passed_over[lane] = 0
         return jobs
 
     def _is_active(self, lane: Lane) -> bool:
@@ -100,4 +134,5 @@ class Lanes(Generic[T]):
         if lane is None:
             return None
         self._running.append(lane)
+        self._passed_over[lane] = max(0, self._passed_over[lane] - 1)
         return self._waiting[lane].popleft()

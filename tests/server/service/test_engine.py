@@ -454,3 +454,53 @@ def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
         timeout=120,
     )
     assert done.stdout == "works\n", done.stderr[-2000:]
+
+
+class Gathered:
+    """Computes results of arguments that it was given in one go."""
+
+    def __init__(self) -> None:
+        self.calls: list[list[int]] = []
+
+    def compute(self, arguments):
+        self.calls.append(list(arguments))
+        return [ZeroDivisionError() if n == 0 else 1 / n for n in arguments]
+
+
+def waiting_together(engine, gate, calls):
+    """Outcomes of calls that wait while the engine is busy."""
+
+    async def ask():
+        busy = asyncio.create_task(engine.call(gate.job))
+        await until_entered(gate)
+        tasks = [asyncio.ensure_future(call) for call in calls]
+        while engine.queue_depth < len(calls) and not any(task.done() for task in tasks):
+            await asyncio.sleep(0.001)
+        gate.open()
+        await busy
+        return await asyncio.gather(*tasks, return_exceptions=True)
+
+    return asyncio.run(ask())
+
+
+def test_calls_of_one_key_that_wait_together_are_made_in_one_go_within_their_shares(make_engine):
+    engine, gathered, key = make_engine(), Gathered(), object()
+    options = {"share": 0.4, "label": "drive", "lane": Lane.DRIVE}
+    calls = [
+        engine.call_together(gathered.compute, n, key=key if n != 2 else object(), **options)
+        for n in (1, 2, 4, 5)
+    ]
+    assert waiting_together(engine, Gate(), calls) == [1, 0.5, 0.25, 0.2]
+    assert gathered.calls == [[1, 4], [2], [5]]
+
+
+def test_what_is_raised_for_one_of_several_calls_reaches_its_caller_alone(make_engine):
+    engine, gathered, key = make_engine(), Gathered(), object()
+    options = {"share": 0.1, "label": "drive", "lane": Lane.DRIVE, "key": key}
+    calls = [engine.call_together(gathered.compute, n, **options) for n in (2, 0, 4)]
+    first, second, third = waiting_together(engine, Gate(), calls)
+    assert (first, third) == (0.5, 0.25)
+    assert isinstance(second, ZeroDivisionError)
+    assert gathered.calls == [[2, 0, 4]]
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(engine.call_together(gathered.compute, 0, **options))

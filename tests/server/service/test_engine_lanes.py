@@ -83,3 +83,39 @@ def test_jobs_nobody_wants_any_more_leave_their_lane():
     assert len(lanes) == 2
     assert lanes.take_all() == ["drive 1", "bulk 1"]
     assert lanes.begin_next() is None
+
+
+def a_begun_lane(*names: str) -> Lanes[str]:
+    lanes: Lanes[str] = Lanes(1000)
+    for name in names:
+        lanes.append(name, Lane.DRIVE)
+    lanes.begin_next()
+    return lanes
+
+
+def test_jobs_that_join_the_running_one_leave_the_others_in_their_order():
+    lanes = a_begun_lane("a1", "a2", "b1", "a3", "b2")
+    assert lanes.begin_with(lambda job: job[0] == "a") == ["a2", "a3"]
+    lanes.end()
+    assert [lanes.begin_next(), lanes.begin_next()] == ["b1", "b2"]
+
+
+def test_a_job_is_left_behind_once_at_most():
+    lanes = a_begun_lane("a1", "a2", "c1", "b1", "a3")
+    joined = iter([True, False, False, True])
+    assert lanes.begin_with(lambda _: next(joined)) == ["a2", "a3"]
+    lanes.append("c2", Lane.DRIVE)
+    assert lanes.begin_next() == "c1"
+    assert lanes.begin_with(lambda job: job[0] == "c") == []
+    assert [lanes.begin_next(), lanes.begin_next()] == ["b1", "c2"]
+
+
+def test_jobs_that_leave_a_lane_do_not_move_who_was_left_behind():
+    lanes = a_begun_lane("a1", "b1", "b2", "a2")
+    assert lanes.begin_with(lambda job: job[0] == "a") == ["a2"]
+    lanes.discard(lambda job: job == "b1")
+    lanes.append("a3", Lane.DRIVE)
+    assert lanes.begin_with(lambda job: job[0] == "a") == []
+    lanes.begin_next()
+    lanes.append("b3", Lane.DRIVE)
+    assert lanes.begin_with(lambda job: job[0] == "b") == ["b3"]

@@ -17,7 +17,15 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.base import Codec
 from real2sim_proto.episode import SensorSpec
 
-from ...render import Backend, Instance, RasterOptions, render_cameras, warm_up
+from ...render import (
+    Backend,
+    Instance,
+    RasterOptions,
+    RigView,
+    draws_together,
+    render_rigs,
+    warm_up,
+)
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, lower_priority
@@ -167,26 +175,52 @@ class Renderer:
         ``between`` is called between pieces of the work.
         """
         started = time.perf_counter()
-        rendered: dict[int, list[RenderedImage]] = {}
-        for options, members in _passes(request.sensors).items():
-            frames = render_cameras(
-                request.instances,
-                [cameras[i] for i in members],
-                request.T_world_vehicle,
-                sky=request.scene.sky,
+        images = self.render_together([(request, cameras)], between=between)[0]
+        return images, (time.perf_counter() - started) * 1e3
+
+    def draws_together(self, modalities: Iterable[str]) -> bool:
+        """Whether images of these modalities are drawn in one go, whoever wants them."""
+        return draws_together(self._backend, modalities)
+
+    def render_together(
+        self,
+        requests: Sequence[tuple[RenderRequest, Sequence[Camera]]],
+        *,
+        between: Callable[[], object] | None = None,
+    ) -> list[list[RenderedImage]]:
+        """Images of all sensors of each request; those that one pass can draw are drawn in one
+        go. On the engine thread.
+
+        Args:
+            requests: each with the cameras of its sensors, in their order.
+            between: called between pieces of the work.
+
+        Raises:
+            RenderError: of any of them.
+        """
+        passes = _passes([request for request, _ in requests])
+        images: list[dict[int, list[RenderedImage]]] = [{} for _ in requests]
+        for (options, modalities), members in passes.items():
+            views = [_rig_view(*requests[r], indices) for r, indices in members.items()]
+            drawn = render_rigs(
+                views,
                 options=options,
-                modalities=_modalities(request.sensors[i] for i in members),
+                modalities=modalities,
                 backend=self._backend,
                 between=between,
             )
-            for i, frame in zip(members, frames, strict=True):
-                sensor, pose, K = request.sensors[i], frame.T_world_camera, cameras[i].K
-                rendered[i] = [
-                    RenderedImage(sensor, name, request.t_us, pose, K, frame.images[name])
-                    for name in sensor.modalities
-                ]
-        images = [image for i in range(len(request.sensors)) for image in rendered[i]]
-        return images, (time.perf_counter() - started) * 1e3
+            for (r, indices), frames in zip(members.items(), drawn, strict=True):
+                request, cameras = requests[r]
+                for i, frame in zip(indices, frames, strict=True):
+                    sensor, pose, K = request.sensors[i], frame.T_world_camera, cameras[i].K
+                    images[r][i] = [
+                        RenderedImage(sensor, name, request.t_us, pose, K, frame.images[name])
+                        for name in sensor.modalities
+                    ]
+        return [
+            [image for i in range(len(request.sensors)) for image in found[i]]
+            for (request, _), found in zip(requests, images, strict=True)
+        ]
 
     def _count(
         self, frames: Sequence[EncodedFrame], timing_ms: dict[str, float], stream: str
@@ -203,18 +237,41 @@ def _lane(cameras: Sequence[Camera], stream: str) -> Lane:
     return Lane.BULK if stream == "export" or pixels > VIEW_PIXELS else Lane.VIEW
 
 
-def _passes(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, list[int]]:
-    """Indices of the sensors by the pass that renders them."""
-    passes: dict[RasterOptions, list[int]] = {}
-    for i, sensor in enumerate(sensors):
-        options = replace(DEFAULT_OPTIONS, detail=sensor.detail)
-        passes.setdefault(options_for(sensor.modalities, options), []).append(i)
+Pass = tuple[RasterOptions, tuple[str, ...]]
+"""What is drawn in one go: by which options, and which modalities."""
+
+
+def _passes(requests: Sequence[RenderRequest]) -> dict[Pass, dict[int, list[int]]]:
+    """Indices of the sensors of each request, by the pass that draws them."""
+    passes: dict[Pass, dict[int, list[int]]] = {}
+    for r, request in enumerate(requests):
+        for options, indices in _sensors_by_options(request.sensors).items():
+            modalities = _modalities(request.sensors[i] for i in indices)
+            passes.setdefault((options, modalities), {})[r] = indices
     return passes
 
 
-def _modalities(sensors: Iterable[SensorSpec]) -> list[str]:
+def _sensors_by_options(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, list[int]]:
+    found: dict[RasterOptions, list[int]] = {}
+    for i, sensor in enumerate(sensors):
+        options = replace(DEFAULT_OPTIONS, detail=sensor.detail)
+        found.setdefault(options_for(sensor.modalities, options), []).append(i)
+    return found
+
+
+def _modalities(sensors: Iterable[SensorSpec]) -> tuple[str, ...]:
     """Everything that one of the sensors wants, each once."""
-    return list(dict.fromkeys(name for sensor in sensors for name in sensor.modalities))
+    wanted = {name for sensor in sensors for name in sensor.modalities}
+    return tuple(name for name in modality_names() if name in wanted)
+
+
+def _rig_view(request: RenderRequest, cameras: Sequence[Camera], indices: Sequence[int]) -> RigView:
+    return RigView(
+        instances=request.instances,
+        cameras=[cameras[i] for i in indices],
+        T_world_vehicle=request.T_world_vehicle,
+        sky=request.scene.sky,
+    )
 
 
 def _samples() -> Iterator[RenderedImage]:

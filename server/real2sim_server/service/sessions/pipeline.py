@@ -22,12 +22,17 @@ phase         runs on                what happens
 A world without sensors moves on a thread of its own: it needs no device, and its planner should not
 wait while other sessions are rendered. Steps that wait for that thread are made in one go, phase by
 phase: their log entries are one transaction, and they wake the event loop once.
+
+Where the backend draws images of several worlds in one go, steps of sessions on one scene that wait
+for the engine together pass the phases together, as far as TOGETHER_PIXELS: their images are those
+that each would get alone, bit for bit. None waits for another that is not there yet, and one that
+came first is left behind once at most.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -67,6 +72,10 @@ from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack
 T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
+TOGETHER_PIXELS = 16_000_000
+"""Of images that are drawn in one go: the first session waits for the last, some milliseconds."""
+MOST_TOGETHER = 8
+"""Steps with images that are made in one go."""
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
@@ -88,6 +97,7 @@ class Transition:
         recorded: whether ``record`` is done.
         sent: whether ``write`` is done.
         account: that pays where no engine counts.
+        scene: with the steps of which other sessions this may be drawn; None for none.
         moved: the new world, kept where its images have to wait for kernels.
     """
 
@@ -100,7 +110,21 @@ class Transition:
     recorded: bool = False
     sent: bool = False
     account: Account | None = None
+    scene: Scene | None = None
     moved: World | None = None
+
+
+Described = tuple[EncodedMembers, list[FrameHeader] | None]
+"""An observation without its images, and the headers of these where all are raw."""
+
+
+class _Moved(NamedTuple):
+    """A new world as far as images show it, and the sensors that are due."""
+
+    transition: Transition
+    world: World
+    sensors: Sequence[SensorSpec]
+    cameras: Sequence[Camera]
 
 
 class Seen(NamedTuple):
@@ -184,6 +208,7 @@ class StepPipeline:
         self._deformation = deformation
         self._max_pixels = max_pixels
         self._stages: dict[str, Histogram] = {}
+        self._draws_together = renderer.draws_together(())
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
         self._steps: GatheredCalls[Transition, EncodedObservation] = GatheredCalls(
             self._compute_together, self._worlds, on_result=self.send
@@ -244,13 +269,108 @@ class StepPipeline:
         return await self._finish(observation)
 
     async def _on_engine(self, transition: Transition) -> RenderedObservation | EncodedObservation:
-        return await self._engine.call(
-            self._compute,
+        told = partial(self.send, transition)
+        if transition.scene is None or not self._draws_together:
+            return await self._engine.call(
+                self._compute, transition, label="drive", lane=Lane.DRIVE, on_result=told
+            )
+        return await self._engine.call_together(
+            self._draw_together,
             transition,
+            key=transition.scene,
+            share=_share(transition.cameras.values()),
             label="drive",
             lane=Lane.DRIVE,
-            on_result=partial(self.send, transition),
+            on_result=told,
         )
+
+    def _draw_together(
+        self, transitions: Sequence[Transition]
+    ) -> list[RenderedObservation | EncodedObservation | Exception]:
+        """All phases of steps with images, drawn in one go; where one fails, the others go on."""
+        if len(transitions) == 1:
+            return [attempt(self._compute, transitions[0])]
+        for transition in transitions:
+            transition.timer.stage("queue")
+        begun = [attempt(self._moved, transition) for transition in transitions]
+        present = [moved for moved in begun if isinstance(moved, _Moved)]
+        for moved in present:
+            moved.transition.timer.stage("world")
+        evaluation = self._evaluators.submit(self._evaluate_together, present)
+        try:
+            images = self._render_together(present)
+        finally:
+            evaluation.exception()  # waits
+        finished = iter(map(self._completed, present, images, evaluation.result()))
+        return [moved if isinstance(moved, Exception) else next(finished) for moved in begun]
+
+    def _moved(self, transition: Transition) -> _Moved:
+        world = self.advance(transition)
+        sensors = world.due_sensors()
+        if sensors:
+            self._require_kernels(world)
+        return _Moved(transition, world, sensors, [transition.cameras[s.camera] for s in sensors])
+
+    def _render_together(
+        self, present: Sequence[_Moved]
+    ) -> list[Sequence[RenderedImage] | Exception]:
+        """Images of each world, its objects deformed first, or what was raised instead."""
+        deformed = [attempt(_deform, moved.world, moved.transition.timer) for moved in present]
+        ready = [m for m, error in zip(present, deformed, strict=True) if error is None]
+        try:
+            drawn = self._images_together([(m.world, m.sensors, m.cameras) for m in ready])
+        except Exception:
+            # Each then finds out for itself: the trouble of one is not that of the others.
+            alone = (attempt(self._images, m.world, m.sensors, m.cameras) for m in ready)
+            found: Iterator[Sequence[RenderedImage] | Exception] = iter(list(alone))
+        else:
+            found = iter(drawn)
+        for moved in present:
+            moved.transition.timer.stage("render")
+        return [next(found) if error is None else error for error in deformed]
+
+    def _evaluate_together(self, present: Sequence[_Moved]) -> list[Described | Exception]:
+        """As :meth:`evaluate` for each, their log entries put on record together."""
+        failed: dict[Transition, Exception] = {}
+        for moved in present:
+            if isinstance(error := attempt(moved.world.evaluate), Exception):
+                failed[moved.transition] = error
+        failed |= self._record([m.transition for m in present if m.transition not in failed])
+        return [
+            failed[m.transition]
+            if m.transition in failed
+            else attempt(_described, m.world, m.sensors, m.cameras)
+            for m in present
+        ]
+
+    def _completed(
+        self,
+        moved: _Moved,
+        images: Sequence[RenderedImage] | Exception,
+        described: Described | Exception,
+    ) -> RenderedObservation | EncodedObservation | Exception:
+        for outcome in (described, images):
+            if isinstance(outcome, Exception):
+                return outcome
+        assert not isinstance(images, Exception)
+        assert not isinstance(described, Exception)
+        return attempt(self._observation, moved.transition, moved.world, images, described)
+
+    def _observation(
+        self,
+        transition: Transition,
+        world: World,
+        images: Sequence[RenderedImage],
+        described: Described,
+    ) -> RenderedObservation | EncodedObservation:
+        """Of a rendered and evaluated world, encoded where all images are raw."""
+        members, headers = described
+        # Of the evaluation only what did not happen beside the rendering.
+        transition.timer.stage("settle")
+        rendered = RenderedObservation(
+            world, images, "obs", members, transition.timer, transition.slot
+        )
+        return rendered if headers is None else self.encode(rendered, headers)
 
     def _compute_together(
         self, transitions: Sequence[Transition]
@@ -331,26 +451,20 @@ class StepPipeline:
         """The phases of one job, which ends encoded where all images are raw."""
         timer = transition.timer
         timer.stage("queue")
-        world = self.advance(transition)
-        sensors = world.due_sensors()
-        cameras = [transition.cameras[s.camera] for s in sensors]
+        _, world, sensors, cameras = self._moved(transition)
         timer.stage("world")
         images: Sequence[RenderedImage] = ()
         if sensors:
-            self._require_kernels(world)
             evaluation = self._evaluators.submit(self.evaluate, transition, world, sensors, cameras)
             try:
                 images = self.render(world, sensors, cameras, timer)
             finally:
                 evaluation.exception()  # waits
-            members, headers = evaluation.result()
+            described = evaluation.result()
         else:
             timer.stage("render")
-            members, headers = self.evaluate(transition, world, sensors, cameras)
-        # Of the evaluation only what did not happen beside the rendering.
-        timer.stage("settle")
-        rendered = RenderedObservation(world, images, "obs", members, timer, transition.slot)
-        return rendered if headers is None else self.encode(rendered, headers)
+            described = self.evaluate(transition, world, sensors, cameras)
+        return self._observation(transition, world, images, described)
 
     def advance(self, transition: Transition) -> World:
         """The new world, as far as images show it."""
@@ -366,9 +480,7 @@ class StepPipeline:
         timer: PhaseTimer,
     ) -> Sequence[RenderedImage]:
         """Images of a world, its objects deformed first."""
-        if world.deformation is not None:
-            world.deformation.solve(world.t_us)
-            timer.stage("physics")
+        _deform(world, timer)
         images = self._images(world, sensors, cameras)
         timer.stage("render")
         return images
@@ -379,18 +491,11 @@ class StepPipeline:
         world: World,
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
-    ) -> tuple[EncodedMembers, list[FrameHeader] | None]:
-        """Complete the world by what images do not show, and put the change on record.
-
-        Returns:
-            The observation without its images, and the headers of these where all are raw.
-        """
+    ) -> Described:
+        """Complete the world by what images do not show, and put the change on record."""
         world.evaluate()
         _record_one(transition)
-        members = pack_members(world.observe().obs_fields())
-        if any(sensor.codec != "raw" for sensor in sensors):
-            return members, None
-        return members, raw_headers(sensors, cameras, world.T_world_estimate, world.t_us)
+        return _described(world, sensors, cameras)
 
     def encode(
         self, rendered: RenderedObservation, headers: Sequence[FrameHeader]
@@ -497,19 +602,17 @@ class StepPipeline:
         *,
         between: Callable[[], object] | None = None,
     ) -> Sequence[RenderedImage]:
-        request = RenderRequest(
-            scene=world.scene,
-            instances=world.instances(),
-            T_world_vehicle=world.T_world_body,
-            t_us=world.t_us,
-            sensors=sensors,
-        )
-        images, _ = self._renderer.render_images(request, cameras, between=between)
-        if world.T_world_estimate is world.T_world_body:
-            return images
-        # Images are of where the ego is; what they say of it is its own estimate.
-        believed = world.T_world_estimate @ invert_transform(world.T_world_body)
-        return [replace(i, T_world_sensor=believed @ i.T_world_sensor) for i in images]
+        return self._images_together([(world, sensors, cameras)], between=between)[0]
+
+    def _images_together(
+        self,
+        worlds: Sequence[tuple[World, Sequence[SensorSpec], Sequence[Camera]]],
+        *,
+        between: Callable[[], object] | None = None,
+    ) -> list[Sequence[RenderedImage]]:
+        requests = [(_request(world, sensors), cameras) for world, sensors, cameras in worlds]
+        drawn = self._renderer.render_together(requests, between=between)
+        return [_believed(world, images) for (world, *_), images in zip(worlds, drawn, strict=True)]
 
     async def _finish(
         self, observation: RenderedObservation | EncodedObservation
@@ -546,6 +649,44 @@ def message_of(world: World) -> EncodedMessage:
     """The observation of an instant without images, as a message."""
     members = pack_members(world.observe().obs_fields())
     return pack_with_frames("obs", members, (), PhaseTimer())
+
+
+def _share(cameras: Iterable[Camera]) -> float:
+    """How much of what is drawn in one go is for a session with these cameras."""
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return max(pixels / TOGETHER_PIXELS, 1 / MOST_TOGETHER)
+
+
+def _deform(world: World, timer: PhaseTimer) -> None:
+    """Find the shapes that images of a world show."""
+    if world.deformation is not None:
+        world.deformation.solve(world.t_us)
+        timer.stage("physics")
+
+
+def _request(world: World, sensors: Sequence[SensorSpec]) -> RenderRequest:
+    return RenderRequest(
+        scene=world.scene,
+        instances=world.instances(),
+        T_world_vehicle=world.T_world_body,
+        t_us=world.t_us,
+        sensors=sensors,
+    )
+
+
+def _believed(world: World, images: Sequence[RenderedImage]) -> Sequence[RenderedImage]:
+    """Images are of where the ego is; what they say of it is its own estimate."""
+    if world.T_world_estimate is world.T_world_body:
+        return images
+    believed = world.T_world_estimate @ invert_transform(world.T_world_body)
+    return [replace(i, T_world_sensor=believed @ i.T_world_sensor) for i in images]
+
+
+def _described(world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]) -> Described:
+    members = pack_members(world.observe().obs_fields())
+    if any(sensor.codec != "raw" for sensor in sensors):
+        return members, None
+    return members, raw_headers(sensors, cameras, world.T_world_estimate, world.t_us)
 
 
 def _record_one(transition: Transition) -> None:

@@ -18,7 +18,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation
 
 from ...edit import EditOutcome
-from ...scene import Camera
+from ...scene import Camera, Scene
 from ...world import Event, Plan, World
 from ...world.recording.replay import (
     KEPT_PLAN,
@@ -230,7 +230,13 @@ class Stepper:
     ) -> tuple[EncodedObservation, bool]:
         record = ("action", session.running_world().steps, payload)
         observation, written = await self._observe(
-            session, change, session.cameras, record, write=write, slot=slot
+            session,
+            change,
+            session.cameras,
+            record,
+            write=write,
+            slot=slot,
+            scene=_drawn_with(session.running_world()),
         )
         session.world, session.late = observation.world, False
         session.publish(observation.message)
@@ -342,11 +348,12 @@ class Stepper:
         *,
         write: Callable[[EncodedMessage], bool] | None = None,
         slot: FrameSlot | None = None,
+        scene: Scene | None = None,
     ) -> tuple[EncodedObservation, bool]:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])
         store = LogWrite(self._store, session.session_id, entries, session.log_unsure)
-        transition = Transition(change, cameras, record=store, write=write, slot=slot)
+        transition = Transition(change, cameras, record=store, write=write, slot=slot, scene=scene)
         try:
             observation = await self._pipeline.run(transition)
         except StoreUnavailableError:
@@ -391,6 +398,13 @@ class Stepper:
                 session.unsure_replies += (reply.key,)
             raise
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
+
+
+def _drawn_with(now: World) -> Scene | None:
+    """With the sessions of which scene the next step may be drawn: none waits for another's
+    deformations."""
+    deformed = now.deformation is not None and now.deformation.has_impacts
+    return None if deformed else now.scene
 
 
 def _action_record(session: Session, plan: Plan | None, payload: bytes) -> LogRecord:

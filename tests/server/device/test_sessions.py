@@ -1,0 +1,174 @@
+"""Steps of several sessions on one scene: one set of launches, the images of each as alone."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Iterator, Sequence
+from functools import partial
+from typing import Any, TypeVar, cast
+
+import pytest
+
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.plans import Control
+from real2sim_server.edit import ScenarioState
+from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
+from real2sim_server.scene import Scene
+from real2sim_server.service.accounts import PAYER, Account, Payer
+from real2sim_server.service.engine import Engine
+from real2sim_server.service.http.metrics import Metrics
+from real2sim_server.service.rendering.renderer import Renderer
+from real2sim_server.service.sessions.pipeline import (
+    EncodedObservation,
+    StepPipeline,
+    Transition,
+)
+from real2sim_server.world import World
+
+from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
+from . import pretended
+from .pretended_launcher import PretendedLauncher
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason=NEEDS_COMPILER)
+T = TypeVar("T")
+SENSORS: list[dict[str, Any]] = [
+    {"camera": "front", "width": 48, "codec": "raw", "modalities": ["rgb", "depth", "instance"]},
+    {"camera": "left", "width": 32, "codec": "raw", "modalities": ["rgb", "depth", "instance"]},
+]
+SPEC: dict[str, Any] = {"action": "control", "sensors": SENSORS}
+
+
+class Service:
+    """The engine and the step pipeline on the pretended device."""
+
+    def __init__(self) -> None:
+        self.engine = Engine()
+        self.engine.start()
+        metrics = Metrics()
+        renderer = Renderer(
+            self.engine, NvrtcBackend(PretendedLauncher()), metrics, max_pixels=10**7
+        )
+        self.pipeline = StepPipeline(
+            self.engine, renderer, metrics, deformation=cast(Any, None), max_pixels=10**7
+        )
+        self._closing = [self.pipeline.close, renderer.close, self.engine.stop]
+
+    def close(self) -> None:
+        for close in self._closing:
+            close()
+
+    def step(self, world: World, steering: float) -> Transition:
+        cameras = self.pipeline.cameras(world.scene, world.spec.sensors)
+        return Transition(partial(moved, world, steering), cameras, scene=world.scene)
+
+    def run(self, *steps: Awaitable[T]) -> list[T | BaseException]:
+        """What comes of steps that wait for the engine at the same time."""
+        entered, opened = threading.Event(), threading.Event()
+
+        def gate() -> None:
+            entered.set()
+            assert opened.wait(10)
+
+        async def all_of_them() -> list[T | BaseException]:
+            busy = asyncio.create_task(self.engine.call(gate))
+            assert await asyncio.to_thread(entered.wait, 10)
+            tasks = [asyncio.ensure_future(step) for step in steps]
+            while self.engine.queue_depth < len(steps) and not any(t.done() for t in tasks):
+                await asyncio.sleep(0.001)
+            pretended.counts.__init__()  # type: ignore[misc]
+            opened.set()
+            await busy
+            return await asyncio.gather(*tasks, return_exceptions=True)
+
+        return asyncio.run(all_of_them())
+
+
+@pytest.fixture
+def service(device_counts: pretended.Counts) -> Iterator[Service]:
+    made = Service()
+    yield made
+    made.close()
+
+
+def moved(world: World, steering: float) -> World:
+    fork = world.fork()
+    fork.move(Control(acceleration=1.0, steering=steering))
+    return fork
+
+
+def begun(scene: Scene, **spec: Any) -> World:
+    return World(scene, ScenarioState.of(scene), ResetSpec(**SPEC | spec))
+
+
+def images(observation: EncodedObservation | BaseException) -> list[bytes]:
+    assert isinstance(observation, EncodedObservation), observation
+    return [bytes(frame.data) for frame in observation.frames]
+
+
+def test_two_sessions_share_launches_and_see_what_each_sees_alone(
+    service: Service, tiny_scene: Scene, device_counts: pretended.Counts
+) -> None:
+    worlds = [begun(tiny_scene), begun(tiny_scene, start_us=500_000)]
+
+    def steps() -> list[Awaitable[EncodedObservation]]:
+        given = zip(worlds, (0.1, -0.2), strict=True)
+        return [service.pipeline.run(service.step(world, angle)) for world, angle in given]
+
+    alone = [images(service.run(step)[0]) for step in steps()]
+    launches = device_counts.launches
+    together = [images(observation) for observation in service.run(*steps())]
+    assert together == alone
+    assert together[0] != together[1]
+    assert device_counts.launches == launches
+    assert (device_counts.to_device, device_counts.to_host, device_counts.waits) == (1, 1, 1)
+
+
+def test_what_fails_in_one_session_leaves_the_others_alone(
+    service: Service, tiny_scene: Scene
+) -> None:
+    world = begun(tiny_scene)
+    sound, refused, unrecorded = (service.step(world, 0.1) for _ in range(3))
+
+    def fail(*_: object) -> World:
+        raise ValueError("no")
+
+    refused.change, unrecorded.record = fail, fail
+    ran = (service.pipeline.run(step) for step in (refused, sound, unrecorded))
+    found = service.run(*ran)
+    assert [isinstance(outcome, ValueError) for outcome in found] == [True, False, True]
+    assert images(found[1]) == images(
+        service.run(service.pipeline.run(service.step(world, 0.1)))[0]
+    )
+
+
+def test_an_image_that_cannot_be_drawn_is_the_trouble_of_its_session(
+    service: Service, tiny_scene: Scene
+) -> None:
+    sound, broken = (service.step(begun(tiny_scene), 0.1) for _ in range(2))
+    change = broken.change
+
+    def bent() -> World:
+        world = change()
+        world.T_world_body = 2.0 * world.T_world_body
+        return world
+
+    broken.change = bent
+    found = service.run(*map(service.pipeline.run, (sound, broken)))
+    assert isinstance(found[0], EncodedObservation)
+    assert "rigid" in str(found[1])
+
+
+def test_time_of_a_joint_drawing_counts_for_all_in_equal_parts(
+    service: Service, tiny_scene: Scene
+) -> None:
+    accounts: Sequence[Account] = [Account("alice"), Account("bob")]
+    worlds = [begun(tiny_scene) for _ in accounts]
+
+    async def paid(account: Account, world: World) -> EncodedObservation:
+        PAYER.set(Payer(account))
+        return await service.pipeline.run(service.step(world, 0.0))
+
+    found = service.run(*map(paid, accounts, worlds))
+    assert not [outcome for outcome in found if isinstance(outcome, BaseException)]
+    assert accounts[0].engine_seconds == accounts[1].engine_seconds > 0
