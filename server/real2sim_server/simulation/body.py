@@ -23,7 +23,7 @@ from ..physics.materials import Material
 from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .result import Rebound
-from .rigid import RigidMotion, best_rotation, cross_matrix, inertia_about
+from .rigid import RigidMotion, added_inertia, best_rotation, cross_matrix, inertia_about
 from .rolling import advance_on_wheels
 from .surroundings import box_gaps, closest, packed
 from .tyres import TyreReaction, Tyres
@@ -130,7 +130,7 @@ class DeformableBody:
             angular_velocity=np.array(angular_velocity, dtype=np.float64),
             mass=particles.mass,
             inertia=inertia_about(
-                particles.centre_of_mass, particles.positions, particles.masses, cell=cell
+                particles.centre_of_mass, particles.positions, particles.masses, particles.volumes
             ),
         )
         self.mode = BodyMode.RIGID
@@ -138,6 +138,8 @@ class DeformableBody:
         self.supports: frozenset[str] = frozenset()
         self.state: BodyState | None = None
         self.rebound: Rebound | None = None
+        self._added_inertia = added_inertia(particles.masses, particles.volumes, cell=cell)
+        self._carried = np.zeros(3)
         self._velocity_before = self.motion.velocity
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
@@ -273,10 +275,11 @@ class DeformableBody:
         return self._radius_m
 
     def solver_body(self) -> Body:
-        """The body as it is now, for a solver; momentum and angular momentum are the motion's."""
+        """The body as it is now, for a solver; velocity and turning are the motion's."""
         if self.state is not None:
             s = self.state
             return self._solver_body(s.positions, s.velocities, s.gradients, s)
+        self._carried = self._on_grid(self.motion)
         pose, rotation = self.T_world_object, self.motion.rotation
         positions = apply_transform(pose, self.shape.positions)
         spin = cross_matrix(self.motion.angular_velocity)
@@ -313,7 +316,10 @@ class DeformableBody:
     @property
     def kinetic_energy(self) -> float:
         """Energy of its motion [J]."""
-        return self.motion.kinetic if self.state is None else self.state.kinetic
+        if self.state is None:
+            return self.motion.kinetic
+        turning = self.motion.angular_velocity
+        return self.state.kinetic - self._added_inertia * float(turning @ turning) / 2
 
     @property
     def elastic_energy(self) -> float:
@@ -379,18 +385,40 @@ class DeformableBody:
         self._deforming_time = self._settle_time = self._sleep_time = 0.0
 
     def update_from_solver(self, state: BodyState) -> None:
-        """Take over the solver's state of this body; the motion becomes its rigid part."""
-        self.state = state
-        inertia = inertia_about(state.centre, state.positions, self.rest.masses, cell=self.cell)
-        # The state's angular momentum is about its centre, spin of particles included.
+        """Take over the solver's state of this body; the motion becomes its rigid part.
+
+        On the grid a body turns as if its particles were wider than they are, so that angular
+        momentum is kept here: what has acted is what it has changed by there.
+        """
+        spin = self.motion.angular_momentum + state.angular_momentum - self._carried
+        self._carried = state.angular_momentum
+        self.state = replace(state, angular_momentum=spin)
+        rest = self.rest
+        inertia = inertia_about(state.centre, state.positions, rest.masses, rest.volumes)
         self.motion = RigidMotion(
             rotation=np.eye(3),
             centre=state.centre,
             velocity=state.velocity,
-            angular_velocity=np.asarray(np.linalg.solve(inertia, state.angular_momentum)),
+            angular_velocity=np.asarray(np.linalg.solve(inertia, spin)),
             mass=state.mass,
             inertia=inertia,
         )
+
+    def _on_grid(self, motion: RigidMotion) -> Float:
+        """[3] angular momentum that particles have on the grid when they move so."""
+        return motion.angular_momentum + self._added_inertia * motion.angular_velocity
+
+    @property
+    def lag(self) -> Float:
+        """[3] by how much slower it turns on the grid than its angular momentum says [rad/s]."""
+        m = self.motion
+        inertia = m.world_inertia + self._added_inertia * np.eye(3)
+        return np.asarray(np.linalg.solve(inertia, self._on_grid(m) - self._carried), np.float64)
+
+    def catch_up(self) -> None:
+        """Let particles turn as fast as its angular momentum says; a solver must start anew."""
+        self._change(np.zeros(3), self.lag)
+        self._carried = self._on_grid(self.motion)
 
     def apply_road(self, road: Sequence[Collider], duration: float) -> TyreReaction | None:
         """Let the road act on the wheels while deforming, as on a rigid body.
@@ -410,18 +438,23 @@ class DeformableBody:
     def apply_impulse(self, after: RigidMotion) -> None:
         """Give all particles the rigid change of velocity from the present motion to ``after``."""
         assert self.state is not None
-        s, m = self.state, self.motion
-        spin = cross_matrix(after.angular_velocity - m.angular_velocity)
+        m = self.motion
+        self._change(after.velocity - m.velocity, after.angular_velocity - m.angular_velocity)
+        self._carried = self._carried + self._on_grid(after) - self._on_grid(m)
         self.state = replace(
-            s,
-            velocities=s.velocities
-            + (after.velocity - m.velocity)
-            + (s.positions - s.centre) @ spin.T,
-            gradients=s.gradients + spin,
-            momentum=after.momentum,
-            angular_momentum=after.angular_momentum,
+            self.state, momentum=after.momentum, angular_momentum=after.angular_momentum
         )
         self.motion = after
+
+    def _change(self, velocity: Float, turning: Float) -> None:
+        """Add a rigid motion to that of all particles: [3] of the centre [m/s], and [3] [rad/s]."""
+        assert self.state is not None
+        s, spin = self.state, cross_matrix(turning)
+        self.state = replace(
+            s,
+            velocities=s.velocities + velocity + (s.positions - s.centre) @ spin.T,
+            gradients=s.gradients + spin,
+        )
 
     def brake_after_hit(self, fraction: float) -> None:
         """Lock the wheels, once and for all, as far as ``fraction`` of their grip says."""

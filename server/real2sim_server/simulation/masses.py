@@ -28,7 +28,11 @@ class ClassMass:
     stability_source: str = ""
 
 
-NHTSA_SSF = "mean of model year 2003, Trends in the Static Stability Factor, NHTSA DOT HS 809 868"
+NHTSA_SSF = (
+    "sales-weighted average of model year 2003 by the abstract of Trends in the Static Stability "
+    "Factor of Passenger Cars, Light Trucks, and Vans, NHTSA DOT HS 809 868 "
+    "(https://trid.trb.org/view/763766)"
+)
 CAR = ClassMass(
     125.0,
     "2015 Chevrolet Malibu as tested, 3639 lb in 4.87 x 1.85 x 1.47 m (NHTSA frontal test)",

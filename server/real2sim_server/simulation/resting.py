@@ -9,7 +9,7 @@ the next begins. What approaches faster than GENTLE is an impact and deforms.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,8 +21,8 @@ from .rigid import RigidMotion, rotation_of
 from .support import body_contacts, collider_contacts, tangents
 from .surroundings import clearance
 
-GENTLE = 0.25
-"""Contacts in which nothing approaches faster carry without deforming [m/s]."""
+GENTLE = 0.3
+"""Contacts in which nothing approaches faster carry without deforming, nor bounce [m/s]."""
 SWEEPS = 30
 """Passes over all contacts in a step."""
 DRIFT = 0.1
@@ -30,7 +30,13 @@ DRIFT = 0.1
 LAID = 0.1
 """Points that lie higher than this above a collider do not carry yet [spacings]."""
 PUSH, PUSH_SPEED = 0.2, 0.05
-"""Fraction of what is too deep that a step takes back, and at most how fast [m/s]."""
+"""Fraction of what is too deep that a step takes back, and at most how fast [m/s]. Bodies are moved
+by it and keep none of it as velocity: what rests would never come to a stop."""
+SLOP = 1e-4
+"""Within so much of where they carry points are held where they are [m]: chasing less than that
+keeps in motion what should rest."""
+PUSH_SWEEPS = 10
+"""Passes over all contacts that are too deep."""
 
 Pair = tuple[str, str]
 
@@ -146,8 +152,13 @@ class Resting:
         """Forget all contacts of a body: from now on the grid or nothing holds it."""
         self._touches = {p: t for p, t in self._touches.items() if body.name not in p}
 
-    def solve(self, duration: float) -> list[Reaction]:
-        """Let contacts act on bodies that have moved freely for ``duration`` [s]; what they did."""
+    def solve(self, duration: float, starts: Mapping[str, Float]) -> list[Reaction]:
+        """Let contacts act on bodies that have moved freely; what they did.
+
+        Args:
+            duration: for how long they have [s].
+            starts: [3] by name, where centres of mass were before that [m].
+        """
         self._look_again()
         touches = [t for own in self._touches.values() for t in own]
         bodies = [b for t in touches for b in (t.body, t.other) if isinstance(b, DeformableBody)]
@@ -156,14 +167,25 @@ class Resting:
             return []
         before = {name: body.motion for name, body in free.items()}
         speeds = {n: np.concatenate([m.velocity, m.angular_velocity]) for n, m in before.items()}
-        rows = [_Row(touch, before, speeds, duration) for touch in touches]
+        went = {n: speed.copy() for n, speed in speeds.items()}
+        for name, speed in went.items():
+            # Steps within a step fall less far than the speed at their end says.
+            speed[:3] = (before[name].centre - starts[name]) / duration
+        shifts = {name: np.zeros(6) for name in free}
+        step = _Step(before, speeds, went, shifts, duration)
+        rows = [_Row(touch, step) for touch in touches]
         for row in rows:
             row.push(row.touch.impulse)
         for _ in range(SWEEPS):
             for row in rows:
                 row.relax()
+        deep = [row for row in rows if row.is_deep]
+        for _ in range(PUSH_SWEEPS):
+            for row in deep:
+                row.lift()
         for name, body in free.items():
-            body.motion = _corrected(before[name], speeds[name], duration)
+            moved = duration * (speeds[name] + shifts[name] - went[name])
+            body.motion = _corrected(before[name], speeds[name], moved)
         return [reaction for row in rows for reaction in row.reactions()]
 
     def _look_again(self) -> None:
@@ -240,24 +262,38 @@ def _closing(touch: Touch) -> float:
     return -float(velocity @ normal)
 
 
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step that contacts act on.
+
+    Attributes:
+        before: motions by name, as bodies have moved freely.
+        speeds: [6] linear and angular by name, to be changed [m/s], [rad/s].
+        went: [6] at which they have moved on the whole.
+        shifts: [6] at which they are shifted beyond that, to be changed.
+        duration: [s].
+    """
+
+    before: Mapping[str, RigidMotion]
+    speeds: Mapping[str, Float]
+    went: Mapping[str, Float]
+    shifts: Mapping[str, Float]
+    duration: float
+
+
 class _Row:
     """A touch in one step: what impulses along its normal and two tangents do."""
 
-    def __init__(
-        self,
-        touch: Touch,
-        motions: dict[str, RigidMotion],
-        speeds: dict[str, Float],
-        duration: float,
-    ) -> None:
+    def __init__(self, touch: Touch, step: _Step) -> None:
         self.touch = touch
         own, normal, gap, _ = touch.place()
         axes = np.stack([normal, *tangents(normal, np.array([1.0, 0.3, 0.2]))])
         self._axes = axes
         self._sides: list[tuple[Float, Float, Float]] = []
-        stiffness = np.zeros(3)
+        self._shifts: list[Float] = []
+        stiffness, gone = np.zeros(3), 0.0
         for body, sign in ((touch.body, 1.0), (touch.other, -1.0)):
-            motion = motions.get(body.name)
+            motion = step.before.get(body.name)
             if motion is None:
                 continue
             levers = np.cross(own - motion.centre, axes)
@@ -266,12 +302,30 @@ class _Row:
             change[:, :3] /= motion.mass
             change[:, 3:] = np.linalg.solve(motion.world_inertia, jacobian[:, 3:].T).T
             stiffness += (jacobian * change).sum(axis=1)
-            self._sides.append((speeds[body.name], jacobian, change))
+            gone += float(jacobian[0] @ step.went[body.name])
+            self._sides.append((step.speeds[body.name], jacobian, change))
+            self._shifts.append(step.shifts[body.name])
         self._masses = 1.0 / np.maximum(stiffness, 1e-12)
-        free = sum(float(jacobian[0] @ speed) for speed, jacobian, _ in self._sides)
-        start = gap - free * duration
-        push = min(-PUSH * start / duration, PUSH_SPEED)
-        self._least = -start / duration if start > 0 else push
+        start = gap - gone * step.duration
+        self._least = -start / step.duration if start > SLOP else 0.0
+        self._lift = min(-PUSH * (start + SLOP) / step.duration, PUSH_SPEED)
+        self._lifted = 0.0
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether the point lies deeper than it carries."""
+        return self._lift > 0
+
+    def lift(self) -> None:
+        """Shift bodies, at a speed that is not kept, so that the point comes out."""
+        rising = sum(
+            float(jacobian[0] @ shift)
+            for (_, jacobian, _), shift in zip(self._sides, self._shifts, strict=True)
+        )
+        wanted = max(self._lifted + (self._lift - rising) * self._masses[0], 0.0)
+        for (_, _, change), shift in zip(self._sides, self._shifts, strict=True):
+            np.add(shift, (wanted - self._lifted) * change[0], out=shift)
+        self._lifted = wanted
 
     def push(self, impulse: Float) -> None:
         """Add an impulse along the three axes [N s]."""
@@ -308,13 +362,12 @@ class _Row:
         self.touch.impulse = wanted
 
 
-def _corrected(motion: RigidMotion, speed: Float, duration: float) -> RigidMotion:
-    """As if the body had moved at ``speed`` [6] from the start of the step."""
-    turn = rotation_of(duration * (speed[3:] - motion.angular_velocity))
+def _corrected(motion: RigidMotion, speed: Float, moved: Float) -> RigidMotion:
+    """The body moved and turned by ``moved`` [6] [m], [rad], and going on at ``speed`` [6]."""
     return replace(
         motion,
-        rotation=turn @ motion.rotation,
-        centre=motion.centre + duration * (speed[:3] - motion.velocity),
+        rotation=rotation_of(moved[3:]) @ motion.rotation,
+        centre=motion.centre + moved[:3],
         velocity=speed[:3].copy(),
         angular_velocity=speed[3:].copy(),
     )

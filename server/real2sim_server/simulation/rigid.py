@@ -97,23 +97,31 @@ class RigidMotion:
         return replace(moved, angular_velocity=turning)
 
 
-def inertia_about(centre: Float, positions: Float, masses: Float, *, cell: float) -> Float:
-    """[3, 3] inertia of particles about ``centre`` as the solver's transfers have it [kg m^2].
-
-    There a particle's velocity gradient carries angular momentum m dx^2/4 axial(C), which is
-    m dx^2/2 times its turning (Jiang et al. 2015, APIC); taking the same here lets both angular
-    momentum and turning go through a handover unchanged.
+def inertia_about(centre: Float, positions: Float, masses: Float, volumes: Float) -> Float:
+    """[3, 3] inertia of particles about ``centre`` [kg m^2]; each counts as a small cube.
 
     Args:
         centre: [3] [m].
-        positions, masses: [N, 3] [m], [N] [kg].
-        cell: dx of the solver's grid [m].
+        positions, masses, volumes: [N, 3] [m], [N] [kg], [N] [m^3].
     """
     r = positions - centre
     second = np.einsum("n,ni,nj->ij", masses, r, r)
-    own = float(masses.sum()) * cell**2 / 2
+    own = float(masses @ np.cbrt(volumes) ** 2) / 6
     inertia: Float = (np.trace(second) + own) * np.eye(3) - second
     return inertia
+
+
+def added_inertia(masses: Float, volumes: Float, *, cell: float) -> float:
+    """What the grid adds to the inertia of particles about any axis [kg m^2].
+
+    A particle's velocity gradient carries angular momentum m dx^2/4 axial(C), which is m dx^2/2
+    times its turning (Jiang et al. 2015, APIC), as if it were a ball that wide.
+
+    Args:
+        masses, volumes: [N] [kg], [m^3].
+        cell: dx of the solver's grid [m].
+    """
+    return float(masses.sum()) * cell**2 / 2 - float(masses @ np.cbrt(volumes) ** 2) / 6
 
 
 def best_rotation(rest: Float, now: Float, masses: Float) -> Float:

@@ -20,9 +20,16 @@ from .unyielding import as_boxes, by_owner, withstands
 STEP = 0.005
 """Longest time between two checks of what is near what [s]."""
 NEAR_CELLS = 3.0
-"""Bodies are activated when something comes this near."""
+"""What is nearer than this shares nodes of a grid."""
+TOUCH_CELLS = 0.25
+"""Bodies are activated when surfaces come this near within a step: falling free until then is exact
+and costs next to nothing. It is more than what the front of a body moves in a step beyond its
+centre."""
 ROAD_CELLS = 0.4
 """On its wheels a body is near the road all the time; contact begins when springs are through."""
+LAG = 0.01
+"""Particles whose turning lags behind by more than this at the surface are made to catch up [m/s].
+"""
 APPROACH_MIN = 1e-3
 """Bodies approach each other when speed times distance is beyond this [m^2/s], or a speed [m/s]."""
 HIT_DELTA_V = 0.3
@@ -94,13 +101,14 @@ class HybridSimulator:
         deforming = [b for b in self.bodies if b.mode == BodyMode.DEFORMING]
         if deforming:
             self._solve(deforming, duration)
+        starts = {b.name: b.motion.centre for b in self.bodies}
         for body in self.bodies:
             if body.mode == BodyMode.RIGID:
                 reaction = body.advance_rigid(duration, self.gravity, self.road)
                 if reaction is not None:
                     self._log_tyres(body, [reaction])
         self._touch_more()
-        for r in self._resting.solve(duration):
+        for r in self._resting.solve(duration, starts):
             self.contact_log.add(r.body, r.other, r.impulse, r.heat, self.time)
         self._lay_to_rest(duration)
         if not deforming:
@@ -140,6 +148,9 @@ class HybridSimulator:
             reaction = body.apply_road(self.road, duration)
             if reaction is not None:
                 self._log_tyres(body, [reaction])
+                self._solver = None
+            if body.reach * float(np.linalg.norm(body.lag)) > LAG:
+                body.catch_up()
                 self._solver = None
         step = (self.time + duration, duration, self.gravity)
         for c in self.bounces.follow(contacts, deforming, self.colliders, before, step):
@@ -245,7 +256,7 @@ class HybridSimulator:
         walls = self._walls(body)
         if asleep:
             walls = [c for c in walls if c.moving]
-        if body.meets(walls, within=NEAR_CELLS * body.cell, ahead=duration):
+        if body.meets(walls, within=_touch_distance(body), ahead=duration):
             return True
         return not asleep and self._strikes_through(body, duration)
 
@@ -266,7 +277,7 @@ class HybridSimulator:
             gap, approach = body.gap_to_colliders([collider])
             # Nothing here carries a collider that moves, however slowly.
             least = APPROACH_MIN if collider.moving else GENTLE
-            if approach > least and gap < NEAR_CELLS * body.cell + approach * duration:
+            if approach > least and gap < _touch_distance(body) + approach * duration:
                 return True
         return not asleep and self._strikes_through(body, duration)
 
@@ -345,7 +356,7 @@ class HybridSimulator:
         if self._is_near_bodies(body, [b for b in self.bodies if b is not body], STEP):
             return False
         gap, approach = body.gap_to_colliders(self._walls(body))
-        if gap < NEAR_CELLS * body.cell and (approach > 0 or body.tyres is None):
+        if gap < _touch_distance(body) and (approach > 0 or body.tyres is None):
             return False
         if body.tyres is None:
             return True
@@ -356,11 +367,12 @@ class HybridSimulator:
         self, body: DeformableBody, others: Iterable[DeformableBody], duration: float
     ) -> bool:
         for other in others:
-            if not _approach(body, other):
+            turning = _turning(body) + _turning(other)
+            if not _approach(body, other) and turning <= GENTLE:
                 continue
             closing = float(np.linalg.norm(body.motion.velocity - other.motion.velocity))
-            near = body.gap_to(other) < NEAR_CELLS * body.cell + closing * duration
-            if near and not withstands(body, other, self.gravity):
+            near = TOUCH_CELLS * body.cell + (closing + turning) * duration
+            if body.gap_to(other) < near and not withstands(body, other, self.gravity):
                 return True
         return False
 
@@ -376,6 +388,16 @@ def _moves(body: DeformableBody) -> bool:
     m = body.motion
     speed = float(np.linalg.norm(m.velocity)) + float(np.linalg.norm(m.angular_velocity))
     return body.mode != BodyMode.SLEEPING and speed > SLEEP_SPEED
+
+
+def _touch_distance(body: DeformableBody) -> float:
+    """How near a collider may come to the outermost particles of a body that stays rigid [m]."""
+    return TOUCH_CELLS * body.cell + body.spacing / 2
+
+
+def _turning(body: DeformableBody) -> float:
+    """Speed that no point of a body exceeds by its turning [m/s]."""
+    return body.reach * float(np.linalg.norm(body.motion.angular_velocity))
 
 
 def _near(a: DeformableBody, b: DeformableBody) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -76,3 +78,30 @@ def test_a_post_within_an_object_is_refused(width):
 def test_a_post_beside_an_object_is_not_refused():
     body = block()
     require_separation([body], [(body.T_world_object, SIZE)], [post(0.62, 0.03)])
+
+
+def test_what_comes_near_stays_rigid_until_surfaces_meet():
+    body = block(speed=2.0)
+    simulated = simulator(body, post(1.0, 0.04))
+    ahead = 1.0 - 0.025 - SIZE[0] / 2
+    for _ in range(round(0.75 * ahead / 2.0 / 0.005)):
+        simulated.advance(0.005)
+    assert body.mode == BodyMode.RIGID
+    for _ in range(round(0.25 * ahead / 2.0 / 0.005)):
+        simulated.advance(0.005)
+    assert body.mode == BodyMode.DEFORMING
+
+
+def test_what_only_turns_strikes_with_its_end():
+    """The end of a beam that turns about its middle comes at a block, neither of which moves on."""
+    beam = block()
+    beam.motion = replace(beam.motion, angular_velocity=np.array([0.0, 0.0, 4.0]))
+    other = block(position=(0.55, 1.15, 0.0))
+    other.name = "other"
+    simulated = HybridSimulator(
+        [beam, other], (), road=(), gravity=(0, 0, 0), backend="cpu", brake_after_hit=1.0
+    )
+    for _ in range(60):
+        simulated.advance(0.005)
+    assert other.motion.velocity[1] > 0.1
+    assert beam.motion.angular_velocity[2] < 3.9

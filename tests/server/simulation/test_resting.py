@@ -97,6 +97,8 @@ def test_the_ground_and_each_box_carry_what_is_above():
     for pair, carried in ((("a", "ground"), 3), (("b", "a"), 2), (("c", "b"), 1)):
         force = (after[pair] - before[pair])[2] / 0.1
         assert force == pytest.approx(carried * weight, rel=0.1)
+    for body in world.bodies:
+        assert np.abs([body.motion.velocity, body.motion.angular_velocity]).max() < 5e-3
 
 
 def test_a_box_slides_as_far_as_friction_lets_it():

@@ -10,7 +10,7 @@ import pytest
 from real2sim_server.physics import FixedCorotated, HeightField, Plane, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
-from real2sim_server.simulation.rigid import RigidMotion, inertia_about, rotation_of
+from real2sim_server.simulation.rigid import RigidMotion, rotation_of
 from real2sim_server.simulation.simulator import HybridSimulator
 from real2sim_server.simulation.tyres import Tyres
 
@@ -45,7 +45,7 @@ SIZE = (4.5, 1.8, 1.5)
 def car(speed: float, *, brake: float, mu=0.7) -> tuple[RigidMotion, Tyres]:
     particles = box_particles(SIZE, spacing=0.15, density=1500 / 12.15)
     centre = np.array([0.0, 0.0, -0.2])
-    inertia = inertia_about(np.zeros(3), particles.positions, particles.masses, cell=0.2)
+    inertia = particles.inertia
     motion = RigidMotion(
         np.eye(3),
         centre + np.array([0, 0, 0.75]),

@@ -11,31 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene import Scene
+from ...scene.obstacles import CELL, occupied_cells
 from ..path import Float, LoggedPath
 from .manifold import ContactManifold
 from .pulse import Patch
 from .rigid_body import BodyProperties, BodyState
 
-CELL = 0.25
-"""Edge of a cell [m]."""
-
-LOWEST, HIGHEST = 0.4, 1.6
-"""Heights above the ground between which a Gaussian is in the way of a car [m]."""
-
-OPAQUE = 0.5
-"""Gaussians fainter than this do not count."""
-
-FEWEST = 3
-"""Gaussians in a cell from which on it is occupied; fewer are floaters."""
-
-REACH = 40.0
-"""Distance from the recorded path within which cells are looked at [m]."""
-
 BREADTH = 1.0
 """How far to the sides of a contact it is looked for how broad an obstacle is [m]."""
-
-DRIVEN_HALF_WIDTH = 1.1
-"""The recorded vehicle drove through here, so there is nothing [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +127,8 @@ _grids: WeakKeyDictionary[Scene, ObstacleGrid] = WeakKeyDictionary()
 def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     """The grid of a scene's background; made once for each scene in memory.
 
-    A cell is occupied when at least three Gaussians of more than half opacity have their centres in
-    it between 0.4 and 1.6 m above the ground. Where the recorded vehicle drove it is free.
+    Which cells are occupied is what :func:`~...scene.obstacles.occupied_cells` says, in simulations
+    too.
 
     Args:
         scene: whose background.
@@ -153,38 +136,6 @@ def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     """
     found = _grids.get(scene)
     if found is None:
-        found = _grids[scene] = _build(scene, path)
+        cells = occupied_cells(scene.background, scene.ground, path)
+        found = _grids[scene] = ObstacleGrid(cells.origin, cells.occupied)
     return found
-
-
-def _build(scene: Scene, path: LoggedPath) -> ObstacleGrid:
-    opaque = (scene.background.opacities > OPAQUE).cpu().numpy()
-    points = scene.background.means.cpu().numpy().astype(np.float64)[opaque]
-    lower = path.positions[:, :2].min(axis=0) - REACH
-    upper = path.positions[:, :2].max(axis=0) + REACH
-    shape = np.ceil((upper - lower) / CELL).astype(np.int64)
-    points = points[((points[:, :2] >= lower) & (points[:, :2] < upper)).all(axis=1)]
-    counts = np.zeros(shape, dtype=np.int32)
-    if len(points):
-        height = points[:, 2] - scene.ground.height_at(points[:, :2])
-        standing = points[(height > LOWEST) & (height < HIGHEST)]
-        cells = np.floor((standing[:, :2] - lower) / CELL).astype(np.int64)
-        np.add.at(counts, (cells[:, 0], cells[:, 1]), 1)
-    occupied = counts >= FEWEST
-    _clear_driven(occupied, lower, path)
-    return ObstacleGrid(lower, occupied)
-
-
-def _clear_driven(occupied: NDArray[np.bool_], lower: Float, path: LoggedPath) -> None:
-    # From behind the rear axle at the start to the front bumper at the end.
-    at = np.arange(-1.0, path.length + 4.0, CELL)
-    x = np.interp(at, path.s, path.positions[:, 0])
-    y = np.interp(at, path.s, path.positions[:, 1])
-    yaw = np.interp(at, path.s, path.yaws)
-    beyond = at - np.clip(at, 0.0, path.length)
-    x, y = x + beyond * np.cos(yaw), y + beyond * np.sin(yaw)
-    for side in np.arange(-DRIVEN_HALF_WIDTH, DRIVEN_HALF_WIDTH + CELL / 2, CELL / 2):
-        points = np.stack([x - side * np.sin(yaw), y + side * np.cos(yaw)], axis=1)
-        cells = np.floor((points - lower) / CELL).astype(np.int64)
-        inside = ((cells >= 0) & (cells < occupied.shape)).all(axis=1)
-        occupied[cells[inside, 0], cells[inside, 1]] = False

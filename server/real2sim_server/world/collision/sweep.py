@@ -17,6 +17,7 @@ import numpy as np
 from real2sim_proto.episode import EgoSpec, ResetSpec
 
 from ...geometry.rotation import quaternion_yaw
+from ...scene.obstacles import CELL
 from ..agents import Agents, rows_in
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
@@ -24,7 +25,7 @@ from ..path import Float
 from ..scoring.contact_side import side_of_contact
 from ..scoring.instant import ContactRecord
 from .manifold import contact_manifold, corners
-from .obstacles import CELL, ObstacleGrid
+from .obstacles import ObstacleGrid
 from .overlaps import BACKGROUND, EgoContacts, OverlapContact
 from .rigid_body import BodyProperties, BodyState
 from .sweep_kernels import first_contacts, first_occupied, holds_any
