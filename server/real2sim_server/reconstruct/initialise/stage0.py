@@ -21,13 +21,18 @@ from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_nei
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
 from .sky_map import SkySamples
-from .surfels import Surfels, fit_surfels
+from .surfels import Surfels, fit_surfels, round_surfels
+from .triangulate import TriangulatedPoints, triangulate
 from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
 
 OPACITY = 0.95
 ABOVE_GROUND = 0.1
 """Points this close to the ground surface are replaced by it [m]."""
+LIDAR_REACH = 0.5
+"""Points from images are taken where LiDAR has none so close [m]."""
+FEATURE_HEIGHT = 0.3
+"""And from this height over the ground on [m]: road has LiDAR, and reflections lie below it."""
 UNDERSIDE_COLOUR = 0.06
 SKY_FRAMES = 15
 WALL_FRAMES = 16
@@ -75,11 +80,13 @@ def initialise_scene(
     """Build a scene from a log in seconds, without training.
 
     LiDAR is accumulated in the world and in each tracked box, thinned, turned into flat Gaussians
-    and coloured from the cameras; the road becomes a closed surface, also where cars hide it;
-    pixels that nothing covers become the sky. The same log gives the same bits.
+    and coloured from the cameras; where no beam went, points are triangulated from features that
+    images have in common; the road becomes a closed surface, also where cars hide it; pixels that
+    nothing covers become the sky. The same log gives the same bits.
 
     Args:
-        log: a drive with LiDAR and at least one camera; boxes may be missing.
+        log: a drive with at least one camera; boxes may be missing. Without LiDAR the scene is
+            made of what is triangulated, the driven path and the boxes.
         options: see InitialiseOptions.
         on_progress: called with the stage, steps done and steps in all.
         timing_s: filled with the seconds of each stage.
@@ -88,7 +95,8 @@ def initialise_scene(
         The scene in the log's world frame, objects under their track's id, SH of degree 0.
 
     Raises:
-        ReconstructError: the log has no camera, no frame or no usable LiDAR point.
+        ReconstructError: the log has no camera or no frame, or neither a usable LiDAR point nor
+            features that tell a depth.
         LogError: a file of the log cannot be read.
     """
     options = options or InitialiseOptions()
@@ -97,13 +105,16 @@ def initialise_scene(
         raise ReconstructError(f"log {log.name!r} has no camera images; colours come from them")
     with stages("accumulate") as report_step:
         measured = accumulate(log, options, lambda f: report_step(f + 1, log.frame_count))
-    if len(measured.background) == 0:
+    with stages("features") as report_step:
+        features = triangulate(log, max_images=options.feature_images, on_image=report_step)
+    if len(measured.background) + len(features) == 0:
         raise ReconstructError(
-            f"log {log.name!r} has no usable LiDAR points; stage 0 builds everything from LiDAR"
+            f"log {log.name!r} has no usable LiDAR points, and its images have no features in "
+            "common that tell a depth; stage 0 builds everything from these"
         )
     with stages("shape"):
-        fitted = _fit_ground(log, measured.background)
-        parts = _shape(log, measured, fitted, options)
+        fitted = _fit_ground(log, measured.background.points, features.points)
+        parts = _shape(log, measured, features, fitted, options)
     with stages("walls") as report_step:
         parts = _keep_real_walls(log, parts, options, report_step)
     with stages("colour") as report_step:
@@ -115,13 +126,21 @@ def initialise_scene(
     return replace(scene, stored_ground=fitted.ground)
 
 
-def _fit_ground(log: DrivingLog, background: PointSet) -> GroundFit:
+def _fit_ground(
+    log: DrivingLog, measured: NDArray[np.float32], features: NDArray[np.float32]
+) -> GroundFit:
+    """The ground of the points of LiDAR; of those from images where a log has no LiDAR."""
     boxes = box_bottoms(log.tracks, log.frame_times_us)
-    return fit_ground(background.points.astype(np.float64), DrivenPath.of(log.ego), boxes)
+    points = measured if len(measured) else features
+    return fit_ground(points.astype(np.float64), DrivenPath.of(log.ego), boxes)
 
 
 def _shape(
-    log: DrivingLog, measured: Accumulation, fitted: GroundFit, options: InitialiseOptions
+    log: DrivingLog,
+    measured: Accumulation,
+    features: TriangulatedPoints,
+    fitted: GroundFit,
+    options: InitialiseOptions,
 ) -> _SurfelSet:
     """Gaussians without colour: the ground, what stands on it, and the objects."""
     path = drive_path(log)
@@ -135,10 +154,15 @@ def _shape(
     above = thin_to(above, options.voxel, limit, levels)
     largest = 0.03 + 0.006 * path_distance(above.points, path)
     structure = fit_surfels(above.points, largest=largest)
+    seen = _beyond_lidar(features, measured.background, fitted.surface)
+    structure = Surfels.join(
+        [structure, round_surfels(seen.points, path_distance(seen.points, path))]
+    )
     walls = continue_walls(structure, measured.limit, max_count=options.max_background // 5)
     surfels = [ground, structure, walls]
     standing = len(ground) + len(structure)
     intensity = [np.zeros(len(ground), np.float32), above.intensity]
+    intensity.append(np.zeros(len(seen), np.float32))
     intensity.append(np.zeros(len(walls), np.float32))
     instance = [np.zeros(standing + len(walls), np.uint16)]
     is_underside = [np.zeros(standing + len(walls), np.bool_)]
@@ -174,6 +198,20 @@ def _above_ground(background: PointSet, surface: Ground) -> PointSet:
     xy = background.points[:, :2].astype(np.float64)
     height = background.points[:, 2] - surface.height_at(xy)
     return background.select(~surface.covers(xy) | (height > ABOVE_GROUND))
+
+
+def _beyond_lidar(
+    features: TriangulatedPoints, background: PointSet, surface: Ground
+) -> TriangulatedPoints:
+    """Those above the ground that have no LiDAR point near them."""
+    from scipy.spatial import cKDTree
+
+    distance = np.full(len(features), np.inf)
+    if len(background):
+        distance, _ = cKDTree(background.points).query(features.points, workers=-1)
+    xy = features.points[:, :2].astype(np.float64)
+    above = features.points[:, 2] - surface.height_at(xy) > FEATURE_HEIGHT
+    return features.select((distance > LIDAR_REACH) & above)
 
 
 def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOptions) -> PointSet:

@@ -90,6 +90,27 @@ def fit_surfels(
     return Surfels(points, axes, scales)
 
 
+def round_surfels(
+    points: NDArray[np.float32], distance: NDArray[np.float32], *, spread: float = 0.012
+) -> Surfels:
+    """Round Gaussians on sparse points that lie on no common surface.
+
+    Args:
+        points: [N, 3] float32 [m].
+        distance: [N] float32, from where they were seen [m].
+        spread: bound of the scale, as part of that distance.
+    """
+    largest = np.maximum(spread * distance, 0.02).astype(np.float32)
+    if len(points) > 3:
+        from scipy.spatial import cKDTree
+
+        near, _ = cKDTree(points).query(points, k=4, workers=-1)
+        largest = np.minimum(largest, np.maximum(0.5 * near[:, 1:].mean(1), 0.02)).astype(
+            np.float32
+        )
+    return _round_surfels(points, largest)
+
+
 def _round_surfels(points: NDArray[np.float32], bound: NDArray[np.float32]) -> Surfels:
     axes = np.broadcast_to(np.eye(3, dtype=np.float32), (len(points), 3, 3)).copy()
     return Surfels(points, axes, np.repeat(bound[:, None], 3, axis=1).astype(np.float32))

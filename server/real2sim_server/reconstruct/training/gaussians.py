@@ -73,6 +73,14 @@ class Gaussians:
         }
         return Gaussians(**taken, counts=tuple(counts.tolist()))
 
+    @torch.no_grad()
+    def normalise(self) -> None:
+        """Give all quaternions the length 1, which changes no rotation; those that have it keep
+        their bits."""
+        length = self.quats.norm(dim=-1, keepdim=True)
+        unit = (length - 1).abs() < 1e-6
+        self.quats.copy_(torch.where(unit, self.quats, self.quats / length))
+
     def clouds(
         self, *, degree: int, tones: Tensor | None = None, mirrored: tuple[bool, ...] = ()
     ) -> list[GaussianCloud]:

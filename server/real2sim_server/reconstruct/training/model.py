@@ -194,9 +194,15 @@ class SceneModel:
         return _small_motion(change) @ viewmat.to(self.device)
 
     def export(self, **provenance: Any) -> Scene:
-        """The scene as it is now with its priors, immutable, on its own memory."""
+        """The scene as it is now with its priors, immutable, on its own memory.
+
+        It shows what the model shows, to the last bit where boxes are as they were given, else to
+        the rounding of their poses. For that the model's own quaternions are made unit ones.
+        """
+        self.gaussians.normalise()
         gaussians = self.gaussians
         if self.priors is not None:
+            self.priors.normalise()
             gaussians, _ = packing.concatenate(gaussians, self.priors)
         with torch.no_grad():
             clouds = gaussians.clouds(degree=self.options.sh_degree)
@@ -220,7 +226,7 @@ class SceneModel:
             background=clouds[0],
             objects=objects,
             rig=rig,
-            sky=Sky(self.sky.detach().clamp(0, 1).cpu().clone()),
+            sky=Sky(self.sky.detach().cpu().clone()),
             provenance={**self.scene.provenance, "reconstruction": provenance},
             content_hash="",
         )
@@ -234,7 +240,6 @@ class SceneModel:
 
 def _own(cloud: GaussianCloud) -> GaussianCloud:
     copies = {name: tensor.detach().cpu().clone() for name, tensor in vars(cloud).items()}
-    copies["quats"] = torch.nn.functional.normalize(copies["quats"], dim=-1)
     return GaussianCloud(**copies)
 
 

@@ -236,8 +236,11 @@ def from_values(kind: type, values: dict[str, Any]) -> Any:
     """The frozen dataclass ``kind`` from ``dataclasses.asdict`` as read back from JSON."""
     given = {}
     for item in fields(kind):
-        value = values[item.name]
         default = getattr(kind(), item.name)
+        if item.name not in values:
+            # A run of a release before did not know of it.
+            continue
+        value = values[item.name]
         if is_dataclass(default):
             value = from_values(type(default), value)
         elif isinstance(value, list):

@@ -217,6 +217,8 @@ class Trainer:
         self.optimizer.step(parameters, rates, masks)
         # A colour no surface has would make up for another one before it, and show when that goes.
         gaussians.sh[:, 0].clamp_(*CONSTANT_SH)
+        # A sky beyond white could be trained, but neither written nor seen.
+        self.model.sky.clamp_(0, 1)
         for parameter in parameters.values():
             parameter.grad = None
         return TrainingStep(self.iteration, rows, screen, float(rates["means"]))

@@ -141,8 +141,8 @@ def test_a_log_without_boxes_becomes_a_scene_without_objects():
     assert len(scene.background) > 1000
 
 
-def test_a_log_without_lidar_is_refused():
-    with pytest.raises(ReconstructError, match="no usable LiDAR"):
+def test_a_log_without_lidar_that_never_moves_is_refused():
+    with pytest.raises(ReconstructError, match="no usable LiDAR points, and its images"):
         initialise_scene(painted_log(lidar=False), options=SMALL)
 
 
@@ -160,7 +160,7 @@ def test_progress_names_the_stages_and_ends_each():
         on_progress=lambda *args: reported.append(args),
         timing_s=timing,
     )
-    assert list(timing) == ["accumulate", "shape", "walls", "colour", "fill"]
+    assert list(timing) == ["accumulate", "features", "shape", "walls", "colour", "fill"]
     for stage in timing:
         last = [(done, total) for name, done, total in reported if name == stage][-1]
         assert last[0] == last[1]

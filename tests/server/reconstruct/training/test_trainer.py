@@ -9,6 +9,7 @@ import torch
 
 from real2sim_server.reconstruct import ReconstructError
 from real2sim_server.reconstruct.evaluation import render_logged_view
+from real2sim_server.reconstruct.evaluation.rendering import scene_instances
 from real2sim_server.reconstruct.training import (
     DensifyOptions,
     Trainer,
@@ -18,6 +19,8 @@ from real2sim_server.reconstruct.training import (
 from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
 from real2sim_server.reconstruct.training.threads import one_torch_thread
+from real2sim_server.render import RasterOptions, rasterize
+from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.scene.spherical_harmonics import sh_basis
 
 from .conftest import TINY
@@ -81,6 +84,37 @@ def test_the_exported_scene_looks_like_the_model(trained, tiny_log):
     exported = render_logged_view(scene, camera, t_us)
     assert np.abs(model.numpy() * 255 - exported).max() < 1.51
     assert any(o.colour is not None for o in scene.objects.values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "rounding"),
+    [({"harmonics": 0, "refine_poses": False}, 0.0), ({}, 1e-6)],
+    ids=["to the last bit", "moving boxes and colours"],
+)
+def test_what_is_written_shows_what_was_trained_also_where_the_sky_wants_to_be_brighter_than_white(
+    tiny_log, tiny_scene, tmp_path, changes, rounding
+):
+    rates = replace(TINY.learning_rates, sky=(0.5, 0.5))
+    options = replace(TINY, iterations=20, learning_rates=rates, **changes)
+    trainer = Trainer(tiny_log, tiny_scene, options)
+    trainer.run()
+    trainer.views.close()
+    save_scene(trainer.model.export(), tmp_path / "street.r2s")
+    scene = load_scene(tmp_path / "street.r2s")
+    assert 0 == trainer.model.sky.min() < trainer.model.sky.max() == 1
+    camera, t_us = tiny_log.rig.cameras[0], int(tiny_log.frame_times_us[3])
+    with torch.no_grad():
+        trained = trainer.model.render(camera, t_us).rgb
+    written = rasterize(
+        scene_instances(scene, t_us),
+        torch.from_numpy(camera.viewmat(scene.ego.transform(t_us)))[None],
+        camera.K[None],
+        camera.width,
+        camera.height,
+        sky=scene.sky,
+        options=RasterOptions(depth=False, instance=False),
+    )
+    assert float((trained - written.rgb[0]).abs().max()) <= rounding
 
 
 def test_a_scene_that_was_exported_shares_nothing_with_the_model(trained):

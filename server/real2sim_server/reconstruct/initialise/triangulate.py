@@ -1,0 +1,306 @@
+"""Points from the images alone, where no LiDAR beam went: features matched between known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.box import box_corners
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
+from ...logs import DrivingLog
+from ...scene import Camera
+
+WIDEST = 1280
+"""Images are made smaller to this width [px]."""
+FEATURES = 4000
+"""Features of an image at most, the strongest."""
+BASELINES = (0.5, 1.5, 4.0)
+"""Two images of a camera are matched when so far apart [m]; and a step further, each."""
+LEAST_STEP = 0.2
+"""Images of a camera closer to each other than this tell nothing new [m]."""
+NEAREST_DEPTH, FARTHEST_DEPTH = 1.0, 400.0
+EPIPOLAR_ERROR = 1.5
+"""Largest distance of a match from its epipolar line, and of an image from its point [px]."""
+RATIO = 0.8
+"""A match is this much closer than the next along its epipolar line (Lowe 2004)."""
+SIGHTINGS = 3
+"""Images that a point must be seen in."""
+RELATIVE_ERROR = 0.2
+"""Largest standard deviation of a point, as part of its distance."""
+BOX_MARGIN = 0.3
+"""Around the boxes of objects nothing is taken: they move [m]."""
+
+_Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class TriangulatedPoints:
+    """Points that several images agree on.
+
+    Attributes:
+        points: [N, 3] float32, world frame [m].
+        deviation: [N] float32, largest standard deviation if images are right to half a pixel [m].
+        sightings: [N] int32, images that saw each.
+    """
+
+    points: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+    sightings: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, index: NDArray[np.bool_]) -> TriangulatedPoints:
+        """Those of a mask."""
+        return TriangulatedPoints(self.points[index], self.deviation[index], self.sightings[index])
+
+
+@dataclass(frozen=True, eq=False)
+class _Features:
+    """Features of one image.
+
+    Attributes:
+        projection: [3, 4], ``K [R | t]`` of the image, to pixels of the scaled one.
+        centre: [3] of the camera, world.
+        pixels: [N, 2] float64.
+        descriptors: [N, 128] float32 of unit length.
+    """
+
+    projection: Float
+    centre: Float
+    pixels: Float
+    descriptors: NDArray[np.float32]
+
+
+def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> TriangulatedPoints:
+    """Points of what stands still, from features that three images or more have in common.
+
+    SIFT features (Lowe 2004) outside of all boxes are matched along epipolar lines, since poses are
+    known, between images of one camera that lie some decimetres to some metres apart. Matches are
+    joined to tracks, and a track becomes a point where it lies within a pixel and a half of all
+    its images and is known to a tenth of its distance. The same log gives the same bits.
+
+    Args:
+        log: with calibrated cameras and poses.
+        max_images: of each camera at most, evenly spread.
+        on_image: called with the images done and all.
+    """
+    sightings: list[tuple[Float, Float, Float]] = []
+    labels: list[NDArray[np.int64]] = []
+    first_label, done = 0, 0
+    chosen = {camera.name: _spread_frames(log, camera, max_images) for camera in log.rig}
+    total = sum(len(frames) for frames in chosen.values())
+    for camera in log.rig:
+        images = []
+        for frame in chosen[camera.name]:
+            images.append(_features(log, camera, frame))
+            done += 1
+            on_image(done, total)
+        tracks = _tracks(images)
+        labels += [track + first_label for track in tracks]
+        first_label += int(max((t.max(initial=-1) for t in tracks), default=-1)) + 1
+        sightings += [(i.projection, i.centre, i.pixels) for i in images]
+    return _points(sightings, labels)
+
+
+def _spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
+    """Frames between which the camera has moved, at most ``limit``."""
+    kept: list[int] = []
+    last: Float | None = None
+    if limit == 0:
+        return []
+    for frame in range(log.frame_count):
+        centre = _pose(log, camera, frame)[:3, 3]
+        if last is None or np.linalg.norm(centre - last) >= LEAST_STEP:
+            kept.append(frame)
+            last = centre
+    picked = np.unique(np.linspace(0, len(kept) - 1, min(limit, len(kept))).round().astype(int))
+    return [kept[i] for i in picked]
+
+
+def _pose(log: DrivingLog, camera: Camera, frame: int) -> Float:
+    return camera.pose(log.ego.transform(log.image_time_us(camera.name, frame)))
+
+
+def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
+    import cv2
+
+    image = log.image(camera.name, frame)
+    scale = min(1.0, WIDEST / camera.width)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if scale < 1:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    height, width = grey.shape
+    shrink = np.diag([width / camera.width, height / camera.height, 1.0])
+    K: Float = shrink @ camera.K
+    pose = _pose(log, camera, frame)
+    viewmat = invert_transform(pose)
+    free = _free_of_objects(log, log.image_time_us(camera.name, frame), K, viewmat, grey.shape)
+    detector = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.005, edgeThreshold=20)
+    keypoints, found = detector.detectAndCompute(grey, free)
+    pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
+    descriptors = np.zeros((0, 128), np.float32) if found is None else found.astype(np.float32)
+    # Of roots of histograms the product is Hellinger's kernel (Arandjelovic, Zisserman 2012).
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    return _Features(K @ viewmat[:3], pose[:3, 3].copy(), pixels, descriptors)
+
+
+def _free_of_objects(
+    log: DrivingLog, t_us: int, K: Float, viewmat: Float, shape: tuple[int, ...]
+) -> NDArray[np.uint8]:
+    """[H, W] 1 outside of the outlines of all boxes."""
+    import cv2
+
+    free = np.ones(shape, np.uint8)
+    for track in log.tracks:
+        pose = track.transform_near(t_us)
+        if pose is None:
+            continue
+        corners = box_corners(pose, np.array(track.size) + 2 * BOX_MARGIN)
+        fraction = np.linspace(0, 1, 9)[:, None, None, None]
+        edges = (corners[:, None] * fraction + corners[None] * (1 - fraction)).reshape(-1, 3)
+        ahead = edges @ viewmat[:3, :3].T + viewmat[:3, 3]
+        ahead = ahead[ahead[:, 2] > 0.2]
+        if len(ahead) >= 3:
+            pixels = ahead @ K.T
+            outline = np.clip(pixels[:, :2] / pixels[:, 2:], -1e4, 1e4).astype(np.int32)
+            cv2.fillConvexPoly(free, cv2.convexHull(outline), 0)
+    return free
+
+
+def _tracks(images: list[_Features]) -> list[NDArray[np.int64]]:
+    """For each image, the track [N] of each feature, -1 for none."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    starts = np.concatenate([[0], np.cumsum([len(i.pixels) for i in images])]).astype(np.int64)
+    pairs = [
+        np.stack([starts[a] + first, starts[b] + second])
+        for a, b in _pairs(images)
+        for first, second in [_matches(images[a], images[b])]
+    ]
+    joined = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0), np.int64)
+    size = int(starts[-1])
+    graph = coo_array((np.ones(joined.shape[1], np.int8), tuple(joined)), shape=(size, size))
+    _, labels = connected_components(graph, directed=False)
+    counts = np.bincount(labels, minlength=1)
+    labels = np.where(counts[labels] >= SIGHTINGS, labels, -1).astype(np.int64)
+    return [labels[a:b] for a, b in pairwise(starts)]
+
+
+def _pairs(images: list[_Features]) -> Iterator[tuple[int, int]]:
+    """Which images are matched: each with the next, and with the first beyond each baseline."""
+    centres = np.array([i.centre for i in images]).reshape(-1, 3)
+    for a in range(len(images) - 1):
+        distance = np.linalg.norm(centres[a + 1 :] - centres[a], axis=1)
+        later = {int(np.argmax(distance >= b)) for b in BASELINES if (distance >= b).any()}
+        yield from ((a, a + 1 + k) for k in sorted(later | {0}))
+
+
+def _matches(first: _Features, second: _Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of features that are each other's best along the epipolar lines, clearly so."""
+    none = np.zeros(0, np.int64)
+    if min(len(first.pixels), len(second.pixels)) < 2:
+        return none, none
+    likeness = first.descriptors @ second.descriptors.T
+    likeness[_epipolar_distance(first, second) > EPIPOLAR_ERROR] = -1
+    best = likeness.argmax(1)
+    rows = np.arange(len(best))
+    top = likeness[rows, best]
+    likeness[rows, best] = -1
+    next_best = likeness.max(1)
+    likeness[rows, best] = top
+    mutual = likeness.argmax(0)[best] == rows
+    # Squared distances of unit vectors are 2 - 2 times their product.
+    clear = (1 - top) < RATIO**2 * (1 - next_best)
+    kept = np.flatnonzero((top > 0.7) & mutual & clear)
+    return kept, best[kept]
+
+
+def _epipolar_distance(first: _Features, second: _Features) -> NDArray[np.float32]:
+    """[N, M] distance of each feature of ``second`` from the line of each of ``first`` [px]."""
+    F = _fundamental(first, second)
+    lines = np.concatenate([first.pixels, np.ones((len(first.pixels), 1))], 1) @ F.T
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    ends = np.concatenate([second.pixels, np.ones((len(second.pixels), 1))], 1)
+    return np.abs(lines.astype(np.float32) @ ends.T.astype(np.float32))
+
+
+def _fundamental(first: _Features, second: _Features) -> Float:
+    """[3, 3] with ``x_second^T F x_first = 0`` (Hartley and Zisserman 2004, 9.2)."""
+    inverse = np.linalg.pinv(first.projection)
+    x, y, z = second.projection @ np.append(first.centre, 1.0)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(cross @ second.projection @ inverse)
+
+
+def _points(
+    sightings: list[tuple[Float, Float, Float]], labels: list[NDArray[np.int64]]
+) -> TriangulatedPoints:
+    """A point for each track that holds."""
+    seen = [np.flatnonzero(label >= 0) for label in labels]
+    if sum(map(len, seen)) == 0:
+        none = np.zeros(0, np.float32)
+        return TriangulatedPoints(none.reshape(0, 3), none, np.zeros(0, np.int32))
+    track = np.concatenate([label[s] for label, s in zip(labels, seen, strict=True)])
+    image = np.repeat(np.arange(len(seen)), [len(s) for s in seen])
+    pixels = np.concatenate([p[s] for (_, _, p), s in zip(sightings, seen, strict=True)])
+    projections = np.array([p for p, _, _ in sightings])
+    centres = np.array([c for _, c, _ in sightings])
+    _, track = np.unique(track, return_inverse=True)
+    counts = np.bincount(track)
+    # Two features of one image in a track: one of its matches was wrong.
+    places = track * len(seen) + image
+    single = np.bincount(track[np.unique(places, return_index=True)[1]], minlength=len(counts))
+    points, precision, in_front, worst = _intersect(track, image, pixels, projections)
+    distance = np.full(len(points), np.inf)
+    np.minimum.at(distance, track, np.linalg.norm(points[track] - centres[image], axis=1))
+    deviation = 0.5 / np.sqrt(np.maximum(np.linalg.eigvalsh(precision)[:, 0], 1e-12))
+    kept = (
+        (single == counts)
+        & in_front
+        & (worst <= EPIPOLAR_ERROR)
+        & (distance >= NEAREST_DEPTH)
+        & (distance <= FARTHEST_DEPTH)
+        & (deviation <= RELATIVE_ERROR * distance)
+    )
+    return TriangulatedPoints(
+        points[kept].astype(np.float32),
+        deviation[kept].astype(np.float32),
+        counts[kept].astype(np.int32),
+    )
+
+
+def _intersect(
+    track: NDArray[np.int64], image: NDArray[np.int64], pixels: Float, projections: Float
+) -> tuple[Float, Float, NDArray[np.bool_], Float]:
+    """Points [T, 3] nearest to all their rays in the images; their precision [T, 3, 3] per square
+    pixel; whether they lie before all cameras; and the largest error in an image [T] [px]."""
+    count = int(track.max()) + 1
+    P = projections[image]
+    weight = np.ones(len(track))
+    points: Float = np.zeros((count, 3))
+    for _ in range(3):
+        # u P_2 - P_0 and v P_2 - P_1, over the depth, are errors in pixels (ibid., 12.2).
+        rows = (pixels[:, :, None] * P[:, 2:3] - P[:, :2]) * weight[:, None, None]
+        normal = np.zeros((count, 3, 3))
+        right = np.zeros((count, 3))
+        np.add.at(normal, track, np.einsum("sai,saj->sij", rows[:, :, :3], rows[:, :, :3]))
+        np.add.at(right, track, -np.einsum("sai,sa->si", rows[:, :, :3], rows[:, :, 3]))
+        normal += 1e-12 * np.eye(3)
+        points = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], np.float64)
+        seen = np.einsum("sij,sj->si", P[:, :, :3], points[track]) + P[:, :, 3]
+        weight = 1 / np.maximum(np.abs(seen[:, 2]), 1e-3)
+    error = np.linalg.norm(
+        seen[:, :2] / np.where(seen[:, 2:] == 0, 1e-9, seen[:, 2:]) - pixels, axis=1
+    )
+    worst = np.zeros(count)
+    np.maximum.at(worst, track, error)
+    ahead = np.ones(count, dtype=np.bool_)
+    np.logical_and.at(ahead, track, seen[:, 2] > 0)
+    return points, normal, ahead, worst
