@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -26,7 +25,8 @@ def simulate(
     scene: SceneBundle,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for film, curves, result.")],
     experiment: Annotated[
-        str | None, typer.Option(help="Of the paper: wall, pair or drop.")
+        str | None,
+        typer.Option(help="Of the paper: wall, pair, drop; crashes: frontal, t_bone, pole, roof."),
     ] = None,
     preset: Annotated[
         str | None, typer.Option(help="paper (soft) or vehicle (kilograms, crush, tyres).")
@@ -49,7 +49,8 @@ def simulate(
     """Let objects of a scene collide, deform and come to rest; leave film and curves."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
-    from ..simulation.experiments import draw_curves, set_up
+    from ..simulation.experiments import FilmPlan, draw_curves, set_up, views, write_film
+    from ..simulation.playback import Playback
     from ..simulation.rollout import simulate
 
     loaded = load_scene(scene)
@@ -58,9 +59,7 @@ def simulate(
     if experiment is None:
         setup = _continue_driving(loaded, state, taking_part, frame, preset=preset or "vehicle")
     else:
-        setup = set_up(
-            experiment, loaded, state, preset=preset or "paper", speed=speed, objects=taking_part
-        )
+        setup = set_up(experiment, loaded, state, preset=preset, speed=speed, objects=taking_part)
     options = replace(setup.options, backend=backend)
     if duration is not None:
         options = replace(options, duration=duration)
@@ -76,8 +75,17 @@ def simulate(
         )
         result.save(out / "simulation")
         draw_curves(result, out / "curves.png")
+        plan = FilmPlan.of(setup, loaded.ground.height)
+        plan.save(out)
         if film:
-            _film(loaded, state, setup, result, out, report)
+            playback = Playback(loaded, state, result)
+            write_film(
+                playback,
+                views(playback, plan),
+                out,
+                slow=plan.slow,
+                on_progress=lambda done, total: report("film", done, total),
+            )
     figures = _figures(result)
     print_figures(f"{setup.name} on {scene.name}", figures)
     console.print(f"in {out}: film.mp4, strip.png, curves.png, simulation/", highlight=False)
@@ -109,27 +117,6 @@ def _continue_driving(
     first = {o.object_id: o for o in state.visible}.get(objects[0])
     focus = np.zeros(3) if first is None else first.trajectory.transform(start_us)[:3, 3]
     return Experiment("rollout", options, objects, focus, np.array([-1.0, 1.0, 0.6]), 10.0)
-
-
-def _film(
-    scene: Scene,
-    state: ScenarioState,
-    setup: Experiment,
-    result: SimulationResult,
-    out: Path,
-    report: Callable[[str, int, int], None],
-) -> None:
-    from ..simulation.experiments import views, walls, write_film
-    from ..simulation.playback import Playback
-
-    playback = Playback(scene, state, result)
-    write_film(
-        playback,
-        views(playback, setup),
-        out,
-        outlines=walls(setup),
-        on_progress=lambda done, total: report("film", done, total),
-    )
 
 
 def _figures(result: SimulationResult) -> dict[str, object]:

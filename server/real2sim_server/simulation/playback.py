@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -10,11 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory
+from .damage import Breakage, DamagedVehicle, fragment_cloud
 from .embedding import Embedding, deform_cloud, stretched
-from .result import SimulationResult
+from .result import ObjectResult, SimulationResult
+from .structure import VEHICLES
 
 WHEEL_RADIUS, WHEEL_HALF_WIDTH = 0.36, 0.2
 """What Gaussians of a vehicle are its wheels: so far around the axle and along it [m]."""
@@ -63,10 +66,14 @@ class Playback:
         missing = set(result.objects) - {o.object_id for o in state.visible}
         if missing:
             raise PhysicsError(f"the simulation holds {sorted(missing)}, the scenario does not")
+        self._breakages: dict[str, list[Breakage]] = {}
+        for breakage in result.breakages or ():
+            self._breakages.setdefault(breakage.object_id, []).append(breakage)
         self._clouds: dict[str, GaussianCloud] = {}
         self._embeddings: dict[str, Embedding] = {}
         self._deformed: dict[str, tuple[tuple[int, bytes], GaussianCloud]] = {}
         self._wheels: dict[str, NDArray[np.bool_]] = {}
+        self._damaged: dict[str, _Damaged] = {}
 
     def instances(self, frame: int, *, without: Collection[str] = ()) -> list[Instance]:
         """Background, then simulated objects as they are at ``frame``, others as recorded.
@@ -91,7 +98,19 @@ class Playback:
                 cloud = self.scene.object(subject.source_id).cloud_at(t_us)
                 pose = subject.trajectory.transform(t_us)
                 instances.append(Instance(cloud, pose, subject.instance_id, subject.scale))
-        return instances
+        return instances + self._fragments(frame, without)
+
+    def _fragments(self, frame: int, without: Collection[str]) -> list[Instance]:
+        """What has come off vehicles by then, with their ids."""
+        time_s, found = float(self.result.times_s[frame]), []
+        for subject in self.state.visible:
+            broken = self._breakages.get(subject.object_id)
+            if not broken or subject.object_id in without:
+                continue
+            cloud = fragment_cloud(broken, time_s, self.scene.ground.height_at)
+            if cloud is not None:
+                found.append(Instance(cloud, None, subject.instance_id))
+        return found
 
     def time_us(self, frame: int) -> int:
         """Scene time of a frame [us]."""
@@ -103,10 +122,14 @@ class Playback:
         lifts = own.wheel_lifts[frame]
         if row < 0 and not lifts.any():
             return Instance(self._cloud(subject), pose, subject.instance_id)
-        kept, key = self._deformed.get(subject.object_id), (row, lifts.tobytes())
+        damaged = self._damage(subject)
+        key = (row if damaged is None else frame, lifts.tobytes())
+        kept = self._deformed.get(subject.object_id)
         if kept is None or kept[0] != key:
             cloud = self._cloud(subject)
-            if row >= 0:
+            if damaged is not None and row >= 0:
+                cloud = damaged.cloud(frame, float(self.result.times_s[frame]))
+            elif row >= 0:
                 deformed = self._embedding(subject).follow(own.shapes[row].astype(np.float64))
                 cloud = deform_cloud(cloud, deformed)
             if lifts.any():
@@ -114,6 +137,24 @@ class Playback:
             kept = (key, cloud)
             self._deformed[subject.object_id] = kept
         return Instance(kept[1], pose, subject.instance_id)
+
+    def _damage(self, subject: PlacedObject) -> _Damaged | None:
+        """What is seen of a crash on a vehicle; None where nobody looked at what broke."""
+        if self.result.breakages is None or subject.category not in VEHICLES:
+            return None
+        key = subject.object_id
+        if key not in self._damaged:
+            own = self.result.objects[key]
+            vehicle = DamagedVehicle(
+                self._cloud(subject),
+                own.rest.astype(np.float64),
+                spacing=own.spacing,
+                category=subject.category,
+                size=subject.scaled_size,
+                object_id=key,
+            )
+            self._damaged[key] = _Damaged(own, vehicle, self._breakages.get(key, []))
+        return self._damaged[key]
 
     def _lifted(
         self, subject: PlacedObject, cloud: GaussianCloud, lifts: NDArray[np.float32]
@@ -124,7 +165,8 @@ class Playback:
             rest = self._cloud(subject).means.detach().cpu().numpy()
             self._wheels[key] = _in_wheels(rest, self.result.objects[key].wheels)
         shift = torch.zeros_like(cloud.means)
-        shift[:, 2] = torch.from_numpy(self._wheels[key] @ lifts).to(shift)
+        wheels = self._wheels[key]
+        shift[: len(wheels), 2] = torch.from_numpy(wheels @ lifts).to(shift)
         return replace(cloud, means=cloud.means + shift)
 
     def _cloud(self, subject: PlacedObject) -> GaussianCloud:
@@ -144,6 +186,32 @@ class Playback:
                 own.rest.astype(np.float64), means, spacing=own.spacing
             )
         return self._embeddings[key]
+
+
+class _Damaged:
+    """A vehicle through the frames of a result; what once folded stays folded."""
+
+    def __init__(
+        self, own: ObjectResult, vehicle: DamagedVehicle, broken: Sequence[Breakage]
+    ) -> None:
+        self._own, self._vehicle, self._broken = own, vehicle, broken
+        self._upto = 0
+        self._most: Float | None = None
+
+    def cloud(self, frame: int, time_s: float) -> GaussianCloud:
+        """What is drawn of it at a frame, ``time_s`` [s] after the start."""
+        rows = self._own.shape_index[: frame + 1].tolist()
+        shown = rows[-1]
+        if self._most is None or self._upto > shown:
+            self._upto, self._most = 0, None
+        for row in range(self._upto, shown + 1):
+            body = self._vehicle.follow(self._own.shapes[row].astype(np.float64))
+            now = self._vehicle.shortening(body)
+            self._most = now if self._most is None else np.maximum(self._most, now)
+        self._upto = shown
+        assert self._most is not None
+        ages = {b.part: time_s - b.time_s for b in self._broken if b.time_s <= time_s}
+        return self._vehicle.cloud(body, self._most, ages)
 
 
 def _in_wheels(means: NDArray[np.float32], wheels: NDArray[np.float32]) -> NDArray[np.bool_]:

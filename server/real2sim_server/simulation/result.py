@@ -17,6 +17,7 @@ from .._files import atomic_folder
 from ..geometry.rotation import Float
 from ..geometry.transform import transform_from
 from ..physics.errors import PhysicsError
+from .damage.breakage import Breakage
 
 FORMAT = "real2sim-simulation"
 VERSION = 2
@@ -126,6 +127,8 @@ class SimulationResult:
         stopped: ``done`` or ``cancelled``; then there are the frames made until then.
         figures: preset, gravity, cells, steps, rollbacks, and ``restitution``: of each object that
             was given one, the members of a Rebound and its ``bounces`` (JSON values only).
+        breakages: parts of vehicles that broke; None where nobody looked (the ``paper`` preset,
+            and results from before that was done), and bodies are then drawn as smooth as they are.
     """
 
     objects: Mapping[str, ObjectResult]
@@ -136,6 +139,7 @@ class SimulationResult:
     impulses: Float
     stopped: str = "done"
     figures: Mapping[str, Any] = field(default_factory=dict)
+    breakages: tuple[Breakage, ...] | None = None
 
     @property
     def frames(self) -> int:
@@ -161,6 +165,8 @@ class SimulationResult:
             "objects": {k: {"mass": o.mass, "spacing": o.spacing} for k, o in self.objects.items()},
             "contacts": [vars(c) for c in self.contacts],
         }
+        if self.breakages is not None:
+            document["breakages"] = [b.record() for b in self.breakages]
         with atomic_folder(path) as folder:
             (folder / "simulation.json").write_text(json.dumps(document, indent=1))
             save_file(tensors, folder / "frames.safetensors")
@@ -192,6 +198,7 @@ class SimulationResult:
             contacts = tuple(
                 ContactRecord(**{**c, "impulse": tuple(c["impulse"])}) for c in document["contacts"]
             )
+            broken = document.get("breakages")
             return cls(
                 objects,
                 tensors["times_s"],
@@ -201,6 +208,7 @@ class SimulationResult:
                 tensors["impulses"],
                 document["stopped"],
                 document["figures"],
+                None if broken is None else tuple(Breakage.of_record(b) for b in broken),
             )
         except (KeyError, TypeError) as error:
             raise PhysicsError(f"{path}: the simulation lacks {error}; save it again") from error

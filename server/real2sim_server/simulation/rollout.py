@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from ..physics.colliders import Collider
 from ..physics.errors import PhysicsError
 from ..scene import Scene
 from .body import DeformableBody
+from .breakages import find_breakages
 from .playback import PlacedObjects
 from .presets import ObjectPhysics, preset_of
 from .recorder import TrajectoryRecorder
@@ -110,7 +111,10 @@ def simulate(
         gravity=gravity,
         max_particles=options.max_particles,
     )
-    return simulate_bodies(bodies, options, on_progress=on_progress, cancelled=cancelled)
+    result = simulate_bodies(bodies, options, on_progress=on_progress, cancelled=cancelled)
+    if options.preset != "vehicle":
+        return result
+    return replace(result, breakages=find_breakages(result, state.visible))
 
 
 def simulate_bodies(

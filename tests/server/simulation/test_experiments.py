@@ -9,8 +9,9 @@ import pytest
 
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.physics import PhysicsError
-from real2sim_server.simulation.experiments import set_up, views, walls
+from real2sim_server.simulation.experiments import FilmPlan, set_up, views
 from real2sim_server.simulation.experiments.film import FilmView, draw, look_at
+from real2sim_server.simulation.experiments.film_plan import obstacle_cloud
 from real2sim_server.simulation.experiments.viewing import visibility_of
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.rollout import simulate
@@ -73,12 +74,53 @@ def test_a_vehicle_that_drives_ahead_was_seen_from_behind(tiny_scene):
     assert seen.whole == seen.rear + seen.front
 
 
-def test_a_wall_is_outlined_where_it_stands(experiment):
+def test_a_wall_is_shown_behind_its_surface(experiment, tiny_scene):
     made = experiment("wall", objects=["car_red"])
     wall = next(c for c in made.options.colliders if c.name == "wall")
-    [corners] = walls(made)
-    np.testing.assert_allclose((corners - wall.point) @ wall.normal, 0.0, atol=1e-9)
-    assert walls(experiment("drop", objects=["car_red"])) == []
+    [obstacle] = FilmPlan.of(made, tiny_scene.ground.height).obstacles
+    beyond = (obstacle_cloud(obstacle).means.numpy() - wall.point) @ wall.normal
+    assert beyond.max() == pytest.approx(0.0, abs=1e-3)
+    assert beyond.min() < -0.2
+    dropped = experiment("drop", objects=["car_red"])
+    assert FilmPlan.of(dropped, tiny_scene.ground.height).obstacles == ()
+
+
+def test_crashes_begin_a_little_before_the_obstacle_and_on_the_road(experiment):
+    for name, other in (("frontal", "barrier"), ("pole", "pole")):
+        made = experiment(name, objects=["car_red"])
+        pose = made.options.objects["car_red"].T_world_object
+        box = next(c for c in made.options.colliders if c.name == other)
+        away = (box.T_world_box[:3, 3] - pose[:3, 3]) @ pose[:3, 0]
+        assert away - box.size[0] / 2 - 2.0 == pytest.approx(1.2, abs=0.01)
+        assert made.options.preset == "vehicle"
+    turned = experiment("roof", objects=["car_red"]).options.objects["car_red"]
+    assert turned.T_world_object[2, 2] < -0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "other"), [("frontal", "barrier"), ("pole", "pole")])
+def test_a_car_is_driven_into_what_stands_on_the_road(experiment, rollout, name, other):
+    result = rollout(experiment(name, objects=["car_red"]), 0.15)
+    assert 0.04 < first_touch(result, other=other) < 0.12
+
+
+@pytest.mark.slow
+def test_a_t_bone_meets_a_side_and_a_roof_crash_the_road(experiment, rollout):
+    result = rollout(experiment("t_bone", objects=["car_red", "car_blue"]), 0.15)
+    assert 0.03 < first_touch(result, other="car_blue") < 0.12
+    turned = experiment("roof", objects=["car_red"])
+    assert 0.03 < first_touch(rollout(turned, 0.12), other="ground") < 0.1
+
+
+def test_how_it_is_filmed_is_kept(experiment, tiny_scene, tmp_path):
+    plan = FilmPlan.of(experiment("frontal", objects=["car_red"]), tiny_scene.ground.height)
+    plan.save(tmp_path)
+    kept = FilmPlan.load(tmp_path)
+    assert kept.slow == plan.slow == 4
+    assert kept.without == plan.without
+    np.testing.assert_array_equal(kept.obstacles[0][0], plan.obstacles[0][0])
+    with pytest.raises(PhysicsError, match=r"film\.json"):
+        FilmPlan.load(tmp_path / "nowhere")
 
 
 def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_camera(
@@ -86,7 +128,7 @@ def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_camera(
 ):
     made = experiment("wall", objects=["car_red"])
     playback = Playback(tiny_scene, ScenarioState.of(tiny_scene), rollout(made, 0.01))
-    near = views(playback, made)[1]
+    near = views(playback, FilmPlan.of(made, tiny_scene.ground.height))[1]
     post = np.array([10.0, 3.5, 1.0])
     eye = post + np.array([-2.0, 0.0, 0.0])
     looking = FilmView(replace(near.camera, T_vehicle_camera=look_at(eye, post)), near.background)

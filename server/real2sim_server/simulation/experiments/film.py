@@ -11,8 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
-from ...physics.colliders import Plane
 from ...render import Instance, RasterOptions, render_cameras
 from ...render.picture_file import write_png
 from ...render.video import video_file
@@ -20,7 +18,7 @@ from ...scene import Camera, GaussianCloud
 from ..body import BodyMode
 from ..playback import Playback
 from ..result import ENERGIES, SimulationResult
-from .setups import Experiment
+from .film_plan import FilmPlan, obstacle_cloud
 
 Image = NDArray[np.uint8]
 
@@ -29,8 +27,6 @@ FILM_RATE = 15.0
 STILLS = 5
 CLEAR = 0.8
 """Of the distance from a near view to its focus."""
-WALL_HALF_WIDTH, WALL_DOWN, WALL_UP = 1.3, 0.7, 0.9
-"""What is drawn of a virtual wall, around the focus [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,22 +38,32 @@ class FilmView:
         background: what of it is drawn.
         clear: what takes no part is left out when it comes this near [m]; nobody ever saw it from
             there, and it would hide what is to be seen.
+        without: objects that are left out.
+        obstacles: what vehicles run into and no recording shows.
     """
 
     camera: Camera
     background: GaussianCloud
     clear: float = 0.0
+    without: frozenset[str] = frozenset()
+    obstacles: tuple[GaussianCloud, ...] = ()
 
 
-def views(playback: Playback, experiment: Experiment) -> list[FilmView]:
-    """The scene's first camera where it stood at the start, and one near the subjects."""
+def views(playback: Playback, plan: FilmPlan, *, width: int | None = None) -> list[FilmView]:
+    """The scene's first camera where it stood at the start, and one near the subjects.
+
+    Args:
+        playback: what is shown.
+        plan: from where.
+        width: of each [px]; the recorded one by default.
+    """
     scene = playback.scene
     recorded = scene.rig.cameras[0]
-    stood = recorded.pose(scene.ego.transform(experiment.options.start_us))
-    viewer = experiment.focus + experiment.distance * experiment.side / np.linalg.norm(
-        experiment.side
-    )
-    near = look_at(viewer, experiment.focus)
+    recorded = recorded if width is None else recorded.resized(width)
+    stood = recorded.pose(scene.ego.transform(plan.start_us))
+    viewer = plan.focus + plan.distance * plan.side / np.linalg.norm(plan.side)
+    near = look_at(viewer, plan.focus)
+    obstacles = tuple(obstacle_cloud(o) for o in plan.obstacles)
     K = np.array(recorded.K)
     K[0, 0] = K[1, 1] = 0.9 * recorded.width
     K[0, 2], K[1, 2] = recorded.width / 2, recorded.height / 2
@@ -65,36 +71,25 @@ def views(playback: Playback, experiment: Experiment) -> list[FilmView]:
         FilmView(
             Camera("scene", recorded.width, recorded.height, np.array(recorded.K), stood),
             scene.background,
+            without=plan.without,
+            obstacles=obstacles,
         ),
         FilmView(
             Camera("near", recorded.width, recorded.height, K, near),
-            _before(scene.background, viewer, experiment),
-            clear=CLEAR * experiment.distance,
+            _before(scene.background, viewer, plan),
+            clear=CLEAR * plan.distance,
+            without=plan.without,
+            obstacles=obstacles,
         ),
     ]
 
 
-def _before(cloud: GaussianCloud, viewer: Float, experiment: Experiment) -> GaussianCloud:
+def _before(cloud: GaussianCloud, viewer: Float, plan: FilmPlan) -> GaussianCloud:
     """The background without trees and posts between a near viewer and the focus."""
     means = cloud.means.detach().cpu().numpy()
-    near = np.linalg.norm(means - viewer, axis=1) < CLEAR * experiment.distance
-    hides = torch.from_numpy(near & (means[:, 2] > experiment.focus[2]))
+    near = np.linalg.norm(means - viewer, axis=1) < CLEAR * plan.distance
+    hides = torch.from_numpy(near & (means[:, 2] > plan.focus[2]))
     return cloud.select(~hides.to(cloud.device))
-
-
-def walls(experiment: Experiment) -> list[Float]:
-    """Corners [4, 3] [m] of what is drawn of each virtual wall, near the experiment's focus."""
-    drawn = []
-    for collider in experiment.options.colliders:
-        if not isinstance(collider, Plane) or collider.name in experiment.options.road:
-            continue
-        point, normal = np.asarray(collider.point), np.asarray(collider.normal)
-        foot = experiment.focus - ((experiment.focus - point) @ normal) * normal
-        across = np.cross([0.0, 0.0, 1.0], normal)
-        across = WALL_HALF_WIDTH * across / max(float(np.linalg.norm(across)), 1e-9)
-        low, high = np.array([0, 0, -WALL_DOWN]), np.array([0, 0, WALL_UP])
-        drawn.append(foot + np.array([-across + low, across + low, across + high, -across + high]))
-    return drawn
 
 
 def look_at(viewer: Float, focus: Float) -> Float:
@@ -112,9 +107,11 @@ def draw(playback: Playback, shown: Sequence[FilmView], frame: int, backend: str
     """RGB images of a frame, one for each view."""
     images = []
     for view in shown:
-        _, *objects = playback.instances(frame, without=_bystanders(playback, view, frame))
+        left_out = view.without | _bystanders(playback, view, frame)
+        _, *objects = playback.instances(frame, without=left_out)
+        obstacles = [Instance(cloud) for cloud in view.obstacles]
         [drawn] = render_cameras(
-            [Instance(view.background), *objects],
+            [Instance(view.background), *obstacles, *objects],
             [view.camera],
             np.eye(4),
             sky=playback.scene.sky,
@@ -143,7 +140,7 @@ def write_film(
     shown: Sequence[FilmView],
     folder: Path,
     *,
-    outlines: Sequence[Float] = (),
+    slow: float = 1.0,
     backend: str = "auto",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -153,7 +150,7 @@ def write_film(
         playback: what is shown.
         shown: as ``views`` gives them.
         folder: for the files.
-        outlines: of things without an appearance, see ``walls``.
+        slow: how many times slower it plays than it was.
         backend: of the renderer.
         on_progress: called with (pictures done, pictures).
 
@@ -162,16 +159,13 @@ def write_film(
     """
     result = playback.result
     frame_rate = float(result.figures["frame_rate"])
-    stride = max(round(frame_rate / FILM_RATE), 1)
+    stride = max(round(frame_rate / slow / FILM_RATE), 1)
     frames = list(range(0, result.frames, stride))
     stills = {frames[round(k * (len(frames) - 1) / (STILLS - 1))] for k in range(STILLS)}
     kept = []
-    with video_file(folder / "film.mp4", frames_per_second=frame_rate / stride) as video:
+    with video_file(folder / "film.mp4", frames_per_second=frame_rate / slow / stride) as video:
         for done, frame in enumerate(frames):
-            images = [
-                _outlined(image, view.camera, outlines)
-                for image, view in zip(draw(playback, shown, frame, backend), shown, strict=True)
-            ]
+            images = draw(playback, shown, frame, backend)
             time = float(result.times_s[frame])
             video.add(_captioned(np.concatenate(images, axis=1), time))
             if frame in stills:
@@ -216,19 +210,6 @@ def draw_curves(result: SimulationResult, path: Path) -> None:
     figure.savefig(path)
 
 
-def _outlined(image: Image, camera: Camera, outlines: Sequence[Float]) -> Image:
-    import cv2
-
-    picture = np.ascontiguousarray(image)
-    for corners in outlines:
-        seen_at = apply_transform(invert_transform(camera.T_vehicle_camera), corners)
-        if seen_at[:, 2].min() < 0.5:
-            continue
-        pixels = seen_at[:, :2] / seen_at[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-        cv2.polylines(picture, [np.rint(pixels).astype(np.int32)], True, (255, 90, 30), 1, 16)
-    return picture
-
-
 def _captioned(image: Image, time: float) -> Image:
     import cv2
 
@@ -246,6 +227,5 @@ __all__ = [
     "draw_curves",
     "look_at",
     "views",
-    "walls",
     "write_film",
 ]

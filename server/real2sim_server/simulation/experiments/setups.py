@@ -1,22 +1,21 @@
-"""The paper's three experiments, set up on the vehicles of a scene."""
+"""Experiments set up on the vehicles of a scene: the paper's three, and crash tests."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from ...geometry.rotation import Float
-from ...physics.colliders import Collider, HeightField, Plane
+from ...physics.colliders import Collider, Plane
 from ...physics.errors import PhysicsError
 from ...physics.materials import FixedCorotated
 from ...scene import Scene
-from ..ground import ground_collider
 from ..playback import PlacedObject, PlacedObjects
 from ..presets import ObjectPhysics, preset_of
 from ..rollout import SimulateOptions
 from ..spawn import object_particles
 from ..structure import VEHICLES
+from .crashes import CRASHES
+from .setup import Experiment, Request, beside, level, others_near, scene_road, viewer
 from .viewing import in_view, visibility_of
 
 WALL_GAP = 0.5
@@ -28,43 +27,7 @@ DAMPED = FixedCorotated(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
 back up by a third of the height; this much leaves a slight bounce."""
 PAIR_GAP = 1.5
 """Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
-SIDEWAYS, SLANT_MIN = 2.0, 0.25
-"""Near views stand at most so many times as far to the side as the recording saw it from, and at
-least so far."""
 DEPTH_RANGE = (4.0, 45.0)
-ROAD_FRICTION = 0.7
-
-
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """A simulation and its camera.
-
-    Attributes:
-        name: ``wall``, ``pair`` or ``drop``.
-        options: what to simulate.
-        subjects: objects that are shown.
-        focus: [3] point of the world that the near camera faces [m].
-        side: [3] direction from the focus to a near-by viewer, unit.
-        distance: of that viewer [m].
-    """
-
-    name: str
-    options: SimulateOptions
-    subjects: tuple[str, ...]
-    focus: Float
-    side: Float
-    distance: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Request:
-    scene: Scene
-    state: PlacedObjects
-    chosen: tuple[PlacedObject, ...]
-    named: bool
-    start_us: int
-    preset: str
-    speed: float | None
 
 
 def set_up(
@@ -72,23 +35,25 @@ def set_up(
     scene: Scene,
     state: PlacedObjects,
     *,
-    preset: str = "paper",
+    preset: str | None = None,
     speed: float | None = None,
     objects: tuple[str, ...] = (),
 ) -> Experiment:
-    """An experiment of the paper on a scene.
+    """An experiment on a scene.
 
     Args:
         name: ``wall``: one vehicle against a virtual wall; ``pair``: two vehicles into standing
-            ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground.
-        preset: of the materials.
-        speed: [m/s]; the paper's 2.5 and 3.5 by default.
+            ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground;
+            ``frontal``, ``t_bone``, ``pole``, ``roof``: see ``crashes``.
+        preset: of the materials; ``paper`` for its experiments and ``vehicle`` for crashes unless
+            told.
+        speed: [m/s]; the experiment's own by default.
         objects: ids to take; by default vehicles in view, those seen best where it hits.
 
     Raises:
         PhysicsError: unknown name or objects, or no vehicles in view.
     """
-    builders = {"wall": _wall, "pair": _pair, "drop": _drop}
+    builders = {"wall": _wall, "pair": _pair, "drop": _drop, **CRASHES}
     if name not in builders:
         raise PhysicsError(f"unknown experiment {name!r}; allowed are {', '.join(builders)}")
     there = {o.object_id: o for o in state.visible}
@@ -99,8 +64,9 @@ def set_up(
     chosen = [there[o] for o in objects] or most_visible(scene, state, start_us)
     if not chosen:
         raise PhysicsError(f"no vehicles in view at {start_us} us; name some with objects")
+    preset = preset or ("vehicle" if name in CRASHES else "paper")
     return builders[name](
-        _Request(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
+        Request(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
     )
 
 
@@ -120,22 +86,13 @@ def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedOb
     return [subject for _, _, subject in sorted(found, key=lambda f: f[:2])]
 
 
-def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
-    """The scene's ground around all objects there at ``t_us`` and around the ego's path."""
-    there = [
-        o.trajectory.pose(t_us)[0][None, :2] for o in state.visible if o.trajectory.covers(t_us)
-    ]
-    places = np.concatenate([scene.ego.positions[:, :2], *there])
-    return ground_collider(scene.ground, places, friction=ROAD_FRICTION)
-
-
-def _wall(request: _Request) -> Experiment:
+def _wall(request: Request) -> Experiment:
     start_us = request.start_us
     # What is to be crushed must have been seen.
     subject = max(request.chosen, key=lambda s: visibility_of(request.scene, s).front)
     speed = 2.5 if request.speed is None else request.speed
     pose = subject.trajectory.transform(start_us)
-    forward, length = _level(pose[:3, 0]), subject.scaled_size[0]
+    forward, length = level(pose[:3, 0]), subject.scaled_size[0]
     front = pose[:3, 3] + _reach(request, subject)[1][0] * forward
     wall = Plane(name="wall", point=front + WALL_GAP * forward, normal=-forward, friction=0.3)
     options = SimulateOptions(
@@ -147,9 +104,15 @@ def _wall(request: _Request) -> Experiment:
         start_us=start_us,
         duration=WALL_GAP / speed + 1.0,
     )
-    view = _viewer(request.scene, subject, pose, slant=0.8)
+    focus = front - 0.25 * length * forward
     return Experiment(
-        "wall", options, (subject.object_id,), front - 0.3 * length * forward, view, 6.5
+        "wall",
+        options,
+        (subject.object_id,),
+        focus,
+        beside(request.scene, subject, pose),
+        7.5,
+        without=others_near(request, options, focus),
     )
 
 
@@ -157,7 +120,7 @@ ROLLING_FRICTION = 0.0
 """In the paper's preset a vehicle has no wheels; that it rolls means it slides freely."""
 
 
-def _standing_road(request: _Request, subject: PlacedObject) -> Collider:
+def _standing_road(request: Request, subject: PlacedObject) -> Collider:
     """The road; without wheels it must not reach into the vehicle's underside."""
     if request.preset != "paper":
         return scene_road(request.scene, request.state, request.start_us)
@@ -170,7 +133,7 @@ def _standing_road(request: _Request, subject: PlacedObject) -> Collider:
     )
 
 
-def _pair(request: _Request) -> Experiment:
+def _pair(request: Request) -> Experiment:
     """Two vehicles start behind standing ones, half a width off centre, as traffic hits."""
     speed, start_us = 3.5 if request.speed is None else request.speed, request.start_us
     chosen = request.chosen
@@ -188,7 +151,7 @@ def _pair(request: _Request) -> Experiment:
     midpoints = []
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
         own = runner.trajectory.transform(start_us)
-        forward = _level(own[:3, 0])
+        forward = level(own[:3, 0])
         away = _reach(request, runner)[1][0] + PAIR_GAP - _reach(request, hit)[0][0]
         target = np.array(own)
         target[:3, 3] += away * forward
@@ -204,11 +167,19 @@ def _pair(request: _Request) -> Experiment:
         duration=PAIR_GAP / speed + 0.8,
         gravity=(0.0, 0.0, 0.0),
     )
-    view = _viewer(request.scene, runners[0], runners[0].trajectory.transform(start_us), slant=1.5)
-    return Experiment("pair", options, tuple(objects), midpoints[0], view, 9.0)
+    view = beside(request.scene, runners[0], runners[0].trajectory.transform(start_us))
+    return Experiment(
+        "pair",
+        options,
+        tuple(objects),
+        midpoints[0],
+        view,
+        9.0,
+        without=others_near(request, options, midpoints[0]),
+    )
 
 
-def _drop(request: _Request) -> Experiment:
+def _drop(request: Request) -> Experiment:
     subjects, start_us = request.chosen[:3], request.start_us
     objects = {}
     for subject in subjects:
@@ -229,12 +200,12 @@ def _drop(request: _Request) -> Experiment:
     )
     shown = max(subjects, key=lambda s: abs(float(visibility_of(request.scene, s).direction[1])))
     pose = shown.trajectory.transform(start_us)
-    view = _viewer(request.scene, shown, pose, slant=1.0, rise=0.15)
+    view = viewer(request.scene, shown, pose, slant=2.6, rise=0.25)
     focus = pose[:3, 3] + np.array([0.0, 0.0, DROP_HEIGHT / 3])
     return Experiment("drop", options, tuple(objects), focus, view, 8.0)
 
 
-def _reach(request: _Request, subject: PlacedObject) -> tuple[Float, Float]:
+def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
     """How far an object's particles reaches back and forth along its own axes, [3] and [3] [m].
 
     Tracked boxes are not that exact: particles reaches up to a voxel out of them.
@@ -242,25 +213,3 @@ def _reach(request: _Request, subject: PlacedObject) -> tuple[Float, Float]:
     preset = preset_of(request.preset)
     particles = object_particles(request.scene, subject, preset, request.start_us).positions
     return particles.min(axis=0) - preset.spacing / 2, particles.max(axis=0) + preset.spacing / 2
-
-
-def _level(direction: Float) -> Float:
-    flat = np.array([direction[0], direction[1], 0.0])
-    return flat / max(float(np.linalg.norm(flat)), 1e-9)
-
-
-def _viewer(
-    scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
-) -> Float:
-    """Direction [3] to a viewer on the side and at the end from which it was seen.
-
-    Args:
-        slant: how much to the side, against along the subject; less for a side hardly seen.
-        rise: how much up.
-    """
-    x, y, _ = visibility_of(scene, subject).direction
-    slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
-    along = (1.0 if x >= 0 else -1.0) * _level(pose[:3, 0])
-    side = (1.0 if y >= 0 else -1.0) * slant * _level(np.cross([0, 0, 1], pose[:3, 0]))
-    direction: Float = _level(along + side) + np.array([0.0, 0.0, rise])
-    return direction

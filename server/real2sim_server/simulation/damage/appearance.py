@@ -1,0 +1,216 @@
+"""A damaged vehicle as it is drawn: its Gaussians moved, folded, lit and broken."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float
+from ...scene import GaussianCloud
+from ..embedding import Deformed, Embedding, deform_cloud
+from .parts import Part, parts_of
+from .sheet import Sheet
+
+SH_0 = 0.28209479177387814
+GLASS_DARKER = 0.55
+"""Glass is what is darker than so much of the vehicle's paint, within a pane's place."""
+OTHER_COLOUR = 0.22
+"""A lamp is what differs by so much from the colour of most of the vehicle, within its place."""
+LAMP_DARKER, LAMP_SHARE = 0.6, 0.6
+"""And is not darker than so much of it, as grilles are; the most unlike of these, this share."""
+AXLES, WHEEL_RADIUS, TREAD = 0.3, 0.38, 0.28
+"""Of wheels: along the length from the middle, radius [m], width within the sides [m]."""
+LAMP_LEFT, PANE_LEFT = 0.22, 0.35
+"""Light that comes from the hole where a lamp or a pane was."""
+CRACKED = np.array([0.62, 0.67, 0.68])
+"""What laminated glass shows where it is crazed."""
+CRAZED = 0.55
+"""Of a cracked windscreen that is crazed."""
+DROOP, DROOP_TIME = 0.16, 0.35
+"""Angle by which a loose bumper hangs down at one end [rad], and in what time [s]."""
+CLEARANCE = 0.04
+"""Of a loose bumper above the road [m]."""
+SPLIT = 1.5
+"""Gaussians stretched by more are drawn as two, side by side."""
+
+
+class DamagedVehicle:
+    """An object whose Gaussians follow its particles.
+
+    Args:
+        cloud: its Gaussians at rest, object frame.
+        rest: [N, 3] particles at rest, object frame [m].
+        spacing: of the particles [m].
+        category, size: of the object.
+        object_id: by which folds differ from vehicle to vehicle.
+    """
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        rest: Float,
+        *,
+        spacing: float,
+        category: str,
+        size: Sequence[float],
+        object_id: str,
+    ) -> None:
+        self._cloud, self._size = cloud, size
+        points = cloud.means.detach().cpu().numpy().astype(np.float64)
+        self._points = points
+        self._embedding = Embedding(rest, points, spacing=spacing)
+        self._parts = {part.name: part for part in parts_of(category, size)}
+        colours = np.clip(cloud.sh[:, 0].detach().cpu().numpy() * SH_0 + 0.5, 0.0, 1.0)
+        self._brightness = colours.mean(axis=1)
+        self._unlike_paint = np.abs(colours - np.median(colours, axis=0)).max(axis=1)
+        self._rows = {name: self._rows_of(part) for name, part in self._parts.items()}
+        glass = np.zeros(len(points), dtype=bool)
+        for name, part in self._parts.items():
+            if part.kind in ("pane", "windscreen"):
+                glass[self._rows[name]] = True
+        self._seed = zlib.crc32(object_id.encode())
+        self._sheet = Sheet(
+            points,
+            rest,
+            spacing=spacing,
+            size=size,
+            smooth=glass | self._in_wheels(),
+            seed=self._seed,
+        )
+
+    def follow(self, displacements: Float) -> Deformed:
+        """Its Gaussians with particles displaced [N, 3] [m], before anything folds."""
+        return self._embedding.follow(displacements)
+
+    def shortening(self, body: Deformed) -> Float:
+        """[G, 3] see :meth:`Sheet.shortening`; largest values go into :meth:`cloud`."""
+        return self._sheet.shortening(body.F)
+
+    def cloud(self, body: Deformed, most: Float, broken: Mapping[str, float]) -> GaussianCloud:
+        """What is drawn.
+
+        Args:
+            body: of :meth:`follow`.
+            most: [G, 3] largest shortening so far.
+            broken: names of parts that have broken, and how long ago [s].
+        """
+        folded = self._sheet.fold(body, most)
+        positions = folded.deformed.positions
+        for name, age in broken.items():
+            if self._parts[name].kind == "bumper":
+                positions = self._drooped(name, positions, age)
+        moved = deform_cloud(self._cloud, replace(folded.deformed, positions=positions))
+        light = folded.light.copy()
+        for name in broken:
+            kind = self._parts[name].kind
+            if kind in ("lamp", "pane"):
+                light[self._rows[name]] *= LAMP_LEFT if kind == "lamp" else PANE_LEFT
+        sh = _lit(moved.sh, light)
+        if "windscreen" in broken:
+            sh = self._crazed(sh)
+        return _split(replace(moved, sh=sh), body.F)
+
+    def _rows_of(self, part: Part) -> NDArray[np.int64]:
+        """Gaussians that a part consists of: all at its place, without paint around it."""
+        inside = part.holds(self._points)
+        if part.kind in ("pane", "windscreen") and inside.any():
+            paint = float(np.median(self._brightness))
+            inside &= self._brightness < max(GLASS_DARKER * paint, 0.12)
+        elif part.kind == "lamp":
+            bright = self._brightness > LAMP_DARKER * float(np.median(self._brightness))
+            inside &= bright & (self._unlike_paint > OTHER_COLOUR)
+            if inside.any():
+                least = np.quantile(self._unlike_paint[inside], 1 - LAMP_SHARE)
+                inside &= self._unlike_paint >= least
+        return np.flatnonzero(inside)
+
+    def _in_wheels(self) -> NDArray[np.bool_]:
+        """[G] by where wheels are under a box of this size."""
+        length, width, height = self._size
+        along = np.abs(np.abs(self._points[:, 0]) - AXLES * length)
+        up = self._points[:, 2] + height / 2 - WHEEL_RADIUS
+        inside: NDArray[np.bool_] = np.hypot(along, up) < WHEEL_RADIUS
+        return inside & (np.abs(self._points[:, 1]) > width / 2 - TREAD)
+
+    def _drooped(self, name: str, positions: Float, age: float) -> Float:
+        """A bumper that hangs by one end; which one differs from vehicle to vehicle."""
+        rows = self._rows[name]
+        if not len(rows):
+            return positions
+        places = positions[rows]
+        side = 1.0 if (self._seed >> 3) % 2 else -1.0
+        arm = places[:, 1] * side
+        arm = arm - arm.min()
+        fallen = 1 - np.exp(-3 * age / DROOP_TIME)
+        sunk = np.tan(DROOP) * fallen * arm
+        sunk = np.minimum(sunk, places[:, 2] + self._size[2] / 2 - CLEARANCE)
+        moved = positions.copy()
+        moved[rows, 2] -= np.maximum(sunk, 0.0)
+        # It comes off forwards as well, where it is loose.
+        moved[rows, 0] += np.sign(places[:, 0].mean()) * 0.25 * np.maximum(sunk, 0.0)
+        return moved
+
+    def _crazed(self, sh: torch.Tensor) -> torch.Tensor:
+        """Cracks all over the screen, denser along rays."""
+        rows = self._rows["windscreen"]
+        if not len(rows):
+            return sh
+        points = self._points[rows]
+        middle = points.mean(axis=0) + np.array([0.0, 0.2, 0.0])
+        angle = np.arctan2(points[:, 2] - middle[2], points[:, 1] - middle[1])
+        rays = 0.5 + 0.5 * np.cos(11 * angle + 2 * np.sin(3 * angle))
+        random = np.random.default_rng(self._seed).uniform(size=len(rows))
+        weight = np.where(random < CRAZED * (0.4 + rays), 0.65, 0.12)
+        weights = torch.from_numpy(weight.astype(np.float32))[:, None, None].to(sh.device)
+        target = torch.zeros_like(sh[rows])
+        colour = torch.from_numpy(((CRACKED - 0.5) / SH_0).astype(np.float32)).to(sh.device)
+        target[:, 0] = colour
+        cracked = sh.clone()
+        cracked[rows] = (1 - weights) * sh[rows] + weights * target
+        return cracked
+
+
+def _lit(sh: torch.Tensor, light: Float) -> torch.Tensor:
+    """Harmonics of Gaussians whose colours are multiplied by ``light`` [G]."""
+    factor = torch.from_numpy(light.astype(np.float32)).to(sh.device)
+    lit = sh * factor[:, None, None]
+    lit[:, 0] += ((factor - 1) * 0.5 / SH_0)[:, None]
+    return lit
+
+
+def _split(cloud: GaussianCloud, F: Float) -> GaussianCloud:
+    """The cloud with Gaussians that were stretched far split in two, so that none is a needle and
+    nothing opens between them."""
+    stretch = np.linalg.norm(F, axis=1).max(axis=1)
+    rows = torch.from_numpy(np.flatnonzero(stretch > SPLIT)).to(cloud.device)
+    if not len(rows):
+        return cloud
+    part = cloud.select(rows)
+    longest = part.scales.argmax(dim=1)
+    axes = _axes(part.quats)
+    each = torch.arange(len(rows), device=cloud.device)
+    along = axes[each, :, longest] * part.scales[each, longest][:, None] * 0.6
+    scales = part.scales.clone()
+    scales[each, longest] *= 0.7
+    means, sizes = cloud.means.clone(), cloud.scales.clone()
+    means[rows], sizes[rows] = part.means + along, scales
+    return GaussianCloud(
+        torch.cat([means, part.means - along]),
+        torch.cat([cloud.quats, part.quats]),
+        torch.cat([sizes, scales]),
+        torch.cat([cloud.opacities, part.opacities]),
+        torch.cat([cloud.sh, part.sh]),
+    )
+
+
+def _axes(quats: torch.Tensor) -> torch.Tensor:
+    """[K, 3, 3] axes of Gaussians, as columns."""
+    from ...geometry.rotation import quaternion_to_matrix
+
+    matrices = quaternion_to_matrix(quats.detach().cpu().numpy())
+    return torch.from_numpy(matrices.astype(np.float32)).to(quats.device)

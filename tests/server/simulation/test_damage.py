@@ -1,0 +1,251 @@
+"""What crashes leave on vehicles: folds, broken parts, fragments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.edit.state import ScenarioState
+from real2sim_server.geometry.rotation import quaternion_to_matrix
+from real2sim_server.physics.particles import box_particles
+from real2sim_server.scene import GaussianCloud
+from real2sim_server.simulation.breakages import find_breakages
+from real2sim_server.simulation.damage import BreakageLog, DamagedVehicle, fragment_cloud
+from real2sim_server.simulation.damage.parts import parts_of
+from real2sim_server.simulation.embedding import deform_cloud
+from real2sim_server.simulation.playback import Playback
+from real2sim_server.simulation.result import ObjectResult, SimulationResult
+
+SIZE = (4.6, 1.8, 1.5)
+SPACING = 0.15
+PARTICLES = box_particles(SIZE, spacing=SPACING, density=1.0).positions
+CRUSHED = 0.3
+"""Of the front, in the tests."""
+
+
+def skin(count: int = 40) -> GaussianCloud:
+    """Gaussians on the left side and on top of a box of SIZE."""
+    x = np.linspace(-2.2, 2.2, count)
+    side = np.stack([x, np.full(count, 0.9), np.full(count, -0.1)], axis=1)
+    top = np.stack([x, np.zeros(count), np.full(count, 0.75)], axis=1)
+    means = torch.from_numpy(np.concatenate([side, top]).astype(np.float32))
+    n = len(means)
+    return GaussianCloud(
+        means,
+        torch.tensor((1.0, 0, 0, 0)).repeat(n, 1),
+        torch.full((n, 3), 0.05),
+        torch.full((n,), 0.9),
+        torch.full((n, 1, 3), 0.7),
+    )
+
+
+def crushed_front(by: float = CRUSHED) -> np.ndarray:
+    """[N, 3] displacements that shorten the front third of the length by a fraction."""
+    moved = np.zeros_like(PARTICLES)
+    begins = SIZE[0] / 2 - SIZE[0] / 3
+    moved[:, 0] = -by * np.maximum(PARTICLES[:, 0] - begins, 0.0)
+    return moved
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    cloud = skin()
+    made = DamagedVehicle(
+        cloud, PARTICLES, spacing=SPACING, category="car", size=SIZE, object_id="car_1"
+    )
+    return cloud, made
+
+
+def drawn(vehicle, displacements, broken=None):
+    cloud, made = vehicle
+    body = made.follow(displacements)
+    return cloud, made.cloud(body, made.shortening(body), broken or {}), body
+
+
+def length(cloud: GaussianCloud, first: int, last: int) -> float:
+    steps = np.diff(cloud.means.numpy()[first:last].astype(np.float64), axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
+
+
+def test_sheet_that_is_shortened_folds_and_so_keeps_most_of_its_length(vehicle):
+    _, _, body = drawn(vehicle, crushed_front())
+    rest, folded, _ = drawn(vehicle, crushed_front())
+    smooth = deform_cloud(rest, body)
+    first, last = 29, 40
+    shortened = length(smooth, first, last) / length(rest, first, last)
+    assert shortened == pytest.approx(1 - CRUSHED, abs=0.06)
+    assert length(folded, first, last) / length(rest, first, last) > shortened + 0.1
+
+
+def test_folds_face_elsewhere_and_are_lit_otherwise(vehicle):
+    rest, folded, _ = drawn(vehicle, crushed_front())
+    light = folded.sh[29:40, 0, 0] / rest.sh[29:40, 0, 0]
+    assert float(light.max() - light.min()) > 0.15
+
+
+def test_what_was_not_crushed_stays_as_it_was(vehicle):
+    rest, folded, _ = drawn(vehicle, crushed_front())
+    behind = slice(0, 20)
+    torch.testing.assert_close(folded.means[behind], rest.means[behind], atol=1e-6, rtol=0)
+    torch.testing.assert_close(folded.sh[behind], rest.sh[behind], atol=1e-5, rtol=0)
+
+
+def test_folds_stay_when_what_is_behind_them_springs_back(vehicle):
+    cloud, made = vehicle
+    most = made.shortening(made.follow(crushed_front()))
+    back = made.cloud(made.follow(np.zeros_like(PARTICLES)), most, {})
+    assert float((back.means - cloud.means)[29:40].abs().max()) > 0.01
+
+
+def test_a_bonnet_rises_in_the_middle(vehicle):
+    x = np.linspace(1.5, 2.25, 16)
+    row = np.stack([x, np.zeros(16), np.full(16, 0.3)], axis=1).astype(np.float32)
+    bonnet = replace(skin(8), means=torch.from_numpy(row))
+    low = PARTICLES[PARTICLES[:, 2] < 0.3]
+    made = DamagedVehicle(
+        bonnet, low, spacing=SPACING, category="car", size=SIZE, object_id="car_1"
+    )
+    body = made.follow(crushed_front()[PARTICLES[:, 2] < 0.3])
+    rise = (made.cloud(body, made.shortening(body), {}).means - bonnet.means)[:, 2].numpy()
+    assert 0.1 < rise[5:11].max() < 0.45
+    assert rise[5:11].max() > max(rise[0], rise[-1]) + 0.05
+
+
+def test_no_gaussian_becomes_a_needle(vehicle):
+    pulled = np.zeros_like(PARTICLES)
+    pulled[:, 0] = 6.0 * np.maximum(PARTICLES[:, 0] - 1.5, 0.0)
+    rest, torn, body = drawn(vehicle, pulled)
+    assert len(torn) > len(rest)
+    assert float(torn.scales.max()) < 1.45 * float(rest.scales.max())
+    assert float(deform_cloud(rest, body).scales.max()) > 1.9 * float(rest.scales.max())
+
+
+def test_the_same_bits_come_of_the_same_crash(vehicle):
+    one, two = (drawn(vehicle, crushed_front(), {"front bumper": 0.2})[1] for _ in range(2))
+    for name in ("means", "quats", "scales", "sh"):
+        assert torch.equal(getattr(one, name), getattr(two, name))
+
+
+def test_a_front_that_is_pushed_in_breaks_what_is_there():
+    log = BreakageLog("car", SIZE, PARTICLES, spacing=SPACING)
+    assert log.follow(np.zeros_like(PARTICLES)) == []
+    broken = {part.name for part in log.follow(crushed_front())}
+    assert broken >= {"front bumper", "front left lamp", "front right lamp"}
+    assert not any(name.startswith("rear") for name in broken)
+    assert log.follow(crushed_front()) == []
+
+
+def test_a_racked_side_breaks_its_windows():
+    moved = np.zeros_like(PARTICLES)
+    left = PARTICLES[:, 1] > 0.4
+    moved[left, 1] = -0.3 * np.exp(-((PARTICLES[left, 0] / 0.6) ** 2))
+    log = BreakageLog("car", SIZE, PARTICLES, spacing=SPACING)
+    broken = {part.name for part in log.follow(moved)}
+    assert "left windows" in broken
+    assert broken.isdisjoint({"right windows", "rear window", "front left lamp", "front bumper"})
+
+
+def test_only_vehicles_have_parts():
+    assert parts_of("pole", (0.3, 0.3, 3.0)) == ()
+    names = [part.name for part in parts_of("van", (5.3, 2.0, 2.2))]
+    assert len(set(names)) == len(names)
+
+
+def crash_result(object_id: str, pose, breakages) -> SimulationResult:
+    """Four frames in which the front of an object is pushed in at the second."""
+    shapes = np.array([crushed_front()], dtype=np.float16)
+    own = ObjectResult(
+        object_id,
+        1500.0,
+        SPACING,
+        PARTICLES.astype(np.float32),
+        np.tile(pose, (4, 1)),
+        np.tile((1.0, 0, 0, 0), (4, 1)),
+        np.zeros((4, 3)),
+        np.zeros((4, 3)),
+        np.full(4, 2, np.uint8),
+        np.array([-1, 0, 0, 0], np.int32),
+        shapes,
+        np.zeros((0, 3), np.float32),
+        np.zeros((4, 0), np.float32),
+    )
+    return SimulationResult(
+        {object_id: own},
+        np.arange(4) * 2.0,
+        0,
+        np.zeros((4, 6)),
+        (),
+        np.zeros((4, 0, 3)),
+        figures={"preset": "vehicle"},
+        breakages=breakages,
+    )
+
+
+@pytest.fixture(scope="module")
+def crash(tiny_scene):
+    state = ScenarioState.of(tiny_scene)
+    result = crash_result("car_red", (14.0, -3.0, 0.75), None)
+    return state, replace(result, breakages=find_breakages(result, state.visible))
+
+
+def test_parts_break_in_the_frame_that_pushes_them_in(crash):
+    _, result = crash
+    assert {b.time_s for b in result.breakages} == {2.0}
+    lamp = next(b for b in result.breakages if b.part == "front left lamp")
+    assert lamp.position[0] > 14.0 + 1.0
+    assert lamp.position[1] > -3.0
+
+
+def test_breakages_are_kept_with_the_result(crash, tmp_path):
+    _, result = crash
+    result.save(tmp_path / "kept")
+    assert SimulationResult.load(tmp_path / "kept").breakages == result.breakages
+
+
+def test_results_from_before_have_none_and_are_drawn_as_they_were(crash, tiny_scene, tmp_path):
+    state, result = crash
+    replace(result, breakages=None).save(tmp_path / "old")
+    old = SimulationResult.load(tmp_path / "old")
+    assert old.breakages is None
+    drawn = Playback(tiny_scene, state, old).instances(3)
+    [_, red] = drawn
+    source = tiny_scene.object("car_red").cloud_at(0)
+    assert torch.equal(red.cloud.sh, source.sh)
+    assert len(red.cloud) == len(source)
+
+
+def test_fragments_are_drawn_once_something_broke_and_lie_on_the_road(crash, tiny_scene):
+    state, result = crash
+    playback = Playback(tiny_scene, state, result)
+    before = len(playback.instances(0))
+    assert len(playback.instances(1)) == before + 1
+    last = playback.instances(3)[-1]
+    assert last.instance_id == next(
+        o.instance_id for o in state.visible if o.object_id == "car_red"
+    )
+    ground = tiny_scene.ground.height_at(last.cloud.means.numpy()[:, :2])
+    above = last.cloud.means.numpy()[:, 2] - ground
+    assert 0.0 < above.max() < 0.05
+    assert above.min() > 0.0
+
+
+def test_fragments_fly_before_they_lie_and_then_stay(crash):
+    _, result = crash
+    flat = lambda places: np.zeros(len(places))  # noqa: E731
+    flying, lying, later = (
+        fragment_cloud(result.breakages, t, flat).means.numpy() for t in (2.1, 10.0, 11.0)
+    )
+    assert flying[:, 2].max() > 0.3
+    np.testing.assert_array_equal(lying, later)
+    assert fragment_cloud(result.breakages, 1.9, flat) is None
+
+
+def test_fragments_are_whole_gaussians(crash):
+    _, result = crash
+    cloud = fragment_cloud(result.breakages, 2.4, lambda places: np.zeros(len(places)))
+    cloud.check_values("fragments")
+    turned = quaternion_to_matrix(cloud.quats.numpy())
+    np.testing.assert_allclose(np.linalg.det(turned), 1.0, atol=1e-5)
