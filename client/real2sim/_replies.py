@@ -118,7 +118,7 @@ def parse_image(reply: Reply, modality: str) -> Image:
     codec = codecs.get(reply.media_type)
     if codec is None:
         raise MalformedReplyError(f"the worker sent {reply.media_type!r} where an image was asked")
-    dtype = "uint8" if modality == "rgb" else "uint16"
+    dtype = "uint8" if modality in ("rgb", "semantic") else "uint16"
     return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype)
 
 

@@ -47,6 +47,8 @@ FORMS: dict[str, tuple[float, type[np.generic]]] = {
     "rgb": (255, np.uint8),
     "depth": (FAR, np.float32),
     "instance": (65535, np.uint16),
+    "median_depth": (FAR, np.float32),
+    "semantic": (255, np.uint8),
 }
 """Largest value and dtype of images by modality."""
 

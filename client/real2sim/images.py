@@ -21,6 +21,7 @@ from .errors import ImageDecodeError, MalformedReplyError
 if TYPE_CHECKING:
     from real2sim_proto.drive import Frame as WireFrame
 
+DEPTHS = ("depth", "median_depth")
 DEPTH_PNG_UNIT = 1 / 256
 """Metres of one level of depth sent as 16-bit png."""
 AS_SENT = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
@@ -34,8 +35,10 @@ class Image:
     Attributes:
         data: encoded bytes; of codec ``raw`` the array in C order, little-endian.
         codec: ``raw``, ``jpeg`` or ``png``.
-        modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` (float32 [H, W], metres along the camera z
-            axis, 0 where nothing was hit) or ``instance`` (uint16 [H, W], 0 is background).
+        modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` or ``median_depth`` (float32 [H, W], metres
+            along the camera z axis, 0 where nothing was hit), ``instance`` (uint16 [H, W], 0 is
+            background) or ``semantic`` (uint8 [H, W], numbers of
+            ``real2sim_proto.SEMANTIC_CLASSES``).
         dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``.
         shape: of the array; empty where only the image itself tells.
 
@@ -69,7 +72,7 @@ class Image:
                 f"{self.codec} image holds {array.dtype} {array.shape} where "
                 f"{self.dtype} {self.shape or ''} was announced"
             )
-        if self.modality == "depth" and array.dtype == np.uint16:
+        if self.modality in DEPTHS and array.dtype == np.uint16:
             return array * np.float32(DEPTH_PNG_UNIT)
         return array
 

@@ -7,6 +7,7 @@ Models live in the module of their concept: ``operations``, ``scenes``, ``scenar
 from .codec import CodecError, decode, encode
 from .conventions import CONVENTIONS
 from .errors import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem, ProblemDetail
+from .semantics import SEMANTIC_CLASSES
 from .version import DRIVE_SUBPROTOCOL, PROTOCOL_VERSION, SUPPORTED_SUBPROTOCOLS, protocol_mismatch
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "PROBLEM_MEDIA_TYPE",
     "PROTOCOL_VERSION",
     "RETRYABLE",
+    "SEMANTIC_CLASSES",
     "SUPPORTED_SUBPROTOCOLS",
     "CodecError",
     "ErrorCode",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from .semantics import SEMANTIC_CLASSES
+
 CONVENTIONS: dict[str, str] = {
     "world_frame": "right-handed, x forward, y left, z up, metres, recentred near the drive",
     "vehicle_frame": "x forward, y left, z up; origin at the rear axle centre on the ground",
@@ -16,5 +18,8 @@ CONVENTIONS: dict[str, str] = {
     "depth": "float32 [H, W], metres along the camera z axis, 0 where nothing was hit",
     "depth_png": "16 bit, steps of 1/256 m, 0 where nothing was hit, 65535 from 255.99 m on",
     "instance": "uint16 [H, W], 0 is background",
+    "median_depth": "as depth, of the Gaussian that takes half of the light; no mean over edges",
+    "semantic": "uint8 [H, W], "
+    + ", ".join(f"{number} {name}" for name, number in SEMANTIC_CLASSES.items()),
 }
 """What each convention says, by its name."""

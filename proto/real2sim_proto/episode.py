@@ -21,9 +21,9 @@ class SensorSpec(Model):
     """One camera of an observation."""
 
     camera: Identifier
-    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=3)
+    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=5)
     width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
-    codec: Codec = Field(default="raw", description="of rgb; depth and instance are raw or png")
+    codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
     quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
     period_us: int | None = Field(
         default=None, gt=0, description="time between frames; a multiple of dt_us; default: dt_us"

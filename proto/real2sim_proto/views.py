@@ -38,8 +38,8 @@ class FreeCamera(Model):
         description="3x3 intrinsics [px]; pixel centres lie at +0.5"
     )
     pose: Pose = Field(description="T_world_camera; x right, y down, z forward")
-    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=3)
-    codec: Codec = Field(default="raw", description="of rgb; depth and instance are raw or png")
+    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=5)
+    codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
     quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
 
 

@@ -128,7 +128,7 @@ class AsyncScenes:
             camera: name of one of its cameras.
             t_us: instant; default: the start of the recording.
             width: pixels; default: as recorded.
-            modality: ``rgb``, ``depth`` or ``instance``.
+            modality: ``rgb``, ``depth``, ``instance``, ``median_depth`` or ``semantic``.
             codec: ``raw``, ``jpeg``, ``png``, or ``auto``: raw on this machine, else jpeg.
 
         Raises:

@@ -36,6 +36,8 @@ class Modality(StrEnum):
     RGB = "rgb"
     DEPTH = "depth"
     INSTANCE = "instance"
+    MEDIAN_DEPTH = "median_depth"
+    SEMANTIC = "semantic"
 
 
 @app.command()

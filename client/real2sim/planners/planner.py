@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    from real2sim_proto.base import Modality
     from real2sim_proto.plans import Plan
     from real2sim_proto.scenes import CameraInfo
 
@@ -56,7 +57,7 @@ class Needs:
         action: kind of its plans.
     """
 
-    modalities: tuple[Literal["rgb", "depth", "instance"], ...] = ()
+    modalities: tuple[Modality, ...] = ()
     cameras: tuple[str, ...] = ()
     width: int | None = None
     privileged: bool = False

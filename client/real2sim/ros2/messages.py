@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 MAP, BASE = "map", "base_link"
-ENCODINGS = {"rgb": "rgb8", "depth": "32FC1", "instance": "16UC1"}
+ENCODINGS = {
+    "rgb": "rgb8",
+    "depth": "32FC1",
+    "instance": "16UC1",
+    "median_depth": "32FC1",
+    "semantic": "8UC1",
+}
 """Of images, by modality."""
 
 

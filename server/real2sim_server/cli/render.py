@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..scene import Scene
 
 CODEC_BY_SUFFIX = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
-MODALITIES = ("rgb", "depth", "instance")
+MODALITIES = ("rgb", "depth", "instance", "median_depth", "semantic")
 
 
 @command("render")
@@ -32,7 +32,9 @@ def render(
     frame: Annotated[int | None, typer.Option(min=0, help="Recorded frame; default 0.")] = None,
     t_us: Annotated[int | None, typer.Option(help="Or a time stamp [us].")] = None,
     width: Annotated[int | None, typer.Option(min=16, max=8192, help="[px]")] = None,
-    modality: Annotated[str, typer.Option(help="rgb, depth or instance")] = "rgb",
+    modality: Annotated[
+        str, typer.Option(help="rgb, depth, instance, median_depth or semantic")
+    ] = "rgb",
     delete: Annotated[list[str] | None, typer.Option(help="Objects to leave out.")] = None,
     log: Annotated[Path | None, typer.Option(help="Compare with this log's image: PSNR.")] = None,
     backend: RenderBackend = "auto",
@@ -41,7 +43,7 @@ def render(
 ) -> None:
     """Draw one logged camera of a scene; with --log print PSNR against the recorded image."""
     from ..edit.compose import instances_at
-    from ..render import RasterOptions, render_cameras
+    from ..render import render_cameras
     from ..scene.io import load_scene
 
     if log is not None and (t_us is not None or delete):
@@ -56,7 +58,7 @@ def render(
         [chosen if width is None else chosen.resized(width)],
         loaded.ego.transform(time_us),
         sky=loaded.sky,
-        options=RasterOptions(depth=modality == "depth", instance=modality == "instance"),
+        modalities=[modality],
         backend=backend,
     )
     _write_image(picture, modality, out)
@@ -106,8 +108,7 @@ def _without(scene: Scene, deleted: Sequence[str]) -> ScenarioState:
 def _write_image(frame: Frame, modality: str, out: Path) -> None:
     from ..render import encode_image
 
-    image = {"rgb": frame.rgb, "depth": frame.depth, "instance": frame.instance}[modality]
-    assert image is not None
+    image = frame.images[modality]
     with atomic_file(out) as file:
         file.write(encode_image(image, modality, CODEC_BY_SUFFIX[out.suffix.lower()]).data)
 

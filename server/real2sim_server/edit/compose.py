@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from real2sim_proto.operations import EraseRegion
+from real2sim_proto.semantics import semantic_class
 
 from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform, transform_from
@@ -95,10 +96,11 @@ def _anywhere(scene: Scene, objects: Iterable[ObjectState]) -> Iterable[Instance
 
 def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> Instance:
     placement = (transform, subject.instance_id, subject.scale)
+    semantic = semantic_class(subject.category)
     if subject.asset is not None:
-        return Instance(subject.asset.cloud_in(scene), *placement)
+        return Instance(subject.asset.cloud_in(scene), *placement, semantic=semantic)
     source = scene.object(subject.source_id)
-    return Instance(source.cloud, *placement, colour=source.colour, t_us=t_us)
+    return Instance(source.cloud, *placement, colour=source.colour, t_us=t_us, semantic=semantic)
 
 
 def contact_shadows(

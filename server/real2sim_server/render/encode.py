@@ -53,13 +53,14 @@ def encode_rgb(image: NDArray[np.uint8], codec: str, *, quality: int = 90) -> by
     return encoded
 
 
-def encode_depth(depth: NDArray[np.float32], codec: str) -> bytes:
+def encode_depth(depth: NDArray[np.float32], codec: str, *, name: str = "depth") -> bytes:
     """Depth [H, W] float32 [m] as raw float32, or 16-bit png in steps of DEPTH_PNG_UNIT.
 
-    In a png a hit is never 0, and everything beyond the range has the largest level.
+    In a png a hit is never 0, and everything beyond the range has the largest level. Messages call
+    the image ``name``.
     """
-    _check_codec("depth", codec, EXACT_CODECS)
-    _check_array("depth", depth, np.float32, 2)
+    _check_codec(name, codec, EXACT_CODECS)
+    _check_array(name, depth, np.float32, 2)
     if codec == "raw":
         return depth.astype("<f4", order="C", copy=False).tobytes()
     levels = np.clip(np.rint(depth / DEPTH_PNG_UNIT), 1, np.iinfo(np.uint16).max)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from real2sim_proto.semantics import UNLABELED
+
 from ..scene import Camera
-from .backends.base import Backend, FrameBackend, RasterRequest
+from .backends.base import Backend, FrameBackend, RasterRequest, class_behind
 from .backends.select import select_backend
 from .modalities import modalities_drawn, modality_of, options_for
-from .rasterize import DEFAULT_OPTIONS, checked_request
+from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .types import Instance, RasterOptions, RenderError, Sky
 
 
@@ -25,7 +27,9 @@ class Frame:
     Attributes:
         camera: its name.
         images: by modality: ``rgb`` [H, W, 3] uint8, ``depth`` [H, W] float32 along the camera z
-            axis [m], 0 where alpha is below 0.5, ``instance`` [H, W] uint16 ids, 0 is background.
+            axis [m], 0 where alpha is below 0.5, ``instance`` [H, W] uint16 ids, 0 is background,
+            ``median_depth`` [H, W] float32 [m], 0 where alpha is below 0.5, ``semantic`` [H, W]
+            uint8, see SEMANTIC_CLASSES.
         T_world_camera: [4, 4] float64, OpenCV camera frame to world.
         timing_ms: by stage; cameras drawn together share their time equally.
     """
@@ -149,6 +153,14 @@ def warm_up(backend: str | Backend = "auto") -> None:
     render_cameras([], [camera], np.eye(4), backend=chosen)
 
 
+def _classes(instances: Sequence[Instance]) -> NDArray[np.uint8]:
+    """Classes [65536] by instance id, of the first that has it."""
+    classes = np.full(MAX_INSTANCE_ID + 1, UNLABELED, np.uint8)
+    for instance in reversed(instances):
+        classes[instance.instance_id] = instance.semantic
+    return classes
+
+
 def _by_size(cameras: Sequence[Camera]) -> list[list[int]]:
     """Indices of cameras of one size each."""
     groups: dict[tuple[int, int], list[int]] = {}
@@ -198,6 +210,9 @@ def _drawn(
         return
     for request in requests:
         output = backend.rasterize(request)
+        if "semantic" in modalities:
+            classes, behind = _classes(request.instances), class_behind(request)
+            output = replace(output, classes=classes, behind=behind)
         yield {name: modality_of(name).pixels(output) for name in modalities}, output.timing_ms
 
 

@@ -34,6 +34,7 @@ UNSCALED = (1.0, 1.0, 1.0)
 RASTERIZE_MODES = ("classic", "antialiased")
 MAX_IMAGE_SIZE = 16_384
 MAX_INSTANCE_ID = 65_535
+MAX_CLASS = 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,12 +269,14 @@ def _joined(outputs: Sequence[RenderOutput]) -> RenderOutput:
             timing[stage] = timing.get(stage, 0.0) + milliseconds
     depths = [output.depth for output in outputs if output.depth is not None]
     instances = [output.instance for output in outputs if output.instance is not None]
+    medians = [output.median_depth for output in outputs if output.median_depth is not None]
     return RenderOutput(
         rgb=torch.cat([output.rgb for output in outputs]),
         alpha=torch.cat([output.alpha for output in outputs]),
         depth=torch.cat(depths) if depths else None,
         instance=torch.cat(instances) if instances else None,
         timing_ms=timing,
+        median_depth=torch.cat(medians) if medians else None,
     )
 
 
@@ -369,6 +372,8 @@ def _check_options(options: RasterOptions) -> None:
 
 def _check_instance(index: int, instance: Instance, *, check_values: bool) -> None:
     name = f"instances[{index}]"
+    if not 0 <= instance.semantic <= MAX_CLASS:
+        raise RenderError(f"{name}.semantic must be 0 to {MAX_CLASS}, not {instance.semantic!r}")
     if not 0 <= instance.instance_id <= MAX_INSTANCE_ID:
         raise RenderError(
             f"{name}.instance_id must be 0 to {MAX_INSTANCE_ID}, not {instance.instance_id!r}"

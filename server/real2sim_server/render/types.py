@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from real2sim_proto.semantics import STATIC, UNLABELED
+
 from ..scene import GaussianCloud, Sky, TimeColour
 
 Detail = Literal["full", "auto"]
@@ -35,6 +37,7 @@ class Instance:
             (deformed clouds), or None.
         colour: how the cloud's colours change over time, or None.
         t_us: instant at which ``colour`` is taken [us].
+        semantic: value in semantic images; instances of one ``instance_id`` have one.
     """
 
     cloud: GaussianCloud
@@ -44,6 +47,7 @@ class Instance:
     covars: Tensor | None = None
     colour: TimeColour | None = None
     t_us: int = 0
+    semantic: int = STATIC
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,7 @@ class RasterOptions:
         rasterize_mode: ``classic``, or ``antialiased`` (opacity compensated for ``eps2d``).
         background: RGB in [0, 1] behind everything where there is no sky.
         depth, instance: whether these images are made besides RGB and alpha.
+        median_depth: whether that image is made, see RenderOutput.
         track_screen: whether ScreenStatistics are gathered, which densification reads; only in
             passes that carry gradients.
         detail: ``full``: every Gaussian that an image shows is drawn; ``auto``: images of at most
@@ -95,6 +100,7 @@ class RasterOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth: bool = True
     instance: bool = True
+    median_depth: bool = False
     track_screen: bool = False
     detail: Detail = "full"
 
@@ -132,6 +138,10 @@ class RenderOutput:
             sum(w z) / sum(w); 0 where alpha is 0. None when not asked for.
         instance: [C, H, W] uint16, instance_id of the Gaussian at which transmittance first falls
             to 0.5 or below; 0 where it never does. None when not asked for.
+        median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none, and
+            without gradients. None when not asked for.
+        classes: [65536] uint8, of ``instance`` by id; None where nobody asked.
+        behind: class of a pixel at which transmittance stays above 0.5.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
         screen: sizes and gradients on the image; None when not asked for or without gradients.
         between: of the request; for what is done with large images afterwards.
@@ -144,6 +154,9 @@ class RenderOutput:
     timing_ms: dict[str, float] = field(default_factory=dict)
     screen: ScreenStatistics | None = None
     between: Callable[[], object] | None = None
+    median_depth: Tensor | None = None
+    classes: NDArray[np.uint8] | None = None
+    behind: int = UNLABELED
 
 
 __all__ = [

@@ -100,7 +100,7 @@ class Account:
         name: of the token.
         limits: what its holder may take.
         requests: and messages of sockets, those that were let in.
-        received_bytes, sent_bytes: bodies and messages.
+        received_bytes, sent_bytes: bodies and messages, and images by shared memory.
         engine_seconds: written by the engine's thread alone.
         world_seconds: of the processor, for what needs no engine; written by the thread of worlds
             alone.
@@ -222,6 +222,13 @@ def admit_message() -> None:
     if payer is not None:
         payer.account.admit()
         payer.on_engine = False
+
+
+def count_sent(nbytes: int) -> None:
+    """Count what reaches the client of the running task by another way than its connection."""
+    payer = PAYER.get()
+    if payer is not None:
+        payer.account.sent_bytes += nbytes
 
 
 async def computing_account() -> Account | None:

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from real2sim_proto.semantics import semantic_class
+
 from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
@@ -97,7 +99,7 @@ class Playback:
             elif subject.trajectory.covers(t_us):
                 cloud = self.scene.object(subject.source_id).cloud_at(t_us)
                 pose = subject.trajectory.transform(t_us)
-                instances.append(Instance(cloud, pose, subject.instance_id, subject.scale))
+                instances.append(_placed(cloud, pose, subject, subject.scale))
         return instances + self._fragments(frame, without)
 
     def _fragments(self, frame: int, without: Collection[str]) -> list[Instance]:
@@ -109,7 +111,7 @@ class Playback:
                 continue
             cloud = fragment_cloud(broken, time_s, self.scene.ground.height_at)
             if cloud is not None:
-                found.append(Instance(cloud, None, subject.instance_id))
+                found.append(_placed(cloud, None, subject))
         return found
 
     def time_us(self, frame: int) -> int:
@@ -121,7 +123,7 @@ class Playback:
         pose, row = own.transform(frame), int(own.shape_index[frame])
         lifts = own.wheel_lifts[frame]
         if row < 0 and not lifts.any():
-            return Instance(self._cloud(subject), pose, subject.instance_id)
+            return _placed(self._cloud(subject), pose, subject)
         damaged = self._damage(subject)
         key = (row if damaged is None else frame, lifts.tobytes())
         kept = self._deformed.get(subject.object_id)
@@ -136,7 +138,7 @@ class Playback:
                 cloud = self._lifted(subject, cloud, lifts)
             kept = (key, cloud)
             self._deformed[subject.object_id] = kept
-        return Instance(kept[1], pose, subject.instance_id)
+        return _placed(kept[1], pose, subject)
 
     def _damage(self, subject: PlacedObject) -> _Damaged | None:
         """What is seen of a crash on a vehicle; None where nobody looked at what broke."""
@@ -212,6 +214,16 @@ class _Damaged:
         assert self._most is not None
         ages = {b.part: time_s - b.time_s for b in self._broken if b.time_s <= time_s}
         return self._vehicle.cloud(body, self._most, ages)
+
+
+def _placed(
+    cloud: GaussianCloud,
+    pose: NDArray[np.float64] | None,
+    subject: PlacedObject,
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Instance:
+    semantic = semantic_class(subject.category)
+    return Instance(cloud, pose, subject.instance_id, scale, semantic=semantic)
 
 
 def _in_wheels(means: NDArray[np.float32], wheels: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ def check_contract(backend: str) -> None:
 def check_images(backend: str) -> None:
     """Colour, alpha, depth and instance of several cameras, poses, degrees and modes."""
     for mode in ("classic", "antialiased"):
-        options = RasterOptions(background=(0.2, 0.4, 0.6), rasterize_mode=mode)
+        options = RasterOptions(background=(0.2, 0.4, 0.6), rasterize_mode=mode, median_depth=True)
         given, expected = _draw(backend, options), _draw("reference", options)
         difference = (given.rgb.cpu() - expected.rgb).abs().amax(dim=-1)
         assert float(difference.mean()) < 1e-4
@@ -40,15 +40,23 @@ def check_images(backend: str) -> None:
         sure = (expected.alpha - 0.5).abs() > 1e-3
         assert torch.equal(given.instance.cpu()[sure], expected.instance[sure])
         assert set(expected.instance.int().unique().tolist()) == {0, 3, 65_535}
+        assert given.median_depth is not None
+        assert expected.median_depth is not None
+        apart = (given.median_depth.cpu() - expected.median_depth).abs()
+        assert float((apart[sure] > 1e-3).float().mean()) < 1e-3
+        assert bool(((expected.median_depth > 0) == (expected.alpha >= 0.5)).all())
 
 
 def check_what_was_not_asked_for(backend: str) -> None:
-    """Without depth and instance the colours are the same, and these images absent."""
-    everything = _draw(backend, RasterOptions())
-    colours = _draw(backend, RasterOptions(depth=False, instance=False))
-    assert torch.equal(colours.rgb, everything.rgb)
-    assert colours.depth is None
-    assert colours.instance is None
+    """Images that are asked for are the same without the others, and the others absent."""
+    names = ("depth", "instance", "median_depth")
+    everything = _draw(backend, RasterOptions(median_depth=True))
+    for asked in ((), *((name,) for name in names), ("depth", "instance")):
+        drawn = _draw(backend, RasterOptions(**{name: name in asked for name in names}))
+        assert torch.equal(drawn.rgb, everything.rgb)
+        for name in names:
+            image, expected = getattr(drawn, name), getattr(everything, name)
+            assert image is None if name not in asked else torch.equal(image, expected)
 
 
 def check_repetition(backend: str) -> None:

@@ -98,7 +98,8 @@ def test_encoded_image_says_how_to_read_it(
         (RGB[..., :2], "rgb", "png", r"\[12, 17, 2\]"),
         (DEPTH.astype(np.float64), "depth", "raw", "float32"),
         (RGB[:0], "rgb", "raw", r"\[0, 17, 3\]"),
-        (RGB, "semantic", "raw", "semantic"),
+        (RGB, "thermal", "raw", "thermal"),
+        (RGB[..., 0].astype(np.uint16), "semantic", "png", "uint8"),
     ],
 )
 def test_what_cannot_be_encoded_is_refused_with_a_reason(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_proto import SEMANTIC_CLASSES
 from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderError, render_cameras, warm_up
@@ -59,6 +60,21 @@ def test_depth_is_zero_where_alpha_is_below_half() -> None:
     assert frame[0].rgb.max() > 50
     assert frame[0].depth is not None
     assert frame[0].depth.max() == 0
+
+
+def test_classes_are_of_what_takes_half_of_the_light_and_of_the_sky_behind() -> None:
+    world = [Instance(ball((5.0, 0, 0), (1, 0, 0)), instance_id=1, semantic=26)]
+
+    def classes(sky: Sky | None) -> list[int]:
+        wanted = ["semantic"]
+        views = [camera("front", 48, 40)]
+        [frame] = render_cameras(
+            world, views, np.eye(4), sky=sky, modalities=wanted, backend="reference"
+        )
+        return [int(frame.images["semantic"][at]) for at in ((20, 24), (0, 0))]
+
+    assert classes(Sky.uniform((0.5, 0.6, 0.9))) == [26, SEMANTIC_CLASSES["sky"]]
+    assert classes(None) == [26, SEMANTIC_CLASSES["unlabeled"]]
 
 
 def test_pose_of_a_frame_is_the_camera_in_the_world() -> None:

@@ -31,6 +31,8 @@ def output() -> RenderOutput:
         alpha=values,
         depth=values * 50,
         instance=(values * 100).to(torch.uint16),
+        median_depth=values * 49,
+        classes=np.arange(65_536, dtype=np.uint8),
     )
 
 

@@ -20,6 +20,7 @@ from real2sim_server.render import (
     WorldViews,
     rasterize,
     rasterize_worlds,
+    render_cameras,
 )
 from real2sim_server.render.backends import RasterRequest
 from real2sim_server.render.backends.nvrtc import backend as backend_module
@@ -27,9 +28,9 @@ from real2sim_server.render.backends.nvrtc import records
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.render.backends.nvrtc.memory import tile_passes
 from real2sim_server.render.backends.nvrtc.needs import unmet_need
-from real2sim_server.render.backends.nvrtc.tables import Tables, tables_of
+from real2sim_server.render.backends.nvrtc.tables import tables_of
 from real2sim_server.render.rasterize import checked_request, views_of
-from real2sim_server.scene import GaussianCloud, Sky, TimeColour
+from real2sim_server.scene import Camera, GaussianCloud, Sky, TimeColour
 
 from .kernel_twin import COMPILER, NEEDS_COMPILER, TwinLauncher, twin
 
@@ -267,23 +268,36 @@ def test_small_images_of_many_worlds_are_drawn_together() -> None:
 
 
 def test_median_depth_and_class_are_of_the_gaussian_that_halves_the_light(
-    serving: NvrtcBackend, monkeypatch: pytest.MonkeyPatch
+    serving: NvrtcBackend,
 ) -> None:
-    def with_classes(*arguments: object) -> Tables:
-        tables = tables_of(*arguments)  # type: ignore[arg-type]
-        tables.objects["semantic"] = [7, 9]
-        return tables
+    world = [
+        Instance(sheet([4.0], 0.3, 9.0), None, 1, semantic=7),
+        Instance(sheet([8.0], 0.8, 9.0), None, 2, semantic=9),
+    ]
+    [images] = serving.frames(requests_of([(45, 37)], world), ["median_depth", "semantic"])
+    assert images["median_depth"][0, 19, 22] == 8.0
+    assert images["semantic"][0, 19, 22] == 9
 
-    monkeypatch.setattr(backend_module, "tables_of", with_classes)
-    world = [Instance(sheet([4.0], 0.3, 9.0), None, 1), Instance(sheet([8.0], 0.8, 9.0), None, 2)]
-    [request] = requests_of([(45, 37)], world)
-    images = serving._draw([request], ["median", "semantic"])
-    shape = (2, HEIGHT, WIDTH)
-    median, semantic = (
-        backend_module._tensor(images, name, shape) for name in ("median", "semantic")
+
+def test_classes_and_median_depths_are_those_of_the_other_backends(serving: NvrtcBackend) -> None:
+    world = [
+        Instance(cloud(0), semantic=4),
+        Instance(cloud(1), transform_from([1.0, 0, 0], np.eye(4)[0]), 3, semantic=26),
+    ]
+    K = np.array([[40.0, 0, 24], [0, 40, 15], [0, 0, 1]])
+    cameras = [Camera("front", 48, 30, K, np.eye(4))]
+    given, reference, cpu = (
+        render_cameras(world, cameras, np.eye(4), sky=SKY, modalities=modalities, backend=backend)[
+            0
+        ].images
+        for backend in (serving, "reference", "cpu")
+        for modalities in [("semantic", "median_depth")]
     )
-    assert float(median[0, 19, 22]) == 8.0
-    assert int(semantic[0, 19, 22]) == 9
+    assert set(np.unique(reference["semantic"])) == {4, 23, 26}
+    for images in (given, cpu):
+        np.testing.assert_array_equal(images["semantic"], reference["semantic"])
+        np.testing.assert_allclose(images["median_depth"], reference["median_depth"], atol=1e-4)
+    assert given["semantic"].dtype == cpu["semantic"].dtype == np.uint8
 
 
 def test_gradients_are_refused_with_what_gives_them(serving: NvrtcBackend) -> None:

@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from real2sim_proto.semantics import SKY, UNLABELED
+
 from ..types import (
     SMALL_IMAGE_PIXELS,
     Instance,
@@ -74,6 +76,11 @@ def is_reduced(request: RasterRequest) -> bool:
     """Whether a backend that can merge Gaussians does so for this request."""
     small = request.width * request.height <= SMALL_IMAGE_PIXELS
     return request.options.detail == "auto" and small and not needs_gradients(request)
+
+
+def class_behind(request: RasterRequest) -> int:
+    """Class of pixels in which nothing takes half of the light."""
+    return UNLABELED if request.sky is None else SKY
 
 
 def with_colours(request: RasterRequest) -> RasterRequest:

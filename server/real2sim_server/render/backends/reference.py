@@ -60,8 +60,8 @@ class ReferenceBackend:
         if options.track_screen and needs_gradients(request):
             tracker = ScreenTracker(request)
         images = [self._camera(request, placement, c, tracker) for c in range(request.cameras)]
-        rgb, alpha, depth, instance = (
-            torch.stack([image[k] for image in images]) for k in range(4)
+        rgb, alpha, depth, instance, median = (
+            torch.stack([image[k] for image in images]) for k in range(5)
         )
         return RenderOutput(
             rgb=rgb.to(self.image_dtype),
@@ -70,6 +70,7 @@ class ReferenceBackend:
             instance=instance.to(torch.uint16) if options.instance else None,
             timing_ms={"total": (time.perf_counter() - start) * 1e3},
             screen=tracker.statistics if tracker else None,
+            median_depth=median.to(self.image_dtype) if options.median_depth else None,
         )
 
     def _camera(
@@ -78,7 +79,7 @@ class ReferenceBackend:
         placement: Placement,
         camera: int,
         tracker: ScreenTracker | None,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         splats = _concatenate(
             [
                 _project(request, placement, camera, index, self.dtype)
@@ -216,8 +217,9 @@ def _jacobian(means: Tensor, z: Tensor, K: Tensor, width: int, height: int) -> T
 
 def _blend_image(
     splats: _Splats, width: int, height: int, watch: ScreenWatch | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """RGB without background, alpha, depth and instance of the whole image, from square tiles."""
+) -> tuple[Tensor, ...]:
+    """RGB without background, alpha, depth, instance and median depth of the whole image, from
+    square tiles."""
     rows = []
     for y0 in range(0, height, TILE):
         y1 = min(y0 + TILE, height)
@@ -231,8 +233,7 @@ def _blend_image(
                 watch.gather(touching, dx, dy)
             tiles.append(_blend_pixels(splats.select(touching), dx, dy, (y1 - y0, x1 - x0)))
         rows.append([torch.cat(column, dim=1) for column in zip(*tiles, strict=True)])
-    rgb, alpha, depth, instance = (torch.cat(c, dim=0) for c in zip(*rows, strict=True))
-    return rgb, alpha, depth, instance
+    return tuple(torch.cat(column, dim=0) for column in zip(*rows, strict=True))
 
 
 def _overlaps(splats: _Splats, axis: int, low: int, high: int) -> Tensor:
@@ -253,7 +254,7 @@ def _offsets(means2d: Tensor, x0: int, x1: int, y0: int, y1: int) -> tuple[Tenso
 
 def _blend_pixels(
     splats: _Splats, dx: Tensor, dy: Tensor, size: tuple[int, int]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Front-to-back blending of sorted splats in one tile of ``size`` (height, width)."""
     dtype = splats.means2d.dtype
     a, b, c = splats.conics[:, 0:1], splats.conics[:, 1:2], splats.conics[:, 2:3]
@@ -272,7 +273,9 @@ def _blend_pixels(
 
     crossing = (before > 0.5) & (after <= 0.5)
     instance = (crossing * splats.instance_ids[:, None]).sum(0)
-    return rgb.reshape(*size, 3), total.reshape(size), depth.reshape(size), instance.reshape(size)
+    median = (crossing * splats.depths.detach()[:, None]).sum(0)
+    rest = (image.reshape(size) for image in (total, depth, instance, median))
+    return rgb.reshape(*size, 3), *rest
 
 
 def _behind(request: RasterRequest, camera: int, dtype: torch.dtype) -> Tensor:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..encode import EncodedImage
 from ..types import RasterOptions, RenderError, RenderOutput
 
-SWITCHES = ("depth", "instance")
+SWITCHES = ("depth", "instance", "median_depth")
 """Fields of RasterOptions that turn an image of the pass on."""
 
 
@@ -92,7 +92,12 @@ def modality_of(name: str) -> SensorModality:
 def options_for(names: Iterable[str], options: RasterOptions) -> RasterOptions:
     """``options`` with the switches of a pass that draws these modalities."""
     wanted = {modality_of(name).switch for name in names}
-    return replace(options, depth="depth" in wanted, instance="instance" in wanted)
+    return replace(
+        options,
+        depth="depth" in wanted,
+        instance="instance" in wanted,
+        median_depth="median_depth" in wanted,
+    )
 
 
 def modalities_drawn(options: RasterOptions) -> tuple[str, ...]:
@@ -106,8 +111,8 @@ def encode_image(
     """Encode an image of a modality; lossless ones become png where jpeg is asked for.
 
     Args:
-        image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` [m], or
-            [H, W] uint16 ``instance``.
+        image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` or
+            ``median_depth`` [m], [H, W] uint16 ``instance``, or [H, W] uint8 ``semantic``.
         modality: name of a registered one.
         codec: ``raw``, ``jpeg`` or ``png``.
         quality: of jpeg, 1 to 100.

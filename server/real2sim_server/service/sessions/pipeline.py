@@ -49,7 +49,7 @@ from ...geometry.transform import invert_transform
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
 from ...world import Observation, World
-from ..accounts import Account, computing_account, counted_world_time
+from ..accounts import Account, computing_account, count_sent, counted_world_time
 from ..engine import Engine
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
@@ -623,6 +623,8 @@ class StepPipeline:
             (observation,) = await self._renderer.on_encoders(
                 lambda rendered: _with_frames(rendered, frames), [observation]
             )
+        if observation.placed is not None:
+            count_sent(sum(len(f.data) for f in observation.frames if f.codec == "raw"))
         asyncio.get_running_loop().call_soon(self._count, observation)
         return observation
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from real2sim_proto import decode
+from real2sim_proto.base import Modality
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_proto.episode import SensorSpec
 from real2sim_server.geometry.transform import transform_from
@@ -36,6 +38,8 @@ def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) 
         "rgb": rng.integers(0, 255, (height, width, 3)).astype(np.uint8),
         "depth": rng.uniform(0, 90, (height, width)).astype(np.float32),
         "instance": rng.integers(0, 65535, (height, width)).astype(np.uint16),
+        "median_depth": rng.uniform(0, 90, (height, width)).astype(np.float32),
+        "semantic": rng.integers(0, 34, (height, width)).astype(np.uint8),
     }[modality]
     sensor = SensorSpec(camera="front", modalities=[modality], codec=codec)
     return RenderedImage(sensor, modality, 7, np.eye(4), np.eye(3), pixels)
@@ -66,7 +70,7 @@ def test_any_number_of_frames_makes_a_valid_message(frames):
     assert message.id == 5
 
 
-@pytest.mark.parametrize("modality", ["rgb", "depth", "instance"])
+@pytest.mark.parametrize("modality", get_args(Modality))
 def test_raw_pixels_arrive_as_they_were(modality):
     drawn = image("raw", modality)
     frame = encode_frame(drawn)
@@ -76,7 +80,7 @@ def test_raw_pixels_arrive_as_they_were(modality):
     np.testing.assert_array_equal(pixels, drawn.pixels)
 
 
-@pytest.mark.parametrize("modality", ["rgb", "depth", "instance"])
+@pytest.mark.parametrize("modality", get_args(Modality))
 def test_what_is_said_of_a_raw_image_before_it_is_drawn_is_what_it_says_itself(modality):
     camera = Camera("front", 30, 20, np.array([[8.0, 0, 15], [0, 8, 10], [0, 0, 1]]), MOUNTED)
     stands = transform_from(np.array([3.0, 4.0, 0.5]), np.array([0.6, 0.0, 0.0, 0.8]))

@@ -69,6 +69,7 @@ class CpuBackend:
         rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         depth = np.empty(shape if options.depth else (shape[0], 0, 0), np.float32)
         instance = np.empty(shape if options.instance else (shape[0], 0, 0), np.uint16)
+        median = np.empty(shape if options.median_depth else (shape[0], 0, 0), np.float32)
         timing: dict[str, float] = dict.fromkeys(("project", "sort", "tile", "blend", "sky"), 0.0)
         placement = place_instances(request.instances, request.viewmats.detach().cpu())
         with self._work_space() as space:
@@ -76,7 +77,7 @@ class CpuBackend:
                 views = [view_of(request, c) for c in range(request.cameras)]
                 seen = seen_chunks(request, placement, views)
             for c in range(request.cameras):
-                images = Images(rgb[c], alpha[c], depth[c], instance[c])
+                images = Images(rgb[c], alpha[c], depth[c], instance[c], median[c])
                 drawing = _Drawing(request, c, images, space, timing)
                 drawing.draw(placement, seen[c])
         return RenderOutput(
@@ -86,6 +87,7 @@ class CpuBackend:
             instance=torch.from_numpy(instance) if options.instance else None,
             timing_ms=timing,
             between=request.between,
+            median_depth=torch.from_numpy(median) if options.median_depth else None,
         )
 
     def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:

@@ -31,10 +31,10 @@ from .records import (
 )
 from .simd import (
     PLANES,
+    blend_all,
     blend_rgb,
     blend_rgb_depth,
     blend_rgb_depth_instance,
-    blend_rgb_instance,
     lowest_bit,
     prefetch,
     touched_halves,
@@ -59,8 +59,10 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
         background: [3] float32.
     """
     extras = (1 if images.depth.shape[0] else 0) + (2 if images.instance.shape[0] else 0)
+    extras += 4 if images.median.shape[0] else 0
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     rgb, alpha, depth, instance = images.rgb, images.alpha, images.depth, images.instance
+    median = images.median
     for task in prange(TASKS):
         pixels = np.empty(TILE * HALVES * PLANES * LANES, np.float32)
         for tile in range(first_tile + task, last_tile, TASKS):
@@ -68,7 +70,7 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
             going = open_tile(pixels, x0, y0, alpha.shape)
             first, last = starts[tile], starts[tile + 1]
             blend_tile(values, lists, first, last, F32(x0), F32(y0), pixels, going, extras)
-            write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance)
+            write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median)
 
 
 @inlined()
@@ -115,7 +117,9 @@ def blend_half(pixels, half, record, start, rest, extras):
     """Blend one record over eight pixels; zero when all of them are finished."""
     sharpness, depth, instance = record[SHARPNESS], record[DEPTH], record[INSTANCE]
     red, green, blue = record[RED], record[GREEN], record[BLUE]
-    if extras == 3:
+    if extras >= 4:
+        return blend_all(pixels, half, sharpness, start, rest, red, green, blue, depth, instance)
+    if extras >= 2:
         return blend_rgb_depth_instance(
             pixels, half, sharpness, start, rest, red, green, blue, depth, instance
         )
@@ -123,15 +127,11 @@ def blend_half(pixels, half, record, start, rest, extras):
         return blend_rgb_depth(
             pixels, half, sharpness, start, rest, red, green, blue, depth, instance
         )
-    if extras == 2:
-        return blend_rgb_instance(
-            pixels, half, sharpness, start, rest, red, green, blue, depth, instance
-        )
     return blend_rgb(pixels, half, sharpness, start, rest, red, green, blue, depth, instance)
 
 
 @inlined()
-def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
+def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median):
     """Put the background behind the tile and write it to the images."""
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
@@ -148,3 +148,5 @@ def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance):
                 depth[y, x] = pixels[p + 4 * LANES] / total if total > 0 else F32(0)
             if instance.shape[0]:
                 instance[y, x] = np.uint16(pixels[p + 5 * LANES])
+            if median.shape[0]:
+                median[y, x] = pixels[p + 6 * LANES]

@@ -40,6 +40,7 @@ CLOUD_PARTS = ("means", "quats", "scales", "opacities", "sh")
 STAGES = ("project", "sort", "tile", "blend", "sky")
 NOTHING = np.zeros((0, 0), np.float32)
 NO_INSTANCES = np.zeros((0, 0), np.uint16)
+NO_MEDIAN = np.zeros((0, 0), np.float32)
 
 
 class TrainingPass:
@@ -56,6 +57,7 @@ class TrainingPass:
         self.cameras: list[CameraPass] = []
         self.timing = dict.fromkeys(STAGES, 0.0)
         self.instance: Tensor | None = None
+        self.median_depth: Tensor | None = None
         self.screen: ScreenStatistics | None = None
         if request.options.track_screen:
             self.screen = empty_statistics(request)
@@ -92,6 +94,7 @@ class TrainingPasses:
             alpha=alpha,
             depth=depth if request.options.depth else None,
             instance=training.instance,
+            median_depth=training.median_depth,
             timing_ms=training.timing,
             screen=training.screen,
         )
@@ -103,11 +106,14 @@ class TrainingPasses:
         rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         depth = np.empty(shape if options.depth else (shape[0], 0, 0), np.float32)
         instance = np.empty(shape if options.instance else (shape[0], 0, 0), np.uint16)
+        median = np.empty(shape if options.median_depth else (shape[0], 0, 0), np.float32)
         spaces = []
         with self.lock:
             for camera in range(request.cameras):
                 spaces.append(self._idle.pop() if self._idle else Workspace())
-                images = Images(rgb[camera], alpha[camera], depth[camera], instance[camera])
+                images = Images(
+                    rgb[camera], alpha[camera], depth[camera], instance[camera], median[camera]
+                )
                 seen = draw_camera(
                     request, training.placement, training.timing, camera, images, spaces[-1]
                 )
@@ -117,6 +123,8 @@ class TrainingPasses:
         weakref.finalize(training, self._idle.extend, spaces)
         if options.instance:
             training.instance = torch.from_numpy(instance)
+        if options.median_depth:
+            training.median_depth = torch.from_numpy(median)
         return torch.from_numpy(rgb), torch.from_numpy(alpha), torch.from_numpy(depth)
 
     def backward(
@@ -127,7 +135,7 @@ class TrainingPasses:
         with self.lock:
             for camera in range(training.request.cameras):
                 rgb, alpha, depth = (_camera_image(image, camera) for image in images)
-                seen = Images(rgb, alpha, depth, NO_INSTANCES)
+                seen = Images(rgb, alpha, depth, NO_INSTANCES, NO_MEDIAN)
                 by_image = Losses(*(_camera_image(loss, camera) for loss in losses))
                 if losses[0] is None:
                     by_image = by_image._replace(rgb=NOTHING[..., None])

@@ -108,16 +108,18 @@ class Records(NamedTuple):
 
 
 class Images(NamedTuple):
-    """Pictures of one camera; ``depth`` and ``instance`` are [0, 0] where not asked for.
+    """Pictures of one camera; ``depth`` and those after it are [0, 0] where not asked for.
 
     Attributes:
         rgb: [H, W, 3] float32.
         alpha: [H, W] float32.
         depth: [H, W] float32 [m].
         instance: [H, W] uint16.
+        median: [H, W] float32, depth of the Gaussian that takes half of the light [m].
     """
 
     rgb: NDArray[np.float32]
     alpha: NDArray[np.float32]
     depth: NDArray[np.float32]
     instance: NDArray[np.uint16]
+    median: NDArray[np.float32]

@@ -1,7 +1,7 @@
 """The innermost step of blending as explicit vector code: one record over eight pixels.
 
 State of eight pixels is PLANES vectors in a row: transmittance (negative once finished), red,
-green, blue, depth, instance.
+green, blue, depth, instance, median depth.
 """
 
 # Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
@@ -21,7 +21,7 @@ from ..base import ALPHA_MAX, TRANSMITTANCE_MIN
 from .lanes import LANES, VECTOR, Lanes, Planes, lane_numbers, splat
 from .records import EXPONENT_LIMIT, EXPONENT_UNIT
 
-PLANES = 6
+PLANES = 7
 
 
 def _exponential_coefficients(degree: int) -> list[float]:
@@ -74,12 +74,14 @@ def _build_blend(builder: ir.IRBuilder, state: Planes, scalars: list[Any], extra
         halving = builder.and_(before.compare(">", 0.5), after.compare("<=", 0.5))
         crossing = builder.and_(blended, halving)
         state.store(5, state.load(5) + values[-1].where(crossing, 0.0))
+        if extras & 4:
+            state.store(6, state.load(6) + values[3].where(crossing, 0.0))
     mask = builder.bitcast(new.compare(">", 0.0), ir.IntType(LANES))
     return builder.zext(mask, ir.IntType(64))
 
 
 def _blend_intrinsic(extras: int) -> Any:
-    """The intrinsic for RGB (0), with depth (+1), with instance (+2).
+    """The intrinsic for RGB (0), with depth (+1), with instance (+2), with median depth (+4).
 
     In kernels: blend(pixels, half, sharpness, offset, rest, red, green, blue, depth, instance)
     with exponent = (sharpness (lane + offset))^2 + rest; returns zero when all are finished.
@@ -101,8 +103,8 @@ def _blend_intrinsic(extras: int) -> Any:
 
 blend_rgb = _blend_intrinsic(0)
 blend_rgb_depth = _blend_intrinsic(1)
-blend_rgb_instance = _blend_intrinsic(2)
 blend_rgb_depth_instance = _blend_intrinsic(3)
+blend_all = _blend_intrinsic(7)
 
 
 @intrinsic

@@ -19,7 +19,7 @@ from ...types import Instance, RenderOutput
 from ..base import Placement, RasterRequest, needs_gradients, pixel_directions, place_instances
 from ..warm_up import warm_up_requests
 from .gsplat_build import load_kernels
-from .instance import instance_image
+from .instance import instance_image, median_depth_image
 from .needs import kernels_for_device
 from .screen import track_screen
 from .stage_times import StageTimes
@@ -59,6 +59,11 @@ class CudaBackend:
             with times.stage("instance"):
                 shape = (request.cameras, request.height, request.width)
                 instance = instance_image(meta, world.instance_ids, shape)
+        median_depth = None
+        if options.median_depth:
+            with times.stage("instance"):
+                shape = (request.cameras, request.height, request.width)
+                median_depth = median_depth_image(meta, shape, self.device)
         with times.stage("sky"):
             rgb = rgb + (1 - alpha)[..., None] * _behind(on_device)
         return RenderOutput(
@@ -68,6 +73,7 @@ class CudaBackend:
             instance=instance,
             timing_ms=times.read(),
             screen=screen,
+            median_depth=median_depth,
         )
 
     def warm_up(self) -> None:

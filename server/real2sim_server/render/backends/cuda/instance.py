@@ -1,4 +1,5 @@
-"""Instance images on the GPU, which gsplat has no mode for: a walk over its tile lists.
+"""Instance and median depth images on the GPU, which gsplat has no mode for: a walk over its
+tile lists.
 
 Needs numba-cuda. The kernel also runs in Numba's CUDA simulator, where it is tested.
 """
@@ -33,10 +34,27 @@ def instance_image(
         instance_ids: [N] int32, of each Gaussian given to gsplat.
         shape: C, H, W.
     """
-    image = torch.zeros(shape, dtype=torch.int32, device=instance_ids.device)
     if meta is None:
-        return image.to(torch.uint16)
-    ids = instance_ids[meta["gaussian_ids"].long()]
+        return torch.zeros(shape, dtype=torch.int32, device=instance_ids.device).to(torch.uint16)
+    return _numbers_image(meta, instance_ids[meta["gaussian_ids"].long()], shape).to(torch.uint16)
+
+
+def median_depth_image(
+    meta: dict[str, Any] | None, shape: tuple[int, int, int], device: torch.device
+) -> Tensor:
+    """Median depths [C, H, W] float32 [m] on the device, 0 where no Gaussian takes half of the
+    light; arguments as of :func:`instance_image`."""
+    if meta is None:
+        return torch.zeros(shape, device=device)
+    # Whose bits are the kernel's numbers; those of 0 are 0.
+    bits = meta["depths"].detach().float().contiguous().view(torch.int32)
+    return _numbers_image(meta, bits, shape).view(torch.float32)
+
+
+def _numbers_image(meta: dict[str, Any], ids: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """[C, H, W] int32: of ``ids`` [V], one for each projected Gaussian, that of the one which takes
+    half of the light; 0 where there is none."""
+    image = torch.zeros(shape, dtype=torch.int32, device=ids.device)
     arrays = (meta["means2d"], meta["conics"], meta["opacities"], ids)
     lists = (meta["isect_offsets"].reshape(shape[0], -1).int(), meta["flatten_ids"].int())
     cameras, height, width = shape
@@ -46,7 +64,7 @@ def instance_image(
         cuda.as_cuda_array(tensor.detach().contiguous()) for tensor in (*arrays, *lists, image)
     ]
     find_instances[blocks, (*THREADS, 1), stream](*given, meta["tile_size"], meta["tile_width"])
-    return image.to(torch.uint16)
+    return image
 
 
 def instance_signature() -> Any:

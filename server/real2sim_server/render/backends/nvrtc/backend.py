@@ -33,8 +33,16 @@ MAX_PIXELS = 1 << 30
 """Of a frame: the kernels count them by 32 bits, and memory is limited."""
 SEEN_SHARE = 4
 """At first one in so many Gaussians of each camera is thought to be seen."""
-FINISHED = {"rgb": "bytes", "depth": "solid", "instance": "instance"}
+FINISHED = {
+    "rgb": "bytes",
+    "depth": "solid",
+    "instance": "instance",
+    "median_depth": "median",
+    "semantic": "semantic",
+}
 """Images as they leave the renderer, by modality."""
+OUTPUTS = {"depth": "depth", "instance": "instance", "median_depth": "median"}
+"""Images on the device, by the option that asks for them."""
 
 
 class NvrtcBackend:
@@ -71,7 +79,7 @@ class NvrtcBackend:
         """Draw requests of one size and the same options together, see BatchBackend."""
         start = time.perf_counter()
         options = requests[0].options
-        asked = (name for name in ("depth", "instance") if getattr(options, name))
+        asked = (OUTPUTS[switch] for switch in OUTPUTS if getattr(options, switch))
         names = ["rgb", "alpha", *asked]
         parts: dict[str, list[Tensor]] = {name: [] for name in names}
         pieces = [(k, piece) for k, request in enumerate(requests) for piece in _pieces(request)]
@@ -89,6 +97,7 @@ class NvrtcBackend:
             alpha=whole["alpha"],
             depth=whole.get("depth"),
             instance=whole.get("instance"),
+            median_depth=whole.get("median"),
             timing_ms={"total": (time.perf_counter() - start) * 1e3},
         )
 

@@ -61,7 +61,7 @@ CAMERA = _structure(
         ("directions", _FLOAT, (3, 3)),
         ("background", _FLOAT, (3,)),
         *_counts("sky_resolution", "width", "height", "tiles_x", "tiles_y"),
-        *_counts("first_tile", "first_pixel", "unused"),
+        *_counts("first_tile", "first_pixel", "behind"),
     ],
 )
 IMAGES: dict[str, tuple[type, tuple[int, ...]]] = {
@@ -71,7 +71,7 @@ IMAGES: dict[str, tuple[type, tuple[int, ...]]] = {
     "median": (np.float32, ()),
     "solid": (np.float32, ()),
     "instance": (np.uint16, ()),
-    "semantic": (np.uint16, ()),
+    "semantic": (np.uint8, ()),
     "bytes": (np.uint8, (3,)),
 }
 """Images that a pass can write: dtype of a number, and channels."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...types import Instance
-from ..base import CLAMP_MARGIN, RasterRequest
+from ..base import CLAMP_MARGIN, RasterRequest, class_behind
 from .launcher import Launcher
 from .records import CAMERA, OBJECT, PIECE, PLACEMENT, TILE
 from .residence import Residence
@@ -111,7 +111,8 @@ def _is_same(a: Instance, b: Instance) -> bool:
     if a is b:
         return True
     timeless = a.colour is b.colour and (a.colour is None or a.t_us == b.t_us)
-    plain = a.covars is b.covars and a.scale == b.scale and a.instance_id == b.instance_id
+    ids = a.instance_id == b.instance_id and a.semantic == b.semantic
+    plain = a.covars is b.covars and a.scale == b.scale and ids
     return a.cloud is b.cloud and timeless and plain and _is_same_pose(a, b)
 
 
@@ -139,6 +140,7 @@ def _cameras(
     skies = [(residence.sky(r.sky), r.sky.resolution) if r.sky else (0, 0) for r in requests]
     table["sky"] = np.repeat(np.array([sky for sky, _ in skies], np.uint64), counts)
     table["sky_resolution"] = np.repeat([resolution for _, resolution in skies], counts)
+    table["behind"] = np.repeat([class_behind(request) for request in requests], counts)
     table["width"], table["height"] = size[:, 0], size[:, 1]
     table["tiles_x"], table["tiles_y"] = (-(-size // TILE)).T
     table["first_tile"] = _sums_before(table["tiles_x"] * table["tiles_y"])
@@ -160,6 +162,7 @@ def _objects(
     table["cameras"] = [item.cameras for item in drawn]
     table["scale"] = [item.instance.scale for item in drawn]
     table["instance"] = [item.instance.instance_id for item in drawn]
+    table["semantic"] = [item.instance.semantic for item in drawn]
     moved: list[Tensor] = []
     tones: list[NDArray[np.float32]] = []
     for row, item in enumerate(drawn):

@@ -63,7 +63,7 @@ HALVES = TILE // LANES
 @kernel(parallel=PARALLEL_LOOPS, fastmath={"contract", "nsz", "arcp"})
 def draw_images(
     table, tones, draws, linear, offset, camera_position, scale, first_draws, views, cell_pixels,
-    background, faces, sky_matrices, work, rgb, alpha, depth, instance
+    background, faces, sky_matrices, work, rgb, alpha, depth, instance, median
 ):  # fmt: skip
     """Draw M images, each on one core.
 
@@ -83,11 +83,13 @@ def draw_images(
         work: values [S, G, RECORD] float32, footprints [S, G] int64, depths [S, G] float32,
             pairs [2, S, G] uint64 and chosen [S, G] int64; G Gaussians of the largest image, for
             each of S threads.
-        rgb, alpha, depth, instance: [M, H, W, 3], [M, H, W] and [M, H, W] or [M, 0, 0], written.
+        rgb, alpha: [M, H, W, 3] and [M, H, W], written.
+        depth, instance, median: [M, H, W], written, or [M, 0, 0].
     """
     values, footprints, depths, pairs, chosen = work
     slots = values.shape[0]
     extras = (1 if depth.shape[1] else 0) + (2 if instance.shape[1] else 0)
+    extras += 4 if median.shape[1] else 0
     for slot in prange(slots):
         planes = np.empty(PROJECTION * LANES, np.float32)
         found = np.empty(LANES, np.int64)
@@ -112,6 +114,7 @@ def draw_images(
                 rgb[image], alpha[image],
                 depth[image] if depth.shape[1] else depth[0],
                 instance[image] if instance.shape[1] else instance[0],
+                median[image] if median.shape[1] else median[0],
             )  # fmt: skip
             if faces.shape[1] > 0:
                 sky_image(faces, sky_matrices[image], rgb[image], alpha[image])
@@ -366,7 +369,9 @@ def tile_lists(values, footprints, order, shape):
 
 
 @inlined()
-def blend_image(values, lists, starts, pixels, extras, background, rgb, alpha, depth, instance):
+def blend_image(
+    values, lists, starts, pixels, extras, background, rgb, alpha, depth, instance, median
+):
     """Blend all tiles of an image."""
     tiles_x = (alpha.shape[1] + TILE - 1) // TILE
     for tile in range(starts.shape[0] - 2):
@@ -374,7 +379,7 @@ def blend_image(values, lists, starts, pixels, extras, background, rgb, alpha, d
         going = open_tile(pixels, x0, y0, alpha.shape)
         first, last = starts[tile], starts[tile + 1]
         blend_tile(values, lists, first, last, F32(x0), F32(y0), pixels, going, extras)
-        write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance)
+        write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median)
 
 
 @inlined()

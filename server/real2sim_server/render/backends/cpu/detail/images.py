@@ -59,6 +59,7 @@ class SmallImages:
         rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         depth = np.empty(shape if options.depth else (1, 0, 0), np.float32)
         instance = np.empty(shape if options.instance else (1, 0, 0), np.uint16)
+        median = np.empty(shape if options.median_depth else (1, 0, 0), np.float32)
         background = (0.0, 0.0, 0.0) if like.sky is not None else options.background
         draw_images(
             draws.table,
@@ -79,6 +80,7 @@ class SmallImages:
             alpha,
             depth,
             instance,
+            median,
         )
         return RenderOutput(
             rgb=torch.from_numpy(rgb),
@@ -86,6 +88,7 @@ class SmallImages:
             depth=torch.from_numpy(depth) if options.depth else None,
             instance=torch.from_numpy(instance) if options.instance else None,
             timing_ms=timing,
+            median_depth=torch.from_numpy(median) if options.median_depth else None,
         )
 
     def _work(self, slots: int, gaussians: int) -> tuple[NDArray[np.generic], ...]:

@@ -77,7 +77,8 @@ __device__ __forceinline__ void write_pixel(
     if (frame.solid) frame.solid[at] = alpha >= 0.5f ? depth : 0.0f;
     if (frame.median) frame.median[at] = pixel.median;
     if (frame.instance) frame.instance[at] = uint16(pixel.ids);
-    if (frame.semantic) frame.semantic[at] = uint16(pixel.ids >> 16);
+    if (frame.semantic)
+        frame.semantic[at] = uint8(pixel.transmittance <= 0.5f ? pixel.ids >> 16 : camera.behind);
 }
 
 // Whether a splat can show on the pixels of a warp, of which the centres lie from (x_low, y_low) to

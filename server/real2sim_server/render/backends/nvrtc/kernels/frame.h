@@ -65,7 +65,7 @@ struct Camera {
     uint32 tiles_x, tiles_y;
     uint32 first_tile;     // counted through all cameras
     uint32 first_pixel;
-    uint32 unused;
+    uint32 behind;         // class of pixels in which nothing takes half of the light
 };
 static_assert(sizeof(Camera) == 120, "Camera differs from records.py");
 
@@ -95,7 +95,7 @@ struct Frame {
     float* median;          // [pixels] depth at which transmittance falls to 0.5 [m]
     float* solid;           // [pixels] expected depth, 0 where alpha is below 0.5 [m]
     uint16* instance;       // [pixels]
-    uint16* semantic;       // [pixels]
+    uint8* semantic;        // [pixels]
     uint8* bytes;           // [pixels, 3] rgb as 0 to 255
     uint32 object_count, camera_count;
     uint32 pieces, entries;
