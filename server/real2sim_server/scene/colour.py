@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -78,7 +79,13 @@ class TimeColour:
 
 def colour_basis(phase: float, count: int, basis: str) -> Tensor:
     """Values [count] float32 of the basis functions at ``phase``, held to [0, 1]."""
-    return torch.from_numpy(_basis_values(np.array([phase]), count, basis)[0])
+    return torch.from_numpy(_values_at(phase, count, basis).copy())
+
+
+@lru_cache(maxsize=1024)
+def _values_at(phase: float, count: int, basis: str) -> NDArray[np.float32]:
+    """Of one instant: the objects of a scene mostly have colours over the same span of time."""
+    return _basis_values(np.array([phase]), count, basis)[0]
 
 
 def _basis_values(phases: NDArray[np.float64], count: int, basis: str) -> NDArray[np.float32]:

@@ -153,11 +153,7 @@ def next_in_strip(knots, s, box, bodies, own):
         [m/s].
     """
     offset, length, width = box
-    strip = np.empty((REACH, 3))
-    for i in range(REACH):
-        x, y, _, yaw = point_at(knots, s + i)
-        strip[i, 0], strip[i, 1] = x - offset * math.sin(yaw), y + offset * math.cos(yaw)
-        strip[i, 2] = yaw
+    strip = _strip(knots, s, offset)
     gap, speed = math.inf, 0.0
     for k in range(len(bodies)):
         if k == own:
@@ -176,6 +172,30 @@ def next_in_strip(knots, s, box, bodies, own):
         if free < gap:
             gap, speed = free, body[5] * cos + body[6] * sin
     return gap, speed
+
+
+@kernel
+def _strip(knots, s, offset):
+    """Places x, y [m] and heading [rad] [REACH, 3] one metre apart from ``s`` on, ``offset`` to the
+    left of the path: what :func:`point_at` gives, whose search each place would begin anew."""
+    found = np.empty((REACH, 3))
+    end, after = knots[len(knots) - 1, 0], _first_not_before(knots, s)
+    for i in range(REACH):
+        at = s + i
+        while after < len(knots) and knots[after, 0] < at:
+            after += 1
+        x, y, yaw = (
+            _between(knots, after, at, 1),
+            _between(knots, after, at, 2),
+            _between(knots, after, at, 4),
+        )
+        beyond = at - min(max(at, 0.0), end)
+        if beyond != 0.0 or offset != 0.0:
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            x, y = x + beyond * cos, y + beyond * sin
+            x, y = x - offset * sin, y + offset * cos
+        found[i, 0], found[i, 1], found[i, 2] = x, y, yaw
+    return found
 
 
 @kernel
@@ -204,7 +224,12 @@ def _first_not_before(knots, s):
 @kernel
 def _along(knots, s, column):
     """A column of the path at distance ``s``, linear between poses, constant beyond both ends."""
-    after = _first_not_before(knots, s)
+    return _between(knots, _first_not_before(knots, s), s, column)
+
+
+@kernel
+def _between(knots, after, s, column):
+    """The same where ``after`` is the number of the first pose at ``s`` or farther."""
     if after == 0:
         return knots[0, column]
     if after == len(knots):

@@ -19,8 +19,9 @@ from .draw import draw_images
 from .hierarchy import Hierarchy, deformed_hierarchy, hierarchy_of
 from .pointers import table_of
 
-CELL_PIXELS = 2.0
-"""Merged cells are at most this large on the image [px]."""
+CELL_PIXELS = 2.5
+"""Merged cells are at most this large on the image [px]. It takes a seventh less time than 2 and is
+0.7 dB farther from a large image scaled down; 3 takes a fifth less, and is 1.4 dB farther."""
 PIXEL_VARIANCE = 0.1
 """Blur of a pixel, little more than that of its own square (1/12) [px^2]. With the usual 0.3 and no
 opacity taken back, Gaussians smaller than a pixel grow together: 8 dB farther from a large image
