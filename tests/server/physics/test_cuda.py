@@ -1,109 +1,228 @@
-"""The CUDA backend against the reference, in Numba's simulator: two processes for all scenes.
+"""The CUDA backend against the CPU's: its kernels run on the CPU, line for line.
 
-The simulator takes seconds a scene, so every run sees one of each kind and the slow ones all.
+Both find the same to rounding: they add up in the same order, particle after particle, and take
+laws and contact from one source.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
+import functools
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
-from numba import cuda
 
-from real2sim_server.physics import SolverError
-from real2sim_server.physics.backends.cuda.backend import CudaSolverBackend
-
-ROOT = Path(__file__).parents[3]
-MATERIALS = ("FixedCorotated", "NeoHookean", "Metal", "Foam", "Sand", "Snow")
-SCENES = (
-    *MATERIALS,
-    "slope",
-    "moving box",
-    "height field",
-    "glue",
-    "post",
-    "two bodies",
-    "leaving",
+from real2sim_server.physics import (
+    Box,
+    HeightField,
+    ParticleError,
+    Plane,
+    Solver,
+    SolverError,
 )
-TOUCHES = dict.fromkeys(SCENES, 1) | {"two bodies": 2, "leaving": 0}
-CASES = ("free_fall", "affine_patch", "spin", "invariants")
-ALWAYS = ("Metal", "Sand", "height field", "post", "two bodies", "leaving", "free_fall")
-TOLERANCES = {"Metal": 1e-7, "Foam": 1e-7}
-"""Compiled laws hold the sqrt(2/3) of von Mises in single precision, the reference in double."""
-pytestmark = pytest.mark.timeout(300, func_only=True)
+from real2sim_server.physics.backends.base import SolverDiverged
+from real2sim_server.physics.backends.cuda import backend as cuda_backend
+from real2sim_server.physics.backends.cuda.backend import CudaSolverBackend
+from real2sim_server.physics.materials import Snow, Structure
+
+from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
+from .kernel_twin import TwinLauncher
+from .on_twin import on_twin
+from .scenes import SOFT, at, cube, ground, solve
+from .test_backends import MATERIALS, STATE, crash, mixed
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason=NEEDS_COMPILER)
+TOLERANCE = 1e-8
+"""Of numbers in double precision, against one and the largest of them: what rounding grows to."""
 
 
-def simulate(*names: str) -> dict[str, Any]:
-    program = [sys.executable, "-W", "error::RuntimeWarning", "-m"]
-    done = subprocess.run(
-        [*program, "tests.server.physics.simulated_cuda", *names],
-        cwd=ROOT,
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
+def both(make: Callable[[], Solver], seconds: float) -> tuple[Solver, Solver]:
+    """The same scene on the CPU and on the device, that much later."""
+    runs = make(), on_twin(make)
+    for run in runs:
+        run.step(seconds)
+    return runs
+
+
+def assert_alike(runs: tuple[Solver, Solver], tolerance: float = TOLERANCE) -> None:
+    expected, found = (run.particles() for run in runs)
+    for name in STATE:
+        scale = 1 + np.abs(getattr(expected, name)).max()
+        off = np.abs(getattr(found, name) - getattr(expected, name)).max() / scale
+        assert off < tolerance, name
+    touched, same = (run.contacts for run in runs)
+    assert [(c.body, c.other) for c in same] == [(c.body, c.other) for c in touched]
+    for a, b in zip(touched, same, strict=True):
+        np.testing.assert_allclose(b.impulse, a.impulse, atol=1e3 * tolerance)
+        np.testing.assert_allclose(b.moment, a.moment, atol=1e3 * tolerance)
+        assert b.friction_work == pytest.approx(a.friction_work, abs=1e3 * tolerance)
+        assert b.work == pytest.approx(a.work, abs=1e3 * tolerance)
+    for name in ("momentum", "angular_momentum", "kinetic", "elastic"):
+        np.testing.assert_allclose(
+            getattr(runs[1].measure, name), getattr(runs[0].measure, name), atol=1e3 * tolerance
+        )
+    assert runs[1].measure.max_wave_speed == pytest.approx(
+        runs[0].measure.max_wave_speed, rel=1e3 * tolerance
     )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
 
 
-@pytest.fixture(scope="module")
-def always() -> dict[str, Any]:
-    return simulate(*ALWAYS)
+@pytest.mark.parametrize("material", MATERIALS, ids=lambda m: type(m).__name__)
+def test_materials_crash_as_on_the_cpu(material):
+    runs = both(lambda: crash(material, "cpu"), 0.008)
+    assert_alike(runs)
+    assert len(runs[0].contacts) == 2
 
 
-@pytest.fixture(scope="module")
-def besides() -> dict[str, Any]:
-    return simulate(*{*SCENES, *CASES} - {*ALWAYS})
+COLLIDERS = [
+    Plane(name="slope", normal=(0.3, 0, 1), friction=0.2),
+    Box(name="box", T_world_box=at(0, 0, -0.2), size=(0.5, 0.5, 0.4), velocity=(0.5, 0, 1)),
+    Box(name="spun", T_world_box=at(0, 0, -0.2), size=(1, 1, 0.4), angular_velocity=(0, 1, 3)),
+    HeightField(
+        name="hills",
+        heights=0.1 * np.sin(np.arange(36.0)).reshape(6, 6) - 0.05,
+        origin=(-1.03, -1.07),
+        spacing=0.4,
+    ),
+    Plane(name="glue", friction=float("inf"), separable=False),
+    Box(name="plate", T_world_box=at(0, 0, -0.01), size=(0.5, 0.5, 0.02), friction=0.3),
+    Box(name="post", T_world_box=at(0.03, 0, -0.01), size=(0.03, 2, 0.02), velocity=(1, 0, 1)),
+]
 
 
-@pytest.fixture
-def simulated(request: pytest.FixtureRequest, name: str) -> dict[str, Any]:
-    return request.getfixturevalue("always" if name in ALWAYS else "besides")
+@pytest.mark.parametrize("collider", COLLIDERS, ids=lambda c: c.name)
+def test_colliders_are_touched_as_on_the_cpu(collider):
+    def thrown() -> Solver:
+        body = cube(position=(0.02, 0.01, 0.13), edge=0.2, velocity=(0.5, 0, -6))
+        return solve([body], [collider], precision="double", dt_max=5e-4)
+
+    runs = both(thrown, 0.01)
+    assert_alike(runs)
+    assert [c.other for c in runs[1].contacts] == [collider.name]
 
 
-def every(*names: str) -> pytest.MarkDecorator:
-    marked = [n if n in ALWAYS else pytest.param(n, marks=pytest.mark.slow) for n in names]
-    return pytest.mark.parametrize("name", marked)
+def test_laws_side_by_side_are_those_of_the_cpu():
+    runs = both(lambda: mixed("cpu", "double"), 0.01)
+    assert np.abs(runs[0].particles().history).max() > 1e-4
+    assert_alike(runs)
 
 
-@every(*SCENES)
-def test_the_device_follows_the_reference(simulated, name):
-    off = dict(simulated["reference"][name])
-    assert off.pop("contacts") == TOUCHES[name]
-    bound = TOLERANCES.get(name, 1e-9)
-    assert {field: value for field, value in off.items() if not value < bound} == {}
+def test_single_precision_stays_near_the_cpu():
+    runs = both(lambda: mixed("cpu", "single"), 0.01)
+    expected, found = (run.particles() for run in runs)
+    assert np.abs(found.positions - expected.positions).max() < 1e-6
+    assert np.abs(found.velocities - expected.velocities).max() < 1e-3
+    assert np.abs(found.F_total - expected.F_total).max() < 1e-4
 
 
-@every(*MATERIALS)
-def test_the_device_follows_the_compiled_cpu(simulated, name):
-    off = dict(simulated["cpu"][name])
-    assert off.pop("contacts") == TOUCHES[name]
-    assert {field: value for field, value in off.items() if not value < 1e-9} == {}
+def travelling(precision: str = "double") -> Solver:
+    body = cube(edge=0.2, velocity=(30, -20, 10), angular_velocity=(0, 30, 60))
+    return solve([body], precision=precision, gravity=(0, 0, 0), dt_max=5e-4)
 
 
-def test_single_precision_stays_near_double(always):
-    assert 1e-12 < always["single"]["positions"] < 1e-6
-    assert always["single"]["F_elastic"] < 1e-4
+def test_bodies_travel_through_blocks_and_the_host_sorts_before_they_leave_theirs():
+    launchers: list[TwinLauncher] = []
+
+    def launcher(precision: str) -> TwinLauncher:
+        launchers.append(TwinLauncher(precision))
+        return launchers[-1]
+
+    runs = travelling(), on_twin(travelling, launcher)
+    for run in runs:
+        report = run.step(0.03)
+    assert_alike(runs)
+    asked = launchers[0].launches
+    assert asked["find_keys"] > 3
+    # One to begin with, and one for each check: nothing was found halted.
+    assert asked["begin_run"] == 1 + -(-report.substeps // 16)
 
 
-def test_a_run_that_is_taken_back_goes_on_as_before(always):
-    assert always["restored"] < 1e-12
+def test_a_particle_that_leaves_its_tile_stops_the_device_until_all_are_sorted(monkeypatch):
+    monkeypatch.setattr(cuda_backend, "CAUTION", 0.0)
+    assert_alike(both(travelling, 0.01))
 
 
-@every(*CASES)
-def test_the_cheap_cases_of_the_table_hold(simulated, name):
-    lines = [line for line in simulated["lines"] if line["case"] == name]
-    assert lines
-    assert [line for line in lines if not line["passed"]] == []
+def many(precision: str = "single") -> Solver:
+    """Two bodies of three laws on a thin plate that moves, and on the ground."""
+    kinds = (Snow(density=200), Structure(young=2e5, density=200), SOFT)
+    bodies = [
+        cube(
+            position=(0.02, 0.01, 0.14),
+            edge=0.2,
+            material=kinds,
+            regions=np.arange(4**3) % len(kinds),
+            velocity=(0.5, 0, -6),
+        ),
+        cube("second", (0.05, 0.0, 0.36), edge=0.2, velocity=(0, 0, -9)),
+    ]
+    plate = Box(name="plate", T_world_box=at(0, 0, 0.01), size=(1, 0.1, 0.02), velocity=(1, 0, 0))
+    return solve(bodies, [ground(), plate], precision=precision, dt_max=2.5e-4)
 
 
-def test_without_a_device_the_reason_is_given(monkeypatch):
-    monkeypatch.setattr(cuda, "is_available", lambda: False)
+def test_the_order_of_blocks_and_threads_does_not_change_a_bit():
+    states = []
+    for backwards in (False, True):
+        run = on_twin(many, functools.partial(TwinLauncher, backwards=backwards))
+        run.step(0.012)
+        assert len(run.contacts) >= 3
+        totals = [np.concatenate([c.impulse, c.moment]) for c in run.contacts]
+        states.append([getattr(run.particles(), name) for name in STATE] + totals)
+    for one, other in zip(*states, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def test_bodies_plates_and_laws_together_are_those_of_the_cpu():
+    assert_alike(both(lambda: many("double"), 0.008))
+
+
+def test_a_restored_snapshot_goes_on_to_the_same_bits():
+    run = on_twin(many)
+    run.step(0.004)
+    kept = run.snapshot()
+    ends = []
+    for _ in range(2):
+        run.step(0.006)
+        ends.append((run.particles(), run.contacts))
+        run.restore(kept)
+    for name in STATE:
+        assert getattr(ends[0][0], name).tobytes() == getattr(ends[1][0], name).tobytes()
+    for one, other in zip(ends[0][1], ends[1][1], strict=True):
+        np.testing.assert_allclose(one.impulse, other.impulse, rtol=1e-12)
+
+
+def test_lists_that_outgrow_their_memory_are_made_again():
+    def scattered() -> Solver:
+        bodies = [cube(f"{k}", (k * 0.31, 0.2 * k, 0.06), edge=0.1) for k in range(40)]
+        return solve(bodies, [ground()], precision="double", dt_max=2.5e-4)
+
+    runs = both(scattered, 0.001)
+    simulation: Any = runs[1].simulation
+    assert simulation._sizes.contacts > 64
+    assert_alike(runs)
+
+
+def test_what_leaves_the_numbers_is_found_and_taken_back():
+    run = on_twin(many)
+    simulation = run.simulation
+    kept = simulation.save()
+    before = simulation.particles().positions
+    with pytest.raises(SolverDiverged):
+        simulation.advance(16, 10.0, run.colliders)
+    simulation.restore(kept)
+    assert simulation.particles().positions.tobytes() == before.tobytes()
+    assert simulation.measure().finite
+    simulation.advance(1, 1e-4, run.colliders)
+    assert simulation.measure().finite
+
+
+def test_particles_beyond_the_grid_are_refused():
+    def far() -> Solver:
+        return solve([cube(position=(3e4, 0, 0), edge=0.1, velocity=(1, 0, 0))])
+
+    with pytest.raises(ParticleError, match="must stay within"):
+        on_twin(far)
+
+
+def test_without_a_device_the_reason_is_given():
     with pytest.raises(SolverError, match=r"'cuda' is not usable here: .*NVIDIA GPU.*take 'cpu'"):
         CudaSolverBackend()

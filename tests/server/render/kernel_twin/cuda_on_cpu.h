@@ -1,4 +1,5 @@
-// As much of CUDA as the serving kernels use, so that their source runs on a CPU, thread by thread.
+// As much of CUDA as our kernels use, so that their source runs on a CPU, thread by thread. Before it
+// is included, FIBERS says how many threads a block has.
 //
 // The threads of a block are fibers of one thread of the machine. A fiber runs until it waits for
 // its warp or its block; when all those are waiting, they go on. Kernels in which a thread waits for
@@ -14,10 +15,10 @@
 #include <ucontext.h>
 
 #define __global__
-#define __device__ static
+#define __device__
 #define __shared__ static
 #define __forceinline__ inline
-#define __launch_bounds__(threads)
+#define __launch_bounds__(...)
 
 struct alignas(16) float4 { float x, y, z, w; };
 struct alignas(8) uint2 { unsigned x, y; };
@@ -47,7 +48,13 @@ static inline unsigned atomicAdd(unsigned* at, unsigned value) {
     return old;
 }
 
-constexpr unsigned FIBERS = 256, LANES = 32;
+static inline unsigned atomicOr(unsigned* at, unsigned value) {
+    const unsigned old = *at;
+    *at = old | value;
+    return old;
+}
+
+constexpr unsigned LANES = 32;
 constexpr size_t STACK = 1 << 16;
 enum State { RUNS, WAITS_FOR_WARP, WAITS_FOR_BLOCK, ENDED };
 static State states[FIBERS];
@@ -60,6 +67,7 @@ static void wait_as(State state) {
     if (_setjmp(places[self]) == 0) _longjmp(scheduler, 1);
 }
 static void __syncthreads() { wait_as(WAITS_FOR_BLOCK); }
+static void __syncwarp() { wait_as(WAITS_FOR_WARP); }
 static bool __syncthreads_and(bool value) {
     const unsigned self = threadIdx.x;
     exchanged[self] = value;

@@ -1,1 +1,1 @@
-"""The CUDA backend: the same blocks and per-particle functions on an NVIDIA GPU."""
+"""The CUDA backend: kernels of our own by NVRTC, laws and contact from the source of the CPU."""

@@ -1,31 +1,52 @@
-"""The CUDA backend: the CPU's blocks and functions on an NVIDIA GPU, or in Numba's simulator.
+"""The CUDA backend: particles, their order, the grid and all sums stay on an NVIDIA GPU.
 
-Particles stay on the device; the host sorts them by their positions alone. Sums of floating-point
-numbers are made by atomics, so the last bits differ from run to run.
+Between two checks of the solver the host queues launches that do not depend on what particles do,
+and reads one report. A particle that leaves its tile stops the substeps that follow on the device;
+the host finds that in the report, has all sorted, and goes on from there. Mostly it need not: from
+the last report it knows how far particles can come, and has them sorted before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, cast
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numba import cuda
+from numpy.typing import NDArray
+from torch import Tensor
 
 from ....geometry.rotation import Float
 from ...colliders import Collider
-from ...errors import SolverError
-from ..base import Model
-from ..blocks import BlockSimulation
-from ..layout import Int, Layout
-from ..particle import COLUMNS, ParticleState, StepParameters, Workspace
-from .kernels import DONE, HALTED, MEASURE_THREADS, NEEDS_RESORT, NODE_THREADS, THREADS, kernels_of
+from ...contact.collider_distance import AXES, POINT, SPEED, SPIN
+from ...errors import ParticleError, SolverError
+from ..base import Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
+from ..layout import (
+    BLOCK,
+    BODY_BITS,
+    COLLIDER_MARGIN,
+    COORDINATE_BITS,
+    COORDINATE_LIMIT,
+)
+from . import records as r
+from .launcher import CudaLauncher, Launch, Launcher
+from .memory import SolverMemory
+from .needs import unmet_need
+from .sequences import arranging, flushing, measuring, substeps
 
-REORDER_THREADS = 256
+TILE_REACH, SORTED_REACH = 3.0, 2.0
+"""How far particles may be from the middle of their block along an axis [cells]: at most, and after
+they have been sorted."""
+CAUTION = 1.25
+"""Particles are taken to come so much further than at the speed of the last check."""
 
 
 class CudaSolverBackend:
     """Solver for NVIDIA GPUs.
+
+    Args:
+        launcher: of the device for a precision; default: torch's current CUDA device.
 
     Raises:
         SolverError: where there is none that works.
@@ -33,112 +54,244 @@ class CudaSolverBackend:
 
     name = "cuda"
 
-    def __init__(self) -> None:
-        try:
-            usable = bool(cuda.is_available())
-            reason = "no CUDA device was found"
-        except Exception as problem:
-            usable, reason = False, f"{type(problem).__name__}: {problem}"
-        if not usable:
+    def __init__(self, launcher: Callable[[str], Launcher] | None = None) -> None:
+        need = unmet_need() if launcher is None else None
+        if need is not None:
             raise SolverError(
-                f"backend 'cuda' is not usable here: {reason}; it needs an NVIDIA GPU with its "
-                "driver and the extra `real2sim[cuda]`; take 'cpu'"
+                f"backend 'cuda' is not usable here: {need.found}; {need.remedy}; it needs an "
+                "NVIDIA GPU with its driver and the extra `real2sim[cuda]`; take 'cpu'"
             )
+        self._launcher = launcher or CudaLauncher
 
     def start(self, model: Model, colliders: Sequence[Collider]) -> CudaSimulation:
         """Load a model in its precision."""
-        return CudaSimulation(model, colliders)
+        precision = "single" if np.dtype(model.dtype).itemsize == 4 else "double"
+        return CudaSimulation(self._launcher(precision), model, colliders)
 
 
-class CudaSimulation(BlockSimulation):
+@dataclass(frozen=True, eq=False)
+class _Saved:
+    """Particles and totals on the device, and what was read of them."""
+
+    particles: Tensor
+    totals: Tensor
+    report: NDArray[np.uint8]
+
+
+class CudaSimulation:
     """A model in motion on the device."""
 
-    def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
-        self._kernels = kernels_of(cast("Any", model.dtype))
-        self._progress = cuda.to_device(np.zeros(3, np.int64))
-        super().__init__(model, colliders)
+    def __init__(self, launcher: Launcher, model: Model, colliders: Sequence[Collider]) -> None:
+        self._launcher, self._model = launcher, model
+        rows, heights = pack_colliders(colliders, model.dx)
+        self._memory = SolverMemory(launcher, model, heights, len(colliders))
+        self._memory.upload(self._memory.sets[0], self._loaded(model.start))
+        self._report = np.zeros(len(self._memory.report), np.uint8)
+        self._keep = False  # Whether sorting leaves particles in the blocks that they are in.
+        self._stale = True  # Whether they must be sorted before anything else.
+        self._moved = 0.0  # How far colliders may have come since they were sorted [m].
+        self._memory.upload_step(0.0, False, rows)
+        done = 0
+        while done == 0:
+            begin = [Launch("begin_run", 1), *self._arranged(0)]
+            done = self._told([*begin, Launch("advance_blocks", self._sizes.blocks, r.DEFORMS)], 1)
 
-    def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
-        k, layout, work, params = (
-            self._kernels,
-            self._device_layout,
-            self._work,
-            self._device_params,
-        )
-        blocks, groups = len(self._layout.block_coordinates), len(self._layout.group_start) - 1
-        progress = self._progress
-        progress[:] = np.zeros(3, np.int64)
-        if steps == 0:
-            k.gather[blocks, THREADS](dt, self._state, layout, work, params, progress, False)
-        for _ in range(steps):
-            k.scatter[blocks, THREADS](dt, self._state, layout, work, params, progress)
-            k.collect[groups, NODE_THREADS](dt, layout, work, params, progress)
-            k.gather[blocks, THREADS](dt, self._state, layout, work, params, progress, True)
-            k.finish[1, 1](progress)
-        counted = progress.copy_to_host()
-        return int(counted[DONE]), bool(counted[NEEDS_RESORT] or counted[HALTED])
+    @property
+    def _sizes(self) -> Any:
+        return self._memory.sizes
 
-    def _measure_blocks(self) -> tuple[Float, Int]:
-        blocks = len(self._layout.block_coordinates)
-        rows = cuda.device_array((blocks * MEASURE_THREADS, COLUMNS), np.float64)
-        self._kernels.measure[blocks, MEASURE_THREADS](
-            self._state, self._device_layout, self._device_params, rows
-        )
-        return rows.copy_to_host(), np.repeat(np.arange(blocks), MEASURE_THREADS)
+    def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
+        """Make ``steps`` substeps; see ``Simulation``.
 
-    def _load_state(self, state: ParticleState) -> ParticleState:
-        return ParticleState(*(cuda.to_device(a) for a in state))
+        Raises:
+            SolverDiverged: particles left the numbers, or went over many blocks at once.
+            ParticleError: they left the reach of the grid.
+        """
+        moving = any(c.moving for c in colliders)
+        self._memory.upload_step(dt, moving, self._rows(steps if moving else 1, dt, colliders))
+        fastest = max((c.fastest_point for c in colliders), default=0.0)
+        done = 0
+        while done < steps:
+            done = self._told(self._planned(done, steps, dt, fastest), steps)
 
-    def _sort_state(self, state: ParticleState, xi: Any, order: Int) -> ParticleState:
-        placed = cuda.to_device(order)
-        moved = state._replace(xi=cuda.to_device(xi))
-        return ParticleState(*(self._sorted(a, placed) for a in moved))
-
-    def _sorted(self, array: Any, order: Any) -> Any:
-        if not array.size:
-            return array
-        out = cuda.device_array(array.shape, array.dtype)
-        rows = (len(order), array.size // len(order))
-        groups = -(-len(order) // REORDER_THREADS)
-        threads = REORDER_THREADS
-        self._kernels.reorder[groups, threads](array.reshape(rows), order, out.reshape(rows))
-        return out
-
-    def _copy_state(self, state: ParticleState) -> ParticleState:
-        return ParticleState(*(_copied(a) for a in state))
-
-    def _fetch(self, array: Any) -> Any:
-        return array.copy_to_host()
-
-    def _make_work(self, layout: Layout) -> Workspace:
-        self._device_layout = Layout(*(cuda.to_device(np.ascontiguousarray(a)) for a in layout))
-        host = self._shapes(layout)
-        return Workspace(
-            tiles=self._array("tiles", host.tiles),
-            moments=self._array("moments", host.moments),
-            velocity=self._array("velocity", host.velocity),
-            offset=self._array("offset", host.offset),
-            scratch=self._array("scratch", (1, 1)),
-            needs_resort=self._array("needs_resort", (1,)),
-            by_collider=cuda.to_device(np.zeros(host.by_collider)),
-            by_thin=cuda.to_device(np.zeros(host.by_thin)),
-            by_body=cuda.to_device(np.zeros(host.by_body)),
+    def measure(self) -> Measure:
+        """Sums and bounds as the device had them at the end of the last substep."""
+        sums = self._memory.measured(self._report)
+        mass = sums[:, 0]
+        return Measure(
+            mass=mass.copy(),
+            centre=sums[:, 1:4] / mass[:, None],
+            momentum=sums[:, 4:7].copy(),
+            angular_momentum=sums[:, 7:10].copy(),
+            kinetic=sums[:, 10].copy(),
+            elastic=sums[:, 11].copy(),
+            max_speed=math.sqrt(_largest(sums[:, 12])),
+            max_wave_speed=math.sqrt(_largest(sums[:, 13])),
+            min_volume_ratio=float(sums[:, 14].min()),
         )
 
-    def _allocate(self, size: int) -> Any:
-        return cuda.device_array(size, self._dtype)
+    def particles(self) -> ParticleArrays:
+        """A copy in the model's order, float64."""
+        memory = self._memory
+        raw = memory.read_set(self._current)
+        values, keys = memory.values(raw).astype(np.float64), memory.keys(raw)
+        place = memory.words(raw, 1)
+        mask = np.uint64((1 << COORDINATE_BITS) - 1)
+        blocks = np.stack(
+            [
+                (keys >> np.uint64(BODY_BITS + axis * COORDINATE_BITS) & mask).astype(np.int64)
+                for axis in (2, 1, 0)
+            ]
+        )
+        cells = (blocks - COORDINATE_LIMIT) * BLOCK + values[r.XI : r.VELOCITY]
 
-    def _set_params(self, colliders: Sequence[Collider]) -> None:
-        super()._set_params(colliders)
-        r = self._params
-        self._device_params = StepParameters(
-            *(a if np.ndim(a) == 0 else cuda.to_device(a) for a in r)
+        def in_order(rows: Float) -> Float:
+            out = np.empty((rows.shape[1], rows.shape[0]))
+            out[place] = rows.T
+            return out
+
+        n = self._sizes.particles
+        elastic = in_order(values[r.ELASTIC_F : r.STRESS]).reshape(n, 3, 3)
+        total = elastic.copy()
+        if memory.numbers > r.TOTAL_F:
+            plastic = self._model.plastic
+            total[plastic] = in_order(values[r.TOTAL_F :]).reshape(n, 3, 3)[plastic]
+        return ParticleArrays(
+            positions=in_order(cells * self._model.dx),
+            velocities=in_order(values[r.VELOCITY : r.GRADIENT]),
+            gradients=in_order(values[r.GRADIENT : r.ELASTIC_F]).reshape(n, 3, 3),
+            F_elastic=elastic,
+            F_total=total,
+            history=in_order(values[r.HISTORY : r.MASS])[:, 0],
         )
 
+    def contacts(self) -> tuple[Float, Float]:
+        """Totals since the start; see ``Simulation``."""
+        by_collider, by_body = self._memory.totals(self._report)
+        return by_collider.copy(), by_body.copy()
 
-def _copied(array: Any) -> Any:
-    """A copy on the device."""
-    out = cuda.device_array(array.shape, array.dtype)
-    if array.size:
-        out.copy_to_device(array)
-    return out
+    def save(self) -> _Saved:
+        """Copy all that changes, on the device."""
+        memory = self._memory
+        return _Saved(memory.sets[self._current].clone(), memory.report.clone(), self._report)
+
+    def restore(self, saved: _Saved) -> None:
+        """Go back, to the bit. Lists are made anew with particles in the blocks that they had."""
+        memory, first = self._memory, r.HELD.itemsize
+        # The device goes on with the set that it had current last.
+        memory.sets[self._current].copy_(saved.particles)
+        memory.report[first:].copy_(saved.totals[first:])
+        current = self._current
+        self._report = saved.report.copy()
+        self._memory.held(self._report)["current"] = current
+        self._keep = self._stale = True
+
+    @property
+    def _current(self) -> int:
+        return int(self._memory.held(self._report)["current"])
+
+    def _planned(self, done: int, steps: int, dt: float, fastest: float) -> list[Launch]:
+        """Launches of the substeps from ``done`` on, with sorting where it may be needed."""
+        speed = math.sqrt(_largest(self._memory.measured(self._report)[:, 12]))
+        stride = CAUTION * speed * dt / self._model.dx
+        reach = float(self._memory.measured(self._report)[:, r.REACH].max())
+        margin = COLLIDER_MARGIN / 2 * self._model.dx
+        launches = [Launch("begin_run", 1, done)]
+        while done < steps:
+            free = _fitting(TILE_REACH - reach, stride)
+            free = min(free, _fitting(margin - self._moved, dt * fastest), steps - done)
+            if self._stale or free < steps - done:
+                launches += [*flushing(self._sizes), *self._arranged(done)]
+                reach = SORTED_REACH
+                free = _fitting(TILE_REACH - reach, stride)
+                free = min(free, _fitting(margin, dt * fastest), steps - done)
+            free = max(free, 1)
+            launches += substeps(self._sizes, done, done + free)
+            reach += free * stride
+            self._moved += free * dt * fastest
+            done += free
+        return launches
+
+    def _arranged(self, step: int) -> list[Launch]:
+        launches = arranging(self._sizes, keep=self._keep, step=step)
+        self._kept, self._keep, self._stale = self._keep, False, False
+        self._moved = 0.0
+        return launches
+
+    def _told(self, launches: list[Launch], steps: int) -> int:
+        """Have launches done and measured; how many substeps are done."""
+        ending = [*measuring(self._sizes), *flushing(self._sizes)]
+        self._launcher.run((*launches, *ending), self._memory.space)
+        self._report = self._memory.read_report()
+        held = self._memory.held(self._report)
+        fault = int(held["fault"])
+        if fault & r.DIVERGED:
+            raise SolverDiverged
+        if fault & r.TOO_FAR:
+            raise self._too_far()
+        if fault & r.OVERFLOW:
+            self._memory.grow({name: int(held[name]) for name in r.CAPACITIES})
+            self._keep, self._stale = self._kept, True
+            return int(held["done"])
+        self._stale = bool(held["stop_after"])
+        return int(held["done"]) if held["stop_after"] else steps
+
+    def _too_far(self) -> ParticleError:
+        reach = COORDINATE_LIMIT * BLOCK * self._model.dx
+        return ParticleError(
+            f"particles must stay within {reach:.0f} m of the origin with cells of "
+            f"{self._model.dx} m; move the scene nearer to the origin or take larger cells"
+        )
+
+    def _rows(self, steps: int, dt: float, colliders: Sequence[Collider]) -> Float:
+        """[steps, K, COLLIDER_ROW] rows of colliders in each substep."""
+        first = pack_colliders(colliders, self._model.dx)[0]
+        rows = np.repeat(first[None], steps, axis=0)
+        for k, collider in enumerate(colliders):
+            if collider.moving:
+                for step in range(1, steps):
+                    later = pack_colliders([collider.after(step * dt)], self._model.dx)[0][0]
+                    for columns in (slice(POINT, AXES + 9), slice(SPIN, SPEED + 3)):
+                        rows[step, k, columns] = later[columns]
+        return rows
+
+    def _loaded(self, start: ParticleArrays) -> NDArray[np.uint8]:
+        """A set of particles in the model's order, each in the block of its first node."""
+        model, memory = self._model, self._memory
+        n = self._sizes.particles
+        cells = start.positions / model.dx
+        blocks = np.floor((cells - 0.5) / BLOCK).astype(np.int64)
+        if np.abs(blocks).max() >= COORDINATE_LIMIT - 2:
+            raise self._too_far()
+        raw = np.zeros(len(memory.sets[0]), np.uint8)
+        key = np.zeros(n, np.int64)
+        for axis in range(3):
+            key = (key << COORDINATE_BITS) | (blocks[:, axis] + COORDINATE_LIMIT)
+        memory.keys(raw)[:] = ((key << BODY_BITS) | model.body).astype(np.uint64)
+        memory.words(raw, 0)[:] = model.material
+        memory.words(raw, 1)[:] = np.arange(n)
+        values = memory.values(raw)
+        values[r.XI : r.VELOCITY] = (cells - blocks * BLOCK).T
+        values[r.VELOCITY : r.GRADIENT] = start.velocities.T
+        values[r.GRADIENT : r.ELASTIC_F] = start.gradients.reshape(n, 9).T
+        values[r.ELASTIC_F : r.STRESS] = start.F_elastic.reshape(n, 9).T
+        values[r.HISTORY], values[r.MASS], values[r.VOLUME] = (
+            start.history,
+            model.masses,
+            model.volumes,
+        )
+        if memory.numbers > r.TOTAL_F:
+            values[r.TOTAL_F :] = start.F_total.reshape(n, 9).T
+        return raw
+
+
+def _largest(values: Float) -> float:
+    """NaN where there is one."""
+    return float(values.max())
+
+
+def _fitting(room: float, stride: float) -> int:
+    """How many strides fit."""
+    if not stride > 0:
+        return 1 << 16 if room >= 0 else 0
+    return max(0, min(1 << 16, math.floor(room / stride)))

@@ -46,8 +46,8 @@ class Usage:
     stack: int
     spilled: int
 
-    def occupancy(self, architecture: str) -> float:
-        """Share of a multiprocessor's threads that can be at work at once.
+    def occupancy(self, architecture: str, of_block: int = THREADS) -> float:
+        """Share of a multiprocessor's threads that can be at work at once, in blocks of so many.
 
         Raises:
             KeyError: for an architecture that MULTIPROCESSORS does not know.
@@ -55,11 +55,11 @@ class Usage:
         threads, shared = MULTIPROCESSORS[architecture]
         of_warp = -(-self.registers * 32 // REGISTER_STEP) * REGISTER_STEP
         blocks = min(
-            threads // THREADS,
-            REGISTERS // of_warp // (THREADS // 32),
+            threads // of_block,
+            REGISTERS // of_warp // (of_block // 32),
             shared // (self.shared + BLOCK_SHARED),
         )
-        return blocks * THREADS / threads
+        return blocks * of_block / threads
 
 
 def usage_of(log: str) -> dict[str, Usage]:

@@ -1,0 +1,151 @@
+"""What the solver asks of a device, and the device that is a GPU."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .compile import compiled_kernels
+from .records import THREADS
+from .source import KERNELS
+
+GRAPHS = 32
+"""Sequences of launches that are kept as graphs, of each simulation."""
+
+
+class Launch(NamedTuple):
+    """One launch.
+
+    Attributes:
+        kernel: one of KERNELS.
+        blocks: of THREADS threads, at least one.
+        argument: see the kernel.
+    """
+
+    kernel: str
+    blocks: int
+    argument: int = 0
+
+
+class Launcher(Protocol):
+    """A device that runs kernels, one after the other, for one precision.
+
+    Attributes:
+        device: on which its memory lies.
+    """
+
+    device: torch.device
+
+    def run(self, launches: tuple[Launch, ...], space: int) -> None:
+        """Queue a sequence of launches.
+
+        Args:
+            launches: which; the same sequence again costs the host next to nothing.
+            space: address of a Space on the device.
+        """
+        ...
+
+    def pointer(self, tensor: Tensor) -> int:
+        """Address of what a contiguous tensor on the device holds."""
+        ...
+
+    def host_memory(self, nbytes: int) -> Tensor:
+        """[nbytes] uint8 that the device can copy from and to without help."""
+        ...
+
+    def wait(self) -> None:
+        """Return when all that was queued is done."""
+        ...
+
+
+class CudaLauncher:
+    """The current CUDA device of torch, on torch's current stream.
+
+    A sequence is launched one by one when it is new, and captured into a CUDA graph when it comes
+    again: what a solver asks for between two checks is the same each time, whatever its particles
+    do.
+
+    Args:
+        precision: ``single`` or ``double``.
+
+    Raises:
+        SolverError: the kernels do not compile for it.
+    """
+
+    def __init__(self, precision: str) -> None:
+        from cuda.core import Device, ObjectCode
+
+        index = torch.cuda.current_device()
+        self.device = torch.device("cuda", index)
+        torch.cuda.synchronize(self.device)  # torch makes the context that all share.
+        Device(index).set_current()
+        major, minor = torch.cuda.get_device_capability(index)
+        code = ObjectCode.from_cubin(compiled_kernels(precision, f"sm_{major}{minor}"))
+        self._kernels = {name: code.get_kernel(name) for name in KERNELS}
+        self._graphs: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
+        self._threads = threading.local()
+
+    def run(self, launches: tuple[Launch, ...], space: int) -> None:
+        """See Launcher."""
+        device, stream, key = self._ready(), self._stream(), (launches, space)
+        try:
+            if key not in self._graphs:
+                self._graphs[key] = None
+                self._queue(stream, launches, space)
+            else:
+                if self._graphs[key] is None:
+                    self._graphs[key] = self._captured(device, launches, space)
+                self._graphs[key].launch(stream)
+        except Exception as error:
+            # In the words of torch, by which a worker knows that its device is lost.
+            raise RuntimeError(f"CUDA error at the solver's launches: {error}") from error
+        self._graphs.move_to_end(key)
+        if len(self._graphs) > GRAPHS:
+            self._graphs.popitem(last=False)
+
+    def _queue(self, stream: Any, launches: tuple[Launch, ...], space: int) -> None:
+        from cuda.core import LaunchConfig, launch
+
+        for kernel, blocks, argument in launches:
+            config = LaunchConfig(grid=blocks, block=THREADS)
+            launch(stream, config, self._kernels[kernel], space, np.uint32(argument))
+
+    def _captured(self, device: Any, launches: tuple[Launch, ...], space: int) -> Any:
+        builder = device.create_graph_builder().begin_building()
+        self._queue(builder, launches, space)
+        return builder.end_building().complete()
+
+    def pointer(self, tensor: Tensor) -> int:
+        """See Launcher."""
+        assert tensor.device == self.device
+        return int(tensor.data_ptr())
+
+    def host_memory(self, nbytes: int) -> Tensor:
+        """See Launcher."""
+        return torch.empty(nbytes, dtype=torch.uint8, pin_memory=True)
+
+    def wait(self) -> None:
+        """See Launcher."""
+        torch.cuda.current_stream(self.device).synchronize()
+
+    def _ready(self) -> Any:
+        from cuda.core import Device
+
+        device = Device(self.device.index)
+        if not getattr(self._threads, "ready", False):
+            # A driver's context is one of a thread.
+            device.set_current()
+            self._threads.ready = True
+        return device
+
+    def _stream(self) -> Any:
+        from cuda.core import LEGACY_DEFAULT_STREAM, Stream
+
+        handle = torch.cuda.current_stream(self.device).cuda_stream
+        # torch calls the default stream 0, which is no handle.
+        return Stream.from_handle(handle) if handle else LEGACY_DEFAULT_STREAM

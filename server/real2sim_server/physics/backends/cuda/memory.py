@@ -1,0 +1,241 @@
+"""Memory of one simulation on the device: two sets of particles, lists, work space, a report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ....geometry.rotation import Float
+from ..base import TOTALS, Model
+from . import records as r
+from .launcher import Launcher
+from .sequences import Sizes
+
+SORT_BLOCKS = 512
+"""At most so many blocks of threads share the list of particles."""
+ALIGNMENT = 256
+_U4, _U8, _F8 = 4, 8, 8
+
+
+class SolverMemory:
+    """What a simulation has on the device.
+
+    Attributes:
+        sizes: what there is room for.
+        pitch: length of the array of one number of all particles.
+        numbers: of a particle.
+        sets: [bytes] uint8 each, see ``kernels/space.h``.
+        report: [bytes] uint8, Held, sums of bodies, and totals of contacts.
+    """
+
+    def __init__(self, launcher: Launcher, model: Model, heights: Float, colliders: int) -> None:
+        self._launcher, self._model = launcher, model
+        n, bodies = len(model.masses), model.bodies
+        self._real = np.dtype(model.dtype).itemsize
+        self.pitch = -(-n // 64) * 64
+        self.numbers = r.TOTAL_F + (9 if model.plastic.any() else 0)
+        guess = n // 32 + 64
+        self.sizes = Sizes(
+            particles=n,
+            bodies=bodies,
+            colliders=colliders,
+            laws=len(np.unique(model.table[model.material, 0])),
+            sort_blocks=max(1, min(SORT_BLOCKS, n // (16 * r.THREADS))),
+            blocks=guess,
+            fields=2 * guess,
+            contacts=64,
+            pairs=64,
+            thins=16,
+        )
+        set_bytes = self.pitch * (16 + self.numbers * self._real)
+        self.sets = [self._zeros(set_bytes), self._zeros(set_bytes)]
+        self._places = [
+            0,
+            r.HELD.itemsize,
+            r.HELD.itemsize + bodies * r.COLUMNS * _F8,
+            r.HELD.itemsize + bodies * (r.COLUMNS + colliders * TOTALS) * _F8,
+        ]
+        totals = bodies * (r.COLUMNS + (colliders + bodies) * TOTALS) * _F8
+        self.report = self._zeros(r.HELD.itemsize + totals)
+        self._told = launcher.host_memory(len(self.report))
+        self._staged = launcher.host_memory(0)
+        self._spaces: dict[str, Tensor] = {}
+        self._space = self._zeros(r.SPACE.itemsize)
+        fixed = {
+            "table": np.ascontiguousarray(model.table, model.dtype),
+            "friction": np.ascontiguousarray(model.friction, np.float64),
+            "heights": np.ascontiguousarray(heights, np.float64),
+        }
+        for name, values in fixed.items():
+            self._reserve(name, values.nbytes)
+            self.upload(self._spaces[name], values)
+        self.grow({})
+
+    @property
+    def space(self) -> int:
+        """Address of the Space."""
+        return self._launcher.pointer(self._space)
+
+    def grow(self, wanted: dict[str, int]) -> None:
+        """Make room for so many of each, and a quarter more; lists must be made anew."""
+        held = {name: getattr(self.sizes, name) for name in r.CAPACITIES}
+        more = {n: c + c // 4 for n, c in wanted.items() if c > held[n]}
+        self.sizes = replace(self.sizes, **more)
+        for name, nbytes in self._bytes().items():
+            self._reserve(name, nbytes)
+        self._describe()
+
+    def upload(self, target: Tensor, values: NDArray[Any]) -> None:
+        """Copy an array over; the device need not be waited for."""
+        if values.nbytes == 0:
+            return
+        if len(self._staged) < values.nbytes:
+            self._staged = self._launcher.host_memory(2 * values.nbytes)
+        else:
+            self._launcher.wait()  # What was staged before may still be on its way.
+        self._staged.numpy()[: values.nbytes] = values.reshape(-1).view(np.uint8)
+        target[: values.nbytes].copy_(self._staged[: values.nbytes], non_blocking=True)
+
+    def upload_step(self, dt: float, moving: bool, rows: Float) -> None:
+        """What the next substeps take, in one copy from memory of its own."""
+        step = np.zeros(1, r.STEP)
+        step["dt"], step["moving"] = dt, moving
+        nbytes = r.STEP.itemsize + rows.nbytes
+        self._reserve_step(nbytes)
+        staged = self._step_staged.numpy()
+        staged[: r.STEP.itemsize] = step.view(np.uint8)
+        staged[r.STEP.itemsize : nbytes] = rows.reshape(-1).view(np.uint8)
+        self._spaces["step"][:nbytes].copy_(self._step_staged[:nbytes], non_blocking=True)
+
+    def read_report(self) -> NDArray[np.uint8]:
+        """The report, in one copy; waits for all that was queued."""
+        self._told.copy_(self.report, non_blocking=True)
+        self._launcher.wait()
+        return self._told.numpy().copy()
+
+    def held(self, report: NDArray[np.uint8]) -> Any:
+        """The Held of a report."""
+        return report[: r.HELD.itemsize].view(r.HELD)[0]
+
+    def measured(self, report: NDArray[np.uint8]) -> Float:
+        """[B, COLUMNS] sums and bounds of each body in a report."""
+        values: Float = report[self._places[1] : self._places[2]].view(np.float64)
+        return values.reshape(-1, r.COLUMNS)
+
+    def totals(self, report: NDArray[np.uint8]) -> tuple[Float, Float]:
+        """Totals of contacts in a report, [B, K, TOTALS] and [B, B, TOTALS]."""
+        bodies, colliders = self.sizes.bodies, self.sizes.colliders
+        on, between = report[self._places[2] : self._places[3]], report[self._places[3] :]
+        return (
+            on.view(np.float64).reshape(bodies, colliders, TOTALS),
+            between.view(np.float64).reshape(bodies, bodies, TOTALS),
+        )
+
+    def read_set(self, which: int) -> NDArray[np.uint8]:
+        """A set of particles on the host."""
+        return self.sets[which].cpu().numpy()
+
+    def keys(self, memory: NDArray[np.uint8]) -> NDArray[np.uint64]:
+        """[N] keys of a set on the host."""
+        return memory[: 8 * self.pitch].view(np.uint64)[: self.sizes.particles]
+
+    def words(self, memory: NDArray[np.uint8], which: int) -> NDArray[np.uint32]:
+        """[N] materials (0) or places in the model (1)."""
+        first = (8 + 4 * which) * self.pitch
+        values: NDArray[np.uint32] = memory[first : first + 4 * self.pitch].view(np.uint32)
+        return values[: self.sizes.particles]
+
+    def values(self, memory: NDArray[np.uint8]) -> NDArray[Any]:
+        """[numbers, N] of a set on the host."""
+        values = memory[16 * self.pitch :].view(self._model.dtype)
+        return values.reshape(self.numbers, self.pitch)[:, : self.sizes.particles]
+
+    def _bytes(self) -> dict[str, int]:
+        s, four = self.sizes, 4 * self._real
+        rows = s.contacts + s.pairs + s.thins
+        by_particle = {f"{name}_{k}": s.particles for name in ("keys", "order") for k in (0, 1)}
+        return {
+            **{n: c * (_U8 if n.startswith("keys") else _U4) for n, c in by_particle.items()},
+            "digit_counts": s.sort_blocks * r.DIGITS * _U4,
+            "counts": (s.listed + 1) * _U4,
+            "sums": (s.listed // r.PIECE + 2) * _U4,
+            "block_key": s.blocks * _U8,
+            "field_key": s.fields * _U8,
+            "block_start": (s.blocks + 1) * _U4,
+            "block_fields": s.blocks * r.AROUND * _U4,
+            "block_near": s.blocks * _U4,
+            "field_blocks": s.fields * r.AROUND * _U4,
+            "field_near": s.fields * _U4,
+            "group_start": (s.fields + 1) * _U4,
+            "contact_start": (s.fields + 1) * _U4,
+            "contact_collider": s.contacts * _U4,
+            "contact_field": s.contacts * _U4,
+            "pair_start": (s.fields + 1) * _U4,
+            "pair_field": s.pairs * _U4,
+            "thin_start": (s.blocks + 1) * _U4,
+            "thin_collider": s.thins * _U4,
+            "thin_block": s.thins * _U4,
+            "tiles": s.blocks * r.TILE * four,
+            "moments": s.blocks * r.TILE * four,
+            "velocity": s.fields * r.NODES * four,
+            "offset": s.fields * r.NODES * four,
+            "by_collider": s.contacts * r.NODES * TOTALS * _F8,
+            "by_pair": s.pairs * r.NODES * 2 * TOTALS * _F8,
+            "by_thin": s.thins * r.THREADS * TOTALS * _F8,
+            "touched": rows * 2 * TOTALS * _F8,
+            "rows": s.blocks * r.COLUMNS * _F8,
+        }
+
+    def _describe(self) -> None:
+        """Tell the device where everything is."""
+        space = np.zeros(1, r.SPACE)
+        at = self._launcher.pointer
+        for name, held in self._spaces.items():
+            if name in (r.SPACE.names or ()):
+                space[name] = at(held)
+        for k in (0, 1):
+            space["sets"][0, k] = at(self.sets[k])
+            space["keys"][0, k] = at(self._spaces[f"keys_{k}"])
+            space["order"][0, k] = at(self._spaces[f"order_{k}"])
+        report = at(self.report)
+        for name, place in zip(
+            ("held", "measured", "collider_totals", "body_totals"), self._places, strict=True
+        ):
+            space[name] = report + place
+        if "step" not in self._spaces:
+            self._reserve_step(ALIGNMENT)
+            space["step"] = at(self._spaces["step"])
+        s = self.sizes
+        space["dx"], space["gravity"] = self._model.dtype(self._model.dx), self._model.gravity
+        space["particles"], space["pitch"] = s.particles, self.pitch
+        space["plastic"] = self.numbers > r.TOTAL_F
+        space["bodies"], space["colliders"], space["sort_blocks"] = (
+            s.bodies,
+            s.colliders,
+            s.sort_blocks,
+        )
+        for name in r.CAPACITIES:
+            space[f"{name[:-1]}_capacity"] = getattr(s, name)
+        self.upload(self._space, space)
+
+    def _reserve_step(self, nbytes: int) -> None:
+        held = self._spaces.get("step")
+        if held is None or len(held) < nbytes:
+            self._spaces["step"] = self._zeros(2 * nbytes)
+            self._step_staged = self._launcher.host_memory(2 * nbytes)
+            if held is not None:
+                self._describe()
+
+    def _reserve(self, name: str, nbytes: int) -> None:
+        held = self._spaces.get(name)
+        if held is None or len(held) < nbytes:
+            self._spaces.pop(name, None)
+            self._spaces[name] = self._zeros(max(ALIGNMENT, nbytes))
+
+    def _zeros(self, nbytes: int) -> Tensor:
+        return torch.zeros(nbytes, dtype=torch.uint8, device=self._launcher.device)

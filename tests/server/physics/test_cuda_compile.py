@@ -1,0 +1,97 @@
+"""NVRTC compiles the solver for GPUs that are not there, and nothing spills."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from real2sim_server.physics import SolverError
+from real2sim_server.physics.backends.cuda import compile as compiling
+from real2sim_server.physics.backends.cuda import translate
+from real2sim_server.physics.backends.cuda.records import THREADS
+from real2sim_server.physics.backends.cuda.source import KERNELS
+from real2sim_server.render.backends.nvrtc.needs import compiler_needs
+
+MISSING = next((need.found for need in compiler_needs() if not need.met), "")
+needs_nvrtc = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("architecture", compiling.ARCHITECTURES)
+@pytest.mark.slow
+def test_every_kernel_compiles_and_none_spills(precision: str, architecture: str) -> None:
+    code, usages = compiling.compile_kernels(precision, architecture)
+    assert code[:4] == b"\x7fELF"
+    assert set(usages) == set(KERNELS)
+    assert {name: usage.spilled for name, usage in usages.items() if usage.spilled} == {}
+    assert all(usage.stack == 0 for usage in usages.values())
+    # A block of threads at least works while another waits.
+    few = min(usage.occupancy(architecture, THREADS) for usage in usages.values())
+    assert few >= (2 if precision == "double" else 3) * THREADS / 2048
+
+
+@needs_nvrtc
+def test_what_was_compiled_is_kept_by_precision_and_architecture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[tuple[str, str]] = []
+
+    def compile_one(precision: str, architecture: str) -> tuple[bytes, str]:
+        made.append((precision, architecture))
+        return architecture.encode(), ""
+
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    monkeypatch.setattr(compiling, "_compile", compile_one)
+    asked = [("single", "sm_90"), ("double", "sm_90"), ("single", "sm_80"), ("single", "sm_90")]
+    for one in asked:
+        assert compiling.compiled_kernels(*one) == one[1].encode()
+    assert made == asked[:3]
+    monkeypatch.setattr(compiling, "solver_source", lambda precision: "another law")
+    compiling.compiled_kernels("single", "sm_90")
+    assert len(made) == 4
+
+
+@needs_nvrtc
+def test_a_source_that_is_wrong_is_refused_in_the_words_of_the_compiler(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    monkeypatch.setattr(compiling, "solver_source", lambda precision: "void f() { nonsense; }")
+    with pytest.raises(SolverError, match="nonsense"):
+        compiling.compile_kernels("single", "sm_90")
+
+
+FACTOR = 2.5
+
+
+def shortened(v: Any, length: Any) -> Any:
+    """What the translator is asked for below."""
+    total = 0
+    for axis in range(3):
+        total += v[axis] * v[axis]
+    if total > length:
+        v = (v[0] / FACTOR, v[1] / FACTOR, math.sqrt(v[2]))
+    return v, total
+
+
+def spread(values: Any) -> Any:
+    return [value * 2 for value in values]
+
+
+def test_a_function_becomes_cpp_with_the_types_that_it_needs() -> None:
+    made = translate.Translator("double", "some_")
+    name, kind = made.add(shortened, (("real",) * 3, "real"))
+    assert (name, kind) == ("shortened", (("real",) * 3, "real"))
+    assert "double total{};" in made.text  # Begun as a whole number, it does not stay one.
+    assert "(v[1] / double(2.5))" in made.text
+    assert "root(v[2])" in made.text
+
+
+def test_more_than_kernels_know_is_refused_with_its_place() -> None:
+    made = translate.Translator("double", "some_")
+    with pytest.raises(translate.Untranslatable, match=r"spread, line \d+: .*\[value \* 2 for"):
+        made.add(spread, (("real",) * 3,))
