@@ -127,6 +127,12 @@ class EgoSpec(Model):
     tracker: Literal["pursuit", "lqr", "ilqr", "perfect"] = Field(
         default="pursuit", description="controller of trajectories; 'perfect' is put on the plan"
     )
+    tracker_version: Literal[1, 2] = Field(
+        default=2,
+        description="2: trackers know a plan's acceleration and direction before its first pose, "
+        "and plans of a single pose by the one before; 1: they do not, as in episodes recorded "
+        "before this option was there",
+    )
     wheelbase: Annotated[float, Field(ge=0.5, le=20)] = Field(default=2.8, description="[m]")
     max_steer: Annotated[float, Field(gt=0, le=1.4)] = Field(default=0.6, description="[rad]")
     max_steer_rate: Annotated[float, Field(gt=0, le=10)] = Field(default=0.8, description="[rad/s]")

@@ -50,7 +50,9 @@ def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
     assert sum(world.accumulator.at_fault.values()) == at_fault
 
 
-def drive_beside(scene: Scene, fields: dict[str, Any], worlds: int, steps: int) -> BatchWorld:
+def drive_beside(
+    scene: Scene, fields: dict[str, Any], worlds: int, steps: int, plan_us: Any = PLAN_US
+) -> BatchWorld:
     """A batch, step by step beside as many single worlds with the same actions."""
     spec, state = ResetSpec(**fields), ScenarioState.of(scene)
     batch = BatchWorld(scene, spec, worlds, state=state)
@@ -66,16 +68,16 @@ def drive_beside(scene: Scene, fields: dict[str, Any], worlds: int, steps: int) 
             plans: list[Any] = [Control(acceleration=a, steering=b) for a, b in actions.tolist()]
             done = batch.step(actions)
         else:
-            way = speeds[:, None] * PLAN_US * 1e-6
+            way = speeds[:, None] * plan_us * 1e-6
             actions = np.stack([way, bias[:, None] * way, 0 * way + bias[:, None]], axis=2)
             now = batch.times_us
             plans = [
                 TrajectoryPlan(
-                    times_us=(now[w] + PLAN_US).tolist(), poses=actions[w].tolist(), frame="vehicle"
+                    times_us=(now[w] + plan_us).tolist(), poses=actions[w].tolist(), frame="vehicle"
                 )
                 for w in range(worlds)
             ]
-            done = batch.step(actions, plan_us=PLAN_US)
+            done = batch.step(actions, plan_us=plan_us)
         for w in np.flatnonzero(running).tolist():
             single[w].step(plans[w])
             compare(batch, w, single[w], int(done.at_fault[w]))
@@ -95,6 +97,11 @@ def drive_beside(scene: Scene, fields: dict[str, Any], worlds: int, steps: int) 
 )
 def test_worlds_of_a_batch_are_single_worlds(street: Scene, fields: dict[str, Any]) -> None:
     drive_beside(street, fields, worlds=5, steps=30)
+
+
+def test_plans_of_a_single_pose_go_on_from_one_another_as_in_single_worlds(street: Scene) -> None:
+    fields = {"action": "trajectory", "ego": {"tracker": "lqr"}}
+    drive_beside(street, fields, worlds=3, steps=15, plan_us=np.array([200_000]))
 
 
 def test_contacts_end_episodes_as_in_single_worlds(street: Scene) -> None:

@@ -23,6 +23,7 @@ from real2sim_server.world.driving import (
     GRAVITY,
     ILQR,
     LQR,
+    NO_POSE,
     NO_SCHEDULE,
     PURSUIT,
     Command,
@@ -63,7 +64,7 @@ def some_plan(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndar
 
 
 def planned(state: PlanarState, times: np.ndarray, poses: np.ndarray, vehicle=VEHICLE):
-    return plan_curve(tuple(state), times, 0, poses, tuple(vehicle))
+    return plan_curve(tuple(state), 0, (times, poses, NO_POSE), tuple(vehicle))
 
 
 # --- tyres ------------------------------------------------------------------------------------
@@ -270,7 +271,7 @@ def some_drives() -> list[list[float]]:
                 spec = EgoSpec(dynamics=dynamics, actuators=actuators)
                 vehicle = tuple(vehicle_parameters(spec))
                 state, pending = tuple(state_of(speed=8.0, y=0.5)), NOTHING
-                curve = plan_curve(state, *_at_zero(some_plan(rng, 10)), vehicle)
+                curve = plan_curve(state, 0, (*some_plan(rng, 10), NO_POSE), vehicle)
                 for k in range(2):
                     driver = (kind, *curve, 0.1 * k, (0.0, 0.0), NO_SCHEDULE)
                     driver = (
@@ -280,10 +281,6 @@ def some_drives() -> list[list[float]]:
                     state, pending = advance_vehicle(state, pending, driver, vehicle, 100_000)
                 found.append([*state, *pending.ravel().tolist()])
     return found
-
-
-def _at_zero(plan: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, int, np.ndarray]:
-    return plan[0], 0, plan[1]
 
 
 def test_compiled_they_drive_as_they_do_in_plain_python():

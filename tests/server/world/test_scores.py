@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -424,6 +425,13 @@ def test_derivatives_are_exact_for_cubics():
     assert felt.yaw_acceleration == pytest.approx(0.2)
     assert felt.lat_acceleration == pytest.approx(8.0 * 0.3)
     assert felt.jerk == pytest.approx(math.hypot(0.4, 0.5 * 0.3 + 8.0 * 0.2))
+
+
+def test_the_first_window_of_comfort_waits_for_no_module(monkeypatch):
+    # Loaded within a step, the module made one wait for a second.
+    monkeypatch.setitem(sys.modules, "scipy.signal", None)
+    samples = np.stack([np.linspace(5.0, 6.0, 17), np.zeros(17)], axis=1)
+    assert comfort_sample(samples, 0.087).lon_acceleration == pytest.approx(1 / 16 / 0.087)
 
 
 def test_comfort_recovers_in_hugsim_and_has_bounds_of_its_own():

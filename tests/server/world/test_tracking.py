@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.logs import open_log
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import World
+from real2sim_server.world.recording.stored_spec import stored_spec
 
 START_US = 5_000_000
 IDEAL = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
@@ -102,6 +104,81 @@ def test_a_start_and_a_stop_are_followed(make_world):
 
     assert errors(world, poses=30, spacing_us=100_000, frame="vehicle").max() < 0.3
     assert world.motion.speed < 0.05
+
+
+def braking(seconds: float) -> float:
+    """Place [m] of a vehicle that brakes from 10 m/s at second 1, at 3 m/s^2."""
+    braked = min(max(seconds - 1, 0.0), 10 / 3)
+    return 10 * min(seconds, 1.0) + 10 * braked - 1.5 * braked**2
+
+
+def driven(world: World, place, *, spacing_us: int, poses: int, steps: int) -> np.ndarray:
+    """Errors [m], speeds [m/s] and gears of a drive by plans that are made anew at every step, of
+    who is at ``place(seconds)`` at each time."""
+    found = []
+    for _ in range(steps):
+        times = [world.t_us + spacing_us * (k + 1) for k in range(poses)]
+        places = [(place((t - START_US) * 1e-6), 0.0, 0.0) for t in times]
+        world.step(TrajectoryPlan(times_us=times, poses=places, frame="world"))
+        error = world.motion.x - place((world.t_us - START_US) * 1e-6)
+        found.append((error, world.motion.speed, world.motion.reversing))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
+@pytest.mark.parametrize(("poses", "spacing_us"), [(30, 100_000), (8, 500_000)])
+def test_a_stop_that_is_planned_anew_at_every_step_ends_where_it_is_planned(
+    make_world, tracker, poses, spacing_us
+):
+    world = make_world(spec={"ego": {"tracker": tracker}})
+
+    found = driven(world, braking, spacing_us=spacing_us, poses=poses, steps=60)
+
+    assert np.abs(found[:, 0]).max() < 0.1
+    assert found[-1, 1] == 0.0
+
+
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
+@pytest.mark.parametrize("speed", [0.5, 1.5, 5.0])
+def test_plans_of_a_single_pose_are_caught_up_with_without_hunting(make_world, tracker, speed):
+    ego = s_curve(speed=speed + 0.3, curvature=0.0)
+    world = make_world(ego, spec={"ego": {"tracker": tracker}})
+
+    found = driven(world, lambda t: speed * t, spacing_us=100_000, poses=1, steps=60)
+
+    assert np.abs(found[:, 0]).max() < 0.15
+    assert np.abs(found[30:, 0]).max() < 0.01
+    assert found[30:, 1] == pytest.approx(speed, abs=0.01)
+    assert not found[:, 2].any()
+
+
+@pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
+def test_single_poses_that_stay_ahead_are_driven_up_to_and_stood_at(make_world, tracker):
+    ego = s_curve(speed=0.0, curvature=0.0)
+    world = make_world(ego, spec={"ego": {"tracker": tracker}})
+
+    found = driven(world, lambda _: 0.2, spacing_us=100_000, poses=1, steps=60)
+
+    assert abs(found[-1, 0]) < 0.03
+    assert found[:, 1].min() >= 0.0
+    assert found[-1, 1] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_single_poses_that_lead_backwards_are_followed_in_reverse_gear(make_world):
+    world = make_world(s_curve(speed=0.0, curvature=0.0))
+
+    found = driven(world, lambda t: -0.5 * t, spacing_us=100_000, poses=1, steps=60)
+
+    assert abs(found[-1, 0]) < 0.02
+    assert found[-1, 2]
+    assert np.abs(np.diff(found[:, 2])).sum() <= 1
+
+
+def test_trackers_of_an_old_log_know_nothing_of_the_way_to_a_plan():
+    fields = ResetSpec().model_dump(mode="json")
+    assert stored_spec(fields).ego.tracker_version == 2
+    del fields["ego"]["tracker_version"]
+    assert stored_spec(fields).ego.tracker_version == 1
 
 
 def test_a_vehicle_beside_its_plan_comes_back_to_it(make_world):

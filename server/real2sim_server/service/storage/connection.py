@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import sqlite3
 import time
 from pathlib import Path
@@ -86,6 +87,8 @@ def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
     engine = sa.create_engine(
         url, pool_pre_ping=True, pool_timeout=timeout_s, connect_args=arguments
     )
+    if url.get_driver_name() == "pg8000":
+        sa.event.listen(engine, "do_connect", _connect_by_own_socket)
     if url.get_backend_name() == "postgresql":
 
         @sa.event.listens_for(engine, "connect")
@@ -97,6 +100,29 @@ def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
             connection.commit()
 
     return engine
+
+
+def _connect_by_own_socket(
+    dialect: Any, _record: object, arguments: list[Any], parameters: dict[str, Any]
+) -> Any:
+    """A connection of pg8000, whose socket is closed at once where none comes of it: pg8000 leaves
+    it open where a server takes connections and answers nothing."""
+    if {"sock", "unix_sock", "source_address"} & parameters.keys():
+        return None  # by the driver itself
+    address = parameters.get("host", "localhost"), parameters.get("port", 5432)
+    try:
+        connected = socket.create_connection(address, parameters.get("timeout"))
+    except OSError as error:
+        raise dialect.loaded_dbapi.InterfaceError(
+            f"no connection to {address[0]}:{address[1]}: {error}"
+        ) from error
+    try:
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        # What `connect` of the driver does, which takes no socket.
+        return dialect.loaded_dbapi.Connection(*arguments, **parameters, sock=connected)
+    except BaseException:
+        connected.close()
+        raise
 
 
 def file_of(url: str) -> Path | None:

@@ -25,6 +25,7 @@ from ..ego.controller import EgoController
 from ..ego.gear import can_reverse
 from ..ego.legs import may_lead_backwards
 from ..ego.motion import Motion
+from ..ego.reference import SinglePose
 from ..ego.route import WAYPOINT_SPACING, WAYPOINTS
 from ..ego.suspension import LEVEL, BodyAttitude, sprung_side_by_side, tilted
 from ..path import Float
@@ -177,6 +178,7 @@ class BatchWorld:
         self.touching: list[frozenset[str]] = [frozenset()] * worlds
         self._attitudes = np.tile(np.array(LEVEL), (worlds, 1))
         self._near = np.zeros(worlds, np.bool_)
+        self._single: list[SinglePose | None] = [None] * worlds
         self.reset()
 
     @property
@@ -249,7 +251,7 @@ class BatchWorld:
         going, before, after = ~self.over, self._now, self._next
         times_us = self.times_us
         kinds = going.astype(np.int8)
-        self._move_in_gear(kinds, times_us, given, after_us)
+        single = self._move_one_by_one(kinds, times_us, given, after_us)
         step_worlds(
             *(kinds, times_us, self.spec.dt_us, self._law, given, after_us, True),
             *(self._vehicle, self._limits, self._tracks, self._road),
@@ -275,6 +277,7 @@ class BatchWorld:
                 at_fault[w], contacts[w] = self._meet(w, int(times_us[w]), given[w], after_us)
             elif self.touching[w]:
                 self.touching[w] = frozenset()
+        self._single = single
         self.terminated |= contacts > 0
         self.truncated |= going & (self.steps >= self.horizons)
         progress = np.where(going, after.places[:, S] - before.places[:, S], 0.0)
@@ -348,24 +351,30 @@ class BatchWorld:
         self.terminated[w] = self.truncated[w] = self.off_road[w] = False
         self.touching[w] = world.contacts.touching
         now.reversing[w], self._attitudes[w] = world.motion.reversing, LEVEL
+        self._single[w] = None
 
-    def _move_in_gear(
+    def _move_one_by_one(
         self, kinds: NDArray[np.int8], times_us: Longs, given: Float, after_us: Longs
-    ) -> None:
-        """Move the egos that are, or may come to be, in reverse gear: one by one, as few are."""
+    ) -> list[SinglePose | None]:
+        """Move the egos that are, or may come to be, in reverse gear, and those that follow plans
+        of a single pose: few are. What the next of those plans go on from."""
         now, after = self._now, self._next
         after.reversing[:] = now.reversing
-        if not can_reverse(self.spec.ego):
-            return
-        geared = now.reversing | (now.motions[:, 3] < 0)
+        single: list[SinglePose | None] = [None] * self.worlds
+        alone = len(after_us) == 1 and self.spec.ego.tracker_version > 1
+        if not (alone or can_reverse(self.spec.ego)):
+            return single
+        apart = now.reversing | (now.motions[:, 3] < 0) | alone
         if self._law != HOLD:
-            geared |= may_lead_backwards(given)
-        for w in np.flatnonzero(geared & (kinds != STANDS)).tolist():
+            apart |= may_lead_backwards(given)
+        for w in np.flatnonzero(apart & (kinds != STANDS)).tolist():
             motion, t_us = now.motion(w), int(times_us[w])
-            controller = self._controller(motion, t_us, given[w], after_us)
-            moved = controller.advance(motion, t_us, self.spec.dt_us)[1]
+            controller = self._controller(w, motion, t_us, given[w], after_us)
+            active, moved = controller.advance(motion, t_us, self.spec.dt_us)
             after.motions[w], after.reversing[w] = moved.numbers, moved.reversing
+            single[w] = active.single
             kinds[w] = MOVED
+        return single
 
     def _checked(self, actions: ArrayLike, plan_us: ArrayLike | None) -> tuple[Float, Longs]:
         given = np.ascontiguousarray(actions, dtype=np.float64)
@@ -406,7 +415,7 @@ class BatchWorld:
         """By the same functions as a single world."""
         before, after = self._next, self._now
         motion = before.motion(w)
-        controller = self._controller(motion, t_us, action, plan_us)
+        controller = self._controller(w, motion, t_us, action, plan_us)
         start = StepStart(
             motion,
             before.poses[w],
@@ -419,10 +428,11 @@ class BatchWorld:
         return contacts.ego_contacts(start, after.poses[w], after.motion(w), self._agents(after, w))
 
     def _controller(
-        self, motion: Motion, t_us: int, action: Float, plan_us: Longs
+        self, w: int, motion: Motion, t_us: int, action: Float, plan_us: Longs
     ) -> EgoController:
         plan = self._plan(t_us, action, plan_us)
-        return EgoController(self.spec, self.scene.ego).with_plan(plan, motion, t_us, t_us)
+        before = EgoController(self.spec, self.scene.ego, single=self._single[w])
+        return before.with_plan(plan, motion, t_us, t_us)
 
     def _plan(self, t_us: int, action: Float, plan_us: Longs) -> Control | TrajectoryPlan:
         if self._law == HOLD:

@@ -16,6 +16,7 @@ from ...scene.ground_kernels import pose_at
 from ..collision.sweep import COARSE
 from ..collision.sweep_kernels import first_contacts
 from ..driving import HOLD, PlanarState
+from ..driving.curve import NO_POSE
 from ..driving.entries import advance_vehicle, plan_curve, world_poses
 from ..ego.box import REAR_OVERHANG
 from ..path_kernels import nearest_point, waypoints
@@ -116,7 +117,7 @@ def advanced(state, t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle
         arguments = (law, np.empty((0, 6)), 0.0, 0.0, held, schedule)
         return advance_vehicle(state, pending, arguments, vehicle, dt_us)[0]
     places = world_poses(action, (state[0], state[1], state[2])) if frame_is_vehicle else action
-    knots, turn_rate = plan_curve(state, t_us + plan_us, t_us, places, vehicle)
+    knots, turn_rate = plan_curve(state, t_us, (t_us + plan_us, places, NO_POSE), vehicle)
     arguments = (law, knots, turn_rate, 0.0, (0.0, 0.0), schedule)
     return advance_vehicle(state, pending, arguments, vehicle, dt_us)[0]
 

@@ -4,7 +4,7 @@ Everything here takes and gives floats, tuples and arrays. :mod:`.entries` is wh
 :mod:`.vehicle_models` and :mod:`.trackers` are the families that it chooses from.
 """
 
-from .curve import MOVING
+from .curve import MOVING, NO_POSE
 from .entries import (
     NO_SCHEDULE,
     advance_vehicle,
@@ -26,6 +26,7 @@ __all__ = [
     "KINDS",
     "LQR",
     "MOVING",
+    "NO_POSE",
     "NO_SCHEDULE",
     "PLANNING_AHEAD",
     "PURSUIT",

@@ -30,6 +30,10 @@ TRUSTED_YAW = 0.5
 """A planned heading that differs more from the planned way is not used as its tangent [rad]."""
 
 
+NO_POSE = math.nan, 0.0, 0.0, 0.0
+"""Of a plan that goes on from no pose of an earlier one."""
+
+
 class PlanCurve(NamedTuple):
     """A plan to be followed.
 
@@ -46,7 +50,7 @@ class PlanCurve(NamedTuple):
 
 
 @func
-def curve_through(state, seconds, poses, vehicle):
+def curve_through(state, seconds, poses, vehicle, before):
     """The plan of a vehicle in a state.
 
     Args:
@@ -54,6 +58,8 @@ def curve_through(state, seconds, poses, vehicle):
         seconds: [N] float64, increasing, above 0, times of the poses from the start [s].
         poses: [N, 3] float64, x, y [m], yaw [rad], world.
         vehicle: constants.
+        before: time [s] and x, y [m], yaw [rad] of the pose that a plan of a single pose goes on
+            from, see :data:`NO_POSE`.
     """
     last = len(seconds)
     knots = np.empty((last + 1, 6))
@@ -64,9 +70,9 @@ def curve_through(state, seconds, poses, vehicle):
         knots[i + 1, T] = seconds[i]
         knots[i + 1, X], knots[i + 1, Y], knots[i + 1, YAW] = poses[i, 0], poses[i, 1], poses[i, 2]
     for i in range(1, last + 1):
-        slope = _slope(knots, i) if last > 1 else _arrival(knots, state.speed, vehicle)
+        slope = _slope(knots, i) if last > 1 else _arrival(knots, state.speed, vehicle, before)
         knots[i, VX], knots[i, VY] = _along_heading(slope, knots[i, YAW])
-    return PlanCurve(knots, _last_turn_rate(knots, state, vehicle), 0.0)
+    return PlanCurve(knots, _last_turn_rate(knots, state, vehicle, before), 0.0)
 
 
 @func
@@ -99,11 +105,17 @@ def at(curve, t):
 
 
 @func
-def planned_at(curve, t):
+def planned_at(curve, t, version):
     """Like :func:`at`, but where the plan itself would be before its first pose: on the arc that
     leads there. The vehicle's distance from it is its error, which :func:`at` hides.
 
     A plan that begins late says nothing about the way to it; there the two are the same.
+
+    Args:
+        curve: of the plan.
+        t: seconds after its start, at least 0.
+        version: of the trackers; since 2 the arc is driven with the acceleration of the first
+            poses, without which plans that are made anew at every step have none.
     """
     knots = curve.knots
     first = knots[1, T]
@@ -112,6 +124,8 @@ def planned_at(curve, t):
     rate = curve.turn_rate
     if len(knots) > 2:
         rate = wrapped(knots[2, YAW] - knots[1, YAW]) / (knots[2, T] - first)
+        if version > 1:
+            return _along_changing_arc(knots[1], rate, _first_gain(knots), t - first)
     return _along_arc(knots[1], rate, t - first)
 
 
@@ -166,16 +180,19 @@ def _far_slope(chord, slope):
 
 
 @func
-def _arrival(knots, speed, vehicle):
-    """Velocity [m/s] at a single planned pose: that of the way there, as far as in reach.
-
-    Without the limit a few centimetres over a short step would count as metres per second.
+def _arrival(knots, speed, vehicle, before):
+    """Velocity [m/s] at a single planned pose, as far as in reach: that of the way from the pose
+    before it, else from where the vehicle is. The latter mixes what the plan moves with what the
+    vehicle is off it, which short steps make large.
     """
-    seconds = knots[1, T]
+    seconds, since = knots[1, T], 0.0
     dx, dy = knots[1, X] - knots[0, X], knots[1, Y] - knots[0, Y]
+    if before[0] < seconds:
+        since = before[0]
+        dx, dy = knots[1, X] - before[1], knots[1, Y] - before[2]
     length = math.hypot(dx, dy)
     change = clamped(
-        length / seconds - speed,
+        length / (seconds - since) - speed,
         -vehicle.max_braking * seconds,
         vehicle.max_acceleration * seconds,
     )
@@ -195,11 +212,13 @@ def _along_heading(velocity, yaw):
 
 
 @func
-def _last_turn_rate(knots, state, vehicle):
+def _last_turn_rate(knots, state, vehicle, before):
     """Turn rate [rad/s] at the last pose, as far as the vehicle can turn."""
     last = len(knots) - 1
     h = knots[last, T] - knots[last - 1, T]
     rate = wrapped(knots[last, YAW] - knots[last - 1, YAW]) / h
+    if last == 1 and before[0] < knots[1, T]:
+        rate = wrapped(knots[1, YAW] - before[3]) / (knots[1, T] - before[0])
     if last == 1:
         reach = abs(state.speed) / vehicle.wheelbase * vehicle.max_steer_rate * h
         rate = clamped(rate, state.yaw_rate - reach, state.yaw_rate + reach)
@@ -219,6 +238,31 @@ def _along_arc(knot, rate, since):
     y = knot[Y] + chord * (sin * vx + cos * vy)
     cos, sin = math.cos(2 * half), math.sin(2 * half)
     return x, y, cos * vx - sin * vy, sin * vx + cos * vy
+
+
+@func
+def _first_gain(knots):
+    """Acceleration [m/s^2] along the way from the first planned pose to the next."""
+    before = math.hypot(knots[1, VX], knots[1, VY])
+    along = knots[1, VX] * knots[2, VX] + knots[1, VY] * knots[2, VY]
+    after = math.copysign(math.hypot(knots[2, VX], knots[2, VY]), along)
+    return (after - before) / (knots[2, T] - knots[1, T])
+
+
+@func
+def _along_changing_arc(knot, rate, gain, since):
+    """Place and velocity on an arc ``since`` <= 0 seconds before a knot, driven with a constant
+    acceleration [m/s^2]; it stands before it has begun to move."""
+    speed = math.hypot(knot[VX], knot[VY])
+    if speed == 0.0:
+        return knot[X], knot[Y], 0.0, 0.0
+    if speed + gain * since < 0.0:
+        since = -speed / gain
+    # As long as the arc would take at the knot's own speed.
+    alike = since * (1.0 + gain * since / (2 * speed))
+    x, y, vx, vy = _along_arc(knot, rate, alike)
+    share = (speed + gain * since) / speed
+    return x, y, share * vx, share * vy
 
 
 @func

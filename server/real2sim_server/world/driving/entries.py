@@ -50,21 +50,24 @@ def world_poses(poses, frame):
 
 
 @kernel
-def plan_curve(state, times_us, start_us, poses, vehicle):
+def plan_curve(state, start_us, plan, vehicle):
     """A plan as a curve, see :class:`.curve.Curve`.
 
     Args:
         state: nine floats of a :class:`.state.PlanarState`.
-        times_us: [N] int64, increasing, after ``start_us`` [us].
         start_us: when the vehicle is in that state [us].
-        poses: [N, 3] float64, x, y [m], yaw [rad], world.
+        plan: times [N] int64, increasing, after ``start_us`` [us]; poses [N, 3] float64, x, y [m],
+            yaw [rad], world; and seconds from the start, x, y, yaw of the single pose of the plan
+            before, which one of a single pose goes on from, else ``NO_POSE``.
         vehicle: the members of a :class:`.vehicle.VehicleParameters`.
 
     Returns:
         Knots [N + 1, 6] float64 and the turn rate at the end [rad/s].
     """
+    times_us, poses, before = plan
     seconds = (times_us - start_us) * 1e-6
-    curve = curve_through(PlanarState(*state), seconds, poses, VehicleParameters(*vehicle))
+    parameters = VehicleParameters(*vehicle)
+    curve = curve_through(PlanarState(*state), seconds, poses, parameters, before)
     return curve.knots, curve.turn_rate
 
 

@@ -86,7 +86,7 @@ def follow_schedule(state, curve, t, vehicle, schedule):
 @func
 def solve_schedule(state, curve, since, vehicle):
     """The schedule of a vehicle that is ``since`` seconds into its plan."""
-    wanted = _reference_states(state, curve, since)
+    wanted = _reference_states(state, curve, since, vehicle.tracker_version)
     model = _model_of(vehicle)
     states, inputs = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
     tried = np.empty((STEPS + 1, NX)), np.empty((STEPS, NU))
@@ -124,13 +124,13 @@ def _model_of(vehicle):
 
 
 @func
-def _reference_states(state, curve, since):
+def _reference_states(state, curve, since, version):
     """Wanted states [STEPS + 1, 6]; yaws continuous from the vehicle's."""
     wanted = np.zeros((STEPS + 1, NX))
     yaw = state.yaw
     for k in range(STEPS + 1):
         # After its end the plan is taken to go on; the vehicle brakes once it gets there.
-        point = point_at(curve, since + k * STEP)
+        point = point_at(curve, since + k * STEP, state.yaw, version)
         yaw += wrapped(point.yaw - yaw)
         wanted[k, 0], wanted[k, 1], wanted[k, 2], wanted[k, 3] = point.x, point.y, yaw, point.speed
     return wanted

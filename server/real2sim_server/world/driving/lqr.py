@@ -50,18 +50,21 @@ def regulate(state, curve, t, vehicle, _schedule):
         last = curve.knots[len(curve.knots) - 1]
         point = PlanPoint(last[X], last[Y], last[YAW], 0.0, 0.0, 0.0)
         return Command(-GENTLE_BRAKING, _steering_onto(point, 0.0, state, vehicle))
-    point = point_at(curve, t)
+    point = point_at(curve, t, state.yaw, vehicle.tracker_version)
     along = (point.x - state.x) * math.cos(point.yaw) + (point.y - state.y) * math.sin(point.yaw)
     speed = state.speed * math.cos(state.yaw - point.yaw)
     by_speed, by_drive = lagging_gains(vehicle.known_drive_lag / TIME)
     acceleration = point.acceleration + along / TIME**2 + by_speed * (point.speed - speed) / TIME
     if vehicle.known_drive_lag > 0.0:
-        later = point_at(curve, t + vehicle.known_drive_lag)
+        later = point_at(curve, t + vehicle.known_drive_lag, state.yaw, vehicle.tracker_version)
         acceleration += later.acceleration - point.acceleration
         acceleration -= by_drive * (state.drive - point.acceleration)
     coming = point.curvature
     if vehicle.known_steering_lag > 0.0:
-        coming = point_at(curve, t + vehicle.known_steering_lag).curvature
+        steered = point_at(
+            curve, t + vehicle.known_steering_lag, state.yaw, vehicle.tracker_version
+        )
+        coming = steered.curvature
     return Command(acceleration, _steering_onto(point, coming, state, vehicle))
 
 
@@ -92,16 +95,31 @@ def lagging_gains(lag):
 
 
 @func
-def point_at(curve, t):
-    """The plan ``t`` seconds after its start, with derivatives."""
-    x, y, vx, vy = planned_at(curve, t)
-    _, _, wx, wy = planned_at(curve, t + DIFFERENCE)
+def point_at(curve, t, ahead, version):
+    """The plan ``t`` seconds after its start, with derivatives.
+
+    Args:
+        curve: of the plan.
+        t: [s].
+        ahead: heading of the vehicle [rad].
+        version: of the trackers; since 2 a plan that goes against that heading, as one does that
+            the vehicle has run past, has a speed below 0.
+    """
+    x, y, vx, vy = planned_at(curve, t, version)
+    _, _, wx, wy = planned_at(curve, t + DIFFERENCE, version)
     speed, later = math.hypot(vx, vy), math.hypot(wx, wy)
+    if version > 1:
+        cos, sin = math.cos(ahead), math.sin(ahead)
+        back, back_later = vx * cos + vy * sin < 0.0, wx * cos + wy * sin < 0.0
+        if back:
+            speed, vx, vy = -speed, -vx, -vy
+        if back_later:
+            later, wx, wy = -later, -wx, -wy
     acceleration = (later - speed) / DIFFERENCE
-    if speed < MOVING:
+    if abs(speed) < MOVING:
         return PlanPoint(x, y, heading(curve, t), speed, acceleration, 0.0)
     yaw = math.atan2(vy, vx)
-    turn = wrapped(math.atan2(wy, wx) - yaw) if later > MOVING else 0.0
+    turn = wrapped(math.atan2(wy, wx) - yaw) if abs(later) > MOVING else 0.0
     return PlanPoint(x, y, yaw, speed, acceleration, turn / (speed * DIFFERENCE))
 
 

@@ -45,6 +45,7 @@ class VehicleParameters(NamedTuple):
         steering_lag, drive_lag: time constants of the first order [s].
         known_steering_delay, known_steering_lag, known_drive_delay, known_drive_lag: what trackers
             take these four to be [s]: the same, or 0 where they know nothing of them.
+        tracker_version: of the trackers, see ``EgoSpec``.
     """
 
     model: int
@@ -71,3 +72,4 @@ class VehicleParameters(NamedTuple):
     known_steering_lag: float
     known_drive_delay: float
     known_drive_lag: float
+    tracker_version: int

@@ -83,4 +83,5 @@ def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
         max_speed=spec.max_speed,
         **lags,
         **known,
+        tracker_version=spec.tracker_version,
     )

@@ -18,7 +18,7 @@ from ..errors import WorldError
 from ..seam import Seam
 from .gear import advance_in_gear, can_reverse
 from .motion import Motion, advance_motion, constant_law, teleported
-from .reference import PlannedTrajectory, Pose
+from .reference import PlannedTrajectory, Pose, SinglePose
 from .trackers import tracker_of
 
 Plan = TrajectoryPlan | Control | PoseCommand
@@ -139,6 +139,7 @@ class EgoController:
         controller: active; None before the first plan.
         since_us: when it took over [us].
         pending: plans that have not taken effect yet, in the order in which they will.
+        single: the pose of the active plan, where it is one of a single pose.
     """
 
     spec: ResetSpec
@@ -146,6 +147,7 @@ class EgoController:
     controller: Controller | None = None
     since_us: int = 0
     pending: tuple[PendingPlan, ...] = ()
+    single: SinglePose | None = None
 
     def with_plan(self, plan: Plan, motion: Motion, t_us: int, from_us: int) -> EgoController:
         """With one more plan.
@@ -182,7 +184,7 @@ class EgoController:
             )
         kept = tuple(p for p in self.pending if p.from_us < from_us)
         pending = (*kept, PendingPlan(from_us, _in_world(plan, motion)))
-        return EgoController(self.spec, self.ego, self.controller, self.since_us, pending)
+        return replace(self, pending=pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
         """Controller and vehicle ``us`` later than ``t_us``."""
@@ -200,7 +202,8 @@ class EgoController:
         """The controller and its plans of an ego that was put back over the seam."""
         controller = self.controller.put_back(seam) if self.controller is not None else None
         pending = tuple(plan.put_back(seam) for plan in self.pending)
-        return replace(self, controller=controller, pending=pending)
+        single = self.single and self.single.put_back(seam)
+        return replace(self, controller=controller, pending=pending, single=single)
 
     def command(self, motion: Motion, t_us: int) -> Command:
         """Of the active controller in a motion at ``t_us``."""
@@ -211,8 +214,12 @@ class EgoController:
         """With the newest plan that has taken effect by ``t_us`` under control."""
         current = self
         while current.pending and current.pending[0].from_us <= t_us:
-            controller = current._controller_of(current.pending[0].plan, motion, t_us)
-            current = EgoController(self.spec, self.ego, controller, t_us, current.pending[1:])
+            plan, *rest = current.pending
+            controller = current._controller_of(plan.plan, motion, t_us)
+            single = None
+            if plan.trajectory is not None and self.spec.ego.tracker_version > 1:
+                single = SinglePose.of(plan.trajectory)
+            current = EgoController(self.spec, self.ego, controller, t_us, tuple(rest), single)
         if current.controller is None:
             log = current._follow_log(motion, t_us)
             current = replace(current, controller=log, since_us=t_us)
@@ -241,7 +248,7 @@ class EgoController:
         return self._tracker(motion, t_us, PlannedTrajectory(times, poses))
 
     def _tracker(self, motion: Motion, t_us: int, trajectory: PlannedTrajectory) -> Controller:
-        return tracker_of(motion, t_us, trajectory, self.spec.ego)
+        return tracker_of(motion, t_us, trajectory, self.spec.ego, self.single)
 
 
 def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) -> Controller:

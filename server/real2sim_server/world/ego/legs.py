@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..path import Float
 from .motion import Motion
-from .reference import PlannedTrajectory, ways_along
+from .reference import PlannedTrajectory, SinglePose, ways_along
 
 CUSP, ON_AGAIN = 0.05, 0.02
 """A plan turns back where it goes the other way for this far, and goes on forwards again for this;
@@ -19,6 +19,11 @@ less is noise of a plan that stands [m]."""
 NEAR = 0.05
 """A plan of a single pose changes the gear where the pose is farther away than this on the other
 side [m]."""
+
+
+CREEPING = 0.1
+"""Plans of a single pose that go faster than this from one to the next have the gear of that way,
+wherever the vehicle is [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +43,19 @@ class Leg:
     cusp: tuple[float, float, float] | None = None
 
 
-def legs_of(trajectory: PlannedTrajectory, motion: Motion) -> tuple[Leg, ...]:
-    """The legs of a plan for a vehicle; one where it leads forwards all the way."""
+def legs_of(
+    trajectory: PlannedTrajectory, motion: Motion, before: SinglePose | None = None
+) -> tuple[Leg, ...]:
+    """The legs of a plan for a vehicle; one where it leads forwards all the way. ``before``: what
+    a plan of a single pose goes on from."""
     poses = trajectory.poses
     if len(poses) == 1:
-        return (Leg(_is_behind(poses[0], motion), trajectory),)
+        at_us = int(trajectory.times_us[0])
+        goes = None if before is None else before.speed_to(at_us, poses[0])
+        backwards = _is_behind(poses[0], motion)
+        if goes is not None and abs(goes) > CREEPING:
+            backwards = goes < 0
+        return (Leg(backwards, trajectory),)
     if not motion.reversing and trajectory.leads_forwards:
         return (Leg(False, trajectory),)
     turns = _turns(ways_along(poses), backwards=motion.reversing)

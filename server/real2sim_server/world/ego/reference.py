@@ -7,13 +7,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto.episode import EgoSpec
 
-from ..driving import curve_at, plan_curve, vehicle_parameters, world_poses
+from ..driving import NO_POSE, curve_at, plan_curve, vehicle_parameters, world_poses
 from ..path import Float
 from ..seam import Seam
 from .motion import ControlLaw, Motion
@@ -24,6 +25,10 @@ Pose = tuple[float, float, float]
 
 FEW, CLEARLY = 40, 1e-6
 """Poses up to so many are looked at one by one; a way [m] that no rounding turns round."""
+
+
+LONGEST_GAP_US = 1_000_000
+"""A plan of a single pose goes on from the one before where their poses are this near in time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +94,47 @@ def ways_along(poses: Float) -> Float:
     return ways
 
 
+class SinglePose(NamedTuple):
+    """The only pose of a plan, in the world; the next plan of one pose goes on from it.
+
+    Attributes:
+        at_us: when the vehicle is to be there [us].
+        x, y: [m].
+        yaw: [rad].
+    """
+
+    at_us: int
+    x: float
+    y: float
+    yaw: float
+
+    @staticmethod
+    def of(trajectory: PlannedTrajectory) -> SinglePose | None:
+        """That of a plan, if it has one only."""
+        if len(trajectory.poses) != 1:
+            return None
+        return SinglePose(int(trajectory.times_us[0]), *trajectory.poses[0].tolist())
+
+    def before(self, start_us: int, at_us: int) -> tuple[float, float, float, float]:
+        """As :func:`.driving.plan_curve` takes it for a plan that begins at ``start_us`` and whose
+        pose is for ``at_us``; none where it is too old to say how fast that plan goes."""
+        if not 0 < at_us - self.at_us <= LONGEST_GAP_US:
+            return NO_POSE
+        return (self.at_us - start_us) * 1e-6, self.x, self.y, self.yaw
+
+    def speed_to(self, at_us: int, pose: Float) -> float | None:
+        """Mean speed along the headings [m/s] to the pose [3] of the next plan; None where that is
+        not one to go on to."""
+        if not 0 < at_us - self.at_us <= LONGEST_GAP_US:
+            return None
+        way = ways_along(np.array([self[1:], pose]))
+        return way.item() / ((at_us - self.at_us) * 1e-6)
+
+    def put_back(self, seam: Seam) -> SinglePose:
+        """For a vehicle that was put back over the seam."""
+        return SinglePose(self.at_us, *seam.poses(np.array([self[1:]]))[0].tolist())
+
+
 class ReferenceTrajectory:
     """A planned trajectory as a smooth curve over time, see :mod:`.driving.curve`."""
 
@@ -99,6 +145,7 @@ class ReferenceTrajectory:
         start_us: int,
         trajectory: PlannedTrajectory,
         spec: EgoSpec,
+        before: SinglePose | None = None,
     ) -> None:
         """The curve of a vehicle that is in ``motion`` at ``start_us``.
 
@@ -107,12 +154,15 @@ class ReferenceTrajectory:
             start_us: now [us].
             trajectory: after ``start_us``.
             spec: of the vehicle.
+            before: what a trajectory of a single pose goes on from.
         """
+        goes_on = NO_POSE
+        if before is not None and len(trajectory.poses) == 1:
+            goes_on = before.before(start_us, int(trajectory.times_us[0]))
         self._curve = plan_curve(
             motion.numbers,
-            trajectory.times_us,
             start_us,
-            trajectory.poses,
+            (trajectory.times_us, trajectory.poses, goes_on),
             tuple(vehicle_parameters(spec)),
         )
 

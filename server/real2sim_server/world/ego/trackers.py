@@ -15,7 +15,7 @@ from ..seam import Seam
 from .gear import advance_in_gear, backwards_spec, can_reverse, command_in_gear, mirrored
 from .legs import Leg, legs_of
 from .motion import Motion, advance_motion, commanded, teleported
-from .reference import PlannedTrajectory, ReferenceTrajectory
+from .reference import PlannedTrajectory, ReferenceTrajectory, SinglePose
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,19 +152,28 @@ class GearedTracker:
 
 
 def tracker_of(
-    motion: Motion, start_us: int, trajectory: PlannedTrajectory, spec: EgoSpec
+    motion: Motion,
+    start_us: int,
+    trajectory: PlannedTrajectory,
+    spec: EgoSpec,
+    before: SinglePose | None = None,
 ) -> ControlledTracker | GearedTracker | PerfectTracker:
-    """The tracker that the spec names, of a vehicle that is in ``motion`` at ``start_us``."""
+    """The tracker that the spec names, of a vehicle that is in ``motion`` at ``start_us``;
+    ``before``: what a trajectory of a single pose goes on from."""
     if spec.tracker != "perfect" and can_reverse(spec):
-        legs = legs_of(trajectory, motion)
+        legs = legs_of(trajectory, motion, before)
         if len(legs) > 1 or legs[0].backwards or motion.reversing or motion.speed < 0:
-            geared = [_geared(leg, motion, start_us, spec) for leg in legs]
+            geared = [_geared(leg, motion, start_us, spec, before) for leg in legs]
             return GearedTracker(KINDS[spec.tracker], tuple(geared), spec)
-    ahead = ReferenceTrajectory(motion, start_us=start_us, trajectory=trajectory, spec=spec)
+    ahead = ReferenceTrajectory(
+        motion, start_us=start_us, trajectory=trajectory, spec=spec, before=before
+    )
     return make_tracker(ahead, spec)
 
 
-def _geared(leg: Leg, motion: Motion, start_us: int, spec: EgoSpec) -> GearedLeg:
+def _geared(
+    leg: Leg, motion: Motion, start_us: int, spec: EgoSpec, before: SinglePose | None
+) -> GearedLeg:
     begin_us = start_us if leg.begin_us is None else leg.begin_us
     trajectory = leg.trajectory
     if leg.cusp is not None:
@@ -174,7 +183,10 @@ def _geared(leg: Leg, motion: Motion, start_us: int, spec: EgoSpec) -> GearedLeg
         motion, spec = mirrored(motion), backwards_spec(spec)
         turned = trajectory.poses + np.array([0.0, 0.0, math.pi])
         trajectory = PlannedTrajectory(trajectory.times_us, turned)
-    reference = ReferenceTrajectory(motion, start_us=begin_us, trajectory=trajectory, spec=spec)
+        before = before and before._replace(yaw=before.yaw + math.pi)
+    reference = ReferenceTrajectory(
+        motion, start_us=begin_us, trajectory=trajectory, spec=spec, before=before
+    )
     end_us = int(trajectory.times_us[-1]) - start_us
     return GearedLeg(leg.backwards, begin_us - start_us, end_us, reference)
 

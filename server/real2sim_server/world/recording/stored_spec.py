@@ -12,6 +12,7 @@ BEFORE: Mapping[str, Any] = {
         "actuators": {"steering_lag": 0.0, "drive_lag": 0.0, "foreseen": False},
         "suspension": None,
         "max_reverse_speed": 0.0,
+        "tracker_version": 1,
     },
     "contact": {"swept": False, "pulse": False},
 }

@@ -108,11 +108,18 @@ def comfort_window(dt: float) -> int:
 
 @lru_cache(maxsize=16)
 def _coefficients(window: int, dt: float) -> Float:
-    """Weights [3, window] of value, first and second derivative in the middle."""
-    from scipy.signal import savgol_coeffs  # takes a second to load
+    """Weights [3, window] of value, first and second derivative in the middle.
 
-    order = min(ORDER, window - 2)
-    rows = [savgol_coeffs(window, order, deriv=k, delta=dt, use="dot") for k in range(3)]
+    They reproduce polynomials up to the order, with the least sum of squares; to the bit those of
+    ``scipy.signal.savgol_coeffs``, which takes a second to load, in the midst of a step.
+    """
+    exponents = np.arange(min(ORDER, window - 2) + 1)
+    places = np.arange(-(window // 2), window // 2 + 1, dtype=np.float64)
+    powers = places ** exponents[:, None]
+    rows = []
+    for k in range(3):
+        wanted = np.where(exponents == k, math.factorial(k) / dt**k, 0.0)
+        rows.append(np.linalg.lstsq(powers, wanted, rcond=None)[0])
     return np.stack(rows)
 
 
