@@ -20,6 +20,10 @@ from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .types import Instance, RasterOptions, RenderError, Sky
 
 
+def _at_once() -> None:
+    """Nothing has to be waited for."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """The images of one camera.
@@ -32,12 +36,14 @@ class Frame:
             uint8, see SEMANTIC_CLASSES.
         T_world_camera: [4, 4] float64, OpenCV camera frame to world.
         timing_ms: by stage; cameras drawn together share their time equally.
+        ready: returns when the images are whole; nobody has to ask but who asked not to wait.
     """
 
     camera: str
     images: Mapping[str, NDArray[Any]]
     T_world_camera: NDArray[np.float64]
     timing_ms: dict[str, float] = field(default_factory=dict)
+    ready: Callable[[], object] = _at_once
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
@@ -114,6 +120,7 @@ def render_rigs(
     modalities: Sequence[str] | None = None,
     backend: str | Backend = "auto",
     between: Callable[[], object] | None = None,
+    waits: bool = True,
 ) -> list[list[Frame]]:
     """Frames of several vehicles, as :func:`render_cameras` gives each; all are drawn in one call
     where the backend can, see :func:`draws_together`.
@@ -121,6 +128,7 @@ def render_rigs(
     Args:
         views: what the cameras of each vehicle look at.
         options, modalities, backend, between: as of :func:`render_cameras`.
+        waits: until images are whole; else each is once its frame's ``ready`` has returned.
 
     Raises:
         RenderError: as :func:`render_cameras`, for any of them; nothing is drawn then.
@@ -134,10 +142,12 @@ def render_rigs(
     requests = [_request(views[v], members, options, between) for v, members in groups]
     frames: list[dict[int, Frame]] = [{} for _ in views]
     drawn = _drawn(requests, modalities, chosen)
-    for (v, members), (images, timing_ms) in zip(groups, drawn, strict=True):
-        made = _frames(views[v], members, images, timing_ms)
+    for (v, members), found in zip(groups, drawn, strict=True):
+        made = _frames(views[v], members, found)
+        if waits:
+            found.ready()
         frames[v].update(zip(members, made, strict=True))
-    return [[found[index] for index in range(len(found))] for found in frames]
+    return [[own[index] for index in range(len(own))] for own in frames]
 
 
 def draws_together(backend: Backend, modalities: Iterable[str]) -> bool:
@@ -196,40 +206,46 @@ def _vehicle_pose(given: ArrayLike) -> NDArray[np.float64]:
     return pose
 
 
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Images [C, H, W, ...] by modality, milliseconds by stage, and what waits for the images."""
+
+    images: Mapping[str, NDArray[Any]]
+    timing_ms: Mapping[str, float]
+    ready: Callable[[], object] = _at_once
+
+
 def _drawn(
     requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
-) -> Iterator[tuple[Mapping[str, NDArray[Any]], dict[str, float]]]:
-    """Images [C, H, W, ...] by modality of each request, and milliseconds by stage."""
-    if isinstance(backend, FrameBackend) and draws_together(backend, modalities):
+) -> Iterator[_Drawn]:
+    """What comes of each request."""
+    if requests and isinstance(backend, FrameBackend) and draws_together(backend, modalities):
         start = time.perf_counter()
-        finished = backend.frames(requests, modalities) if requests else []
+        started = backend.start_frames(requests, modalities)
         cameras = sum(request.cameras for request in requests)
         each = (time.perf_counter() - start) * 1e3 / max(cameras, 1)
-        for request, images in zip(requests, finished, strict=True):
-            yield images, {"total": each * request.cameras}
+        for request, images in zip(requests, started.images, strict=True):
+            yield _Drawn(images, {"total": each * request.cameras}, started.ready)
         return
     for request in requests:
         output = backend.rasterize(request)
         if "semantic" in modalities:
             classes, behind = _classes(request.instances), class_behind(request)
             output = replace(output, classes=classes, behind=behind)
-        yield {name: modality_of(name).pixels(output) for name in modalities}, output.timing_ms
+        images = {name: modality_of(name).pixels(output) for name in modalities}
+        yield _Drawn(images, output.timing_ms)
 
 
-def _frames(
-    view: RigView,
-    members: Sequence[int],
-    images: Mapping[str, NDArray[Any]],
-    timing_ms: Mapping[str, float],
-) -> list[Frame]:
-    share = {stage: value / len(members) for stage, value in timing_ms.items()}
+def _frames(view: RigView, members: Sequence[int], drawn: _Drawn) -> list[Frame]:
+    share = {stage: value / len(members) for stage, value in drawn.timing_ms.items()}
     vehicle = _vehicle_pose(view.T_world_vehicle)
     return [
         Frame(
             camera=view.cameras[index].name,
-            images={name: pixels[c] for name, pixels in images.items()},
+            images={name: pixels[c] for name, pixels in drawn.images.items()},
             T_world_camera=view.cameras[index].pose(vehicle),
             timing_ms=dict(share),
+            ready=drawn.ready,
         )
         for c, index in enumerate(members)
     ]

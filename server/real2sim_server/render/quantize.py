@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
+import torch
 from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
@@ -30,7 +32,7 @@ def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDA
     """
     if rgb.device.type != "cpu":
         rounded = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
-        return rounded.cpu().numpy()
+        return _on_host(rounded)
     values = np.ascontiguousarray(rgb.detach().numpy())
     levels = np.empty(values.shape, np.uint8)
     given, result = values.reshape(-1), levels.reshape(-1)
@@ -45,7 +47,7 @@ def solid_depth(
     """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA; ``between`` is called
     between pieces of the work."""
     if depth.device.type != "cpu":
-        return depth.where(alpha >= SOLID_ALPHA, 0.0).cpu().numpy()
+        return _on_host(depth.where(alpha >= SOLID_ALPHA, 0.0))
     values = np.ascontiguousarray(depth.detach().numpy())
     kept = np.empty_like(values)
     cover = np.ascontiguousarray(alpha.detach().numpy())
@@ -53,6 +55,14 @@ def solid_depth(
     for piece in _pieces(len(given), between):
         _keep_solid(given[piece], covers[piece], result[piece])
     return kept
+
+
+def _on_host(image: Tensor) -> NDArray[Any]:
+    """By memory that a GPU writes to without help, several times as fast as any other."""
+    if image.device.type != "cuda":
+        return image.cpu().numpy()
+    held = torch.empty(image.shape, dtype=image.dtype, pin_memory=True)
+    return held.copy_(image).numpy()
 
 
 def _pieces(length: int, between: Callable[[], object] | None) -> Iterator[slice]:

@@ -301,6 +301,11 @@ class Engine:
             del job
         self._began = time.perf_counter()
 
+    def note_error(self, error: BaseException) -> None:
+        """Something that began here has failed on another thread: the device may be lost."""
+        if self._failure is None and _loses_device(error):
+            self._lose_device(error)
+
     # --- state ------------------------------------------------------------------------------
 
     @property
@@ -468,8 +473,7 @@ class Engine:
         if job.companions is None or not isinstance(result, Exception):
             job.future.set_result(result)
             return
-        if self._failure is None and _loses_device(result):
-            self._lose_device(result)
+        self.note_error(result)
         job.future.set_exception(result)
 
     def _lose_device(self, error: BaseException) -> None:

@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.render import Instance, rasterize, render_cameras
+from real2sim_server.render import (
+    Frame,
+    Instance,
+    RigView,
+    rasterize,
+    render_cameras,
+    render_rigs,
+)
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.scene import Camera, GaussianCloud, Sky, TimeColour
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
@@ -64,7 +71,7 @@ COLOUR = TimeColour(torch.full((30, 2, 3), 0.1), "cosine", 0, 10**7)
 
 
 @pytest.mark.parametrize("objects", [2, 40])
-def test_a_frame_is_one_copy_each_way_one_wait_and_few_launches(
+def test_a_frame_is_one_copy_to_the_device_and_few_launches(
     serving: NvrtcBackend, device_counts: pretended.Counts, objects: int
 ) -> None:
     def draw(seconds: float) -> None:
@@ -77,8 +84,30 @@ def test_a_frame_is_one_copy_each_way_one_wait_and_few_launches(
     draw(0.5)
     assert device_counts.launches <= 25
     assert device_counts.to_device == 1
-    assert device_counts.to_host == 1
-    assert device_counts.waits == 1
+    # The counters of the kernels, and all images: what follows is drawn beside this copy.
+    assert device_counts.to_host == 2
+    assert device_counts.waits == 2
+
+
+def test_the_next_frame_is_drawn_before_the_last_one_is_copied(
+    serving: NvrtcBackend, device_counts: pretended.Counts
+) -> None:
+    def started(seconds: float) -> list[Frame]:
+        view = RigView(world(3, seconds), cameras(), np.eye(4), SKY)
+        wanted = ["rgb", "depth"]
+        return render_rigs([view], modalities=wanted, backend=serving, waits=False)[0]
+
+    started(0.0)
+    device_counts.__init__()  # type: ignore[misc]
+    first, second = started(0.2), started(0.6)
+    # Each has waited for its kernels, by their counters, and for no image.
+    assert (device_counts.to_host, device_counts.waits) == (2, 2)
+    for frames, seconds in ((first, 0.2), (second, 0.6)):
+        expected = render_cameras(world(3, seconds), cameras(), np.eye(4), sky=SKY, backend=serving)
+        for frame, other in zip(frames, expected, strict=True):
+            frame.ready()
+            np.testing.assert_array_equal(frame.rgb, other.rgb)
+            np.testing.assert_array_equal(frame.images["depth"], other.images["depth"])
 
 
 def test_pictures_of_the_device_are_those_of_the_reference(serving: NvrtcBackend) -> None:

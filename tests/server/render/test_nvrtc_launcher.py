@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,6 +37,9 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
     stream = SimpleNamespace(cuda_stream=0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
+    copying = SimpleNamespace(wait_stream=lambda other: taken.append(("waits for", other)))
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: copying)
+    monkeypatch.setattr(torch.cuda, "stream", lambda given: nullcontext(taken.append(given)))
     return taken
 
 
@@ -56,6 +60,41 @@ def test_a_launch_names_stream_blocks_kernel_and_arguments(
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: other)
     launcher.launch("find_ranges", 1, 0x7000)
     assert launches[2][0] == "stream 5"
+
+
+def test_images_are_copied_on_a_stream_of_their_own_and_waited_for_by_an_event(
+    launches: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Event:
+        def __init__(self, *, blocking: bool) -> None:
+            assert blocking
+
+        def record(self, stream: object) -> None:
+            launches.append(("records", stream))
+
+        def synchronize(self) -> None:
+            launches.append(("waits",))
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    launcher = CudaLauncher()
+    launches.clear()
+    source = SimpleNamespace(record_stream=lambda stream: launches.append(("kept for", stream)))
+    target = SimpleNamespace(
+        copy_=lambda given, non_blocking: launches.append(("copies", given, non_blocking))
+    )
+    ready = launcher.copy_out(source, target)  # type: ignore[arg-type]
+    copying = launcher._copying
+    assert launches == [
+        ("waits for", torch.cuda.current_stream(None)),
+        copying,
+        ("copies", source, True),
+        ("records", copying),
+        ("kept for", copying),
+    ]
+    launches.clear()
+    ready()
+    ready()
+    assert launches == [("waits",)] * 2
 
 
 def test_a_launch_that_fails_is_known_as_the_loss_of_the_device(

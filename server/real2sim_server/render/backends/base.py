@@ -121,6 +121,20 @@ class BatchBackend(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class StartedFrames:
+    """Images on their way to the host.
+
+    Attributes:
+        images: [C, H, W, ...] by modality of each request, on the host; whole once ``ready`` has
+            returned.
+        ready: waits for them; on any thread, any number of times.
+    """
+
+    images: list[dict[str, NDArray[Any]]]
+    ready: Callable[[], object]
+
+
 @runtime_checkable
 class FrameBackend(Protocol):
     """A Backend that draws images of several sizes in one go, as they leave the renderer."""
@@ -136,6 +150,13 @@ class FrameBackend(Protocol):
         """Images [C, H, W, ...] by modality of each request, on the host and for the caller to
         keep; what the modality's ``pixels`` makes of :meth:`Backend.rasterize`, within one level
         of a byte."""
+        ...
+
+    def start_frames(
+        self, requests: Sequence[RasterRequest], modalities: Sequence[str]
+    ) -> StartedFrames:
+        """As :meth:`frames`, but returns when they are drawn: the next ones are drawn while they
+        are copied."""
         ...
 
 

@@ -7,7 +7,7 @@ image is known before the image is drawn; the image itself is never copied.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +36,7 @@ class RenderedImage:
         T_world_sensor: [4, 4] float64, camera frame to world.
         K: [3, 3] float64 intrinsics [px].
         pixels: of the dtype and shape of the modality.
+        ready: returns when they are there; asked before they are read.
     """
 
     sensor: SensorSpec
@@ -44,6 +45,7 @@ class RenderedImage:
     T_world_sensor: NDArray[np.float64]
     K: NDArray[np.float64]
     pixels: NDArray[Any]
+    ready: Callable[[], object] = lambda: None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,7 @@ class EncodedFrame:
 
 def encode_frame(image: RenderedImage) -> EncodedFrame:
     """The frame of an image; raw ones are views of its pixels. On any thread."""
+    image.ready()
     fields = _place_fields(image.sensor, image.modality, image.t_us, image.T_world_sensor, image.K)
     if image.sensor.codec == "raw":
         return with_pixels(_raw_header(fields, image.pixels.shape[:2]), image.pixels)

@@ -501,6 +501,8 @@ class StepPipeline:
         self, rendered: RenderedObservation, headers: Sequence[FrameHeader]
     ) -> EncodedObservation:
         """The message of an instant whose images are all raw."""
+        for image in rendered.images:
+            image.ready()
         frames = [with_pixels(h, i.pixels) for h, i in zip(headers, rendered.images, strict=True)]
         return _with_frames(rendered, frames)
 

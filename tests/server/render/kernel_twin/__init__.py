@@ -14,7 +14,9 @@ import hashlib
 import shutil
 import subprocess
 import tempfile
+import threading
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -83,3 +85,14 @@ class TwinLauncher:
 
     def wait(self) -> None:
         """Everything is done when it is launched."""
+
+    def copy_out(self, source: Tensor, target: Tensor) -> Callable[[], object]:
+        lock, copied = threading.Lock(), []
+
+        def copy() -> None:
+            """Once, as late as may be, so that who reads before is found out."""
+            with lock:
+                if not copied:
+                    copied.append(target.copy_(source))
+
+        return copy

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...types import RasterOptions, RenderError, RenderOutput, WorldViews
-from ..base import RasterRequest, needs_gradients
+from ..base import RasterRequest, StartedFrames, needs_gradients
 from ..warm_up import warm_up_requests
 from .launcher import CudaLauncher, Launcher
 from .memory import PAIRS_PER_SPLAT, REPORT_BYTES, FrameMemory, Images, tile_passes
@@ -124,26 +124,44 @@ class NvrtcBackend:
         self, requests: Sequence[RasterRequest], modalities: Sequence[str]
     ) -> list[dict[str, NDArray[Any]]]:
         """Images of all requests as they leave the renderer, see FrameBackend."""
+        started = self.start_frames(requests, modalities)
+        started.ready()
+        return started.images
+
+    def start_frames(
+        self, requests: Sequence[RasterRequest], modalities: Sequence[str]
+    ) -> StartedFrames:
+        """As :meth:`frames`, returning when they are drawn, see FrameBackend."""
         pieces = [(k, piece) for k, request in enumerate(requests) for piece in _pieces(request)]
         found: list[list[dict[str, NDArray[Any]]]] = [[] for _ in requests]
+        copies = []
         for batch in _batches(pieces):
             drawn = self._frame([piece for _, piece in batch], modalities)
-            for (k, _), images in zip(batch, drawn, strict=True):
+            copies.append(drawn.ready)
+            for (k, _), images in zip(batch, drawn.images, strict=True):
                 found[k].append(images)
-        return [
+
+        def ready() -> None:
+            for copied in copies:
+                copied()
+
+        if any(len(parts) > 1 for parts in found):
+            ready()
+        whole = [
             parts[0]
             if len(parts) == 1
             else {name: np.concatenate([part[name] for part in parts]) for name in modalities}
             for parts in found
         ]
+        return StartedFrames(whole, ready)
 
-    def _frame(
-        self, requests: Sequence[RasterRequest], modalities: Sequence[str]
-    ) -> list[dict[str, NDArray[Any]]]:
+    def _frame(self, requests: Sequence[RasterRequest], modalities: Sequence[str]) -> StartedFrames:
         names = [FINISHED[name] for name in modalities]
         with self._lock:
-            images = self._draw(requests, names, keeps_images=True)
-        memory = images.memory.numpy()
+            images = self._draw(requests, names)
+            host = self._launcher.host_memory(len(images.memory))
+            ready = self._launcher.copy_out(images.memory, host)
+        memory = host.numpy()
         results, first = [], 0
         for request in requests:
             pixels = request.cameras * request.height * request.width
@@ -157,12 +175,10 @@ class NvrtcBackend:
                 }
             )
             first += pixels
-        return results
+        return StartedFrames(results, ready)
 
-    def _draw(
-        self, requests: Sequence[RasterRequest], names: Sequence[str], *, keeps_images: bool = False
-    ) -> Images:
-        """Images on the device, or with ``keeps_images`` on the host, when they are whole.
+    def _draw(self, requests: Sequence[RasterRequest], names: Sequence[str]) -> Images:
+        """Images on the device, when they are whole.
 
         Space is what frames before have needed; a frame that needs more is drawn again.
         """
@@ -184,16 +200,15 @@ class NvrtcBackend:
             images = memory.images(names, tables.pixels)
             frame = memory.upload(tables, images, requests[0].options)
             self._launch(frame, tables)
-            given = images.memory if keeps_images else images.memory[:REPORT_BYTES]
-            host = self._launcher.host_memory(len(given))
-            host.copy_(given, non_blocking=True)
+            host = self._launcher.host_memory(REPORT_BYTES)
+            host.copy_(images.memory[:REPORT_BYTES], non_blocking=True)
             self._launcher.wait()
-            report = host.numpy()[:REPORT_BYTES].view(np.uint32)
+            report = host.numpy().view(np.uint32)
             seen, pairs = int(report[SEEN_WANTED]), int(report[PAIRS_WANTED])
             if not tables.pieces or (
                 seen <= memory.seen_capacity and pairs <= memory.pair_capacity
             ):
-                return replace(images, memory=host) if keeps_images else images
+                return images
             memory.reserve(seen + seen // 4, pairs + pairs // 4)
 
     def _launch(self, frame: int, tables: Tables) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -42,7 +43,16 @@ class Launcher(Protocol):
         ...
 
     def wait(self) -> None:
-        """Return when all that was queued is done."""
+        """Return when all launches, and copies queued with them, are done."""
+        ...
+
+    def copy_out(self, source: Tensor, target: Tensor) -> Callable[[], object]:
+        """Copy a tensor of the device to host memory once all launches up to now are done, beside
+        those to come.
+
+        Returns:
+            Waits for the copy, on any thread.
+        """
         ...
 
 
@@ -64,6 +74,7 @@ class CudaLauncher:
         code = ObjectCode.from_cubin(compiled_kernels(f"sm_{major}{minor}"))
         self._kernels = {name: code.get_kernel(name) for name in KERNELS}
         self._streams: dict[int, Any] = {}
+        self._copying = torch.cuda.Stream(self.device)
         self._threads = threading.local()
 
     def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
@@ -93,6 +104,18 @@ class CudaLauncher:
     def wait(self) -> None:
         """See Launcher."""
         torch.cuda.current_stream(self.device).synchronize()
+
+    def copy_out(self, source: Tensor, target: Tensor) -> Callable[[], object]:
+        """See Launcher."""
+        self._copying.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.cuda.stream(self._copying):
+            target.copy_(source, non_blocking=True)
+            # Who waits for it sleeps; it may be one of several threads that encode.
+            copied = torch.cuda.Event(blocking=True)
+            copied.record(self._copying)
+        # Its memory is not given to the next frame before.
+        source.record_stream(self._copying)
+        return copied.synchronize
 
     def _stream(self) -> Any:
         from cuda.core import LEGACY_DEFAULT_STREAM, Stream
