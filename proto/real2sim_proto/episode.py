@@ -430,6 +430,11 @@ class ContactSpec(Model):
         default=True,
         description="images show struck objects deformed, by the material point method",
     )
+    breakage: bool = Field(
+        default=True,
+        description="sheet of struck vehicles folds, their lamps and glass break, and fragments "
+        "stay on the road; false: dents only, as in episodes recorded before this option was there",
+    )
 
 
 class ScoringSpec(Model):

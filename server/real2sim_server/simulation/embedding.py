@@ -7,6 +7,7 @@ once. Any affine motion of the particles is reproduced exactly.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,8 +72,28 @@ class Embedding:
         beyond = np.linalg.norm(self._offset, axis=1) / spacing
         self._trust = np.clip(2.5 - beyond, 0, 1)[:, None, None]
 
-    def follow(self, displacements: Float) -> Deformed:
-        """Where the points are when particles are displaced by ``displacements`` [N, 3] [m]."""
+    def near(self, particles: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """[G] which points follow any of some particles [N]."""
+        found: NDArray[np.bool_] = np.any(particles[self._index], axis=1)
+        return found
+
+    def gradients(self, displacements: Float, rows: NDArray[np.int64]) -> Float:
+        """[R, 3, 3] F of some points, without bounds on their stretch; a fraction of the cost of
+        :meth:`follow`."""
+        u = np.asarray(displacements, dtype=np.float64)[self._index[rows]]
+        trust = self._trust[rows]
+        F: Float = np.eye(3) + trust * (u.transpose(0, 2, 1) @ self._slopes[rows])
+        return F
+
+    def follow(self, displacements: Float, rows: NDArray[np.int64] | None = None) -> Deformed:
+        """Where the points are when particles are displaced by ``displacements`` [N, 3] [m].
+
+        Args:
+            displacements: of all particles.
+            rows: points that are asked for; all by default.
+        """
+        if rows is not None:
+            return self._of(rows).follow(displacements)
         u = np.asarray(displacements, dtype=np.float64)[self._index]
         F = np.eye(3) + u.transpose(0, 2, 1) @ self._slopes
         left, stretch, right = np.linalg.svd(F)
@@ -83,6 +104,13 @@ class Embedding:
         mean = (self._weights[:, None] @ u)[:, 0]
         moved = self._centre + mean + (F @ self._offset[:, :, None])[:, :, 0]
         return Deformed(moved, F, rotations)
+
+    def _of(self, rows: NDArray[np.int64]) -> Embedding:
+        """Of some of the points alone."""
+        part = copy(self)
+        for name in ("_index", "_weights", "_slopes", "_centre", "_offset", "_trust"):
+            setattr(part, name, getattr(self, name)[rows])
+        return part
 
 
 def deform_cloud(cloud: GaussianCloud, deformed: Deformed) -> GaussianCloud:

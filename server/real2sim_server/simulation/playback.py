@@ -207,13 +207,13 @@ class _Damaged:
         if self._most is None or self._upto > shown:
             self._upto, self._most = 0, None
         for row in range(self._upto, shown + 1):
-            body = self._vehicle.follow(self._own.shapes[row].astype(np.float64))
-            now = self._vehicle.shortening(body)
+            moved = self._own.shapes[row].astype(np.float64)
+            now = self._vehicle.shortening(moved)
             self._most = now if self._most is None else np.maximum(self._most, now)
         self._upto = shown
         assert self._most is not None
         ages = {b.part: time_s - b.time_s for b in self._broken if b.time_s <= time_s}
-        return self._vehicle.cloud(body, self._most, ages)
+        return self._vehicle.cloud(moved, self._most, ages)
 
 
 def _placed(

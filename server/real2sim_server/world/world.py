@@ -135,7 +135,7 @@ class World:
         self._off_route = self._off_road = False
         self._contacts = self._initial_contacts()
         if deformation is None and self._contacts.exchanges_momentum and spec.contact.dents:
-            self.deformation = DeformationTracker(scene)
+            self.deformation = DeformationTracker(scene, breakage=spec.contact.breakage)
         self.impacts: tuple[Impact, ...] = ()
         self._events: tuple[Event, ...] = ()
         self._edit_events: tuple[Event, ...] = ()
@@ -362,6 +362,7 @@ class World:
                 drawn[k] = self.deformation.deformed_instance(
                     subject.object_id, drawn[k], self.t_us
                 )
+            drawn += self.deformation.fragments(self.t_us)
         return drawn
 
     def due_sensors(self) -> list[SensorSpec]:

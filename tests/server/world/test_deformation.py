@@ -175,9 +175,28 @@ def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_sce
         other = again.apply(entry)
         other.instances()
     assert bits(cloud_of(world)) == bits(cloud_of(other))
+    assert bits(world.instances()[-1].cloud) == bits(other.instances()[-1].cloud)
     fork.step(COAST)
     assert bits(cloud_of(fork)) == bits(cloud_of(world))
     assert bits(cloud_of(world)) != bits(scene.objects["car"].cloud)
+
+
+def test_what_broke_lies_on_the_road_unless_the_episode_is_from_before(crash_scene, moving):
+    scene = crash_scene(car=moving(20, 0, z=0.75))
+    drawn = {}
+    for breakage in (True, False):
+        world = world_of(scene, contact=GO_ON["contact"] | {"breakage": breakage})
+        drive_until_contact(world)
+        for _ in range(12):
+            world.step(COAST)
+        drawn[breakage] = world.instances()
+    assert len(drawn[True]) == len(drawn[False]) + 1
+    fragments = drawn[True][-1]
+    assert fragments.instance_id == drawn[True][1].instance_id
+    means = fragments.cloud.means.numpy()
+    assert (means[:, 2] > scene.ground.height_at(means[:, :2])).all()
+    assert bits(drawn[True][1].cloud) != bits(drawn[False][1].cloud)
+    assert len(drawn[False][1].cloud) == len(scene.objects["car"].cloud)
 
 
 @pytest.mark.parametrize(

@@ -94,8 +94,9 @@ def test_a_fork_amid_an_impact_goes_on_as_the_world_does(make_world, moving):
 def test_specs_of_older_logs_keep_their_sudden_impacts(make_world, moving):
     spec = rear_end(make_world, moving).spec
     fields = spec.model_dump(mode="json")
-    del fields["contact"]["pulse"]
+    del fields["contact"]["pulse"], fields["contact"]["breakage"]
     assert not stored_spec(fields).contact.pulse
+    assert not stored_spec(fields).contact.breakage
     assert recorded_spec(Entry(0, "reset", reset_payload(spec))).contact.pulse
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...scene import GaussianCloud
-from ..embedding import Deformed, Embedding, deform_cloud
+from ..embedding import Embedding, deform_cloud, replaced_rows
 from .parts import Part, parts_of
 from .sheet import Sheet
 
@@ -33,8 +33,12 @@ CRAZED = 0.55
 """Of a cracked windscreen that is crazed."""
 DROOP, DROOP_TIME = 0.16, 0.35
 """Angle by which a loose bumper hangs down at one end [rad], and in what time [s]."""
+LOOSE = 0.25
+"""How far its loose end stands off, against how far it hangs down."""
 CLEARANCE = 0.04
 """Of a loose bumper above the road [m]."""
+LEAST_MOVED = 5e-3
+"""Particles that have moved less than this leave Gaussians where they are [m]."""
 SPLIT = 1.5
 """Gaussians stretched by more are drawn as two, side by side."""
 
@@ -83,37 +87,47 @@ class DamagedVehicle:
             seed=self._seed,
         )
 
-    def follow(self, displacements: Float) -> Deformed:
-        """Its Gaussians with particles displaced [N, 3] [m], before anything folds."""
-        return self._embedding.follow(displacements)
+    def shortening(self, displacements: Float) -> Float:
+        """[G, 3] by what fraction the sheet at each Gaussian is shorter along the vehicle's axes,
+        with particles displaced [N, 3] [m]; the largest so far goes into :meth:`cloud`."""
+        shorter = np.zeros((len(self._points), 3))
+        rows = np.flatnonzero(self._embedding.near(_moved(displacements)))
+        shorter[rows] = self._sheet.shortening(self._embedding.gradients(displacements, rows))
+        return shorter
 
-    def shortening(self, body: Deformed) -> Float:
-        """[G, 3] see :meth:`Sheet.shortening`; largest values go into :meth:`cloud`."""
-        return self._sheet.shortening(body.F)
-
-    def cloud(self, body: Deformed, most: Float, broken: Mapping[str, float]) -> GaussianCloud:
-        """What is drawn.
+    def cloud(
+        self, displacements: Float, most: Float, broken: Mapping[str, float]
+    ) -> GaussianCloud:
+        """What is drawn; Gaussians that nothing has moved stay as they are, bit for bit.
 
         Args:
-            body: of :meth:`follow`.
+            displacements: [N, 3] of its particles from rest [m].
             most: [G, 3] largest shortening so far.
             broken: names of parts that have broken, and how long ago [s].
         """
-        folded = self._sheet.fold(body, most)
-        positions = folded.deformed.positions
-        for name, age in broken.items():
-            if self._parts[name].kind == "bumper":
-                positions = self._drooped(name, positions, age)
-        moved = deform_cloud(self._cloud, replace(folded.deformed, positions=positions))
-        light = folded.light.copy()
+        changed = self._embedding.near(_moved(displacements)) | (most > 0).any(axis=1)
+        if (changed & self._sheet.bonnet).any():
+            changed |= self._sheet.bonnet
+        rows = np.flatnonzero(changed)
+        body = self._embedding.follow(displacements, rows)
+        folded = self._sheet.fold(body, most[rows], rows)
+        index = torch.from_numpy(rows).to(self._cloud.device)
+        part = deform_cloud(self._cloud.select(index), folded.deformed)
+        light = np.ones(len(self._points))
+        light[rows] = folded.light
         for name in broken:
             kind = self._parts[name].kind
             if kind in ("lamp", "pane"):
                 light[self._rows[name]] *= LAMP_LEFT if kind == "lamp" else PANE_LEFT
+        moved = replaced_rows(self._cloud, index, part)
         sh = _lit(moved.sh, light)
         if "windscreen" in broken:
             sh = self._crazed(sh)
-        return _split(replace(moved, sh=sh), body.F)
+        means = moved.means
+        for name, age in broken.items():
+            if self._parts[name].kind == "bumper":
+                means = self._drooped(name, means, age)
+        return _split(replace(moved, means=means, sh=sh), rows, body.F)
 
     def _rows_of(self, part: Part) -> NDArray[np.int64]:
         """Gaussians that a part consists of: all at its place, without paint around it."""
@@ -137,22 +151,24 @@ class DamagedVehicle:
         inside: NDArray[np.bool_] = np.hypot(along, up) < WHEEL_RADIUS
         return inside & (np.abs(self._points[:, 1]) > width / 2 - TREAD)
 
-    def _drooped(self, name: str, positions: Float, age: float) -> Float:
+    def _drooped(self, name: str, means: torch.Tensor, age: float) -> torch.Tensor:
         """A bumper that hangs by one end; which one differs from vehicle to vehicle."""
         rows = self._rows[name]
         if not len(rows):
-            return positions
-        places = positions[rows]
+            return means
+        places = means[rows].detach().cpu().numpy().astype(np.float64)
         side = 1.0 if (self._seed >> 3) % 2 else -1.0
         arm = places[:, 1] * side
         arm = arm - arm.min()
         fallen = 1 - np.exp(-3 * age / DROOP_TIME)
         sunk = np.tan(DROOP) * fallen * arm
         sunk = np.minimum(sunk, places[:, 2] + self._size[2] / 2 - CLEARANCE)
-        moved = positions.copy()
-        moved[rows, 2] -= np.maximum(sunk, 0.0)
+        sunk = np.maximum(sunk, 0.0)
+        places[:, 2] -= sunk
         # It comes off forwards as well, where it is loose.
-        moved[rows, 0] += np.sign(places[:, 0].mean()) * 0.25 * np.maximum(sunk, 0.0)
+        places[:, 0] += np.sign(places[:, 0].mean()) * LOOSE * sunk
+        moved = means.clone()
+        moved[rows] = torch.from_numpy(places.astype(np.float32)).to(means.device)
         return moved
 
     def _crazed(self, sh: torch.Tensor) -> torch.Tensor:
@@ -175,6 +191,12 @@ class DamagedVehicle:
         return cracked
 
 
+def _moved(displacements: Float) -> NDArray[np.bool_]:
+    """[N] particles that have moved by more than what leaves Gaussians where they are."""
+    moved: NDArray[np.bool_] = np.linalg.norm(displacements, axis=1) > LEAST_MOVED
+    return moved
+
+
 def _lit(sh: torch.Tensor, light: Float) -> torch.Tensor:
     """Harmonics of Gaussians whose colours are multiplied by ``light`` [G]."""
     factor = torch.from_numpy(light.astype(np.float32)).to(sh.device)
@@ -183,11 +205,11 @@ def _lit(sh: torch.Tensor, light: Float) -> torch.Tensor:
     return lit
 
 
-def _split(cloud: GaussianCloud, F: Float) -> GaussianCloud:
-    """The cloud with Gaussians that were stretched far split in two, so that none is a needle and
-    nothing opens between them."""
+def _split(cloud: GaussianCloud, changed: NDArray[np.int64], F: Float) -> GaussianCloud:
+    """The cloud with those Gaussians split in two that were stretched far, so that none is a needle
+    and nothing opens between them; F [R, 3, 3] is of those that were ``changed`` [R]."""
     stretch = np.linalg.norm(F, axis=1).max(axis=1)
-    rows = torch.from_numpy(np.flatnonzero(stretch > SPLIT)).to(cloud.device)
+    rows = torch.from_numpy(changed[stretch > SPLIT]).to(cloud.device)
     if not len(rows):
         return cloud
     part = cloud.select(rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,9 +13,11 @@ from ...geometry.rotation import Float
 from .parts import Kind, Part, parts_of
 
 LIMITS: dict[Kind, float] = {"lamp": 0.05, "bumper": 0.08, "windscreen": 0.03, "pane": 0.035}
-"""A lamp or a bumper breaks when what carries it was pushed in by so much on average; glass when
-its frame is racked by so much, root mean square over the frame [m]. Laminated screens crack first:
-side windows give way with their door."""
+"""A lamp or a bumper breaks when the outer part of what carries it was pushed in by so much; glass
+when its frame is racked by so much, root mean square over the frame [m]. Laminated screens crack
+first: side windows give way with their door."""
+OUTER = 0.75
+"""Quantile of the way in that counts: half of what is around a lamp is behind it."""
 LEAST_PARTICLES = 3
 NEAR = 0.6
 """Particles within so many spacings of a part's box carry it."""
@@ -89,6 +92,12 @@ class BreakageLog:
                 self.broken[part.name] = max(self.broken.get(part.name, 0.0), passed)
         return new
 
+    def copy(self) -> BreakageLog:
+        """A log that goes on from here on its own."""
+        twin = copy(self)
+        twin.broken = dict(self.broken)
+        return twin
+
     def place(self, part: Part, displacements: Float) -> Float:
         """[3] where the middle of a part is, object frame [m]."""
         near = next(n for p, n in self._carried if p.name == part.name)
@@ -100,4 +109,4 @@ def _strain(part: Part, moved: Float) -> float:
     """What counts against the part's limit [m]."""
     if part.kind in ("windscreen", "pane"):
         return float(np.sqrt(((moved - moved.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return float(-(moved @ np.array(part.outward)).mean())
+    return float(np.quantile(-(moved @ np.array(part.outward)), OUTER))

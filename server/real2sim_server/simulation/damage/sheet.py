@@ -40,6 +40,8 @@ BONNET_BEHIND, BONNET_UP = 0.2, 0.55
 """A bonnet is in this fraction of the length from the front, where the skin faces up so much."""
 BONNET_HEIGHT = 0.72
 """Highest place of a bonnet, as a fraction of the vehicle's height."""
+ACROSS_BONNET = 0.35
+"""Of a bonnet's shortening that goes into folds besides."""
 BONNET_MOST = 0.32
 """Height by which a bonnet rises at most [m]."""
 SKY, SUN = 0.5, 0.5
@@ -93,7 +95,7 @@ class Sheet:
         place = points / np.asarray(size) + 0.5
         bonnet = (self.normals[:, 2] > BONNET_UP) & (place[:, 2] < BONNET_HEIGHT)
         bonnet &= (place[:, 0] > 1 - BONNET_BEHIND) & ~smooth
-        self._bonnet = bonnet
+        self.bonnet = bonnet
         self._bonnet_length = BONNET_BEHIND * size[0]
         self._hinge = np.clip((place[:, 0] - 1 + BONNET_BEHIND) / BONNET_BEHIND, 0.0, 1.0)
 
@@ -102,26 +104,28 @@ class Sheet:
         shorter: Float = np.clip(1 - np.linalg.norm(F, axis=1) - ELASTIC, 0.0, STEEPEST)
         return shorter
 
-    def fold(self, body: Deformed, most: Float) -> FoldedSheet:
+    def fold(self, body: Deformed, most: Float, rows: NDArray[np.int64]) -> FoldedSheet:
         """The sheet on a body.
 
         Args:
-            body: how points move with the particles around them.
-            most: [G, 3] largest shortening so far, of this instant too.
+            body: how R points move with the particles around them.
+            most: [R, 3] their largest shortening so far, of this instant too.
+            rows: [R] which points; all of a bonnet or none.
         """
-        shortened = np.maximum(self.shortening(body.F), KEPT * most) * self._foldable[:, None]
+        at_rest, foldable = self.normals[rows], self._foldable[rows]
+        shortened = np.maximum(self.shortening(body.F), KEPT * most) * foldable[:, None]
         # A sheet is shortened along itself only.
-        shortened = shortened * (1 - self.normals**2)
-        normals = _turned(body.rotations, self.normals)
-        raised, hump = self._bonnet_rise(shortened)
-        shortened[self._bonnet, 0] *= 0.35
+        shortened = shortened * (1 - at_rest**2)
+        normals = _turned(body.rotations, at_rest)
+        raised, hump = self._bonnet_rise(shortened, rows)
+        shortened[self.bonnet[rows], 0] *= ACROSS_BONNET
         offset, tilted, deepest = np.zeros(len(normals)), normals.copy(), np.zeros(len(normals))
         F = body.F.copy()
         for axis in range(3):
             along = F[:, :, axis] / np.maximum(np.linalg.norm(F[:, :, axis], axis=1), 1e-6)[:, None]
             for k, (wavelength, share) in enumerate(zip(WAVELENGTHS, SHARES, strict=True)):
                 sine = np.sqrt(1 - (1 - share * shortened[:, axis]) ** 2)
-                wave, slope = _triangle(self._along[axis, k])
+                wave, slope = _triangle(self._along[axis, k, rows])
                 offset += wavelength / 4 * sine * wave
                 tilted -= (sine * slope)[:, None] * along
                 deepest += sine * (1 - wave) / 2
@@ -132,22 +136,24 @@ class Sheet:
         positions = body.positions + offset[:, None] * normals + up
         tilt = _between(normals, tilted)
         F = tilt @ _lengthened(F, shortened)
-        light = _light(tilted) / _light(self.normals)
+        light = _light(tilted) / _light(at_rest)
         light *= 1 - OCCLUDED * np.clip(deepest, 0.0, 1.0)
-        light = np.where(self._foldable > 0, np.clip(light, DARKEST, BRIGHTEST), 1.0)
+        light = np.where(foldable > 0, np.clip(light, DARKEST, BRIGHTEST), 1.0)
         return FoldedSheet(Deformed(positions, F, tilt @ body.rotations), light)
 
-    def _bonnet_rise(self, shortened: Float) -> tuple[Float, Float]:
-        """[G] height by which the bonnet is raised, [G] and its slope."""
+    def _bonnet_rise(self, shortened: Float, rows: NDArray[np.int64]) -> tuple[Float, Float]:
+        """[R] height by which the bonnet is raised, [R] and its slope."""
         raised, slope = np.zeros(len(shortened)), np.zeros(len(shortened))
-        if not self._bonnet.any():
+        bonnet = self.bonnet[rows]
+        if not bonnet.any():
             return raised, slope
-        by = float(np.quantile(shortened[self._bonnet, 0], 0.6))
+        by = float(np.quantile(shortened[bonnet, 0], 0.6))
         sine = np.sqrt(1 - (1 - by) ** 2)
         rise = min(self._bonnet_length / 2 * sine, BONNET_MOST)
-        ridge = 1 - np.abs(2 * self._hinge - 1)
-        slope = np.where(self._hinge < 0.5, 1.0, -1.0) * 2 * rise / self._bonnet_length
-        return rise * ridge * self._bonnet, slope * self._bonnet
+        hinge = self._hinge[rows]
+        ridge = 1 - np.abs(2 * hinge - 1)
+        slope = np.where(hinge < 0.5, 1.0, -1.0) * 2 * rise / self._bonnet_length
+        return rise * ridge * bonnet, slope * bonnet
 
 
 def _outward(points: Float, rest: Float, spacing: float) -> tuple[Float, Float]:

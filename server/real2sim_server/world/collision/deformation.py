@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol, Self, TypeVar
 
@@ -27,7 +27,10 @@ from ...physics.errors import PhysicsError
 from ...render.types import Instance
 from ...scene import GaussianCloud, Scene
 from ...simulation import impact as crash
+from ...simulation.damage import BreakageLog, DamagedVehicle, fragment_cloud
 from ...simulation.embedding import Deformed, Embedding, deform_cloud, replaced_rows, stretched
+from ...simulation.structure import VEHICLES
+from .damage import DamageHistory, VehicleDamage
 from .impact import Impact, ImpactParticipant
 from .rigid_body import BodyState
 
@@ -62,6 +65,10 @@ where the background is, down to a POLE."""
 POLE = 0.25
 
 
+FOR_GOOD = 2**62
+"""An instant at which every impact is over [us]."""
+
+
 class Deformation(Protocol):
     """Deforms objects after impacts. Immutable: an impact makes a new one, so that worlds can fork.
 
@@ -82,6 +89,9 @@ class Deformation(Protocol):
     def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
         """What is drawn of an object; the given instance where it is not deformed."""
 
+    def fragments(self, t_us: int) -> list[Instance]:
+        """What has come off objects, with their ids."""
+
 
 @dataclass(frozen=True, eq=False)
 class DeformationTracker:
@@ -89,10 +99,12 @@ class DeformationTracker:
 
     Attributes:
         scene: holds their Gaussians.
+        breakage: whether vehicles fold, and lose lamps and glass; else they are only dented.
         deformed: objects after an impact that may deform them, by id.
     """
 
     scene: Scene
+    breakage: bool = False
     deformed: Mapping[str, _DeformedObject] = field(default_factory=dict)
 
     @property
@@ -130,6 +142,18 @@ class DeformationTracker:
             return instance
         return replace(instance, cloud=cloud, colour=None, scale=(1.0, 1.0, 1.0))
 
+    def fragments(self, t_us: int) -> list[Instance]:
+        """What has come off vehicles by ``t_us``, each vehicle's as one instance with its id."""
+        found = []
+        for deformed in self.deformed.values():
+            damage = deformed.damage(t_us)
+            if damage is None or not damage.broken:
+                continue
+            cloud = fragment_cloud(damage.broken, t_us * 1e-6, self.scene.ground.height_at)
+            if cloud is not None:
+                found.append(Instance(cloud, None, deformed.origin.subject.instance_id))
+        return found
+
     def _before_impact(
         self, name: str | None, subjects: Mapping[str, ObjectState], impact: Impact
     ) -> _DeformedObject | None:
@@ -144,7 +168,13 @@ class DeformationTracker:
         participant = impact.participants[0 if name == impact.other_id else 1]
         assert participant is not None
         return _DeformedObject(
-            _UndeformedObject(self.scene, subject, participant.properties.mass, impact.began_us)
+            _UndeformedObject(
+                self.scene,
+                subject,
+                participant.properties.mass,
+                impact.began_us,
+                breakage=self.breakage and subject.category in VEHICLES,
+            )
         )
 
 
@@ -154,13 +184,39 @@ class _UndeformedObject:
     Everything is found on demand and kept; a lock lets sessions on several threads share it.
     """
 
-    def __init__(self, scene: Scene, subject: ObjectState, mass: float, t_us: int) -> None:
-        self.subject = subject
+    def __init__(
+        self, scene: Scene, subject: ObjectState, mass: float, t_us: int, *, breakage: bool
+    ) -> None:
+        self.subject, self.breakage = subject, breakage
         self.lock = threading.RLock()
         self._scene, self._mass, self._t_us = scene, mass, t_us
         self._cloud: GaussianCloud | None = None
         self._body: crash.CrashBody | None = None
         self._pieces: list[_Piece] | None = None
+        self._vehicle: DamagedVehicle | None = None
+
+    @property
+    def vehicle(self) -> DamagedVehicle:
+        """It as a vehicle that breaks."""
+        if self._vehicle is None:
+            self._vehicle = DamagedVehicle(
+                self.cloud,
+                self.body.rest.positions,
+                spacing=self.body.spacing,
+                category=self.subject.category,
+                size=self.subject.scaled_size,
+                object_id=self.subject.object_id,
+            )
+        return self._vehicle
+
+    def unbroken(self) -> BreakageLog:
+        """Of its parts, before any impact."""
+        return BreakageLog(
+            self.subject.category,
+            self.subject.scaled_size,
+            self.body.rest.positions,
+            spacing=self.body.spacing,
+        )
 
     @property
     def cloud(self) -> GaussianCloud:
@@ -250,7 +306,8 @@ class _DeformedObject:
     before: _DeformedObject | None = None
     collision: _ImpactSolution | None = None
     role: int = 0
-    _shown: tuple[int, GaussianCloud] | None = None
+    _shown: tuple[Hashable, GaussianCloud] | None = None
+    _history: DamageHistory | None = None
 
     @property
     def body(self) -> crash.CrashBody:
@@ -278,10 +335,45 @@ class _DeformedObject:
         frames = self.displacements(t_us)
         if not frames:
             return self.before.cloud(t_us) if self.before is not None else None
+        damage = self.damage(t_us)
+        # A bumper hangs farther down for a while.
+        loose = damage is not None and any(b.kind == "bumper" for b in damage.broken)
+        key = (len(frames), t_us if loose else 0)
         with self.origin.lock:
-            if self._shown is None or self._shown[0] != len(frames):
-                self._shown = len(frames), self.origin.deformed(frames[-1])
+            if self._shown is None or self._shown[0] != key:
+                if damage is None:
+                    shown = self.origin.deformed(frames[-1])
+                else:
+                    shown = damage.cloud(self.origin.vehicle, frames[-1], t_us)
+                self._shown = key, shown
             return self._shown[1]
+
+    def damage(self, t_us: int) -> VehicleDamage | None:
+        """What has folded and broken until an instant; None where nothing does."""
+        if not self.origin.breakage:
+            return None
+        frames = self.displacements(t_us)
+        if not frames:
+            return self.before.damage(t_us) if self.before is not None else None
+        assert self.collision is not None
+        with self.origin.lock:
+            history = self._begin_history()
+            return history.after(frames, self.collision.impact, self.role)
+
+    def _begin_history(self) -> DamageHistory:
+        """Of the latest impact, after all that the ones before have done."""
+        if self._history is None:
+            origin, before = self.origin, None
+            log = origin.unbroken()
+            if self.before is not None:
+                before = self.before.damage(FOR_GOOD)
+                if self.before._history is not None:
+                    log = self.before._history.final_log().copy()
+            if before is None:
+                before = VehicleDamage(np.zeros((len(origin.cloud), 3)))
+            name = origin.subject.object_id
+            self._history = DamageHistory(name, origin.vehicle, log, before)
+        return self._history
 
 
 class _ImpactSolution:
