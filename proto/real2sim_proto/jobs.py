@@ -82,7 +82,12 @@ class SimulateRequest(Model):
         default=None,
         max_length=64,
         description="what the physics moves; default: what has a velocity or physics of its own, "
-        "and whatever that touches",
+        "and whatever that touches; 'ego': the recording vehicle, with a body of its size",
+    )
+    background: bool | None = Field(
+        default=None,
+        description="whether walls, poles, trees and all else that stands in the background "
+        "stops what hits it; default: true. figures.background of the result says what was taken",
     )
     preset: Literal["vehicle", "paper"] = Field(
         default="vehicle", description="how objects become bodies: crumpling cars, or soft ones"

@@ -206,6 +206,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         objects: Sequence[str] | None = None,
         preset: str = "vehicle",
         backend: str = "auto",
+        background: bool | None = None,
     ) -> AsyncJob:
         """Start a physics rollout of the scenario as it is now.
 
@@ -213,8 +214,11 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             start_us, end_us: default: the scenario's span.
             frame_us: from one kept frame to the next.
             objects: what the physics moves; default: what has a velocity or physics of its own.
+                ``ego`` is the recording vehicle.
             preset: how objects become bodies: ``vehicle`` or ``paper``.
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+            background: whether walls, poles and trees of the scene stop what hits them; default:
+                true. The job's ``figures.background`` says which.
 
         Raises:
             ValueError: a field that is not allowed.
@@ -236,6 +240,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             objects=None if objects is None else list(objects),
             preset=preset,
             backend=backend,
+            background=background,
         )
         info = await self._transport.send(_requests.simulate(self.scenario_id, body))
         return AsyncJob(self._transport, info)

@@ -205,6 +205,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
         objects: Sequence[str] | None = None,
         preset: str = "vehicle",
         backend: str = "auto",
+        background: bool | None = None,
     ) -> Job:
         """Start a physics rollout of the scenario as it is now.
 
@@ -212,8 +213,11 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             start_us, end_us: default: the scenario's span.
             frame_us: from one kept frame to the next.
             objects: what the physics moves; default: what has a velocity or physics of its own.
+                ``ego`` is the recording vehicle.
             preset: how objects become bodies: ``vehicle`` or ``paper``.
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+            background: whether walls, poles and trees of the scene stop what hits them; default:
+                true. The job's ``figures.background`` says which.
 
         Raises:
             ValueError: a field that is not allowed.
@@ -235,6 +239,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             objects=None if objects is None else list(objects),
             preset=preset,
             backend=backend,
+            background=background,
         )
         info = self._transport.send(_requests.simulate(self.scenario_id, body))
         return Job(self._transport, info)

@@ -13,9 +13,9 @@ from .command import command
 from .options import JsonFile, SceneBundle
 
 if TYPE_CHECKING:
-    from ..edit.state import ScenarioState
     from ..scene import Scene
     from ..simulation.experiments import Experiment
+    from ..simulation.playback import PlacedObjects
     from ..simulation.result import SimulationResult
 
 
@@ -35,7 +35,8 @@ def simulate(
         float | None, typer.Option(min=0.01, max=100, help="Of an experiment [m/s].")
     ] = None,
     objects: Annotated[
-        list[str] | None, typer.Option("--object", help="What takes part; repeat it.")
+        list[str] | None,
+        typer.Option("--object", help="What takes part, ego: the recording vehicle; repeat it."),
     ] = None,
     duration: Annotated[float | None, typer.Option(min=0.01, max=600, help="[s]")] = None,
     frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
@@ -43,24 +44,33 @@ def simulate(
     max_particles: Annotated[
         int | None, typer.Option(min=100, help="Of all bodies; fewer are coarser and faster.")
     ] = None,
+    background: Annotated[
+        bool,
+        typer.Option(
+            help="Walls, poles and trees of the scene stop what hits them; not in experiments."
+        ),
+    ] = True,
     film: Annotated[bool, typer.Option(help="Draw film and stills.")] = True,
     json: JsonFile = None,
 ) -> None:
     """Let objects of a scene collide, deform and come to rest; leave film and curves."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
+    from ..simulation.ego import EGO, with_ego
     from ..simulation.experiments import FilmPlan, draw_curves, set_up, views, write_film
     from ..simulation.playback import Playback
     from ..simulation.rollout import simulate
 
     loaded = load_scene(scene)
-    state = ScenarioState.of(loaded)
+    state: PlacedObjects = ScenarioState.of(loaded)
     taking_part = tuple(objects or ())
+    if EGO in taking_part:
+        loaded, state = with_ego(loaded, state)
     if experiment is None:
         setup = _continue_driving(loaded, state, taking_part, frame, preset=preset or "vehicle")
     else:
         setup = set_up(experiment, loaded, state, preset=preset, speed=speed, objects=taking_part)
-    options = replace(setup.options, backend=backend)
+    options = replace(setup.options, backend=backend, background=background and not experiment)
     if duration is not None:
         options = replace(options, duration=duration)
     if max_particles is not None:
@@ -93,7 +103,7 @@ def simulate(
 
 
 def _continue_driving(
-    scene: Scene, state: ScenarioState, objects: tuple[str, ...], frame: int, *, preset: str
+    scene: Scene, state: PlacedObjects, objects: tuple[str, ...], frame: int, *, preset: str
 ) -> Experiment:
     """Everything named goes on from where and how fast it was driving."""
     import numpy as np
@@ -123,6 +133,9 @@ def _figures(result: SimulationResult) -> dict[str, object]:
     import numpy as np
 
     figures: dict[str, object] = {k: v for k, v in result.figures.items() if k != "gravity"}
+    if "background" in figures:
+        figures["colliders of the background"] = len(result.figures["background"])
+        del figures["background"]
     figures["simulated [s]"] = float(result.times_s[-1])
     for name, o in result.objects.items():
         figures[f"{name} mass [kg]"] = o.mass

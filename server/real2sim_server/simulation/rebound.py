@@ -118,6 +118,8 @@ def first_touch(
         trial.motion = motion
         shell = trial.shell_points()
         for collider in now:
+            if isinstance(collider, Box) and _is_far(collider, motion.centre, body.reach):
+                continue
             distance, normals = clearance(collider, shell)
             k = int(distance.argmin())
             normal = normals[k]
@@ -130,6 +132,12 @@ def first_touch(
         now = [c.after(step) for c in now]
         time += step
     return None
+
+
+def _is_far(box: Box, centre: Float, reach: float) -> bool:
+    """Whether a box is further from a point than ``reach`` [m] and a body's surface."""
+    away = float(np.linalg.norm(np.asarray(box.T_world_box)[:3, 3] - centre))
+    return away - float(np.linalg.norm(np.asarray(box.size))) / 2 > 2 * reach
 
 
 def _still(body: DeformableBody) -> Any:

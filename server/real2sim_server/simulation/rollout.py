@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..physics.colliders import Collider
+from ..physics.colliders import Box, Collider
 from ..physics.errors import PhysicsError
 from ..scene import Scene
+from .background import BACKGROUND, Cleared, background_colliders, described
 from .body import DeformableBody
 from .breakages import find_breakages
 from .playback import PlacedObjects
@@ -19,9 +20,11 @@ from .presets import ObjectPhysics, preset_of
 from .recorder import TrajectoryRecorder
 from .result import SimulationResult
 from .simulator import STEP, HybridSimulator
-from .spawn import spawn_bodies
+from .spawn import spawn_bodies, starts_of
 
 PARTICLES_MIN = 100
+BESIDE, FURTHEST = 10.0, 80.0
+"""The background counts so far beyond what the fastest could reach, and no further than [m]."""
 
 Progress = Callable[[int, int], None]
 
@@ -41,6 +44,8 @@ class SimulateOptions:
         gravity: [3] [m/s^2].
         backend: of the solver.
         brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
+        background: whether walls, poles, trees and what else stands in the scene's background are
+            colliders too, see ``background``.
         max_particles: of all bodies together; where they would be more, all are filled more
             coarsely than the preset has it.
     """
@@ -55,6 +60,7 @@ class SimulateOptions:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     backend: str = "auto"
     brake_after_hit: float = 1.0
+    background: bool = False
     max_particles: int = 400_000
 
     def __post_init__(self) -> None:
@@ -100,6 +106,8 @@ def simulate(
     gravity = np.array(options.gravity, dtype=np.float64)
     if gravity.shape != (3,) or not np.isfinite(gravity).all():
         raise PhysicsError(f"gravity must be 3 finite numbers [m/s^2], not {options.gravity!r}")
+    solid = _solid_background(scene, state, options) if options.background else []
+    options = replace(options, colliders=[*options.colliders, *solid])
     bodies = spawn_bodies(
         scene,
         state,
@@ -112,9 +120,20 @@ def simulate(
         max_particles=options.max_particles,
     )
     result = simulate_bodies(bodies, options, on_progress=on_progress, cancelled=cancelled)
-    if options.preset != "vehicle":
-        return result
-    return replace(result, breakages=find_breakages(result, state.visible))
+    if options.preset == "vehicle":
+        result = replace(result, breakages=find_breakages(result, state.visible))
+    if options.background:
+        result = replace(result, figures={**result.figures, BACKGROUND: described(solid)})
+    return result
+
+
+def _solid_background(scene: Scene, state: PlacedObjects, options: SimulateOptions) -> list[Box]:
+    """What of the background the objects may come to."""
+    starts = starts_of(state, options.objects, options.start_us)
+    cleared = [Cleared(s.T_world_object, np.array(s.size)) for s in starts]
+    fastest = max(float(np.linalg.norm(s.velocity)) for s in starts)
+    way = min(fastest * options.duration + BESIDE, FURTHEST)
+    return background_colliders(scene, cleared, within=way)
 
 
 def simulate_bodies(

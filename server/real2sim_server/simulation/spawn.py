@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,6 +75,36 @@ def spawn_bodies(
     boxes = [(a.T_world_object, s.scaled_size) for a, s in zip(bodies, subjects, strict=True)]
     require_separation(bodies, boxes, [c for c in colliders if c.name not in road])
     return bodies
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where an object starts, and how fast.
+
+    Attributes:
+        T_world_object: [4, 4].
+        size: (length, width, height) of its box [m].
+        velocity: [3] [m/s].
+    """
+
+    T_world_object: Float
+    size: tuple[float, float, float]
+    velocity: Float
+
+
+def starts_of(
+    state: PlacedObjects, wanted: Mapping[str, ObjectPhysics], start_us: int
+) -> list[Start]:
+    """Where and how fast each wanted object starts. Raises as :func:`spawn_bodies`."""
+    subjects = _subjects(state, wanted, start_us)
+    return [
+        Start(
+            _pose(subject, physics, start_us),
+            subject.scaled_size,
+            _velocities(subject, physics, start_us)[0],
+        )
+        for subject, physics in zip(subjects, wanted.values(), strict=True)
+    ]
 
 
 def _subjects(

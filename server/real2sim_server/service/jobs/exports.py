@@ -35,11 +35,13 @@ class VideoSource:
         scene: gives cameras, sky and the ego trajectory.
         instances: what is drawn at an instant [us]; called off the event loop.
         span: first and last instant that can be shown [us].
+        outside: the same for who looks on from outside the ego; None where that is the same.
     """
 
     scene: Scene
     instances: Callable[[int], Sequence[Instance]]
     span: tuple[int, int]
+    outside: Callable[[int], Sequence[Instance]] | None = None
 
 
 async def export_video(

@@ -22,8 +22,9 @@ from ...physics.colliders import Box, Collider, HeightField, Plane
 from ...physics.materials import named_material
 from ...render import Instance
 from ...scene import Scene, SceneObject
+from ...simulation.ego import EGO, with_ego
 from ...simulation.ground import ground_collider
-from ...simulation.playback import Playback
+from ...simulation.playback import PlacedObjects, Playback
 from ...simulation.presets import ObjectPhysics
 from ...simulation.result import ENERGIES, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
@@ -48,7 +49,7 @@ class RolloutPlan:
 
     scene: Scene
     state: ScenarioState
-    resolved_objects: ResolvedObjects
+    resolved_objects: PlacedObjects
     options: SimulateOptions
 
 
@@ -68,16 +69,29 @@ def plan_rollout(scene: Scene, state: ScenarioState, request: SimulateRequest) -
     """
     start, end = _span(state, request)
     present = {o.object_id: o for o in state.visible if o.trajectory.covers(start)}
-    chosen = _chosen(present, request, start)
+    has_ego = EGO in (request.objects or ()) and EGO not in present
+    chosen = _chosen(present, request, start, also=[EGO] if has_ego else [])
     complete, resolved_objects = with_assets(scene, state)
+    background = request.background is not False
+    if background:
+        poses = {o.object_id: o.trajectory.transform(start) for o in present.values()}
+        complete = replace(complete, background=composed_background(scene, state, poses))
+    if has_ego:
+        complete, resolved_objects = with_ego(complete, resolved_objects)
     options = SimulateOptions(
         preset=request.preset,
-        objects={object_id: _physics(present[object_id], start) for object_id in chosen},
+        objects={
+            object_id: _physics(present[object_id], start)
+            if object_id in present
+            else ObjectPhysics()
+            for object_id in chosen
+        },
         colliders=colliders_of(state),
         start_us=start,
         duration=(end - start) * 1e-6,
         frame_rate=1e6 / request.frame_us,
         backend=request.backend,
+        background=background,
     )
     return RolloutPlan(complete, state, resolved_objects, options)
 
@@ -150,11 +164,18 @@ class RolloutPlayback:
         self._state = state
         self._result = result
         complete, resolved_objects = with_assets(scene, state)
+        if EGO in result.objects:
+            complete, resolved_objects = with_ego(complete, resolved_objects)
         self._playback = Playback(complete, resolved_objects, result)
         self.span = (result.start_us, self._playback.time_us(result.frames - 1))
 
-    def instances(self, t_us: int) -> Sequence[Instance]:
-        """What is drawn at the kept frame nearest to ``t_us`` [us], with contact shadows."""
+    def instances(self, t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
+        """What is drawn at the kept frame nearest to ``t_us`` [us], with contact shadows.
+
+        Args:
+            t_us: instant [us].
+            aboard: whether it is for cameras of the ego itself, which do not see its body.
+        """
         since = (t_us - self._result.start_us) * 1e-6
         frame = int(np.abs(self._result.times_s - since).argmin())
         standing = [
@@ -164,7 +185,8 @@ class RolloutPlayback:
         ]
         poses = {subject.object_id: pose for subject, pose in standing}
         background = Instance(composed_background(self._scene, self._state, poses))
-        _, *objects = self._playback.instances(frame)
+        unseen = [EGO] if aboard and EGO not in poses else []
+        _, *objects = self._playback.instances(frame, without=unseen)
         placed = [
             (subject, pose)
             for subject, pose in standing
@@ -179,7 +201,7 @@ class RolloutPlayback:
         return subject.trajectory.transform(t_us)
 
 
-def with_assets(scene: Scene, state: ScenarioState) -> tuple[Scene, ResolvedObjects]:
+def with_assets(scene: Scene, state: ScenarioState) -> tuple[Scene, PlacedObjects]:
     """The scene with the scenario's assets as objects of it."""
     objects = dict(scene.objects)
     visible = []
@@ -210,9 +232,11 @@ def _span(state: ScenarioState, request: SimulateRequest) -> tuple[int, int]:
     return start, end
 
 
-def _chosen(present: dict[str, ObjectState], request: SimulateRequest, start: int) -> list[str]:
+def _chosen(
+    present: dict[str, ObjectState], request: SimulateRequest, start: int, *, also: Sequence[str]
+) -> list[str]:
     if request.objects is not None:
-        missing = [name for name in request.objects if name not in present]
+        missing = [name for name in request.objects if name not in {*present, *also}]
         if missing or not request.objects:
             raise ServiceError(
                 ErrorCode.UNKNOWN_OBJECT if missing else ErrorCode.INVALID_REQUEST,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -83,12 +84,13 @@ class Simulations:
         self._playbacks.move_to_end(job_id)
         scene, playback = cached
 
-        def instances(t_us: int) -> Sequence[Instance]:
+        def instances(t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
             # It keeps the last deformed clouds, which is not for two threads at once.
             with self._drawing:
-                return playback.instances(t_us)
+                return playback.instances(t_us, aboard=aboard)
 
-        return VideoSource(scene, instances, playback.span)
+        outside = functools.partial(instances, aboard=False)
+        return VideoSource(scene, instances, playback.span, outside)
 
     async def _open(self, job_id: str) -> tuple[Scene, RolloutPlayback]:
         info = await self._jobs.get(job_id)

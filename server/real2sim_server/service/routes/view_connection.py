@@ -166,7 +166,10 @@ class ViewConnection:
             scene = video_source.scene
 
             def instances() -> Sequence[Instance]:
-                return video_source.instances(request.t_us)
+                show = video_source.instances
+                if request.T_world_camera is not None:
+                    show = video_source.outside or show
+                return show(request.t_us)
 
         render_request = await asyncio.to_thread(
             lambda: _render_request(scene, instances(), request)

@@ -1,0 +1,234 @@
+"""The background of a scene as colliders: upright boxes about what stands in the way.
+
+What is solid is what the closed loop takes for solid (``scene.obstacles``). Cells that touch each
+other are one thing; its Gaussians are parted along their length until a box seen from above fits
+each part: one for a pole, one for each side of a house, several for a hedge that bends. Only one
+side of a wall was seen, so that boxes grow away from the recorded way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.rotation import Float
+from ..geometry.transform import invert_transform
+from ..physics.colliders import Box
+from ..scene import GaussianCloud, Ground, Scene
+from ..scene.obstacles import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells
+
+BACKGROUND = "background"
+"""Names of these colliders begin with it."""
+TOP = 4.0
+"""Nothing above this height over the ground is looked at [m]."""
+FOOT = 0.5
+"""Boxes begin this far below the ground [m]."""
+THIN = 0.4
+"""A part that is narrower fits its box, however few of its cells are filled [m]."""
+FILLED = 0.6
+"""A broader part fits when this fraction of the cells of its box is occupied."""
+DEPTH = 0.5
+"""Sides that were seen are made as thick as this, away from the recorded way [m]."""
+NARROW = 0.12
+"""Boxes are at least so wide [m]."""
+TRIM = 0.02
+"""Fraction of a part's Gaussians that may lie before and behind its box, and above it."""
+AROUND = 0.2
+"""Around objects that take part nothing stands when they start [m]."""
+BEYOND = 0.06
+"""Boxes reach so far beyond the outermost centres of Gaussians along them [m]."""
+BOXES_MAX = 200
+"""Of all that there are the nearest are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cleared:
+    """A box around an object that starts there: where it is nothing else stands.
+
+    Attributes:
+        T_world_box: [4, 4].
+        size: [3] [m].
+    """
+
+    T_world_box: Float
+    size: Float
+
+    def holds(self, points: Float) -> NDArray[np.bool_]:
+        """Which points [N, 2] are in it, seen from above."""
+        back = invert_transform(self.T_world_box)
+        level = np.column_stack([points, np.full(len(points), self.T_world_box[2, 3])])
+        local = level @ back[:3, :3].T + back[:3, 3]
+        inside: NDArray[np.bool_] = np.all(
+            np.abs(local[:, :2]) <= self.size[:2] / 2 + AROUND, axis=1
+        )
+        return inside
+
+
+@dataclass(frozen=True, eq=False)
+class _Rectangle:
+    """Seen from above: centre [2], unit vector along it [2], full length and width [m]."""
+
+    centre: Float
+    along: Float
+    length: float
+    width: float
+
+    @property
+    def across(self) -> Float:
+        return np.array([-self.along[1], self.along[0]])
+
+    def grid(self, step: float) -> Float:
+        """[N, 2] points all over it, at most ``step`` [m] apart."""
+        u, v = (
+            np.linspace(-edge / 2, edge / 2, max(math.ceil(edge / step), 1) + 1)
+            for edge in (self.length, self.width)
+        )
+        grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+        points: Float = self.centre + grid @ np.stack([self.along, self.across])
+        return points
+
+
+def background_colliders(scene: Scene, cleared: Sequence[Cleared], *, within: float) -> list[Box]:
+    """Boxes about what of a scene's background could be hit, ``background.0`` and so on.
+
+    Args:
+        scene: whose background, ground and recorded way.
+        cleared: places of the objects that take part, as they start; at least one.
+        within: distance from these at which something still counts [m].
+    """
+    way = RecordedWay.of(scene.ego)
+    cells = occupied_cells(scene.background, scene.ground, way)
+    starts = np.array([c.T_world_box[:2, 3] for c in cleared])
+    points = cells.points
+    apart = np.linalg.norm(points[:, None, :2] - starts, axis=2).min(axis=1)
+    free = ~np.any([c.holds(points[:, :2]) for c in cleared], axis=0)
+    found = [
+        _seen_side(rectangle, way, cleared)
+        for part in _connected(points[(apart < within) & free], cells)
+        for rectangle in _fitted(part, cells, cleared)
+    ]
+    distances = [float(np.linalg.norm(starts - r.centre, axis=1).min()) for r in found]
+    kept = [found[k] for k in np.argsort(distances, kind="stable")[:BOXES_MAX].tolist()]
+    high = _high_points(scene.background, scene.ground, kept)
+    return [_upright(f"{BACKGROUND}.{k}", r, scene.ground, high) for k, r in enumerate(kept)]
+
+
+def described(boxes: Sequence[Box]) -> list[dict[str, object]]:
+    """What was taken for a collider, as JSON values."""
+    rows: list[dict[str, object]] = []
+    for box in boxes:
+        pose = np.asarray(box.T_world_box)
+        rows.append(
+            {
+                "name": box.name,
+                "position": np.round(pose[:3, 3], 3).tolist(),
+                "size": np.round(np.asarray(box.size), 3).tolist(),
+                "yaw": round(math.atan2(pose[1, 0], pose[0, 0]), 4),
+            }
+        )
+    return rows
+
+
+def _connected(points: Float, cells: OccupiedCells) -> Iterator[Float]:
+    """Points [K, 2] of each thing: of cells that touch each other, by a corner at least."""
+    from scipy import ndimage
+
+    if not len(points):
+        return
+    index = np.floor((points[:, :2] - cells.origin) / CELL).astype(np.int64)
+    there = np.zeros(cells.occupied.shape, dtype=np.bool_)
+    there[index[:, 0], index[:, 1]] = True
+    labels, count = ndimage.label(there, structure=np.ones((3, 3)))
+    own = labels[index[:, 0], index[:, 1]]
+    order = np.argsort(own, kind="stable")
+    ends = np.searchsorted(own[order], np.arange(1, count + 2))
+    for first, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        yield points[order[first:end], :2]
+
+
+def _fitted(
+    points: Float, cells: OccupiedCells, cleared: Sequence[Cleared]
+) -> Iterator[_Rectangle]:
+    """Rectangles that cover points [K, 2] of one thing, parted where one does not fit."""
+    rectangle = _around(points)
+    grid = rectangle.grid(CELL / 2)
+    blocked = any(c.holds(grid).any() for c in cleared)
+    index = np.floor((grid - cells.origin) / CELL).astype(np.int64)
+    index = np.clip(index, 0, np.array(cells.occupied.shape) - 1)
+    filled = float(cells.occupied[index[:, 0], index[:, 1]].mean())
+    fits = rectangle.width <= THIN or filled >= FILLED
+    if fits and not blocked:
+        yield rectangle
+        return
+    if rectangle.length <= CELL:
+        # Nothing smaller is resolved.
+        if not blocked:
+            yield rectangle
+        return
+    far = (points - rectangle.centre) @ rectangle.along > 0
+    for part in (points[far], points[~far]):
+        if len(part):
+            yield from _fitted(part, cells, cleared)
+
+
+def _around(points: Float) -> _Rectangle:
+    """The rectangle about points [K, 2], along their longest extent."""
+    middle = points.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((points - middle).T) if len(points) > 1 else np.eye(2))
+    along = axes[:, 1]
+    frame = np.stack([along, [-along[1], along[0]]])
+    local = (points - middle) @ frame.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    # Parts of one wall must meet; across it stray ones make nothing broader.
+    low[0], high[0] = low[0] - BEYOND, high[0] + BEYOND
+    low[1], high[1] = np.quantile(local[:, 1], [TRIM, 1 - TRIM])
+    length, width = np.maximum(high - low, NARROW).tolist()
+    return _Rectangle(middle + (low + high) / 2 @ frame, along, length, width)
+
+
+def _seen_side(rectangle: _Rectangle, way: RecordedWay, cleared: Sequence[Cleared]) -> _Rectangle:
+    """What is long and thin is made thicker, away from the recorded way and where nothing starts; a
+    pole stays as it is."""
+    missing = DEPTH - rectangle.width
+    if missing <= 0 or rectangle.length < 2 * DEPTH:
+        return rectangle
+    apart = way.positions[:, :2] - rectangle.centre
+    towards = apart[int((apart**2).sum(axis=1).argmin())]
+    sign = -math.copysign(1.0, float(rectangle.across @ towards))
+    centre = rectangle.centre + sign * missing / 2 * rectangle.across
+    deep = _Rectangle(centre, rectangle.along, rectangle.length, DEPTH)
+    return rectangle if any(c.holds(deep.grid(CELL / 2)).any() for c in cleared) else deep
+
+
+def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rectangle]) -> Float:
+    """[K, 3] x, y and height above the ground of what is opaque above what a car is tall [m]."""
+    if not near:
+        return np.zeros((0, 3))
+    means = background.means.cpu().numpy().astype(np.float64)
+    centres = np.array([r.centre for r in near])
+    margin = max(r.length for r in near)
+    low, high = centres.min(axis=0) - margin, centres.max(axis=0) + margin
+    inside = ((means[:, :2] > low) & (means[:, :2] < high)).all(axis=1)
+    inside &= (background.opacities > OPAQUE).cpu().numpy()
+    points = means[inside]
+    points[:, 2] -= ground.height_at(points[:, :2])
+    low_enough: Float = points[(points[:, 2] > 0) & (points[:, 2] < TOP)]
+    return low_enough
+
+
+def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> Box:
+    """The box over a rectangle, as tall as what is above it."""
+    local = (high[:, :2] - rectangle.centre) @ np.stack([rectangle.along, rectangle.across]).T
+    reach = np.array([rectangle.length, rectangle.width]) / 2 + CELL / 2
+    above = high[np.all(np.abs(local) < reach, axis=1), 2]
+    tall = float(np.quantile(above, 1 - TRIM)) if len(above) else HIGHEST
+    heights = ground.height_at(rectangle.grid(CELL))
+    low, top = float(heights.min()) - FOOT, float(heights.max()) + tall
+    pose = np.eye(4)
+    pose[:2, 0], pose[:2, 1] = rectangle.along, rectangle.across
+    pose[:2, 3], pose[2, 3] = rectangle.centre, (low + top) / 2
+    return Box(name=name, T_world_box=pose, size=(rectangle.length, rectangle.width, top - low))
