@@ -484,6 +484,11 @@ class DeformableBody:
         self._sleep_time = self._sleep_time + duration if slow else 0.0
 
     @property
+    def is_undamped(self) -> bool:
+        """Whether it is elastic throughout, with nothing that takes energy away."""
+        return all(m.viscosity == 0 and not m.plastic for m in self.materials)
+
+    @property
     def may_rigidify(self) -> bool:
         """Whether it has deformed and then been settled for long enough."""
         return self._settle_time >= SETTLE_TIME and self._deforming_time >= 2 * SETTLE_TIME

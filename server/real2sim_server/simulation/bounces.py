@@ -5,12 +5,16 @@ So an impact is followed from its first to its last impulse, and what is missing
 restitution at the contact, or beyond it, is one impulse more when bodies part: along the normal,
 through the centre of what acted before, and on both sides, so that momentum and angular momentum
 stay. With a restitution of at most 1 it never gives more energy than the impact has taken.
+
+Impacts that are under way together and share a body are one chain, as where the first of three
+bodies that touch is struck. What each comes to is what they do one after the other, the fastest
+approach first; so the last of equal ones leaves with what the first has brought.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +34,13 @@ EXACT = 0.01
 """What parts within this fraction of the approach of what was requested is left as it is."""
 SLOWEST = 0.3
 """Impacts that begin more slowly are no bounces [m/s]."""
+ELASTIC = 0.81
+"""Least restitution between bodies that nothing damps and of which none was requested: what cubes
+come to on ever finer grids, the rest is vibration and slip. Coarse grids lose more."""
+LONGEST = 0.1
+"""Impacts that take longer are waited for no more by others of their chain [s]."""
+ROUNDS = 100
+"""Impacts of a chain one after the other, at most; with a restitution below 1 few matter."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +82,66 @@ class Correction:
 
 @dataclass(eq=False)
 class _Impact:
-    """An impact under way: motions before it, and impulse and moment on the body so far."""
+    """An impact under way: motions before it, and impulse and moment on the body so far; for how
+    long, and for how many steps nothing has acted."""
 
     before: tuple[RigidMotion, ...]
     impulse: Float = field(default_factory=lambda: np.zeros(3))
     moment: Float = field(default_factory=lambda: np.zeros(3))
     quiet: int = 0
+    age: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """One impact of a chain that is over.
+
+    Attributes:
+        sides: the body, and the other where that is one.
+        other: what it has hit.
+        point, normal: where [m], and the unit normal towards the body.
+        requested: restitution.
+        still: speed along the normal of what is no body, when it began and now [m/s].
+    """
+
+    sides: tuple[DeformableBody, ...]
+    other: DeformableBody | Collider
+    point: Float
+    normal: Float
+    requested: float
+    still: tuple[float, float]
+
+    def apart(self, motions: Mapping[str, RigidMotion]) -> float:
+        """Speed at which the sides part, or the body from what does not move [m/s]."""
+        speeds = [float(self._velocity(motions[s.name], s) @ self.normal) for s in self.sides]
+        return speeds[0] - sum(speeds[1:])
+
+    def _velocity(self, motion: RigidMotion, side: DeformableBody) -> Float:
+        lever = self.point - side.motion.centre
+        velocity: Float = motion.velocity + np.cross(motion.angular_velocity, lever)
+        return velocity
+
+    @property
+    def ease(self) -> float:
+        """Speed at which the sides part by one N s between them [1/kg]."""
+        return sum(_ease(s.motion, self.point - s.motion.centre, self.normal) for s in self.sides)
+
+    def pushed(self, motions: dict[str, RigidMotion], impulse: float) -> None:
+        """Change motions by an impulse [N s] between the sides, turning about the present place."""
+        for sign, side in zip((1.0, -1.0), self.sides, strict=False):
+            now = motions[side.name]
+            lever = self.point - side.motion.centre
+            given = sign * impulse * self.normal
+            turn = np.linalg.solve(side.motion.world_inertia, np.cross(lever, given))
+            motions[side.name] = replace(
+                now,
+                velocity=now.velocity + given / now.mass,
+                angular_velocity=now.angular_velocity + turn,
+            )
 
 
 class Bounces:
-    """Impacts of bodies with a wanted restitution, from step to step.
+    """Impacts of bodies with a wanted restitution, or that nothing damps, from step to step.
 
     Attributes:
         log: those that are over.
@@ -123,24 +184,38 @@ class Bounces:
             before: motions of the bodies before the step.
             step: time now and length of the step [s], and gravity [m/s^2].
         """
-        wanted = {b.name: b for b in bodies if b.rebound is not None}
+        wanted = {b.name: b for b in bodies if _restitution(b) is not None}
         walls = {c.name: c for c in colliders}
         seen = set()
         for c in contacts:
             pair = (c.body, c.other)
             both = c.other in wanted and c.body < c.other
-            if c.body in wanted and (both or c.other in walls):
+            on_wall = c.other in walls and c.body in wanted and wanted[c.body].rebound is not None
+            if c.body in wanted and (both or on_wall):
                 seen.add(pair)
                 members = (c.body, c.other) if both else (c.body,)
                 self._add(pair, c, tuple(before[name] for name in members))
-        for pair in list(self._impacts):
+        for pair, impact in self._impacts.items():
+            impact.age += step[1]
             if pair not in seen:
-                self._impacts[pair].quiet += 1
-            if self._impacts[pair].quiet >= QUIET:
-                impact = self._impacts.pop(pair)
-                if pair[0] in wanted and (pair[1] in wanted or pair[1] in walls):
-                    other = wanted.get(pair[1]) or walls[pair[1]]
-                    yield from self._part(wanted[pair[0]], other, impact, step)
+                impact.quiet += 1
+        for chain in self._chains(wanted):
+            impacts = {pair: self._impacts[pair] for pair in chain}
+            over = {p: i for p, i in impacts.items() if i.quiet >= QUIET}
+            if all(i.quiet >= QUIET or i.age > LONGEST for i in impacts.values()):
+                for pair in over:
+                    del self._impacts[pair]
+                yield from self._part(over, wanted, walls, step)
+
+    def _chains(self, wanted: Mapping[str, DeformableBody]) -> list[list[tuple[str, str]]]:
+        """Impacts under way, those that share a body together, in the order they began."""
+        chains: list[list[tuple[str, str]]] = []
+        for pair in self._impacts:
+            own = {name for name in pair if name in wanted}
+            linked = [c for c in chains if any(own.intersection(p) for p in c)]
+            chains = [c for c in chains if c not in linked]
+            chains.append([p for c in linked for p in c] + [pair])
+        return chains
 
     def _add(
         self, pair: tuple[str, str], now: ContactTotals, before: tuple[RigidMotion, ...]
@@ -163,46 +238,113 @@ class Bounces:
 
     def _part(
         self,
-        body: DeformableBody,
-        other: DeformableBody | Collider,
-        impact: _Impact,
+        chain: Mapping[tuple[str, str], _Impact],
+        wanted: Mapping[str, DeformableBody],
+        walls: Mapping[str, Collider],
         step: tuple[float, float, Float],
-    ) -> list[Correction]:
-        """The impulse with which a body and what it hit part as requested."""
-        time, duration, gravity = step
-        sides = [body, other] if isinstance(other, DeformableBody) else [body]
-        if any(side.mode != BodyMode.DEFORMING for side in sides):
-            return []
-        point = _centre(impact, body.motion.centre)
+    ) -> Iterator[Correction]:
+        """The impulses with which bodies of a chain and what they hit part as requested."""
+        meetings: list[_Meeting] = []
+        before: dict[str, RigidMotion] = {}
+        for pair, impact in chain.items():
+            other = wanted.get(pair[1]) or walls.get(pair[1])
+            if pair[0] in wanted and other is not None:
+                meeting = _meeting(wanted[pair[0]], other, impact, step)
+                if all(side.mode == BodyMode.DEFORMING for side in meeting.sides):
+                    meetings.append(meeting)
+                    for side, motion in zip(meeting.sides, impact.before, strict=True):
+                        before.setdefault(side.name, motion)
+        if not meetings:
+            return
+        approaches, wanted_speeds = _one_after_the_other(meetings, before)
+        now = {side.name: side.motion for m in meetings for side in m.sides}
+        speeds = np.array([m.apart(now) - m.still[1] for m in meetings])
+        if max(approaches) < SLOWEST or (len(meetings) == 1 and speeds[0] <= 0):
+            return
+        give = wanted_speeds - speeds
+        # What is at least so elastic as the grid has it stays so.
+        given = [any(s.rebound is not None for s in m.sides) for m in meetings]
+        give = np.where(given, give, np.maximum(give, 0.0))
+        if np.all(np.abs(give) < EXACT * np.maximum(approaches, SLOWEST)):
+            give = np.zeros(len(meetings))
+        for m, approach, speed, more in zip(meetings, approaches, speeds, give, strict=True):
+            if approach >= SLOWEST:
+                self.log.append(
+                    Bounce(
+                        m.sides[0].name,
+                        m.other.name,
+                        step[0],
+                        approach,
+                        float(speed) / approach,
+                        float(speed + more) / approach,
+                    )
+                )
+        if np.any(give):
+            yield from _corrections(meetings, now, give)
+
+
+def _meeting(
+    body: DeformableBody,
+    other: DeformableBody | Collider,
+    impact: _Impact,
+    step: tuple[float, float, Float],
+) -> _Meeting:
+    _, duration, gravity = step
+    point = _centre(impact, body.motion.centre)
+    if isinstance(other, DeformableBody):
         normal = impact.impulse / float(np.linalg.norm(impact.impulse))
-        requested = min(side.rebound.requested for side in sides if side.rebound is not None)
-        drift = np.zeros(3)
-        if not isinstance(other, DeformableBody):
-            shell = body.shell_points()
-            distance, normals = clearance(other, shell)
-            normal = normals[int(distance.argmin())]
-            # A wall does not fall with the body while nothing acts.
-            drift = QUIET * duration * gravity + _velocity(other, point)
-        levers = [point - side.motion.centre for side in sides]
-        start = _apart(impact.before, levers, normal) - float(_velocity_of(other, point) @ normal)
-        end = _apart([s.motion for s in sides], levers, normal) - float(drift @ normal)
-        if -start < SLOWEST or end <= 0:
-            return []
-        give = requested * -start - end
-        if abs(give) < EXACT * -start:
-            give = 0.0
-        ease = sum(_ease(s.motion, lever, normal) for s, lever in zip(sides, levers, strict=True))
-        impulse = give / ease * normal
-        self.log.append(
-            Bounce(body.name, other.name, time, -start, end / -start, (end + give) / -start)
-        )
-        if give == 0:
-            return []
-        made = [Correction(body, other.name, impulse, body.motion.with_impulse(impulse, point))]
-        if isinstance(other, DeformableBody):
-            after = other.motion.with_impulse(-impulse, point)
-            made.append(Correction(other, body.name, -impulse, after))
-        return made
+        known = [e for e in map(_restitution, (body, other)) if e is not None]
+        return _Meeting((body, other), other, point, normal, min(known), (0.0, 0.0))
+    assert body.rebound is not None
+    distance, normals = clearance(other, body.shell_points())
+    normal = normals[int(distance.argmin())]
+    moving = _velocity(other, point)
+    # A wall does not fall with the body while nothing acts.
+    drift = QUIET * duration * gravity + moving
+    still = float(moving @ normal), float(drift @ normal)
+    return _Meeting((body,), other, point, normal, body.rebound.requested, still)
+
+
+def _restitution(body: DeformableBody) -> float | None:
+    """What was requested of a body, or what one has that nothing damps; None for what else is."""
+    if body.rebound is not None:
+        return body.rebound.requested
+    return ELASTIC if body.is_undamped else None
+
+
+def _one_after_the_other(
+    meetings: Sequence[_Meeting], before: Mapping[str, RigidMotion]
+) -> tuple[list[float], Float]:
+    """Fastest approach of each impact of a chain, and how fast its sides part in the end [m/s], by
+    Newton's restitution at the fastest approach until there is none."""
+    motions = dict(before)
+    fastest = [0.0] * len(meetings)
+    for _ in range(ROUNDS):
+        approaches = [m.still[0] - m.apart(motions) for m in meetings]
+        fastest = [max(f, a) for f, a in zip(fastest, approaches, strict=True)]
+        k = int(np.argmax(approaches))
+        if approaches[k] <= EXACT * max(*fastest, SLOWEST):
+            break
+        m = meetings[k]
+        m.pushed(motions, (1 + m.requested) * approaches[k] / m.ease)
+    return fastest, np.array([m.apart(motions) - m.still[0] for m in meetings])
+
+
+def _corrections(
+    meetings: Sequence[_Meeting], now: Mapping[str, RigidMotion], give: Float
+) -> Iterator[Correction]:
+    """Impulses that change the speeds at which sides part by ``give`` [m/s]."""
+    response = np.zeros((len(meetings), len(meetings)))
+    for k, m in enumerate(meetings):
+        pushed = dict(now)
+        m.pushed(pushed, 1.0)
+        response[:, k] = [other.apart(pushed) - other.apart(now) for other in meetings]
+    impulses = np.linalg.lstsq(response, give, rcond=1e-9)[0]
+    after = dict(now)
+    for m, impulse in zip(meetings, impulses.tolist(), strict=True):
+        m.pushed(after, impulse)
+        for sign, side, other in zip((1.0, -1.0), m.sides, (m.other, m.sides[0]), strict=False):
+            yield Correction(side, other.name, sign * impulse * m.normal, after[side.name])
 
 
 def _centre(impact: _Impact, near: Float) -> Float:
@@ -214,23 +356,10 @@ def _centre(impact: _Impact, near: Float) -> Float:
     return point
 
 
-def _apart(motions: Sequence[RigidMotion], levers: Sequence[Float], normal: Float) -> float:
-    """Speed at which the first departs from the second, or from what stands still [m/s]."""
-    speeds = [
-        float((m.velocity + np.cross(m.angular_velocity, lever)) @ normal)
-        for m, lever in zip(motions, levers, strict=True)
-    ]
-    return speeds[0] - sum(speeds[1:])
-
-
 def _ease(motion: RigidMotion, lever: Float, normal: Float) -> float:
     """Change of speed along the normal by one N s along it at a lever [1/kg]."""
     turn = np.cross(lever, normal)
     return 1.0 / motion.mass + float(turn @ np.linalg.solve(motion.world_inertia, turn))
-
-
-def _velocity_of(other: DeformableBody | Collider, point: Float) -> Float:
-    return np.zeros(3) if isinstance(other, DeformableBody) else _velocity(other, point)
 
 
 def _velocity(collider: Collider, point: Float) -> Float:

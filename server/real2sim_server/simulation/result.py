@@ -126,7 +126,8 @@ class SimulationResult:
         impulses: [F, C, 3] of each contact up to each frame [N s].
         stopped: ``done`` or ``cancelled``; then there are the frames made until then.
         figures: preset, gravity, cells, steps, rollbacks, and ``restitution``: of each object that
-            was given one, the members of a Rebound and its ``bounces`` (JSON values only).
+            was given one, the members of a Rebound and its ``bounces``; with ``background`` the
+            boxes that stood for it (JSON values only).
         breakages: parts of vehicles that broke; None where nobody looked (the ``paper`` preset,
             and results from before that was done), and bodies are then drawn as smooth as they are.
     """

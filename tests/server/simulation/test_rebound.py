@@ -89,16 +89,26 @@ def test_more_than_the_grid_gives_back_is_given_when_they_part():
     assert bounce["achieved"] == pytest.approx(seen, abs=0.03)
 
 
-def test_balls_of_a_cradle_hand_on_what_they_have():
-    """Three blocks in a row; the first flies at the second."""
+@pytest.mark.parametrize(
+    ("gap", "requested", "last", "kept"),
+    [(0.15, 0.98, 1.8, 0.9), (0.0, 0.98, 1.8, 0.9), (0.0, None, 1.6, 0.66)],
+    ids=["spaced", "touching", "touching, none requested"],
+)
+def test_balls_of_a_cradle_hand_on_what_they_have(gap, requested, last, kept):
+    """Three blocks in a row; the first flies at the second.
+
+    Of elastic cubes the last leaves at 1.64 of 2 m/s and 0.70 of the energy stays in motion where
+    grids of 0.2, 0.1 and 0.05 m converge to; one of 0.2 m alone gives 0.9 and 0.37.
+    """
     turn = rotation_of(np.array([0.0, np.pi / 2, 0.0]))
     bodies = []
     for k, name in enumerate("cba"):
-        body = block(turn, ahead=k * 0.75)
+        body = block(turn, ahead=k * (0.6 + gap) + (0.1 if k == 2 and not gap else 0.0))
         body.name = name
         if k < 2:
             body.motion = replace(body.motion, velocity=np.zeros(3))
-        body.rebound = Rebound(0.98, 0.98, 0.98, None, SPEED, 0.0)
+        if requested is not None:
+            body.rebound = Rebound(requested, requested, requested, None, SPEED, 0.0)
         bodies.append(body)
     options = SimulateOptions(
         objects=dict.fromkeys("abc", ObjectPhysics()),
@@ -109,8 +119,8 @@ def test_balls_of_a_cradle_hand_on_what_they_have():
     simulate_bodies(bodies, options)
     speeds = np.array([-b.motion.velocity @ turn[:, 2] for b in bodies])
     assert speeds.sum() == pytest.approx(SPEED, rel=1e-3)
-    assert speeds[0] > 1.8
-    assert (speeds**2).sum() > 0.9 * SPEED**2
+    assert speeds[0] > last
+    assert (speeds**2).sum() > kept * SPEED**2
 
 
 @pytest.mark.slow
