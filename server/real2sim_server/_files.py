@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import secrets
@@ -96,13 +97,24 @@ def _exchange(new: Path, path: Path) -> None:
         new.rename(path)
         return
     aside = _sibling(path, "old")
-    path.rename(aside)
+    _move(path, aside)
     try:
         new.rename(path)
     except BaseException:
         aside.rename(path)
         raise
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def _move(folder: Path, target: Path) -> None:
+    try:
+        folder.rename(target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        # In a container: what a layer of its image holds is copied and removed, but not renamed.
+        shutil.copytree(folder, target, symlinks=True)
+        shutil.rmtree(folder)
 
 
 def _flush_folder(folder: Path) -> None:

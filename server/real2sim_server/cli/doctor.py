@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from .._files import atomic_file
 from ..console import SERVER_MODULES, CommandError, console, run_command, write_json
 from .command import app
 from .options import JsonFile
@@ -64,6 +65,17 @@ def doctor(
             "tested, and say what each takes; fails where one spills. Needs no GPU.",
         ),
     ] = False,
+    gpu_check: Annotated[
+        bool,
+        typer.Option(
+            "--gpu-check",
+            help="Try this machine's GPU in some minutes: its pictures and training against the "
+            "CPU's, times of frames, physics, memory. Fails where something is not right.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="With --gpu-check: the table as a Markdown file.")
+    ] = None,
     json: JsonFile = None,
 ) -> None:
     """Say what this machine can do, what is missing, and how to mend it."""
@@ -74,6 +86,9 @@ def doctor(
         advice = [f"pip install 'real2sim[server]'  # for {', '.join(missing)}"]
         _report(_Report(findings, advice=advice), json)
         raise typer.Exit(1)
+    if gpu_check:
+        run_command(_check_gpu, out=out, json=json)
+        return
     if build_gpu:
         run_command(_build_gpu, findings=findings, arch=arch)
     report = _inspected(findings)
@@ -117,10 +132,30 @@ def _build_gpu(*, findings: dict[str, str], arch: list[str] | None) -> None:
     from ..render.backends.cuda.gsplat_build import build_kernels
 
     names = sorted({_capability(name) for name in arch or _own_architecture()})
+    there = _compiled_already(names)
+    if there is not None:
+        findings["gsplat's kernels"] = f"{there}, compiled before; remove it to compile it again"
+        return
     console.print(f"compiling gsplat's kernels for {', '.join(names)}: this takes minutes")
     built, seconds = build_kernels(names)
     megabytes = built.library.stat().st_size / 1e6
     findings["gsplat's kernels"] = f"{built.library}, {megabytes:.1f} MB, in {seconds:.0f} s"
+
+
+def _compiled_already(architectures: list[str]) -> Path | None:
+    """The kernels for exactly these architectures, if they can be loaded."""
+    from ..render import RenderError
+    from ..render.backends.cuda.gsplat_build import built_kernels, load_kernels
+
+    for kernels in built_kernels():
+        if sorted(kernels.architectures) != architectures:
+            continue
+        try:
+            load_kernels(kernels)
+        except (RenderError, ImportError):
+            continue
+        return kernels.library
+    return None
 
 
 def _own_architecture() -> list[str]:
@@ -142,6 +177,26 @@ def _capability(name: str) -> str:
     if not digits.isdecimal() or len(digits) not in (2, 3) or int(digits) < 70:
         raise CommandError(f"--arch {name!r}; allowed are such as sm_75, sm_90, sm_120, or 9.0")
     return f"{digits[:-1]}.{digits[-1]}"
+
+
+def _check_gpu(*, out: Path | None, json: Path | None) -> None:
+    """Try everything on the GPU of this machine, and print what was found."""
+    from ..render.backends.nvrtc.needs import unmet_need
+
+    need = unmet_need()
+    if need is not None:
+        raise CommandError(f"there is no GPU to check: {need.found}; {need.remedy}")
+    from ..benchmarks import gpu_check
+
+    check = gpu_check.run(gpu_check.this_gpu(), on_part=lambda part: console.print(f"{part} ..."))
+    text = check.markdown()
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
+    if out is not None:
+        with atomic_file(out) as file:
+            file.write(text.encode())
+    write_json(json, asdict(check))
+    if not check.right:
+        raise CommandError("something is not right: see the lines that do not hold, or failed")
 
 
 def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:

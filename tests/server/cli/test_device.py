@@ -15,6 +15,8 @@ from real2sim_server.cli.device import chosen_backend
 from real2sim_server.console import CommandError
 from real2sim_server.reconstruct import ReconstructOptions, reconstruct
 from real2sim_server.render import RenderError, select_backend
+from real2sim_server.render.backends.cuda import gsplat_build
+from real2sim_server.render.backends.cuda.gsplat_build import BuiltKernels
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +84,32 @@ def test_doctor_asks_what_to_build_for_where_there_is_no_gpu() -> None:
     code, output = doctor("--build-gpu", "--arch", "hopper")
     assert code == 1
     assert "'hopper'" in output
+
+
+def test_doctor_compiles_no_kernels_that_are_there_already(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = BuiltKernels(tmp_path / "csrc.so", ("9.0",))
+    monkeypatch.setattr(gsplat_build, "built_kernels", lambda: [built])
+    loaded: list[BuiltKernels] = []
+    monkeypatch.setattr(gsplat_build, "load_kernels", loaded.append)
+    monkeypatch.setattr(gsplat_build, "build_kernels", lambda names: (built, 1.0))
+    code, output = doctor("--build-gpu", "--arch", "sm_90")
+    assert (code, loaded) == (0, [built])
+    assert "compiled before" in output
+    assert "takes minutes" in doctor("--build-gpu", "--arch", "sm_80")[1]
+
+    def refuse(kernels: BuiltKernels) -> None:
+        raise RenderError(f"{kernels.library} cannot be loaded")
+
+    monkeypatch.setattr(gsplat_build, "load_kernels", refuse)
+    assert "takes minutes" in doctor("--build-gpu", "--arch", "sm_90")[1]
+
+
+def test_doctor_checks_no_gpu_where_there_is_none() -> None:
+    code, output = doctor("--gpu-check")
+    assert code == 1
+    assert "there is no GPU to check" in output
 
 
 def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(

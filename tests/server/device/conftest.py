@@ -29,6 +29,7 @@ def cuda_backend(
     monkeypatch.delitem(sys.modules, name, raising=False)
     from real2sim_server.render.backends.cuda import backend
 
-    monkeypatch.setattr(backend, "instance_image", gsplat_stand_in.instance_image)
+    for name_of_image in ("instance_image", "median_depth_image"):
+        monkeypatch.setattr(backend, name_of_image, getattr(gsplat_stand_in, name_of_image))
     yield backend.CudaBackend(pretended.DEVICE)
     sys.modules.pop(name, None)

@@ -163,8 +163,9 @@ def _blend(
     )  # fmt: skip
     order = torch.argsort(made.depth_key, stable=True)
     sorted_watch = None if watch is None else _Sorted(watch, order)
-    rgb, alpha, depth, instance = _blend_image(made.select(order), *size, sorted_watch)
-    return rgb.float(), alpha.float(), depth.float(), instance
+    images = _blend_image(made.select(order), *size, sorted_watch)
+    rgb, alpha, depth, instance, median = images
+    return rgb.float(), alpha.float(), depth.float(), instance, median.float()
 
 
 class _Sorted(ScreenWatch):
@@ -183,14 +184,29 @@ def instance_image(
     """In place of the CUDA kernel that walks gsplat's tile lists."""
     if meta is None:
         return torch.zeros(shape, device=instance_ids.device).to(torch.uint16)
-    ids, cameras = held(instance_ids)[held(meta["gaussian_ids"])], held(meta["camera_ids"])
+    ids = held(instance_ids)[held(meta["gaussian_ids"])]
+    return Pretended(_walked(meta, ids, shape, 3).to(torch.uint16))
+
+
+def median_depth_image(
+    meta: dict[str, Any] | None, shape: tuple[int, int, int], device: torch.device
+) -> Tensor:
+    """In place of the same kernel."""
+    if meta is None:
+        return torch.zeros(shape, device=device)
+    ids = torch.zeros_like(held(meta["gaussian_ids"]))
+    return Pretended(_walked(meta, ids, shape, 4))
+
+
+def _walked(meta: dict[str, Any], ids: Tensor, shape: tuple[int, int, int], image: int) -> Tensor:
+    cameras = held(meta["camera_ids"])
     names = ("means2d", "conics", "opacities", "colors", "depths", "extents")
     images = []
     for camera in range(shape[0]):
         mine = cameras == camera
         parts = [held(meta.get(n, meta["conics"]))[mine].detach() for n in names]
-        images.append(_blend(tuple(parts), ids[mine].long(), (shape[2], shape[1]), None)[3])
-    return Pretended(torch.stack(images).to(torch.uint16))
+        images.append(_blend(tuple(parts), ids[mine].long(), (shape[2], shape[1]), None)[image])
+    return torch.stack(images)
 
 
 def module() -> types.ModuleType:

@@ -43,7 +43,7 @@ def test_pictures_of_the_device_are_those_of_the_reference(cuda_backend: Backend
             60,
             48,
             sky=Sky.uniform((0.3, 0.5, 0.9), resolution=8),
-            options=RasterOptions(),
+            options=RasterOptions(median_depth=True),
             backend=backend,
         )
         for backend in (cuda_backend, "reference")
@@ -58,3 +58,7 @@ def test_pictures_of_the_device_are_those_of_the_reference(cuda_backend: Backend
     assert expected.instance is not None
     same = given.instance.cpu().int() == expected.instance.int()
     assert float(same.float().mean()) > 0.999
+    assert given.median_depth is not None
+    assert expected.median_depth is not None
+    near = (given.median_depth.cpu() - expected.median_depth).abs() < 0.01
+    assert float(near.float().mean()) > 0.999

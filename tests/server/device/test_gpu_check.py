@@ -1,0 +1,67 @@
+"""The check of a GPU, on the pretended device: it runs through and tells what it found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from real2sim_server.benchmarks.gpu_check import PARTS, Devices, FrameCase, Scale, run
+from real2sim_server.render.backends import Backend
+from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
+
+from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
+from . import pretended
+from .pretended_launcher import PretendedLauncher
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason=NEEDS_COMPILER)
+SMALL = Scale(
+    compared=1500,
+    compared_width=32,
+    frames=(
+        FrameCase(1, 32, 16, 1000, 2),
+        FrameCase(5, 32, 16, 1000, 3, wanted_ms=1e9, jpeg=True),
+    ),
+    repeats=2,
+    particles=(1000,),
+    train_steps=2,
+    train_width=32,
+    train_frames=2,
+    train_gaussians=100,
+)
+
+
+def devices(training: str | Backend = "cpu") -> Devices:
+    return Devices(lambda: NvrtcBackend(PretendedLauncher()), training, "cpu", "pretended")
+
+
+def test_pictures_and_times_are_checked_and_told_as_a_table(
+    device_counts: pretended.Counts,
+) -> None:
+    check = run(devices(), SMALL, parts=["pictures", "frames", "memory"])
+    assert check.failed == {}
+    assert check.right
+    text = check.markdown()
+    assert text.startswith(f"Checked on {check.date}: pretended\n\n| Part |")
+    assert ": jpeg | p50 " in text
+    assert "10 km from the origin | 0 | 0 (holds) |" in text
+
+
+def test_a_part_that_fails_says_why_and_the_others_go_on() -> None:
+    def broken() -> Backend:
+        raise RuntimeError("CUDA error: no kernel image")
+
+    check = run(replace(devices(), serving=broken), SMALL, parts=["frames", "memory"])
+    assert check.failed == {"frames": "RuntimeError: CUDA error: no kernel image"}
+    assert not check.right
+    assert [finding.part for finding in check.findings] == ["memory"]
+    assert "| frames | failed | RuntimeError" in check.markdown()
+
+
+@pytest.mark.slow
+def test_all_parts_run_through(device_counts: pretended.Counts, cuda_backend: Backend) -> None:
+    begun: list[str] = []
+    check = run(devices(cuda_backend), SMALL, on_part=begun.append)
+    assert check.failed == {}
+    assert begun == list(PARTS)
+    assert {finding.part for finding in check.findings} == set(PARTS)
