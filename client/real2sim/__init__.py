@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ._sync.client import Client, connect
     from ._sync.drive_batch import DriveBatch
     from ._sync.drive_session import DriveSession
-    from .batch_observation import BatchObservation
+    from .batch_observation import BatchImages, BatchObservation
     from .env import DriveEnv
     from .errors import (
         BadStepError,
@@ -70,6 +70,7 @@ __all__ = [
     "AsyncDriveBatch",
     "AsyncDriveSession",
     "BadStepError",
+    "BatchImages",
     "BatchObservation",
     "CapacityError",
     "Client",
@@ -116,6 +117,7 @@ _ELSEWHERE = {
     "AsyncClient": "real2sim._async.client",
     "AsyncDriveBatch": "real2sim._async.drive_batch",
     "AsyncDriveSession": "real2sim._async.drive_session",
+    "BatchImages": "real2sim.batch_observation",
     "BatchObservation": "real2sim.batch_observation",
     "Client": "real2sim._sync.client",
     "Control": "real2sim_proto.plans",

@@ -29,9 +29,10 @@ from real2sim_proto.drive_batch import ControlPlans
 
 from ._protocol import error_of
 from ._references import ScenarioRef, SceneRef
+from ._sensors import Sensor
 from ._sync.client import connect
 from .batch_observation import BatchObservation
-from .env import ACCELERATION, BRAKING, FAR, STEERING, WAYPOINTS
+from .env import ACCELERATION, BRAKING, FAR, FORMS, STEERING, WAYPOINTS
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -44,17 +45,19 @@ STATE = ("speed", "lateral_speed", "acceleration", "steering", "yaw_rate")
 class DriveVectorEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
     """N sessions that are stepped by one message; each does what ``real2sim.DriveEnv`` does.
 
-    Actions, observations (``state`` [N, 5], ``route`` [N, 20, 2] float32) and rewards are those of
-    the single environment without cameras and agents. Ended worlds are reset as Gymnasium's
-    ``autoreset_mode`` says. ``info`` has ``metrics``: [N] float64 by name.
+    Actions, observations (``state`` [N, 5], ``route`` [N, 20, 2] float32, the images of each sensor
+    [N, H, W, ...] under the names that they have there) and rewards are those of the single
+    environment without agents. Ended worlds are reset as Gymnasium's ``autoreset_mode`` says.
+    ``info`` has ``metrics``: [N] float64 by name.
 
     The worker has to have N sessions free (``REAL2SIM_MAX_SESSIONS``). For worlds in the process of
-    the learner, and for images, see ``real2sim_server.learning``.
+    the learner see ``real2sim_server.learning``.
 
     Args:
         num_envs: N, 1 to 256.
         url, token: of the worker; defaults as of :func:`real2sim.connect`.
         scene, scenario: exactly one of them, or its name or id.
+        sensors: camera names or specs, as of ``DriveBatch.reset``.
         options: of ``DriveBatch.reset``; ``seed`` and ``action`` are the environment's.
         autoreset_mode: of Gymnasium: at the next step (its default), in the same step, or not.
 
@@ -80,22 +83,17 @@ class DriveVectorEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
         token: str | None = None,
         scene: SceneRef | None = None,
         scenario: ScenarioRef | None = None,
+        sensors: Sequence[Sensor] = (),
         options: Mapping[str, Any] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ) -> None:
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
-        self._options: dict[str, Any] = {**dict(options or {}), "action": "control"}
+        fixed = {"sensors": list(sensors), "action": "control"}
+        self._options: dict[str, Any] = {**dict(options or {}), **fixed}
         self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.single_observation_space: Any = spaces.Dict(
-            {
-                "state": spaces.Box(-FAR, FAR, (len(STATE),), np.float32),
-                "route": spaces.Box(-FAR, FAR, (WAYPOINTS, 2), np.float32),
-            }
-        )
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._random = [seeding.np_random()[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, np.bool_)
         self._seen: Arrays = {
@@ -111,6 +109,8 @@ class DriveVectorEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
             # What the options get wrong is said here, where they are given.
             self._begin(np.ones(num_envs, np.bool_), [0] * num_envs)
             opened.pop_all()
+        self.single_observation_space: Any = self._space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
 
     def reset(
         self,
@@ -217,6 +217,26 @@ class DriveVectorEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
             self._metrics[name][rows] = values
         for name in self._metrics.keys() - obs.metrics.keys():
             self._metrics[name][rows] = np.nan
+
+        for images in obs.images:
+            name = images.sensor
+            if images.modality != "rgb":
+                name = f"{name}/{images.modality}"
+            # A slower camera keeps its last images until the next ones are due.
+            most, dtype = FORMS[images.modality]
+            if name not in self._seen:
+                self._seen[name] = np.zeros((self.num_envs, *images.shape), dtype)
+            self._seen[name][images.worlds] = np.minimum(images.array, most)
+
+    def _space(self) -> Any:
+        parts: dict[str, spaces.Space[Any]] = {
+            "state": spaces.Box(-FAR, FAR, (len(STATE),), np.float32),
+            "route": spaces.Box(-FAR, FAR, (WAYPOINTS, 2), np.float32),
+        }
+        for name in self._seen.keys() - parts.keys():
+            most, dtype = FORMS[name.partition("/")[2] or "rgb"]
+            parts[name] = spaces.Box(0, most, self._seen[name].shape[1:], dtype)
+        return spaces.Dict(parts)
 
     def _observed(self) -> Arrays:
         return {name: values.copy() for name, values in self._seen.items()}

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
-from .base import Identifier, Microseconds, Model, Vector3
+from .base import Codec, Identifier, Microseconds, Modality, Model, Vector3
 from .drive import (
     AgentState,
     Array,
@@ -262,6 +262,21 @@ class WorldError(ServerModel):
     retry_after_s: int | None = None
 
 
+class BatchImages(ServerModel):
+    """Images of one sensor and one modality in those worlds that show it now, all of one form."""
+
+    sensor: str
+    modality: Modality
+    codec: Codec
+    dtype: Literal["uint8", "uint16", "float32"]
+    shape: list[int] = Field(description="[H, W, 3] or [H, W], of each image")
+    K: Array = Field(description="[3, 3] float64 intrinsics [px]")
+    worlds: Array = Field(description="[I] int64, whose images these are")
+    T_world_sensor: Array = Field(description="[I, 4, 4] float64, camera frame to world")
+    sizes: Array = Field(description="[I] int64 bytes of each image")
+    data: bytes = Field(description="the images, one after the other")
+
+
 class BatchObs(ServerEnvelope):
     """New instants of M worlds; a world with an error has no row."""
 
@@ -279,6 +294,9 @@ class BatchObs(ServerEnvelope):
     warming_up: Array = Field(description="[M] bool, the ego still moves as recorded")
     lap: Array = Field(description="[M] int64")
     reverse: Array = Field(description="[M] bool, the ego is in reverse gear")
+    images: list[BatchImages] = Field(
+        default_factory=list, description="of the sensors that are due"
+    )
     events: list[WorldEvent] = Field(default_factory=list)
     details: list[WorldDetail] = Field(default_factory=list)
     errors: list[WorldError] = Field(default_factory=list)

@@ -17,6 +17,7 @@ PUBLIC = [
     "AsyncDriveBatch",
     "AsyncDriveSession",
     "BadStepError",
+    "BatchImages",
     "BatchObservation",
     "CapacityError",
     "Client",

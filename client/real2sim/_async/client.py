@@ -183,6 +183,7 @@ class AsyncClient:
         scene: SceneRef | None = None,
         scenario: ScenarioRef | None = None,
         worlds: int,
+        codec: str = "auto",
         reconnect: float = 60.0,
     ) -> AsyncDriveBatch:
         """New sessions on a scene or a scenario that are stepped together, by one message a step.
@@ -191,6 +192,7 @@ class AsyncClient:
             scene: a scene or its name; or
             scenario: a scenario or its id.
             worlds: how many sessions, 1 to 256; the worker has to have as many free.
+            codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
             reconnect: seconds for which a lost connection is tried again; 0 gives up.
 
         Raises:
@@ -209,6 +211,7 @@ class AsyncClient:
         plan = SessionPlan(
             scene=optional_scene_name(scene),
             scenario=optional_scenario_id(scenario),
+            codec=codec,
             reconnect=reconnect,
         )
         return AsyncDriveBatch(self._transport, plan, worlds)

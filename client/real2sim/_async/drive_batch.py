@@ -17,7 +17,7 @@ from .. import _requests
 from .._batch_protocol import BatchProtocol
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest, error_of
-from .._sensors import ResetOptions, reset_spec
+from .._sensors import ResetOptions, Sensor, reset_spec
 from .._session_state import SessionPlan, not_open
 from ..batch_observation import BatchObservation, batch_observation_from_wire
 from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError
@@ -36,7 +36,7 @@ class AsyncDriveBatch:
 
     Worlds are numbered from 0. Each does what a session of its own would do, bit for bit; what is
     wrong with one is in ``errors`` of the observation, and the others go on. Episodes of a batch
-    have neither cameras nor deadlines.
+    have no deadlines.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -110,6 +110,7 @@ class AsyncDriveBatch:
     async def reset(
         self,
         *,
+        sensors: Sequence[Sensor] = (),
         worlds: Sequence[int] | None = None,
         seeds: Sequence[int] | None = None,
         starts_us: Sequence[int] | None = None,
@@ -118,10 +119,11 @@ class AsyncDriveBatch:
         """Start episodes and return their first instants.
 
         Args:
+            sensors: as of :meth:`AsyncDriveSession.reset`; all images come in one message.
             worlds: numbers of those that begin anew; default: all.
             seeds: one for each of them, in place of ``seed``.
             starts_us: one for each of them, in place of ``start_us`` [us].
-            options: as of :meth:`AsyncDriveSession.reset`; no sensors, no deadlines.
+            options: as of :meth:`AsyncDriveSession.reset`; no deadlines.
 
         Raises:
             ValueError: an option that is not allowed.
@@ -133,7 +135,7 @@ class AsyncDriveBatch:
             >>> obs.worlds.tolist()
             [2]
         """
-        spec = reset_spec((), "raw", options)
+        spec = reset_spec(sensors, self._target.codec(self._plan.codec), options)
         request = self._protocol.reset(spec, worlds, seeds, starts_us)
         return _observed(await self._request(request))
 

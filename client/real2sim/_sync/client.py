@@ -184,6 +184,7 @@ class Client:
         scene: SceneRef | None = None,
         scenario: ScenarioRef | None = None,
         worlds: int,
+        codec: str = "auto",
         reconnect: float = 60.0,
     ) -> DriveBatch:
         """New sessions on a scene or a scenario that are stepped together, by one message a step.
@@ -192,6 +193,7 @@ class Client:
             scene: a scene or its name; or
             scenario: a scenario or its id.
             worlds: how many sessions, 1 to 256; the worker has to have as many free.
+            codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
             reconnect: seconds for which a lost connection is tried again; 0 gives up.
 
         Raises:
@@ -210,6 +212,7 @@ class Client:
         plan = SessionPlan(
             scene=optional_scene_name(scene),
             scenario=optional_scenario_id(scenario),
+            codec=codec,
             reconnect=reconnect,
         )
         return DriveBatch(self._transport, plan, worlds)

@@ -18,7 +18,7 @@ from .. import _requests
 from .._batch_protocol import BatchProtocol
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest, error_of
-from .._sensors import ResetOptions, reset_spec
+from .._sensors import ResetOptions, Sensor, reset_spec
 from .._session_state import SessionPlan, not_open
 from ..batch_observation import BatchObservation, batch_observation_from_wire
 from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError
@@ -37,7 +37,7 @@ class DriveBatch:
 
     Worlds are numbered from 0. Each does what a session of its own would do, bit for bit; what is
     wrong with one is in ``errors`` of the observation, and the others go on. Episodes of a batch
-    have neither cameras nor deadlines.
+    have no deadlines.
 
     Examples:
         >>> client = real2sim.connect()
@@ -111,6 +111,7 @@ class DriveBatch:
     def reset(
         self,
         *,
+        sensors: Sequence[Sensor] = (),
         worlds: Sequence[int] | None = None,
         seeds: Sequence[int] | None = None,
         starts_us: Sequence[int] | None = None,
@@ -119,10 +120,11 @@ class DriveBatch:
         """Start episodes and return their first instants.
 
         Args:
+            sensors: as of :meth:`DriveSession.reset`; all images come in one message.
             worlds: numbers of those that begin anew; default: all.
             seeds: one for each of them, in place of ``seed``.
             starts_us: one for each of them, in place of ``start_us`` [us].
-            options: as of :meth:`DriveSession.reset`; no sensors, no deadlines.
+            options: as of :meth:`DriveSession.reset`; no deadlines.
 
         Raises:
             ValueError: an option that is not allowed.
@@ -134,7 +136,7 @@ class DriveBatch:
             >>> obs.worlds.tolist()
             [2]
         """
-        spec = reset_spec((), "raw", options)
+        spec = reset_spec(sensors, self._target.codec(self._plan.codec), options)
         request = self._protocol.reset(spec, worlds, seeds, starts_us)
         return _observed(self._request(request))
 

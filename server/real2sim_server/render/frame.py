@@ -13,11 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from real2sim_proto.semantics import UNLABELED
 
 from ..scene import Camera
-from .backends.base import Backend, FrameBackend, RasterRequest, class_behind
+from .backends.base import (
+    Backend,
+    BatchBackend,
+    FrameBackend,
+    RasterRequest,
+    class_behind,
+    is_reduced,
+)
 from .backends.select import select_backend
 from .modalities import modalities_drawn, modality_of, options_for
 from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
-from .types import Instance, RasterOptions, RenderError, Sky
+from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
 
 
 def _at_once() -> None:
@@ -227,13 +234,56 @@ def _drawn(
         for request, images in zip(requests, started.images, strict=True):
             yield _Drawn(images, {"total": each * request.cameras}, started.ready)
         return
-    for request in requests:
-        output = backend.rasterize(request)
+    for request, output in zip(requests, _rasterized(requests, backend), strict=True):
+        seen = output
         if "semantic" in modalities:
             classes, behind = _classes(request.instances), class_behind(request)
-            output = replace(output, classes=classes, behind=behind)
-        images = {name: modality_of(name).pixels(output) for name in modalities}
-        yield _Drawn(images, output.timing_ms)
+            seen = replace(output, classes=classes, behind=behind)
+        images = {name: modality_of(name).pixels(seen) for name in modalities}
+        yield _Drawn(images, seen.timing_ms)
+
+
+def _rasterized(requests: Sequence[RasterRequest], backend: Backend) -> Iterator[RenderOutput]:
+    """Outputs of requests in their order; small images alike are drawn in one go where the backend
+    can, the same bits as one by one."""
+    if not isinstance(backend, BatchBackend):
+        yield from map(backend.rasterize, requests)
+        return
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    for k, request in enumerate(requests):
+        if is_reduced(request):
+            key = (request.width, request.height, id(request.sky), request.options)
+            alike.setdefault(key, []).append(k)
+    drawn: dict[int, RenderOutput] = {}
+    for members in alike.values():
+        if len(members) > 1:
+            output = backend.rasterize_batch([requests[k] for k in members])
+            drawn.update(_taken_apart(output, [requests[k].cameras for k in members], members))
+    for k, request in enumerate(requests):
+        yield drawn[k] if k in drawn else backend.rasterize(request)
+
+
+def _taken_apart(
+    output: RenderOutput, cameras: Sequence[int], numbers: Sequence[int]
+) -> Iterator[tuple[int, RenderOutput]]:
+    """Outputs of requests that were drawn in one go, by their numbers."""
+    first = 0
+    for number, count in zip(numbers, cameras, strict=True):
+        part = slice(first, first + count)
+        timing_ms = {k: v * count / sum(cameras) for k, v in output.timing_ms.items()}
+        first += count
+        yield (
+            number,
+            replace(
+                output,
+                rgb=output.rgb[part],
+                alpha=output.alpha[part],
+                depth=None if output.depth is None else output.depth[part],
+                instance=None if output.instance is None else output.instance[part],
+                median_depth=None if output.median_depth is None else output.median_depth[part],
+                timing_ms=timing_ms,
+            ),
+        )
 
 
 def _frames(view: RigView, members: Sequence[int], drawn: _Drawn) -> list[Frame]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,17 @@ import torch
 from real2sim_proto import SEMANTIC_CLASSES
 from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.render import Instance, RasterOptions, RenderError, render_cameras, warm_up
+from real2sim_server.render import (
+    Instance,
+    RasterOptions,
+    RenderError,
+    RenderOutput,
+    RigView,
+    render_cameras,
+    render_rigs,
+    select_backend,
+    warm_up,
+)
 from real2sim_server.render.quantize import solid_depth, to_uint8
 from real2sim_server.scene import Camera, GaussianCloud, Sky
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
@@ -75,6 +87,31 @@ def test_classes_are_of_what_takes_half_of_the_light_and_of_the_sky_behind() -> 
 
     assert classes(Sky.uniform((0.5, 0.6, 0.9))) == [26, SEMANTIC_CLASSES["sky"]]
     assert classes(None) == [26, SEMANTIC_CLASSES["unlabeled"]]
+
+
+def test_small_images_of_several_vehicles_are_drawn_in_one_go(monkeypatch) -> None:
+    backend, drawn = select_backend("cpu"), []
+    draw = type(backend).rasterize_batch
+
+    def counted(self: object, requests: Sequence[object]) -> RenderOutput:
+        drawn.append(len(requests))
+        return draw(self, requests)
+
+    monkeypatch.setattr(type(backend), "rasterize_batch", counted)
+    cameras = [camera("a", 32, 20), camera("b", 20, 32), camera("c", 32, 20)]
+    views = [
+        RigView([Instance(ball((x, 0, 0), (1, x / 9, 0)), semantic=26)], cameras, np.eye(4))
+        for x in (5.0, 7.0, 9.0)
+    ]
+    modalities, small = ("rgb", "depth", "instance", "semantic"), RasterOptions(detail="auto")
+    together = render_rigs(views, options=small, modalities=modalities, backend=backend)
+    assert drawn == [3, 3]
+    for view, frames in zip(views, together, strict=True):
+        [alone] = render_rigs([view], options=small, modalities=modalities, backend=backend)
+        for one, other in zip(frames, alone, strict=True):
+            assert one.camera == other.camera
+            for name in modalities:
+                np.testing.assert_array_equal(one.images[name], other.images[name])
 
 
 def test_pose_of_a_frame_is_the_camera_in_the_world() -> None:

@@ -203,6 +203,12 @@ def _frame_header(fields: dict[str, Any], size: int) -> FrameHeader:
     return FrameHeader(fields, members, encoded)
 
 
+def bytes_member(fields: Mapping[str, Any], data: Sequence[Part]) -> list[Part]:
+    """A msgpack map of ``fields`` and ``data``, the latter one after the other, in parts."""
+    header = map_header(len(fields) + 1) + pack_pairs(fields) + DATA
+    return [header + _bin_header(sum(len(part) for part in data)), *data]
+
+
 def _bin_header(length: int) -> bytes:
     # Always of 32 bits, which msgpack's own packer writes for large values only.
     return b"\xc6" + length.to_bytes(4, "big")

@@ -16,7 +16,7 @@ from typing import Any, assert_never
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from real2sim_proto import DRIVE_SUBPROTOCOL
+from real2sim_proto import DRIVE_SUBPROTOCOL, ErrorCode
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from real2sim_proto.drive_batch import (
     BATCH_CLIENT_MESSAGE,
@@ -27,11 +27,13 @@ from real2sim_proto.drive_batch import (
     BatchHello,
     BatchReset,
 )
+from real2sim_proto.episode import ResetSpec
 
 from ...world import Observation, metrics_version
 from ..accounts import admit_message
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import send_parts
+from ..rendering.frames import EncodedFrame
 from .batch_obs import pack_batch_obs, pack_errors
 from .batch_plans import ReadPlan, check_for_batch, numbers_of, read_plans, steps_of
 from .connection import NORMAL_CLOSURE, Connection
@@ -45,10 +47,14 @@ from .handshake import (
     receive_as,
 )
 from .messages import BadMessageError, bad_message, read_as
+from .pipeline import MAX_IMAGE_BYTES, raw_image_bytes
 from .registry import Sessions
 from .session import Session, controller_taken
 from .step import DueAction
 from .wire import EncodedMessage, PhaseTimer, pack_message
+
+Frames = dict[int, Sequence[EncodedFrame]]
+"""Images by number of the world, of those that have any."""
 
 Errors = dict[int, tuple[ServiceError, int | None]]
 """What went wrong by number of the world, and the step that it is at."""
@@ -127,6 +133,7 @@ class BatchConnection:
             "protocol": DRIVE_SUBPROTOCOL,
             "versions": {"server": version("real2sim"), "metrics": metrics_version()},
             "limits": {
+                "max_image_bytes": MAX_IMAGE_BYTES,
                 "max_message_bytes": MAX_CLIENT_MESSAGE_BYTES,
                 "max_sessions_per_socket": MAX_WORLDS,
             },
@@ -187,13 +194,20 @@ class BatchConnection:
                     again.append(number)
                 else:
                     due[number] = action
+            self._check_image_bytes({n: self._members[n].spec for n in (*due, *again)})
             timer.stage("check")
-            seen = await self._taken(due, errors) | await self._present(again)
+            blind = {n: action for n, action in due.items() if not action.session.cameras}
+            seen = await self._taken(blind, errors)
             timer.stage("world")
+            frames = await self._drawn({n: due[n] for n in due if n not in blind}, errors)
+            frames |= await self._drawn_again(again, errors)
+            shown = dict.fromkeys((*frames, *again))
+            seen |= await self._present([n for n in shown if n not in errors])
+            timer.stage("render")
         seconds = time.perf_counter() - arrived
         for _ in due.keys() - errors.keys():
             self._sessions.metrics.steps.observe(seconds)
-        return await self._packed(numbers, seen, errors, timer)
+        return await self._packed(numbers, (seen, frames), errors, timer)
 
     def _due(self, number: int, step: int, given: ReadPlan | ServiceError) -> DueAction | None:
         """The action of a world; None where it was taken already, and is asked for again.
@@ -226,6 +240,29 @@ class BatchConnection:
                     seen[number] = outcome.observation
         return seen
 
+    async def _drawn(self, due: Mapping[int, DueAction], errors: Errors) -> Frames:
+        """Take due actions of worlds with sensors, all drawn in one go; their images."""
+        outcomes = await self._sessions.stepper.act_seeing(list(due.values())) if due else []
+        frames: Frames = {}
+        for number, outcome in zip(due, outcomes, strict=True):
+            if isinstance(outcome, Exception):
+                errors[number] = self._error(number, outcome)
+            else:
+                frames[number] = outcome.frames
+        return frames
+
+    async def _drawn_again(self, numbers: Sequence[int], errors: Errors) -> Frames:
+        """Images of worlds that have moved already, once more."""
+        frames: Frames = {}
+        for number in numbers:
+            world = self._members[number].running_world()
+            if sensors := world.due_sensors():
+                try:
+                    frames[number] = (await self._sessions.pipeline.view(world, sensors)).frames
+                except Exception as error:
+                    errors[number] = self._error(number, error)
+        return frames
+
     async def _reset(self, message: BatchReset) -> EncodedMessage:
         timer = PhaseTimer()
         numbers = numbers_of(message.worlds, None, len(self._members))
@@ -236,15 +273,17 @@ class BatchConnection:
                 if len(values) != len(numbers):
                     raise bad_message(f"{len(values)} of {name} for {len(numbers)} worlds")
                 specs = [s.model_copy(update={name: v}) for s, v in zip(specs, values, strict=True)]
+        self._check_image_bytes(dict(zip(numbers, specs, strict=True)))
         stepper = self._sessions.stepper
         async with self._held(numbers):
             begun, errors = await self._each(
                 numbers,
-                [partial(stepper.reset, spec=spec) for spec in specs],
+                [partial(stepper.reset_seen, spec=spec) for spec in specs],
             )
             seen = await self._present(list(begun))
+        frames = {number: observation.frames for number, observation in begun.items()}
         timer.stage("world")
-        return await self._packed(numbers, seen, errors, timer)
+        return await self._packed(numbers, (seen, frames), errors, timer)
 
     async def _finish(self) -> EncodedMessage:
         """The results; every session ends."""
@@ -305,14 +344,31 @@ class BatchConnection:
     async def _packed(
         self,
         numbers: Sequence[int],
-        seen: Mapping[int, Observation],
+        shown: tuple[Mapping[int, Observation], Frames],
         errors: Errors,
         timer: PhaseTimer,
     ) -> EncodedMessage:
+        seen, images = shown
         ordered = {number: seen[number] for number in numbers if number in seen}
-        return await self._sessions.pipeline.on_world_thread(
-            pack_batch_obs, ordered, errors, timer.timing_ms
-        )
+        frames = {number: images[number] for number in ordered if images.get(number)}
+        pack = partial(pack_batch_obs, ordered, errors, timer.timing_ms, frames=frames)
+        return await self._sessions.pipeline.on_world_thread(pack)
+
+    def _check_image_bytes(self, specs: Mapping[int, ResetSpec]) -> None:
+        """Raises ServiceError: INVALID_REQUEST for raw images that no one message holds."""
+        size = 0
+        for number, spec in specs.items():
+            if spec.sensors:
+                rig = self._members[number].start.scene.rig
+                known = [sensor for sensor in spec.sensors if sensor.camera in rig.names]
+                cameras = [rig[s.camera].resized(s.width or rig[s.camera].width) for s in known]
+                size += raw_image_bytes(known, cameras)
+        if size > MAX_IMAGE_BYTES:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"{size} bytes of raw images in one message; readers allow {MAX_IMAGE_BYTES}",
+                hint="name fewer worlds in a message, or ask for smaller images or codec 'jpeg'",
+            )
 
     def _error(self, number: int, error: Exception) -> tuple[ServiceError, int | None]:
         step = self._members[number].lockstep.step

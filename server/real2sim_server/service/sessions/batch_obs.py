@@ -14,8 +14,10 @@ from real2sim_proto.drive_batch import COMMANDS, EGO_COLUMNS
 from ...world import Observation, agent_fields
 from ...world.ego.route import WAYPOINTS
 from ..http.problems import ServiceError
+from ..rendering.frames import EncodedFrame
+from .batch_images import pack_images
 from .handshake import error_fields
-from .wire import EncodedMessage, pack_message
+from .wire import EncodedMessage, pack_members, pack_message, pack_with_images
 
 NUMBER_OF = {command: k for k, command in enumerate(COMMANDS)}
 MOTION = ("yaw", "speed", "lateral_speed", "acceleration", "steering", "yaw_rate")
@@ -25,6 +27,8 @@ def pack_batch_obs(
     seen: Mapping[int, Observation],
     errors: Mapping[int, tuple[ServiceError, int | None]],
     timing_ms: Mapping[str, float],
+    *,
+    frames: Mapping[int, Sequence[EncodedFrame]],
 ) -> EncodedMessage:
     """The wire's BatchObs, without id.
 
@@ -32,6 +36,7 @@ def pack_batch_obs(
         seen: by number of the world, in the order asked for.
         errors: why a world has no row, and the step that it is at.
         timing_ms: by stage.
+        frames: images by number of the world, of those that have any.
     """
     found = list(seen.values())
     fields: dict[str, Any] = {
@@ -53,7 +58,9 @@ def pack_batch_obs(
         "errors": pack_errors(errors),
         "timing": dict(timing_ms),
     }
-    return pack_message("batch_obs", fields)
+    if not frames:
+        return pack_message("batch_obs", fields)
+    return pack_with_images("batch_obs", pack_members(fields), pack_images(frames))
 
 
 def pack_errors(errors: Mapping[int, tuple[ServiceError, int | None]]) -> list[dict[str, Any]]:

@@ -101,7 +101,6 @@ def steps_of(action: BatchAction) -> list[int]:
 def check_for_batch(spec: ResetSpec) -> None:
     """Raises ServiceError: INVALID_REQUEST for an episode that runs on a socket of its own only."""
     outside = (
-        ("sensors", bool(spec.sensors)),
         ("deadline_ms", spec.deadline_ms is not None),
         ("wall_clock_s", spec.wall_clock_s is not None),
         ("latency.model 'measured'", spec.latency.model == "measured"),

@@ -44,8 +44,9 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
 from real2sim_proto.episode import SensorSpec
 
-from ...edit import ScenarioState, instances_at, things_at_start
+from ...edit import ScenarioState, compose, instances_at, things_at_start
 from ...geometry.transform import invert_transform
+from ...render import Instance
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
 from ...world import Observation, World
@@ -76,6 +77,8 @@ TOGETHER_PIXELS = 16_000_000
 """Of images that are drawn in one go: the first session waits for the last, some milliseconds."""
 MOST_TOGETHER = 8
 """Steps with images that are made in one go."""
+MOST_OF_ONE_CLIENT = 64
+"""The same of one client's message: nobody else gets the engine meanwhile."""
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
 
@@ -240,6 +243,17 @@ class StepPipeline:
         sizes = [cameras[sensor.camera] for sensor in sensors]
         await self._renderer.levels.ready(sensors, sizes, lambda: things_at_start(scene, state))
 
+    async def edit_ready(self, world: World, cameras: Mapping[str, Camera]) -> None:
+        """The same for a world that has just been edited, by what it shows now and later."""
+        sensors = world.spec.sensors
+
+        def shown() -> list[Instance]:
+            scene, state = world.scene, world.state
+            now = compose(scene, state, world.agents, min(world.t_us, scene.end_us))
+            return [*now, *things_at_start(scene, state)]
+
+        await self._renderer.levels.ready(sensors, [cameras[s.camera] for s in sensors], shown)
+
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
         counted = partial(counted_world_time, await computing_account(), fn, *args)
@@ -384,6 +398,37 @@ class StepPipeline:
             else _counted(self._encode_blind, transition, world)
             for transition, world in zip(transitions, self._worlds_of(transitions), strict=True)
         ]
+
+    async def run_seeing(
+        self, transitions: Sequence[Transition]
+    ) -> list[EncodedObservation | Exception]:
+        """Advance, render, evaluate and encode worlds with sensors, drawn in one go as far as
+        TOGETHER_PIXELS and MOST_OF_ONE_CLIENT: the observation of each, or what it has failed by.
+        """
+        found: list[EncodedObservation | Exception] = []
+        for piece in _pieces(transitions):
+            try:
+                drawn = await self._engine.call(
+                    self._draw_together, piece, label="drive", lane=Lane.DRIVE
+                )
+            except Exception as error:
+                found += [error] * len(piece)
+                continue
+            encoded = (self._encoded(t, o) for t, o in zip(piece, drawn, strict=True))
+            found += await asyncio.gather(*encoded)
+        return found
+
+    async def _encoded(
+        self,
+        transition: Transition,
+        drawn: RenderedObservation | EncodedObservation | Exception,
+    ) -> EncodedObservation | Exception:
+        try:
+            if isinstance(drawn, _KernelsMissingError):
+                return await self.run(transition)
+            return drawn if isinstance(drawn, Exception) else await self._finish(drawn)
+        except Exception as error:
+            return error
 
     async def run_together(self, transitions: Sequence[Transition]) -> list[Seen | Exception]:
         """Advance, evaluate and record, in one go: the new worlds and what is seen of them, or what
@@ -575,12 +620,7 @@ class StepPipeline:
 
     def _checked(self, scene: Scene, sensors: Sequence[SensorSpec]) -> list[Camera]:
         cameras = check_sensors(scene.rig, sensors, max_pixels=self._max_pixels)
-        size = sum(
-            modality_of(modality).raw_bytes(camera.width, camera.height)
-            for camera, sensor in zip(cameras, sensors, strict=True)
-            for modality in sensor.modalities
-            if sensor.codec == "raw"
-        )
+        size = raw_image_bytes(sensors, cameras)
         if size > MAX_IMAGE_BYTES:
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
@@ -653,6 +693,30 @@ def message_of(world: World) -> EncodedMessage:
     """The observation of an instant without images, as a message."""
     members = pack_members(world.observe().obs_fields())
     return pack_with_frames("obs", members, (), PhaseTimer())
+
+
+def raw_image_bytes(sensors: Sequence[SensorSpec], cameras: Iterable[Camera]) -> int:
+    """Of the raw images of one instant; ``cameras``: of the sensors, in their order."""
+    return sum(
+        modality_of(modality).raw_bytes(camera.width, camera.height)
+        for camera, sensor in zip(cameras, sensors, strict=True)
+        for modality in sensor.modalities
+        if sensor.codec == "raw"
+    )
+
+
+def _pieces(transitions: Sequence[Transition]) -> list[list[Transition]]:
+    """What is drawn in one go of many."""
+    pieces: list[list[Transition]] = []
+    room = 0
+    for transition in transitions:
+        pixels = sum(camera.width * camera.height for camera in transition.cameras.values())
+        room -= pixels
+        if room < 0 or not pieces or len(pieces[-1]) == MOST_OF_ONE_CLIENT:
+            pieces.append([])
+            room = TOGETHER_PIXELS - pixels
+        pieces[-1].append(transition)
+    return pieces
 
 
 def _share(cameras: Iterable[Camera]) -> float:

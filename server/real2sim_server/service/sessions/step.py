@@ -90,6 +90,12 @@ class Stepper:
         Raises:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
+        return (await self.reset_seen(session, spec, slot=slot)).answer
+
+    async def reset_seen(
+        self, session: Session, spec: ResetSpec, *, slot: FrameSlot | None = None
+    ) -> EncodedObservation:
+        """As :meth:`reset`; the observation with its parts."""
         cameras = await self._announced(session, spec)
         record = ("reset", 0, reset_payload(spec))
         observation, _ = await self._observe(
@@ -97,7 +103,7 @@ class Stepper:
         )
         session.begin(observation.world, cameras)
         session.publish(observation.message)
-        return observation.answer
+        return observation
 
     async def restart(self, session: Session, spec: ResetSpec, *, reply: MakeReply) -> None:
         """Begin an episode without rendering its first observation. Raises like reset().
@@ -173,28 +179,48 @@ class Stepper:
         Raises:
             OverLimitError: the account of the running task has had its time on the engine.
         """
-        transitions = [
-            Transition(
-                partial(_moved, session.running_world(), plan, 0, session.late),
-                {},
-                record=LogWrite(
-                    self._store,
-                    session.session_id,
-                    _entries(session, [_action_record(session, plan, payload)]),
-                    session.log_unsure,
-                ),
-            )
-            for session, plan, payload in actions
-        ]
+        transitions = [self._transition(action, {}) for action in actions]
         found = await self._pipeline.run_together(transitions)
         for action, transition, outcome in zip(actions, transitions, found, strict=True):
             if isinstance(outcome, Seen):
-                _commit(action, outcome.world)
-            elif isinstance(outcome, StoreUnavailableError):
-                action.session.log_unsure = True
-            elif transition.recorded:
-                await self._withdraw(action.session)
+                message = DeferredMessage(partial(message_of, outcome.world))
+                _commit(action, outcome.world, message)
+            else:
+                await self._failed(action, transition, outcome)
         return found
+
+    async def act_seeing(
+        self, actions: Sequence[DueAction]
+    ) -> list[EncodedObservation | Exception]:
+        """As :meth:`act_together`, of sessions with sensors, whose images are drawn in one go."""
+        transitions = [self._transition(action, action.session.cameras) for action in actions]
+        found = await self._pipeline.run_seeing(transitions)
+        for action, transition, outcome in zip(actions, transitions, found, strict=True):
+            if isinstance(outcome, EncodedObservation):
+                _commit(action, outcome.world, outcome.message)
+            else:
+                await self._failed(action, transition, outcome)
+        return found
+
+    def _transition(self, action: DueAction, cameras: Mapping[str, Camera]) -> Transition:
+        session, plan, payload = action
+        return Transition(
+            partial(_moved, session.running_world(), plan, 0, session.late),
+            cameras,
+            record=LogWrite(
+                self._store,
+                session.session_id,
+                _entries(session, [_action_record(session, plan, payload)]),
+                session.log_unsure,
+            ),
+        )
+
+    async def _failed(self, action: DueAction, transition: Transition, error: Exception) -> None:
+        """A step that has not taken effect leaves nothing on record."""
+        if isinstance(error, StoreUnavailableError):
+            action.session.log_unsure = True
+        elif transition.recorded:
+            await self._withdraw(action.session)
 
     async def step_without_action(self, session: Session) -> EncodedMessage:
         """Go on without the action that is due, by the episode's fallback; the observation.
@@ -276,7 +302,7 @@ class Stepper:
         """Edit the world before its next step; ``reply`` makes the answer that is stored with it.
 
         Raises:
-            EditError: nothing has changed.
+            EditError, ServiceError: nothing has changed.
         """
         now = session.running_world()
 
@@ -285,6 +311,7 @@ class Stepper:
             return world, world.apply(operations, base_revision=base_rev)
 
         world, outcome = await self._pipeline.on_world_thread(edited)
+        await self._pipeline.edit_ready(world, session.cameras)
         stored = reply(world, outcome) if reply is not None else None
         await self._record(session, [("edit", now.steps, edit_payload(operations))], reply=stored)
         session.world = world
@@ -412,12 +439,11 @@ def _action_record(session: Session, plan: Plan | None, payload: bytes) -> LogRe
     return ("action", session.running_world().steps, entry)
 
 
-def _commit(action: DueAction, world: World) -> None:
-    """A step without images takes effect; it is on record."""
+def _commit(action: DueAction, world: World, message: EncodedMessage) -> None:
+    """A step takes effect; it is on record. ``message``: shows it."""
     session, _, payload = action
     session.next_seq, session.log_unsure = session.next_seq + 1, False
     session.world, session.late = world, False
-    message = DeferredMessage(partial(message_of, world))
     session.lockstep.advance(payload, message, over=world.over)
     session.publish(message)
 

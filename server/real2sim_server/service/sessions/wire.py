@@ -15,6 +15,7 @@ from real2sim_proto import PROTOCOL_VERSION
 from ..rendering.frames import EncodedFrame, Part, array_header, map_header, pack_pairs
 
 FRAMES: bytes = msgpack.packb("frames")
+IMAGES: bytes = msgpack.packb("images")
 
 
 @dataclass(eq=False)
@@ -110,6 +111,16 @@ def pack_with_frames(
     watch.stage("pack")
     parts.append(pack_pairs({"timing": watch.timing_ms}))
     return EncodedMessage(_head(kind, members.count + 2), tuple(parts))
+
+
+def pack_with_images(
+    kind: str, members: EncodedMembers, images: Sequence[Sequence[Part]]
+) -> EncodedMessage:
+    """A message with the member ``images`` besides ``members``: maps, each in parts."""
+    parts: list[Part] = [members.encoded + IMAGES + array_header(len(images))]
+    for each in images:
+        parts += each
+    return EncodedMessage(_head(kind, members.count + 1), tuple(parts))
 
 
 @functools.cache

@@ -69,6 +69,24 @@ def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(cl
     assert len(makers) == 4
 
 
+@pytest.mark.network
+def test_an_edit_of_a_running_world_waits_for_them_and_the_engine_does_not(client, makers):
+    while client.get("/readyz").status_code != 200:
+        time.sleep(0.05)
+    made = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": SMALL}).json()
+    session = f"/v1/sessions/{made['session_id']}"
+    headers = {"Authorization": f"Bearer {made['token']}"}
+    makers.clear()
+    region = {"op": "erase_region", "pose": {"position": [8, 0, 0]}, "size": [4, 4, 4]}
+    edited = client.post(f"{session}/operations", json={"operations": [region]}, headers=headers)
+    assert edited.status_code == 200, edited.text
+    assert len(makers) == 1
+    assert makers[0].startswith("levels")
+    view = {"sensors": SMALL["sensors"]}
+    assert client.post(f"{session}/render", json=view, headers=headers).status_code == 200
+    assert len(makers) == 1
+
+
 def test_they_are_counted_with_their_scene(tiny_scene, makers):
     budget = MemoryBudget(10**9)
     levels = DetailLevels(select_backend("cpu"), budget)

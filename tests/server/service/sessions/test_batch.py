@@ -121,6 +121,110 @@ def test_worlds_of_a_batch_do_what_single_sessions_do_bit_for_bit(site, batch, j
         assert states[0] | {"session_id": ""} == states[1] | {"session_id": ""}
 
 
+# --- images -----------------------------------------------------------------------------------
+
+SENSORS = [
+    {"camera": "front", "modalities": ["rgb", "depth"], "codec": "raw"},
+    {"camera": "left", "codec": "jpeg", "period_us": 200_000},
+]
+SEEING = SPEC | {"sensors": SENSORS}
+
+
+def images_of(obs: dict[str, Any], world: int) -> list[dict[str, Any]]:
+    """A world's images, as its own obs has them."""
+    found = []
+    for images in obs["images"]:
+        if world in (worlds := images["worlds"].tolist()):
+            k = worlds.index(world)
+            end = int(images["sizes"][: k + 1].sum())
+            shared = {n: images[n] for n in ("sensor", "modality", "codec", "dtype", "shape")}
+            place = (images["K"].tobytes(), images["T_world_sensor"][k].tobytes())
+            data = images["data"][end - int(images["sizes"][k]) : end]
+            found.append(shared | {"place": place, "data": data})
+    return found
+
+
+def images_of_single(obs: dict[str, Any]) -> list[dict[str, Any]]:
+    """The images of an obs, as :func:`images_of` tells them."""
+    named = ("sensor", "modality", "codec", "dtype", "shape", "data")
+    return [
+        {n: frame[n] for n in named}
+        | {"place": (frame["K"].tobytes(), frame["T_world_sensor"].tobytes())}
+        for frame in obs["frames"]
+    ]
+
+
+def test_images_of_a_batch_are_those_of_single_sessions_bit_for_bit(site, batch, join):
+    many = batch(2)
+    assert many.welcome["limits"]["max_image_bytes"] > 2**20
+    singles = [join(site.create()) for _ in range(2)]
+    together = many.reset(SEEING)
+    alone = [p.reset(**SEEING) for p in singles]
+    for step in range(4):
+        for k, obs in enumerate(alone):
+            assert images_of(together, k) == images_of_single(obs), (step, k)
+            assert row_of(together, k) == row_of_single(obs), (step, k)
+        values = [[1.0, 0.1], [3.0, 0.0]]
+        together = many.act([step] * 2, values)
+        alone = [
+            p.act(step, acceleration=a, steering=s)
+            for p, (a, s) in zip(singles, values, strict=True)
+        ]
+    assert [i["modality"] for i in together["images"]] == ["rgb", "depth", "rgb"]
+    assert len(images_of(many.act([4] * 2, values), 0)) == 2
+
+
+def test_images_of_a_batch_are_drawn_in_one_go(site, batch, monkeypatch):
+    many = batch(3)
+    many.reset(SEEING)
+    renderer, drawn = site.worker.renderer, []
+    render = renderer.render_together
+
+    def counted(requests, **options):
+        drawn.append(len(requests))
+        return render(requests, **options)
+
+    monkeypatch.setattr(renderer, "render_together", counted)
+    many.act([0] * 3, [[0.0, 0.0]] * 3)
+    assert drawn == [3]
+
+
+def test_an_action_sent_again_brings_the_same_images_again(batch):
+    many = batch(2)
+    many.reset(SEEING)
+    first = many.act([0, 0], [[1.0, 0.0]] * 2)
+    again = many.act([0, 0], [[1.0, 0.0]] * 2)
+    assert [images_of(again, k) for k in range(2)] == [images_of(first, k) for k in range(2)]
+    assert many.act([1, 1], [[1.0, 0.0]] * 2)["step"].tolist() == [2, 2]
+
+
+def test_what_is_wrong_with_one_world_leaves_the_images_of_the_others(batch):
+    many = batch(3)
+    unknown = many.reset(SPEC | {"sensors": [{"camera": "top"}]})
+    assert [e["code"] for e in unknown["errors"]] == ["UNKNOWN_CAMERA"] * 3
+    many.reset(SEEING, worlds=[0, 1])
+    many.reset(worlds=[2])
+    obs = many.act([0, 5, 0], [[1.0, 0.0]] * 3)
+    assert [(e["world"], e["code"]) for e in obs["errors"]] == [(1, "BAD_STEP")]
+    assert obs["worlds"].tolist() == [0, 2]
+    assert [len(images_of(obs, k)) for k in range(3)] == [2, 0, 0]
+
+
+def test_more_raw_images_than_a_message_holds_are_refused(batch, monkeypatch):
+    many = batch(2)
+    one = 96 * 64 * (3 + 4)
+    monkeypatch.setattr(
+        "real2sim_server.service.sessions.batch_connection.MAX_IMAGE_BYTES", 2 * one - 1
+    )
+    refused = many.reset(SEEING)
+    assert refused["code"] == "INVALID_REQUEST"
+    assert f"{2 * one} bytes" in refused["detail"]
+    assert len(many.reset(SEEING, worlds=[1])["images"]) == 3
+
+
+# --- what goes wrong --------------------------------------------------------------------------
+
+
 def test_what_is_wrong_with_one_world_is_said_in_its_place(batch):
     many = batch(4)
     many.reset()
@@ -197,9 +301,9 @@ def test_the_gear_of_a_batch_is_that_of_its_plans(batch, site, join):
 
 def test_what_a_batch_has_not_is_refused_as_a_whole(batch):
     many = batch(2)
-    refused = many.reset(SPEC | {"sensors": [{"camera": "front"}], "deadline_ms": 50})
+    refused = many.reset(SPEC | {"deadline_ms": 50, "wall_clock_s": 3.0})
     assert refused["code"] == "INVALID_REQUEST"
-    assert "sensors, deadline_ms" in refused["detail"]
+    assert "deadline_ms, wall_clock_s" in refused["detail"]
     many.reset()
     for worlds in ([0, 0], [0, 2]):
         assert many.act([0, 0], [[0, 0]] * 2, worlds=worlds)["code"] == "BAD_MESSAGE"

@@ -55,6 +55,20 @@ def test_each_world_is_a_single_environment(make, site):
     single.close()
 
 
+def test_each_world_has_the_images_of_a_single_environment(make, site):
+    sensors = [{"camera": "front", "modalities": ["rgb", "depth"], "codec": "raw"}]
+    env = make(2, sensors=sensors)
+    seen, _ = env.reset(seed=0)
+    assert env.observation_space.contains(seen)
+    assert seen["front"].shape == (2, 64, 96, 3)
+    single = real2sim.make_env(url=site.url, scene="tiny", sensors=sensors)
+    single.reset(seed=0)
+    seen, *_ = env.step(ACTIONS[:2])
+    alone, *_ = single.step(ACTIONS[1])
+    assert data_equivalence({k: v[1] for k, v in seen.items()}, alone, exact=True)
+    single.close()
+
+
 def test_ended_worlds_begin_anew_at_the_next_step(make):
     env = make(2, options={"horizon": 2})
     env.reset(seed=1)
