@@ -42,6 +42,8 @@ PEER_STEPS = 30
 """After so many substeps peers must have fallen as far."""
 TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6, VEHICLE: 8e6}
 """Particle-substeps per second of 100,000 particles on two cores."""
+CUDA_TARGETS = dict.fromkeys(TARGETS, 500e6)
+"""The same of a million particles on an H200."""
 CAR_SIZE, CAR_MASS, CAR_SPEED = (4.5, 1.8, 1.4), 1500.0, 15.7
 """Of the car that is driven against a wall [m], [kg], [m/s]."""
 CRASH_SECONDS = 0.08
@@ -49,12 +51,16 @@ CRASH_SECONDS = 0.08
 
 
 def run(
-    *, peers: bool = False, on_progress: Callable[[int, int], None] | None = None
+    *,
+    peers: bool = False,
+    backend: str = "cpu",
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Measure the solver and return the figures.
 
     Args:
         peers: also measure other frameworks, in the same process on the same block.
+        backend: ``cpu`` or ``cuda``; of the latter the rates alone, and bytes of a substep.
         on_progress: takes (parts done, parts).
 
     Returns:
@@ -64,19 +70,23 @@ def run(
     """
     report_progress = on_progress or (lambda done, parts: None)
     cases = [(m, n) for m in (*MATERIALS, VEHICLE) for n in SIZES]
-    parts = len(cases) + 3 + peers
+    parts = len(cases) + (3 + peers) * (backend == "cpu")
     report: dict[str, Any] = {
         "threads": numba.get_num_threads(),
         "cores": os.cpu_count(),
         "particles_per_cell": PARTICLES_PER_CELL,
         "repeats": REPEATS,
-        "targets": TARGETS,
+        "backend": backend,
+        "targets": TARGETS if backend == "cpu" else CUDA_TARGETS,
         "speed": [],
+        "domain": [],
     }
     for done, (material, particles) in enumerate(cases):
         report_progress(done, parts)
-        report["speed"].append(_speed(material, particles))
+        report["speed"].append(_speed(material, particles, backend))
     report_progress(len(cases), parts)
+    if backend != "cpu":
+        return report
     report["domain"] = _domain()
     report_progress(len(cases) + 1, parts)
     report["crash"] = _crash()
@@ -91,12 +101,17 @@ def run(
 
 def as_rows(figures: dict[str, Any]) -> dict[str, str]:
     """The figures as lines for a person."""
-    rows = {"threads": str(figures["threads"])}
+    rows = {"backend": figures["backend"], "threads": str(figures["threads"])}
     for line in figures["speed"]:
         name = f"{line['material'].replace('_', ' ')}, {line['particles']:,} particles"
         rows[name] = f"{line['rate'] / 1e6:.2f} M/s, {line['substep_ms']:.2f} ms a substep"
+        if "moved_bytes" in line:
+            floor = line["moved_bytes"] / line["floor_bytes"]
+            rows[name] += f", {line['bandwidth'] / 1e12:.2f} TB/s of {floor:.1f} times the floor"
     for line in figures["domain"]:
         rows[f"two blocks {line['distance']:,.0f} m apart"] = f"{line['rate'] / 1e6:.2f} M/s"
+    if "crash" not in figures:
+        return rows
     crash = figures["crash"]
     name = f"a car against a wall, {crash['particles']:,} particles"
     rows[name] = f"{crash['rate'] / 1e6:.2f} M/s, {crash['substeps']} substeps"
@@ -112,18 +127,44 @@ def as_rows(figures: dict[str, Any]) -> dict[str, str]:
     return rows
 
 
-def _speed(material: str, particles: int) -> dict[str, Any]:
+def _speed(material: str, particles: int, backend: str) -> dict[str, Any]:
     """Rate of a turning, falling block of about that many particles."""
-    solver = Solver([_block(material, particles)], [Plane(name="ground")], _options())
+    solver = Solver([_block(material, particles)], [Plane(name="ground")], _options(backend))
     elapsed, processor = _time_substep(solver)
     count = len(solver.model.masses)
+    figures = _traffic(solver, elapsed) if backend == "cuda" else {}
     return {
+        **figures,
         "material": material,
         "particles": count,
         "rate": count / elapsed,
         "cpu_rate": count / processor,
         "substep_ms": 1e3 * elapsed,
     }
+
+
+def _traffic(solver: Solver, elapsed: float) -> dict[str, Any]:
+    """Bytes of a substep on the device, counted, and how fast that moved them."""
+    from ..physics.backends.cuda.traffic import substep_traffic
+
+    simulation: Any = solver.simulation
+    positions = simulation.particles().positions / solver.dx
+    plastic = bool(solver.model.plastic.any())
+    traffic = substep_traffic(
+        **simulation.counts(), nodes=_nodes(positions), plastic=plastic, itemsize=4
+    )
+    return {
+        "moved_bytes": traffic.moved,
+        "floor_bytes": traffic.floor,
+        "bandwidth": traffic.moved / elapsed,
+    }
+
+
+def _nodes(cells: Any) -> int:
+    """Nodes of the grid that particles at ``cells`` [N, 3] give to."""
+    first = np.unique(np.floor(cells - 0.5).astype(np.int64), axis=0)
+    offsets = np.stack(np.meshgrid(*[range(3)] * 3), axis=-1).reshape(-1, 3)
+    return len(np.unique((first[:, None] + offsets).reshape(-1, 3), axis=0))
 
 
 def _domain() -> list[dict[str, Any]]:

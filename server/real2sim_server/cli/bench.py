@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from ..console import print_figures, progress, write_json
+from ..console import CommandError, print_figures, progress, write_json
 from .command import command
 from .options import JsonFile
 
@@ -48,13 +48,21 @@ def physics(
     peers: Annotated[
         bool, typer.Option("--peers", help="Also measure Taichi and Warp, where installed.")
     ] = False,
+    backend: Annotated[
+        Literal["cpu", "cuda"], typer.Option(help="Where the solver computes.")
+    ] = "cpu",
     json: JsonFile = None,
 ) -> None:
     """Particle-substeps per second, and what they depend on."""
     from ..benchmarks import physics
+    from ..physics.backends import select_backend
 
+    if backend == "cuda":
+        if peers:
+            raise CommandError("--peers are measured beside the CPU; take --backend cpu")
+        select_backend("cuda")  # Says what it lacks.
     with progress("measuring") as report:
-        figures = physics.run(peers=peers, on_progress=report)
+        figures = physics.run(peers=peers, backend=backend, on_progress=report)
     print_figures("particle-substeps per second", physics.as_rows(figures))
     _report(json, figures)
 

@@ -7,9 +7,10 @@ import importlib.util
 import os
 import platform
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -18,6 +19,9 @@ from .._files import atomic_file
 from ..console import SERVER_MODULES, CommandError, console, run_command, write_json
 from .command import app
 from .options import JsonFile
+
+if TYPE_CHECKING:
+    from ..render.backends.nvrtc.usage import Usage
 
 DISTRIBUTIONS = (
     "real2sim",
@@ -47,7 +51,7 @@ def doctor(
     arch: Annotated[
         list[str] | None,
         typer.Option(
-            help="With --build-gpu and --serving-kernels: sm_90, sm_86 ...; default: of this GPU."
+            help="With --build-gpu and the options about kernels: sm_90 ...; default: of this GPU."
         ),
     ] = None,
     need_cuda: Annotated[
@@ -76,6 +80,13 @@ def doctor(
     out: Annotated[
         Path | None, typer.Option(help="With --gpu-check: the table as a Markdown file.")
     ] = None,
+    solver_kernels: Annotated[
+        bool,
+        typer.Option(
+            "--solver-kernels",
+            help="The same for the kernels of the solver on CUDA, in both precisions.",
+        ),
+    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Say what this machine can do, what is missing, and how to mend it."""
@@ -94,6 +105,8 @@ def doctor(
     report = _inspected(findings)
     if serving_kernels:
         run_command(_compile_serving, report=report, arch=arch)
+    if solver_kernels:
+        run_command(_compile_solver, report=report, arch=arch)
     compiled: list[str] = []
     if warm or warmed:
         seconds, compiled = _warm_up()
@@ -201,24 +214,59 @@ def _check_gpu(*, out: Path | None, json: Path | None) -> None:
 
 def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
     """Put down what each serving kernel takes on each architecture."""
+    _require_compiler()
+    from ..render.backends.nvrtc.compile import ARCHITECTURES, compile_kernels
+    from ..render.backends.nvrtc.records import THREADS
+
+    for architecture in _given(arch) or ARCHITECTURES:
+        _, usages = compile_kernels(architecture)
+        _put_down(report, architecture, usages, THREADS)
+    _refuse_spills(report)
+
+
+def _compile_solver(*, report: _Report, arch: list[str] | None) -> None:
+    """Put down what each kernel of the solver takes on each architecture."""
+    _require_compiler()
+    from ..physics.backends.cuda.compile import ARCHITECTURES, compile_kernels
+    from ..physics.backends.cuda.records import THREADS
+    from ..physics.backends.cuda.source import PRECISIONS
+
+    for architecture in _given(arch) or ARCHITECTURES:
+        for precision in PRECISIONS:
+            _, usages = compile_kernels(precision, architecture)
+            named = {f"{kernel} ({precision})": usage for kernel, usage in usages.items()}
+            _put_down(report, architecture, named, THREADS)
+    _refuse_spills(report)
+
+
+def _require_compiler() -> None:
     from ..render.backends.nvrtc.needs import compiler_needs
 
     for need in compiler_needs():
         if not need.met:
             raise CommandError(f"{need.found}; {need.remedy}")
-    from ..render.backends.nvrtc.compile import ARCHITECTURES, compile_kernels
+
+
+def _given(arch: list[str] | None) -> list[str]:
+    return [f"sm_{_capability(name).replace('.', '')}" for name in arch or []]
+
+
+def _put_down(
+    report: _Report, architecture: str, usages: Mapping[str, Usage], threads: int
+) -> None:
     from ..render.backends.nvrtc.usage import MULTIPROCESSORS
 
-    rows = report.kernels
-    given = [f"sm_{_capability(name).replace('.', '')}" for name in arch or []]
-    for architecture in given or ARCHITECTURES:
-        _, usages = compile_kernels(architecture)
-        known = architecture in MULTIPROCESSORS
-        for kernel, usage in usages.items():
-            occupancy = usage.occupancy(architecture) if known else None
-            rows.append({"architecture": architecture, "kernel": kernel, **vars(usage)})
-            rows[-1]["occupancy"] = occupancy
-    spilled = [f"{row['kernel']} on {row['architecture']}" for row in rows if row["spilled"]]
+    known = architecture in MULTIPROCESSORS
+    for kernel, usage in usages.items():
+        occupancy = usage.occupancy(architecture, threads) if known else None
+        row = {"architecture": architecture, "kernel": kernel, **vars(usage)}
+        report.kernels.append({**row, "occupancy": occupancy})
+
+
+def _refuse_spills(report: _Report) -> None:
+    spilled = [
+        f"{row['kernel']} on {row['architecture']}" for row in report.kernels if row["spilled"]
+    ]
     if spilled:
         raise CommandError(f"registers do not hold {', '.join(spilled)}: they would run slowly")
 
@@ -296,7 +344,7 @@ def _report(report: _Report, json: Path | None) -> None:
         console.print(table)
     if report.kernels:
         columns = list(report.kernels[0])
-        table = Table(*columns, title="serving kernels", title_justify="left")
+        table = Table(*columns, title="kernels", title_justify="left")
         for row in report.kernels:
             table.add_row(*(f"{row[name]}" for name in columns))
         console.print(table)

@@ -36,7 +36,7 @@ class SolverOptions:
         dx: cell size [m]; None takes twice the spacing of the coarsest body's particles.
         gravity: [3] [m/s^2].
         backend: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``.
-        precision: ``single`` or ``double`` state on ``cpu``; the reference is always double.
+        precision: ``single`` or ``double`` state; the reference is always double.
         cfl: fraction of a cell that the fastest wave may cross in a substep, in (0, 0.9].
         dt_max: longest substep [s].
         substeps_max: a single ``step`` that would need more substeps is refused.

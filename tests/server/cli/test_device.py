@@ -134,6 +134,39 @@ def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(
     assert "blend on sm_90" in output
 
 
+def test_doctor_says_what_the_solver_takes_in_both_precisions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cuda.core")
+    from real2sim_server.physics.backends.cuda import compile as compiling
+    from real2sim_server.render.backends.nvrtc.usage import Usage
+
+    def compile_kernels(precision: str, architecture: str) -> tuple[bytes, dict[str, Usage]]:
+        return b"", {"advance_blocks": Usage(128 if precision == "single" else 256, 0, 0, 0)}
+
+    monkeypatch.setattr(compiling, "compile_kernels", compile_kernels)
+    report = tmp_path / "report.json"
+    code, output = doctor("--solver-kernels", "--arch", "sm_90", "--json", str(report))
+    assert code == 0, output
+    rows = json.loads(report.read_text())["kernels"]
+    found = [(row["kernel"], row["occupancy"]) for row in rows]
+    assert found == [("advance_blocks (single)", 0.25), ("advance_blocks (double)", 0.125)]
+
+
+def test_the_bench_of_the_solver_on_a_gpu_says_what_it_lacks() -> None:
+    from real2sim_server.render.backends.nvrtc.needs import unmet_need
+
+    if unmet_need() is None:
+        pytest.skip("everything is here")
+    arguments = ["bench", "physics", "--backend", "cuda"]
+    done = CliRunner().invoke(build_app(), arguments, env={"COLUMNS": "300"})
+    assert done.exit_code == 1
+    assert "'cuda' is not usable here" in done.output
+    done = CliRunner().invoke(build_app(), [*arguments, "--peers"], env={"COLUMNS": "300"})
+    assert done.exit_code == 1
+    assert "--backend cpu" in done.output
+
+
 def test_the_serving_backend_is_refused_without_a_gpu() -> None:
     with pytest.raises(RenderError, match="'nvrtc' is not usable"):
         select_backend("nvrtc")

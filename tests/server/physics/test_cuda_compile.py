@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,22 @@ from real2sim_server.physics import SolverError
 from real2sim_server.physics.backends.cuda import compile as compiling
 from real2sim_server.physics.backends.cuda import translate
 from real2sim_server.physics.backends.cuda.records import THREADS
-from real2sim_server.physics.backends.cuda.source import KERNELS
+from real2sim_server.physics.backends.cuda.source import KERNELS, PRECISIONS
 from real2sim_server.render.backends.nvrtc.needs import compiler_needs
 
 MISSING = next((need.found for need in compiler_needs() if not need.met), "")
+ALWAYS = ("single", "sm_90")
 needs_nvrtc = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 
 
 @needs_nvrtc
-@pytest.mark.parametrize("precision", ["single", "double"])
-@pytest.mark.parametrize("architecture", compiling.ARCHITECTURES)
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("precision", "architecture"),
+    [
+        pytest.param(*case, marks=[] if case == ALWAYS else [pytest.mark.slow])
+        for case in itertools.product(PRECISIONS, compiling.ARCHITECTURES)
+    ],
+)
 def test_every_kernel_compiles_and_none_spills(precision: str, architecture: str) -> None:
     code, usages = compiling.compile_kernels(precision, architecture)
     assert code[:4] == b"\x7fELF"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,7 +37,7 @@ class Builder:
 
 
 @pytest.fixture
-def taken(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     """What cuda-core was asked for, on a machine with one GPU."""
     taken: list[Any] = []
     device = SimpleNamespace(set_current=lambda: None, create_graph_builder=lambda: Builder(taken))
@@ -56,7 +57,9 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
     stream = SimpleNamespace(cuda_stream=0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
-    return taken
+    launcher_module._loaded_kernels.cache_clear()
+    yield taken
+    launcher_module._loaded_kernels.cache_clear()
 
 
 def test_a_sequence_is_launched_then_captured_then_launched_as_one(taken: list[Any]) -> None:

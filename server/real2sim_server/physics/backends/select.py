@@ -16,7 +16,7 @@ def select_backend(name: str = "auto") -> SolverBackend:
 
     Args:
         name: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``: a device is used only
-            when asked for, as its sums differ in the last bits from run to run.
+            when asked for, as its last bits are not the CPU's.
 
     Raises:
         SolverError: for an unknown name, or for ``cuda`` where no device is usable.

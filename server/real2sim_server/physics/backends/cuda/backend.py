@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....geometry.rotation import Float
+from ....render.backends.nvrtc.needs import unmet_need
 from ...colliders import Collider
 from ...contact.collider_distance import AXES, POINT, SPEED, SPIN
 from ...errors import ParticleError, SolverError
@@ -32,9 +33,11 @@ from ..layout import (
 from . import records as r
 from .launcher import CudaLauncher, Launch, Launcher
 from .memory import SolverMemory
-from .needs import unmet_need
 from .sequences import arranging, flushing, measuring, substeps
 
+INTERVAL = 16
+"""Substeps that are queued at once: the solver checks as often, and sequences of launches that come
+again are captured."""
 TILE_REACH, SORTED_REACH = 3.0, 2.0
 """How far particles may be from the middle of their block along an axis [cells]: at most, and after
 they have been sorted."""
@@ -101,12 +104,17 @@ class CudaSimulation:
         return self._memory.sizes
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
-        """Make ``steps`` substeps; see ``Simulation``.
+        """Make ``steps`` substeps, INTERVAL of them with one wait; see ``Simulation``.
 
         Raises:
             SolverDiverged: particles left the numbers, or went over many blocks at once.
             ParticleError: they left the reach of the grid.
         """
+        for first in range(0, steps, INTERVAL):
+            later = [c.after(first * dt) for c in colliders] if first else colliders
+            self._interval(min(INTERVAL, steps - first), dt, later)
+
+    def _interval(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
         moving = any(c.moving for c in colliders)
         self._memory.upload_step(dt, moving, self._rows(steps if moving else 1, dt, colliders))
         fastest = max((c.fastest_point for c in colliders), default=0.0)
@@ -169,6 +177,12 @@ class CudaSimulation:
         """Totals since the start; see ``Simulation``."""
         by_collider, by_body = self._memory.totals(self._report)
         return by_collider.copy(), by_body.copy()
+
+    def counts(self) -> dict[str, int]:
+        """Particles, blocks and fields of the present layout."""
+        held = self._memory.held(self._report)
+        named = {name: int(held[name]) for name in ("blocks", "fields")}
+        return {"particles": self._sizes.particles, **named}
 
     def save(self) -> _Saved:
         """Copy all that changes, on the device."""

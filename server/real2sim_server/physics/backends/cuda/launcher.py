@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections import OrderedDict
 from typing import Any, NamedTuple, Protocol
@@ -63,6 +64,16 @@ class Launcher(Protocol):
         ...
 
 
+@functools.cache
+def _loaded_kernels(precision: str, index: int) -> dict[str, Any]:
+    """Kernels on a device, which must be the current one."""
+    from cuda.core import ObjectCode
+
+    major, minor = torch.cuda.get_device_capability(index)
+    code = ObjectCode.from_cubin(compiled_kernels(precision, f"sm_{major}{minor}"))
+    return {name: code.get_kernel(name) for name in KERNELS}
+
+
 class CudaLauncher:
     """The current CUDA device of torch, on torch's current stream.
 
@@ -78,15 +89,13 @@ class CudaLauncher:
     """
 
     def __init__(self, precision: str) -> None:
-        from cuda.core import Device, ObjectCode
+        from cuda.core import Device
 
         index = torch.cuda.current_device()
         self.device = torch.device("cuda", index)
         torch.cuda.synchronize(self.device)  # torch makes the context that all share.
         Device(index).set_current()
-        major, minor = torch.cuda.get_device_capability(index)
-        code = ObjectCode.from_cubin(compiled_kernels(precision, f"sm_{major}{minor}"))
-        self._kernels = {name: code.get_kernel(name) for name in KERNELS}
+        self._kernels = _loaded_kernels(precision, index)
         self._graphs: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
         self._threads = threading.local()
 

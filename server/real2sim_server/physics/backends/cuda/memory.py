@@ -161,7 +161,7 @@ class SolverMemory:
         by_particle = {f"{name}_{k}": s.particles for name in ("keys", "order") for k in (0, 1)}
         return {
             **{n: c * (_U8 if n.startswith("keys") else _U4) for n, c in by_particle.items()},
-            "digit_counts": s.sort_blocks * r.DIGITS * _U4,
+            "digit_counts": (s.sort_blocks + 1) * r.DIGITS * _U4,
             "counts": (s.listed + 1) * _U4,
             "sums": (s.listed // r.PIECE + 2) * _U4,
             "block_key": s.blocks * _U8,

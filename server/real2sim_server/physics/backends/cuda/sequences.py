@@ -55,7 +55,7 @@ def arranging(sizes: Sizes, *, keep: bool, step: int) -> list[Launch]:
         argument = one | (r.FLIPPED if number % 2 else 0)
         launches += [
             Launch("count_digits", sizes.sort_blocks, argument),
-            Launch("sum_digits", 1),
+            Launch("sum_digits", r.DIGITS),
             Launch("scatter_digits", sizes.sort_blocks, argument),
         ]
     launches.append(Launch("reorder", by_particle, r.FLIPPED if len(passes) % 2 else 0))

@@ -3,7 +3,7 @@
 // keys of blocks are sorted as their particles are, and those of fields as layout.py has them.
 #pragma once
 
-#include "space.h"
+#include "scan.h"
 
 // Lists that are summed up: heads of blocks among particles; fields first met, by offset and block;
 // then four behind each other: groups, near colliders and pairs of each field, thin ones of blocks.
@@ -26,23 +26,6 @@ __device__ __forceinline__ uint32 length_of(const Space& space, uint32 list) {
 
 __device__ __forceinline__ bool is_head(const Particles& all, uint32 p) {
     return p == 0 || all.key(p) != all.key(p - 1);
-}
-
-// Sum over the threads before this one, and over all.
-__device__ __forceinline__ uint32 sum_before(uint32 value, uint32& total) {
-    __shared__ uint32 values[THREADS];
-    values[threadIdx.x] = value;
-    __syncthreads();
-    for (uint32 step = 1; step < THREADS; step *= 2) {
-        const uint32 other = threadIdx.x >= step ? values[threadIdx.x - step] : 0;
-        __syncthreads();
-        values[threadIdx.x] += other;
-        __syncthreads();
-    }
-    total = values[THREADS - 1];
-    const uint32 before = values[threadIdx.x] - value;
-    __syncthreads();
-    return before;
 }
 
 // Sum of each piece of a list.

@@ -2,7 +2,7 @@
 // of the list; equal keys keep their order, so the result is the same however blocks run.
 #pragma once
 
-#include "space.h"
+#include "scan.h"
 
 // Passes by the bytes of keys, and one by law, which comes first: what it leaves, the others keep.
 constexpr uint32 BY_LAW = 15, FLIPPED = 16;
@@ -101,36 +101,27 @@ extern "C" __global__ void __launch_bounds__(THREADS) count_digits(
         space.digit_counts[blockIdx.x * DIGITS + digit] = counts[digit];
 }
 
-// Turns counts into places: sums over smaller digits, and over the blocks before. One block.
+// Turns counts of a digit into sums over the blocks before; a block of threads for each digit.
 extern "C" __global__ void __launch_bounds__(THREADS) sum_digits(const Space* given, uint32) {
-    __shared__ uint32 starts[DIGITS];
     const Space& space = *given;
     if (is_halted(space, AFTER_ANY)) return;
-    for (uint32 digit = threadIdx.x; digit < DIGITS; digit += THREADS) {
-        uint32 sum = 0;
-        for (uint32 block = 0; block < space.sort_blocks; ++block)
-            sum += space.digit_counts[block * DIGITS + digit];
-        starts[digit] = sum;
+    uint32* counts = space.digit_counts + blockIdx.x;
+    if (space.sort_blocks == 1) {
+        if (threadIdx.x == 0) counts[DIGITS] = counts[0], counts[0] = 0;
+        return;
     }
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        uint32 sum = 0;
-        for (uint32 digit = 0; digit < DIGITS; ++digit) {
-            const uint32 here = starts[digit];
-            starts[digit] = sum;
-            sum += here;
-        }
+    const uint32 each = (space.sort_blocks + THREADS - 1) / THREADS;
+    const uint32 first = min(threadIdx.x * each, space.sort_blocks);
+    const uint32 last = min(first + each, space.sort_blocks);
+    uint32 sum = 0, total;
+    for (uint32 block = first; block < last; ++block) sum += counts[block * DIGITS];
+    uint32 before = sum_before(sum, total);
+    for (uint32 block = first; block < last; ++block) {
+        const uint32 here = counts[block * DIGITS];
+        counts[block * DIGITS] = before;
+        before += here;
     }
-    __syncthreads();
-    for (uint32 digit = threadIdx.x; digit < DIGITS; digit += THREADS) {
-        uint32 sum = starts[digit];
-        for (uint32 block = 0; block < space.sort_blocks; ++block) {
-            uint32& count = space.digit_counts[block * DIGITS + digit];
-            const uint32 here = count;
-            count = sum;
-            sum += here;
-        }
-    }
+    if (threadIdx.x == 0) counts[space.sort_blocks * DIGITS] = total;
 }
 
 // Puts keys and numbers of particles where sum_digits says.
@@ -141,8 +132,14 @@ extern "C" __global__ void __launch_bounds__(THREADS) scatter_digits(
     if (is_halted(space, AFTER_ANY)) return;
     const Pass pass = pass_of(space, argument);
     const uint32 lane = threadIdx.x % WARP, warp = threadIdx.x / WARP;
-    for (uint32 digit = threadIdx.x; digit < DIGITS; digit += THREADS)
-        next[digit] = space.digit_counts[blockIdx.x * DIGITS + digit];
+    // Each thread has two digits; all smaller ones come before.
+    const uint32* totals = space.digit_counts + space.sort_blocks * DIGITS;
+    const uint32* counts = space.digit_counts + blockIdx.x * DIGITS;
+    const uint32 even = 2 * threadIdx.x, of_even = totals[even];
+    uint32 all;
+    const uint32 before = sum_before(of_even + totals[even + 1], all);
+    next[even] = before + counts[even];
+    next[even + 1] = before + of_even + counts[even + 1];
     for (uint32 first = pass.first; first < pass.last; first += THREADS) {
         for (uint32 digit = threadIdx.x; digit < DIGITS; digit += THREADS)
             for (uint32 w = 0; w < WARPS; ++w) starts[w][digit] = 0;

@@ -9,6 +9,7 @@ constexpr uint32 WARP = 32;
 constexpr uint32 WARPS = THREADS / WARP;
 constexpr uint32 ALL_LANES = 0xffffffffu;
 constexpr uint32 DIGITS = 256;        // of a pass of the radix sort
+static_assert(DIGITS == 2 * THREADS, "each thread has two digits");
 constexpr uint32 PIECE = 1024;        // of a list that is summed up
 constexpr int BLOCK = 4;              // nodes along the edge of a block
 constexpr int SIDE = 8;               // and of its tile, which begins a node below the block
@@ -50,7 +51,7 @@ struct Space {
     unsigned char* sets[2];  // keys [pitch], materials and origins, then the numbers above
     uint64* keys[2];
     uint32* order[2];
-    uint32* digit_counts;    // [sort_blocks, DIGITS]
+    uint32* digit_counts;    // [sort_blocks + 1, DIGITS], sums of all blocks at the end
     uint32* counts;          // of the list that is summed up
     uint32* sums;            // of its pieces
     // Layout: P blocks with particles of one body each, M fields, see layout.py.

@@ -44,8 +44,8 @@ __device__ __forceinline__ Place place_of(const Numbers<real, 3>& xi) {
 // What a particle gives: weights along axes, and for each of four components its value at the first
 // node and its slopes along x, y and z; see particle.momentum.
 struct Staged {
-    real weights[9][CHUNK];
-    real values[4][4][CHUNK];
+    real weights[9][CHUNK + 1];  // So that those of one axis lie in different banks.
+    Real4 values[4][CHUNK];
     int first[CHUNK];
 };
 
@@ -66,16 +66,14 @@ __device__ __forceinline__ void stage_momentum(
     const real k = -dt * real(4) / dx * all.at(VOLUME, p);
     const int stress[3][3] = {{0, 3, 4}, {3, 1, 5}, {4, 5, 2}};
     for (int c = 0; c < 3; ++c) {
-        real start = m * v[c];
+        real slopes[3], start = m * v[c];
         for (int axis = 0; axis < 3; ++axis) {
-            const real slope = k * t[stress[axis][c]] + md * L[3 * c + axis];
-            start -= slope * place.from[axis];
-            staged.values[c][axis + 1][threadIdx.x] = slope;
+            slopes[axis] = k * t[stress[axis][c]] + md * L[3 * c + axis];
+            start -= slopes[axis] * place.from[axis];
         }
-        staged.values[c][0][threadIdx.x] = start;
+        staged.values[c][threadIdx.x] = {start, slopes[0], slopes[1], slopes[2]};
     }
-    staged.values[3][0][threadIdx.x] = m;
-    for (int axis = 1; axis < 4; ++axis) staged.values[3][axis][threadIdx.x] = 0;
+    staged.values[3][threadIdx.x] = {m, 0, 0, 0};
 }
 
 // w V (x_p - x_i) and w V, V at rest.
@@ -83,11 +81,11 @@ __device__ __forceinline__ void stage_moment(
     Staged& staged, const Particles& all, uint32 p, const Place& place) {
     stage_place(staged, place);
     const real V = all.at(VOLUME, p);
-    for (int c = 0; c < 4; ++c) {
-        staged.values[c][0][threadIdx.x] = c < 3 ? V * place.from[c] : V;
-        for (int axis = 0; axis < 3; ++axis)
-            staged.values[c][axis + 1][threadIdx.x] = axis == c ? -V : real(0);
-    }
+    const Numbers<real, 3>& from = place.from;
+    staged.values[0][threadIdx.x] = {V * from[0], -V, 0, 0};
+    staged.values[1][threadIdx.x] = {V * from[1], 0, -V, 0};
+    staged.values[2][threadIdx.x] = {V * from[2], 0, 0, -V};
+    staged.values[3][threadIdx.x] = {V, 0, 0, 0};
 }
 
 // Adds what is staged to a tile, one particle after the other: a warp for each component, a lane
@@ -100,9 +98,8 @@ __device__ __forceinline__ void add_staged(real (*tile)[PADDED], const Staged& s
         if (lane < AROUND) {
             const real w = staged.weights[a][p] * staged.weights[3 + b][p] *
                            staged.weights[6 + d][p];
-            const real value = staged.values[c][0][p] + real(a) * staged.values[c][1][p] +
-                               real(b) * staged.values[c][2][p] +
-                               real(d) * staged.values[c][3][p];
+            const Real4 q = staged.values[c][p];
+            const real value = q.x + real(a) * q.y + real(b) * q.z + real(d) * q.w;
             tile[c][staged.first[p] + own] += w * value;
         }
         __syncwarp();
@@ -215,11 +212,14 @@ __device__ __forceinline__ void advance_particle(
     const real dt = does & (MOVES | SCATTERS) ? real(space.step->dt) : real(0);
     const uint32 step = does & STEP_MASK;
     auto xi = all.several<3>(XI, p);
-    auto v = all.several<3>(VELOCITY, p);
-    auto L = all.several<9>(GRADIENT, p);
-    auto tau = all.several<6>(STRESS, p);
+    Numbers<real, 3> v;
+    Numbers<real, 9> L;
     bool stays = true;
-    if (does & MOVES) {
+    // What is found anew is not read.
+    if (!(does & MOVES)) {
+        v = all.several<3>(VELOCITY, p);
+        L = all.several<9>(GRADIENT, p);
+    } else {
         gather(velocities, place_of(xi), dx, v, L);
         if (obstructed) hold_particle(space, all, p, block, step, xi, v);
         const real stride = dt / dx;
@@ -233,7 +233,8 @@ __device__ __forceinline__ void advance_particle(
         all.put(GRADIENT, p, L);
         if (!stays) space.held->stop_after = step + 1;
     }
-    if (does & DEFORMS) tau = deform(space, all, p, does & MOVES ? dt : real(0), L);
+    const auto tau = does & DEFORMS ? deform(space, all, p, does & MOVES ? dt : real(0), L)
+                                    : all.several<6>(STRESS, p);
     if (!(does & SCATTERS)) return;
     // What has left the tile is scattered nowhere: all are sorted before anything else.
     Place place = place_of(stays ? xi : Numbers<real, 3>{real(1), real(1), real(1)});
