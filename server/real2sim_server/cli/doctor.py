@@ -69,6 +69,13 @@ def doctor(
             "tested, and say what each takes; fails where one spills. Needs no GPU.",
         ),
     ] = False,
+    solver_kernels: Annotated[
+        bool,
+        typer.Option(
+            "--solver-kernels",
+            help="The same for the kernels of the solver on CUDA, in both precisions.",
+        ),
+    ] = False,
     gpu_check: Annotated[
         bool,
         typer.Option(
@@ -80,13 +87,6 @@ def doctor(
     out: Annotated[
         Path | None, typer.Option(help="With --gpu-check: the table as a Markdown file.")
     ] = None,
-    solver_kernels: Annotated[
-        bool,
-        typer.Option(
-            "--solver-kernels",
-            help="The same for the kernels of the solver on CUDA, in both precisions.",
-        ),
-    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Say what this machine can do, what is missing, and how to mend it."""
