@@ -179,7 +179,8 @@ class Resting:
         for _ in range(SWEEPS):
             for row in rows:
                 row.relax()
-        deep = [row for row in rows if row.is_deep]
+        # Bodies that part are not shifted: angular momentum goes with where velocities are.
+        deep = [row for row in rows if row.is_deep and row.carries]
         for _ in range(PUSH_SWEEPS):
             for row in deep:
                 row.lift()
@@ -310,6 +311,11 @@ class _Row:
         self._least = -start / step.duration if start > SLOP else 0.0
         self._lift = min(-PUSH * (start + SLOP) / step.duration, PUSH_SPEED)
         self._lifted = 0.0
+
+    @property
+    def carries(self) -> bool:
+        """Whether the point presses."""
+        return float(self.touch.impulse[0]) > 0
 
     @property
     def is_deep(self) -> bool:

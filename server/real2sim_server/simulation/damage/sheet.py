@@ -160,8 +160,8 @@ def _outward(points: Float, rest: Float, spacing: float) -> tuple[Float, Float]:
     """[G, 3] normals, away from the particles about each point, and how far away [spacings]."""
     from scipy.spatial import cKDTree
 
-    count = min(NEIGHBOURS, len(rest))
-    distance, index = cKDTree(rest).query(points, k=count)
+    nearest = np.arange(1, min(NEIGHBOURS, len(rest)) + 1)
+    distance, index = cKDTree(rest).query(points, k=nearest)
     weights = np.maximum(1 - (distance / (AROUND * spacing)) ** 2, 1e-6)
     middle = (weights[:, None] @ rest[index])[:, 0] / weights.sum(axis=1, keepdims=True)
     away = points - middle

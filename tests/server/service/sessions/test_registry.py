@@ -183,7 +183,7 @@ def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join,
     planner = join(info)
     planner.reset(sensors=[CAMERA])
     session, renderer, seen = site.session(info), site.worker.renderer, []
-    render_images = renderer.render_images
+    render_together = renderer.render_together
 
     def check_log(*given: object, **options: object) -> object:
         give_up = time.monotonic() + 30
@@ -191,10 +191,10 @@ def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join,
             time.sleep(0.001)
         seen.append([e.kind for e in entries(site, info)])
         seen.append([e.kind for e in asyncio.run(site.worker.sessions.entries(session))])
-        return render_images(*given, **options)
+        return render_together(*given, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(renderer, "render_images", check_log)
+        patch.setattr(renderer, "render_together", check_log)
         planner.act(0)
     assert seen == [["reset", "action"], ["reset"]]
 
