@@ -5,8 +5,8 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
     .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
 
-NAME is one of demo, scenario, studio, wall, pair, drop, ground; without one, all are made. It takes
-about ten minutes on two cores.
+NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground; without one, all are made.
+It takes about a quarter of an hour on two cores.
 """
 
 from __future__ import annotations
@@ -133,6 +133,18 @@ def drop(work: Path, scenes: Path) -> None:
     experiment(work, scenes, "drop", "--preset", "paper")
 
 
+def crashes(work: Path, scenes: Path) -> None:
+    """``crashes.jpg``: frontal, T-bone, pole and roof, each in a row of stills."""
+    rows = []
+    for name in ("frontal", "t_bone", "pole", "roof"):
+        folder = work / name
+        simulated = ("simulate", scenes / SCENE, "--out", folder, "--experiment", name)
+        command(*simulated, "--max-particles", "8000", "--no-film")
+        command("film", scenes / SCENE, folder, "--view", "near")
+        rows.append(read(folder / "strip.png"))
+    save("crashes.jpg", np.concatenate(rows), width=1600)
+
+
 def experiment(work: Path, scenes: Path, name: str, *options: str) -> None:
     """The strip of stills that ``real2sim simulate`` leaves."""
     command("simulate", scenes / SCENE, "--out", work / name, "--experiment", name, *options)
@@ -148,7 +160,9 @@ def ground(work: Path, scenes: Path) -> None:
     save("ground.jpg", read(picture), width=1100)
 
 
-PICTURES = {make.__name__: make for make in (demo, scenario, studio, wall, pair, drop, ground)}
+PICTURES = {
+    make.__name__: make for make in (demo, scenario, studio, wall, pair, drop, crashes, ground)
+}
 
 
 def command(*arguments: object) -> None:

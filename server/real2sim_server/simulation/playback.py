@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -23,6 +23,10 @@ from .structure import VEHICLES
 
 WHEEL_RADIUS, WHEEL_HALF_WIDTH = 0.36, 0.2
 """What Gaussians of a vehicle are its wheels: so far around the axle and along it [m]."""
+
+
+HANGING = 2.0
+"""After this time a bumper that came loose no longer moves [s]."""
 
 
 class PlacedObject(Protocol):
@@ -73,7 +77,7 @@ class Playback:
             self._breakages.setdefault(breakage.object_id, []).append(breakage)
         self._clouds: dict[str, GaussianCloud] = {}
         self._embeddings: dict[str, Embedding] = {}
-        self._deformed: dict[str, tuple[tuple[int, bytes], GaussianCloud]] = {}
+        self._deformed: dict[str, tuple[tuple[Hashable, bytes], GaussianCloud]] = {}
         self._wheels: dict[str, NDArray[np.bool_]] = {}
         self._damaged: dict[str, _Damaged] = {}
 
@@ -125,12 +129,14 @@ class Playback:
         if row < 0 and not lifts.any():
             return _placed(self._cloud(subject), pose, subject)
         damaged = self._damage(subject)
-        key = (row if damaged is None else frame, lifts.tobytes())
+        time_s = float(self.result.times_s[frame])
+        state: Hashable = row if damaged is None else damaged.state(row, time_s)
+        key = (state, lifts.tobytes())
         kept = self._deformed.get(subject.object_id)
         if kept is None or kept[0] != key:
             cloud = self._cloud(subject)
             if damaged is not None and row >= 0:
-                cloud = damaged.cloud(frame, float(self.result.times_s[frame]))
+                cloud = damaged.cloud(row, time_s)
             elif row >= 0:
                 deformed = self._embedding(subject).follow(own.shapes[row].astype(np.float64))
                 cloud = deform_cloud(cloud, deformed)
@@ -200,10 +206,14 @@ class _Damaged:
         self._upto = 0
         self._most: Float | None = None
 
-    def cloud(self, frame: int, time_s: float) -> GaussianCloud:
-        """What is drawn of it at a frame, ``time_s`` [s] after the start."""
-        rows = self._own.shape_index[: frame + 1].tolist()
-        shown = rows[-1]
+    def state(self, row: int, time_s: float) -> Hashable:
+        """What it looks like depends on this alone; a loose bumper moves on for a while."""
+        ages = [time_s - b.time_s for b in self._broken if b.time_s <= time_s]
+        loose = [round(min(age, HANGING), 6) for age in ages]
+        return row, tuple(loose)
+
+    def cloud(self, shown: int, time_s: float) -> GaussianCloud:
+        """What is drawn of it in the shape ``shown``, ``time_s`` [s] after the start."""
         if self._most is None or self._upto > shown:
             self._upto, self._most = 0, None
         for row in range(self._upto, shown + 1):
@@ -212,7 +222,7 @@ class _Damaged:
             self._most = now if self._most is None else np.maximum(self._most, now)
         self._upto = shown
         assert self._most is not None
-        ages = {b.part: time_s - b.time_s for b in self._broken if b.time_s <= time_s}
+        ages = {b.part: min(time_s - b.time_s, HANGING) for b in self._broken if b.time_s <= time_s}
         return self._vehicle.cloud(moved, self._most, ages)
 
 

@@ -130,6 +130,7 @@ def summary_of(result: SimulationResult) -> dict[str, Any]:
         "end_us": result.start_us + round(float(result.times_s[-1]) * 1e6),
         "objects": list(result.objects),
         "contacts": [vars(contact) for contact in result.contacts],
+        "breakages": [breakage.record() for breakage in result.breakages or ()],
         "figures": dict(result.figures),
         "stopped": result.stopped,
     }

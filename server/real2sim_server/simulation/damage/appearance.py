@@ -17,8 +17,12 @@ from .parts import Part, parts_of
 from .sheet import Sheet
 
 SH_0 = 0.28209479177387814
-GLASS_DARKER = 0.55
+GLASS_DARKER = 0.7
 """Glass is what is darker than so much of the vehicle's paint, within a pane's place."""
+OF_GLASS = 0.1
+"""A windscreen differs from paint by so much."""
+SILLS = 0.3
+"""Below this fraction of a vehicle's height there are wheels and shadow."""
 OTHER_COLOUR = 0.22
 """A lamp is what differs by so much from the colour of most of the vehicle, within its place."""
 LAMP_DARKER, LAMP_SHARE = 0.6, 0.6
@@ -71,7 +75,9 @@ class DamagedVehicle:
         self._parts = {part.name: part for part in parts_of(category, size)}
         colours = np.clip(cloud.sh[:, 0].detach().cpu().numpy() * SH_0 + 0.5, 0.0, 1.0)
         self._brightness = colours.mean(axis=1)
-        self._unlike_paint = np.abs(colours - np.median(colours, axis=0)).max(axis=1)
+        painted = self._painted()
+        self._paint = float(np.median(self._brightness[painted]))
+        self._unlike_paint = np.abs(colours - np.median(colours[painted], axis=0)).max(axis=1)
         self._rows = {name: self._rows_of(part) for name, part in self._parts.items()}
         glass = np.zeros(len(points), dtype=bool)
         for name, part in self._parts.items():
@@ -132,16 +138,27 @@ class DamagedVehicle:
     def _rows_of(self, part: Part) -> NDArray[np.int64]:
         """Gaussians that a part consists of: all at its place, without paint around it."""
         inside = part.holds(self._points)
-        if part.kind in ("pane", "windscreen") and inside.any():
-            paint = float(np.median(self._brightness))
-            inside &= self._brightness < max(GLASS_DARKER * paint, 0.12)
+        if part.kind == "windscreen":
+            # It shows the sky, brighter than paint at times; nothing else faces ahead up there.
+            inside &= self._unlike_paint > OF_GLASS
+        elif part.kind == "pane":
+            inside &= self._brightness < max(GLASS_DARKER * self._paint, 0.12)
         elif part.kind == "lamp":
-            bright = self._brightness > LAMP_DARKER * float(np.median(self._brightness))
+            bright = self._brightness > LAMP_DARKER * self._paint
             inside &= bright & (self._unlike_paint > OTHER_COLOUR)
             if inside.any():
                 least = np.quantile(self._unlike_paint[inside], 1 - LAMP_SHARE)
                 inside &= self._unlike_paint >= least
         return np.flatnonzero(inside)
+
+    def _painted(self) -> NDArray[np.bool_]:
+        """[G] what is neither glass nor below the sills; all where nothing is left."""
+        height = self._points[:, 2] / self._size[2] + 0.5
+        painted: NDArray[np.bool_] = height > SILLS
+        for part in self._parts.values():
+            if part.kind in ("pane", "windscreen"):
+                painted = painted & ~part.holds(self._points)
+        return painted if painted.any() else np.ones(len(painted), dtype=bool)
 
     def _in_wheels(self) -> NDArray[np.bool_]:
         """[G] by where wheels are under a box of this size."""

@@ -27,7 +27,8 @@ TALL = 1.9
 """Vehicles higher than this [m] are vans or lorries: belt and bumpers are higher."""
 BELT, BELT_TALL = 0.6, 0.5
 """Heights at which glass begins, as fractions of the vehicle's."""
-UNDER_ROOF = 0.94
+COWL, UNDER_ROOF = 0.05, 0.94
+"""From the belt up to where a windscreen begins, and where glass ends, as such fractions."""
 SCREEN, REAR_SCREEN = (0.56, 0.86), (0.02, 0.3)
 """Where screens are along a car, as fractions of its length from the rear."""
 SCREEN_TALL = (0.72, 0.98)
@@ -109,13 +110,20 @@ def _glass(size: Sequence[float]) -> list[Part]:
     half, inner = width / 2 + 0.1, (0.5 - INSIDE) * width
     x = [(f - 0.5) * length for f in (SCREEN_TALL if tall else SCREEN)]
     found = [
-        Part("windscreen", "windscreen", (x[0], -inner, belt), (x[1], inner, top), (0.8, 0, 0.6))
+        Part(
+            "windscreen",
+            "windscreen",
+            (x[0], -inner, belt + COWL * height),
+            (x[1], inner, top),
+            (0.8, 0.0, 0.6),
+        )
     ]
     back = [(f - 0.5) * length for f in REAR_SCREEN]
     if not tall:
         low, high = (back[0], -inner, belt), (back[1], inner, top)
         found.append(Part("rear window", "pane", low, high, (-0.8, 0.0, 0.6)))
-    along = (x[0] - 0.15 * length if tall else back[1] - 0.16 * length, x[1])
+    # Side windows end at the pillar before the front door, which a crushed front does not reach.
+    along = (x[0] - 0.15 * length, x[0] + 0.1 * length) if tall else (-0.36 * length, 0.18 * length)
     for side, name in ((1.0, "left"), (-1.0, "right")):
         y = (inner, half) if side > 0 else (-half, -inner)
         low, high = (along[0], y[0], belt), (along[1], y[1], top)

@@ -25,6 +25,10 @@ Image = NDArray[np.uint8]
 RGB_ONLY = RasterOptions(depth=False, instance=False)
 FILM_RATE = 15.0
 STILLS = 5
+HARD_SHARE = 0.05
+"""Of the kinetic energy, lost from one picture of a film to the next: something was hit."""
+AFTERWARDS = 0.25
+"""Of the time from there to the end, at which the still between them is."""
 CLEAR = 0.8
 """Of the distance from a near view to its focus."""
 
@@ -161,7 +165,7 @@ def write_film(
     frame_rate = float(result.figures["frame_rate"])
     stride = max(round(frame_rate / slow / FILM_RATE), 1)
     frames = list(range(0, result.frames, stride))
-    stills = {frames[round(k * (len(frames) - 1) / (STILLS - 1))] for k in range(STILLS)}
+    stills = _stills(result, frames)
     kept = []
     with video_file(folder / "film.mp4", frames_per_second=frame_rate / slow / stride) as video:
         for done, frame in enumerate(frames):
@@ -174,6 +178,20 @@ def write_film(
                 on_progress(done + 1, len(frames))
     rows = [np.concatenate([still[c] for still in kept], axis=1) for c in range(len(shown))]
     write_png(folder / "strip.png", np.concatenate(rows, axis=0))
+
+
+def _stills(result: SimulationResult, frames: Sequence[int]) -> set[int]:
+    """Frames of a film that tell what happens: the beginning, before, in and after the hardest
+    moment, and the end."""
+    energy = result.energies[:, ENERGIES.index("kinetic")]
+    lost = -np.diff(energy[list(frames)])
+    hardest = int(lost.argmax()) if len(lost) else 0
+    last = len(frames) - 1
+    if not len(lost) or lost[hardest] < HARD_SHARE * float(energy.max()):
+        return {frames[round(k * last / (STILLS - 1))] for k in range(STILLS)}
+    later = hardest + 1 + round(AFTERWARDS * (last - hardest - 1))
+    shown = (0, max(hardest - 1, 0), min(hardest + 1, last), later, last)
+    return {frames[k] for k in shown}
 
 
 def draw_curves(result: SimulationResult, path: Path) -> None:

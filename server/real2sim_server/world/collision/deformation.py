@@ -151,6 +151,7 @@ class DeformationTracker:
                 continue
             cloud = fragment_cloud(damage.broken, t_us * 1e-6, self.scene.ground.height_at)
             if cloud is not None:
+                cloud = cloud.to(self.scene.background.device)
                 found.append(Instance(cloud, None, deformed.origin.subject.instance_id))
         return found
 
