@@ -158,7 +158,8 @@ def render_rigs(
 
 
 def draws_together(backend: Backend, modalities: Iterable[str]) -> bool:
-    """Whether images of these modalities are drawn in one go, whatever is in them."""
+    """Whether images of these modalities are drawn in one go, whatever is in them and of any size;
+    small ones of one size may be by other backends too, see BatchBackend."""
     return isinstance(backend, FrameBackend) and backend.modalities.issuperset(modalities)
 
 

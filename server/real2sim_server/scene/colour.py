@@ -85,7 +85,8 @@ def colour_basis(phase: float, count: int, basis: str) -> Tensor:
 @lru_cache(maxsize=1024)
 def _values_at(phase: float, count: int, basis: str) -> NDArray[np.float32]:
     """Of one instant: the objects of a scene mostly have colours over the same span of time."""
-    return _basis_values(np.array([phase]), count, basis)[0]
+    values: NDArray[np.float32] = _basis_values(np.array([phase]), count, basis)[0]
+    return values
 
 
 def _basis_values(phases: NDArray[np.float64], count: int, basis: str) -> NDArray[np.float32]:

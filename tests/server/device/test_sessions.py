@@ -13,6 +13,9 @@ import pytest
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
+from real2sim_server.render import RenderOutput
+from real2sim_server.render.backends import Backend, RasterRequest
+from real2sim_server.render.backends.cpu.backend import CpuBackend
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.scene import Scene
 from real2sim_server.service.accounts import PAYER, Account, Payer
@@ -42,13 +45,11 @@ SPEC: dict[str, Any] = {"action": "control", "sensors": SENSORS}
 class Service:
     """The engine and the step pipeline on the pretended device."""
 
-    def __init__(self) -> None:
+    def __init__(self, backend: Backend) -> None:
         self.engine = Engine()
         self.engine.start()
         metrics = Metrics()
-        renderer = Renderer(
-            self.engine, NvrtcBackend(PretendedLauncher()), metrics, max_pixels=10**7
-        )
+        renderer = Renderer(self.engine, backend, metrics, max_pixels=10**7)
         self.pipeline = StepPipeline(
             self.engine, renderer, metrics, deformation=cast(Any, None), max_pixels=10**7
         )
@@ -60,7 +61,8 @@ class Service:
 
     def step(self, world: World, steering: float) -> Transition:
         cameras = self.pipeline.cameras(world.scene, world.spec.sensors)
-        return Transition(partial(moved, world, steering), cameras, scene=world.scene)
+        scene = self.pipeline.drawn_with(world, cameras)
+        return Transition(partial(moved, world, steering), cameras, scene=scene)
 
     def run(self, *steps: Awaitable[T]) -> list[T | BaseException]:
         """What comes of steps that wait for the engine at the same time."""
@@ -86,7 +88,7 @@ class Service:
 
 @pytest.fixture
 def service(device_counts: pretended.Counts) -> Iterator[Service]:
-    made = Service()
+    made = Service(NvrtcBackend(PretendedLauncher()))
     yield made
     made.close()
 
@@ -126,6 +128,36 @@ def test_two_sessions_share_launches_and_see_what_each_sees_alone(
     assert device_counts.launches == launches
     assert (device_counts.to_device, device_counts.to_host, device_counts.waits) == counted
     assert device_counts.to_device == 1
+
+
+def test_small_images_of_two_sessions_are_drawn_together_on_the_cpu(
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = CpuBackend()
+    batches: list[int] = []
+    draw = backend.rasterize_batch
+
+    def noted(requests: Sequence[RasterRequest]) -> RenderOutput:
+        batches.append(len(requests))
+        return draw(requests)
+
+    monkeypatch.setattr(backend, "rasterize_batch", noted)
+    service = Service(backend)
+    try:
+        worlds = [begun(tiny_scene), begun(tiny_scene, start_us=500_000)]
+        steps = [
+            lambda world=world: service.pipeline.run(service.step(world, 0.1)) for world in worlds
+        ]
+        alone = [images(service.run(step())[0]) for step in steps]
+        batches.clear()
+        together = service.run(*(step() for step in steps))
+        assert [images(observation) for observation in together] == alone
+        # One for each size.
+        assert batches == [2, 2]
+        large = [sensor | {"detail": "full"} for sensor in SENSORS]
+        assert service.step(begun(tiny_scene, sensors=large), 0.1).scene is None
+    finally:
+        service.close()
 
 
 def test_what_fails_in_one_session_leaves_the_others_alone(

@@ -25,6 +25,7 @@ from ...render import (
     RigView,
     draws_together,
     render_rigs,
+    uses_levels,
     warm_up,
 )
 from ...render.modalities import modality_names, modality_of, options_for
@@ -185,9 +186,18 @@ class Renderer:
         images = self.render_together([(request, cameras)], between=between)[0]
         return images, (time.perf_counter() - started) * 1e3
 
-    def draws_together(self, modalities: Iterable[str]) -> bool:
-        """Whether images of these modalities are drawn in one go, whoever wants them."""
-        return draws_together(self._backend, modalities)
+    def draws_together(self, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]) -> bool:
+        """Whether images of these sensors are drawn in one go with those of others like them.
+
+        Args:
+            sensors: and their cameras, in the same order.
+            cameras: at the sizes that the sensors name.
+        """
+        modalities = {name for sensor in sensors for name in sensor.modalities}
+        return draws_together(self._backend, modalities) or all(
+            uses_levels(self._backend, camera.width, camera.height, sensor.detail)
+            for sensor, camera in zip(sensors, cameras, strict=True)
+        )
 
     def render_together(
         self,

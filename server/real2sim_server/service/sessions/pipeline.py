@@ -23,7 +23,8 @@ A world without sensors moves on a thread of its own: it needs no device, and it
 wait while other sessions are rendered. Steps that wait for that thread are made in one go, phase by
 phase: their log entries are one transaction, and they wake the event loop once.
 
-Where the backend draws images of several worlds in one go, steps of sessions on one scene that wait
+Where the backend draws images of several worlds in one go (the serving kernels all, the CPU's small
+ones), steps of sessions on one scene that wait
 for the engine together pass the phases together, as far as TOGETHER_PIXELS: their images are those
 that each would get alone, bit for bit. None waits for another that is not there yet, and one that
 came first is left behind once at most.
@@ -211,7 +212,6 @@ class StepPipeline:
         self._deformation = deformation
         self._max_pixels = max_pixels
         self._stages: dict[str, Histogram] = {}
-        self._draws_together = renderer.draws_together(())
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
         self._steps: GatheredCalls[Transition, EncodedObservation] = GatheredCalls(
             self._compute_together, self._worlds, on_result=self.send
@@ -227,6 +227,17 @@ class StepPipeline:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
         cameras = self._checked(scene, sensors)
         return {s.camera: c for s, c in zip(sensors, cameras, strict=True)}
+
+    def drawn_with(self, world: World, cameras: Mapping[str, Camera]) -> Scene | None:
+        """With the sessions of which scene the next step of a world may be drawn; None for none.
+
+        No session waits for the deformations of another.
+        """
+        if world.deformation is not None and world.deformation.has_impacts:
+            return None
+        sensors = world.spec.sensors
+        sizes = [cameras[sensor.camera] for sensor in sensors]
+        return world.scene if self._renderer.draws_together(sensors, sizes) else None
 
     async def levels_ready(
         self,
@@ -284,7 +295,7 @@ class StepPipeline:
 
     async def _on_engine(self, transition: Transition) -> RenderedObservation | EncodedObservation:
         told = partial(self.send, transition)
-        if transition.scene is None or not self._draws_together:
+        if transition.scene is None:
             return await self._engine.call(
                 self._compute, transition, label="drive", lane=Lane.DRIVE, on_result=told
             )

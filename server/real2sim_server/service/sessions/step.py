@@ -262,7 +262,7 @@ class Stepper:
             record,
             write=write,
             slot=slot,
-            scene=_drawn_with(session.running_world()),
+            scene=self._pipeline.drawn_with(session.running_world(), session.cameras),
         )
         session.world, session.late = observation.world, False
         session.publish(observation.message)
@@ -425,13 +425,6 @@ class Stepper:
                 session.unsure_replies += (reply.key,)
             raise
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
-
-
-def _drawn_with(now: World) -> Scene | None:
-    """With the sessions of which scene the next step may be drawn: none waits for another's
-    deformations."""
-    deformed = now.deformation is not None and now.deformation.has_impacts
-    return None if deformed else now.scene
 
 
 def _action_record(session: Session, plan: Plan | None, payload: bytes) -> LogRecord:
