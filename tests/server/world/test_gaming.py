@@ -188,6 +188,59 @@ def test_leaving_the_road_is_worth_nothing_where_a_score_sees_the_road(judged):
     assert "leaving the road" in found["neuroncap"].cannot_see
 
 
+def around(way: float, *, turn_at: float, radius: float = 12.0) -> Pose:
+    """Out along x, round to the left and back."""
+    if way < turn_at:
+        return way, 0.0, 0.0
+    if way < turn_at + math.pi * radius:
+        angle = (way - turn_at) / radius
+        return turn_at + radius * math.sin(angle), radius * (1 - math.cos(angle)), angle
+    return turn_at - (way - turn_at - math.pi * radius), 2 * radius, math.pi
+
+
+def test_a_short_cut_is_no_way_along_the_route(make_world):
+    times = np.arange(200) * 100_000
+    out_and_back = np.array([around(0.8 * k, turn_at=60.0) for k in range(200)])
+    places = np.column_stack([out_and_back[:, :2], np.zeros(200)])
+    recorded = Trajectory(times, places, np.stack([yaw_quaternion(a) for a in out_and_back[:, 2]]))
+    found = []
+    for turn_at in (60.0, 8.0):
+        world = make_world(recorded, spec={"action": "pose", "horizon": 60})
+        for step in range(1, 61):
+            x, y, yaw = around(0.8 * step, turn_at=turn_at)
+            world.step(PoseCommand(x=x, y=y, yaw=yaw))
+        found.append(({s.name: s for s in world.scores()}, world.metrics()))
+    (whole, _), (cut, metrics) = found
+
+    assert cut["feasible"].value == 1.0
+    for name in ("hugsim_hd", "carla_ds"):
+        assert cut[name].value < whole[name].value, name
+    assert cut["carla_ds"].terms["RC"] < 1.0
+    assert metrics["route_progress"] < 50.0
+    assert "left out by a short cut" in cut["neuroncap"].cannot_see
+
+
+def test_a_drive_without_a_step_has_no_scores(judged, make_world, pulling_away):
+    world = make_world(pulling_away, spec={"action": "pose", "horizon": STEPS})
+
+    scores = world.scores()
+    assert [s.value for s in scores] == [None] * len(scores)
+    assert {s.missing for s in scores} == {("a step that counts",)}
+
+
+def test_who_ends_early_is_told_that_the_rest_was_not_seen(make_world, pulling_away, judged):
+    world = make_world(pulling_away, spec={"action": "pose", "horizon": STEPS})
+    for step in range(1, 11):
+        x, y, yaw = honest(step)
+        world.step(PoseCommand(x=x, y=y, yaw=yaw))
+    early = {s.name: s.cannot_see for s in world.scores()}
+    whole, _ = judged(honest)
+
+    assert all("what comes after 1 s (the episode may last 6 s)" in said for said in early.values())
+    assert not any("what comes after" in score.cannot_see for score in whole.values())
+    assert "following closely" in whole["pdms"].cannot_see
+
+
 def test_oscillating_costs_comfort(judged):
     found, _ = judged(oscillating)
     quiet, _ = judged(honest)

@@ -414,6 +414,17 @@ def test_longitudinal_bounds_hold_for_steady_acceleration(acceleration, comforta
     assert found["pdms"].terms["C"] == float(comfortable)
 
 
+@pytest.mark.parametrize(
+    ("acceleration", "comfortable"), [(-2.3, True), (-2.5, False), (4.0, True), (4.2, False)]
+)
+def test_backwards_the_bounds_are_those_of_the_mirror_image(acceleration, comfortable):
+    window = comfort_window(DT)
+    t = (np.arange(window) - window // 2) * DT
+    felt = comfort_sample(np.stack([-8.0 + acceleration * t, 0 * t], axis=1), DT)
+    assert felt.lon_acceleration == pytest.approx(-acceleration)
+    assert felt.comfortable == felt.comfortable_to_hugsim == comfortable
+
+
 def test_derivatives_are_exact_for_cubics():
     window = comfort_window(DT)
     t = (np.arange(window) - window // 2) * DT

@@ -27,7 +27,9 @@ class MetricAccumulator:
         distance: driven [m].
         outside: part of it beside all lanes that go the ego's way [m].
         tail_first: way along the route that was made facing against it, in reverse gear [m].
-        s, furthest: along the route: now and at most; the latter less what was tail first [m].
+        cut: way along the route that was left out by meeting it again elsewhere [m].
+        s, furthest: along the route: now and at most; the latter less what was tail first or left
+            out [m].
         offset: from the route now [m].
         at_fault: at-fault contacts of the ego, by kind: vehicle, vru, object.
         contacts: contacts begun, by category.
@@ -60,6 +62,7 @@ class MetricAccumulator:
     distance: float = 0.0
     outside: float = 0.0
     tail_first: float = 0.0
+    cut: float = 0.0
     s: float = 0.0
     furthest: float = 0.0
     offset: float = 0.0

@@ -26,6 +26,9 @@ UNSEEN: dict[Aspect, str] = {
 }
 """In the order in which a reader misses them."""
 
+LONG_STEP = 0.1
+"""TTC is looked at once a clock step; longer ones leave something out [s]."""
+
 NOT_NOTICED = 2.0
 """Ways up to this are not mentioned [m]."""
 
@@ -37,6 +40,9 @@ def cannot_see(
     what it left uncounted of what happened."""
     blind = [phrase for aspect, phrase in UNSEEN.items() if aspect not in sees]
     blind += _seen_in_part(sees, accumulator, context)
+    seconds, most = accumulator.steps * context.dt, context.horizon * context.dt
+    if not accumulator.contacts and seconds + context.warmup_steps * context.dt < most - 1e-9:
+        blind.append(f"what comes after {seconds:g} s (the episode may last {most:g} s)")
     blind.append("traffic lights, signs and right of way (no map)")
     if not context.background:
         blind.append("walls and poles (contact.background is off)")
@@ -59,6 +65,10 @@ def _seen_in_part(
             f"where the road ends (no map: {context.corridor:g} m to either side of the recorded "
             "drive count as road)"
         )
+    if "near_misses" in sees:
+        found.append("following closely at the same speed")
+        if context.dt > LONG_STEP:
+            found.append(f"near misses between instants, {context.dt:g} s apart")
     if "lane" in sees:
         found.append("lanes that nobody drove in the recording")
     if "comfort" in sees:
@@ -85,6 +95,8 @@ def _uncounted(
         found.append(f"up to {accumulator.oncoming:.0f} m in a second against the route")
     if "progress" not in sees and accumulator.tail_first >= NOT_NOTICED:
         found.append(f"{accumulator.tail_first:.0f} m of the route driven tail first")
+    if "progress" not in sees and accumulator.cut >= NOT_NOTICED:
+        found.append(f"{accumulator.cut:.0f} m of the route left out by a short cut")
     if "lane" not in sees and accumulator.outside >= NOT_NOTICED:
         found.append(f"{accumulator.outside:.0f} m beside all lanes that were driven")
     without_fault = accumulator.collisions - sum(accumulator.at_fault.values())

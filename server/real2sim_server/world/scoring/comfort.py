@@ -29,7 +29,8 @@ HUGSIM_LON_JERK = 8.37
 
 
 class ComfortSample(NamedTuple):
-    """What passengers feel at one time: SI units, as the bounds."""
+    """What passengers feel at one time: SI units, as the bounds. ``lon_acceleration`` is that in
+    the direction of the gear: below 0 a vehicle brakes, backwards too."""
 
     lon_acceleration: float
     lat_acceleration: float
@@ -132,7 +133,8 @@ def comfort_sample(samples: Float, dt: float) -> ComfortSample:
     # d/dt of the lateral acceleration v w, by the product rule.
     lat_jerk = acceleration * rate + speed * yaw_acceleration
     jerk = math.hypot(lon_jerk, lat_jerk)
-    return ComfortSample(acceleration, lateral, jerk, lon_jerk, rate, yaw_acceleration)
+    driven = -acceleration if speed < 0.0 else acceleration
+    return ComfortSample(driven, lateral, jerk, lon_jerk, rate, yaw_acceleration)
 
 
 def plans_agree(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | None:

@@ -57,6 +57,9 @@ class MetricValue(NamedTuple):
 Formula = Callable[[MetricAccumulator, ScoringContext], MetricValue]
 
 
+NO_STEP = "a step that counts"
+
+
 @dataclass(frozen=True)
 class Metric:
     """One member of the family.
@@ -84,6 +87,9 @@ class Metric:
     def score(self, accumulator: MetricAccumulator, context: ScoringContext) -> Score:
         """The score of an episode so far."""
         found = self.formula(accumulator, context)
+        if not accumulator.steps:
+            # Nothing was driven that any formula could be about.
+            found = MetricValue(None, {}, missing=(NO_STEP,))
         blind = "" if self.sees is None else cannot_see(self.sees, accumulator, context)
         return Score(
             self.name,

@@ -82,7 +82,7 @@ def ttc_within_bound(accumulator: MetricAccumulator) -> float:
 # --- scores -----------------------------------------------------------------------------------
 
 
-@metric("pdms", version="4", streamed=True, sees=NAVSIM_SEES)
+@metric("pdms", version="5", streamed=True, sees=NAVSIM_SEES)
 def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven; F
     is :func:`feasible`, as in all scores below."""
@@ -99,7 +99,7 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue
     return MetricValue(value, terms, assumed=(NO_MAP, *assumed_progress(accumulator, context)))
 
 
-@metric("epdms", version="4", sees={*NAVSIM_SEES, "lane", "direction"})
+@metric("epdms", version="5", sees={*NAVSIM_SEES, "lane", "direction"})
 def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
     without the penalty filter by the human drive."""
@@ -123,7 +123,7 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
     return MetricValue(math.prod(multipliers) * weighted / 16, terms, assumed=assumed)
 
 
-@metric("nuplan_cls", version="4", streamed=True, sees={*NAVSIM_SEES, "direction", "speed_limit"})
+@metric("nuplan_cls", version="5", streamed=True, sees={*NAVSIM_SEES, "direction", "speed_limit"})
 def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
     way, expert = progress_along_route(accumulator), expert_progress(accumulator, context)
@@ -149,7 +149,7 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
 
 
 @metric(
-    "hugsim_hd", version="4", streamed=True, sees=("progress", "comfort", "near_misses", "road")
+    "hugsim_hd", version="5", streamed=True, sees=("progress", "comfort", "near_misses", "road")
 )
 def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
@@ -178,7 +178,7 @@ def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> Metric
     return MetricValue(4 * possible * max(0.0, 1 - ratio), terms)
 
 
-@metric("carla_ds", version="3", streamed=True, sees=("progress", "lane"))
+@metric("carla_ds", version="4", streamed=True, sees=("progress", "lane"))
 def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F times route completion in percent times the product of penalties (CARLA leaderboard), with
     those infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65, and the share of
@@ -201,7 +201,7 @@ def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
     return MetricValue(100 * possible * completion * penalty, terms, assumed=assumed)
 
 
-@metric("alpasim", version="4", sees=("progress", "road", "fault"))
+@metric("alpasim", version="5", sees=("progress", "road", "fault"))
 def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """0 if at fault, off the road or as no car moves, else min(progress / 0.8, 1) (AlpaSim scene
     score)."""
@@ -254,7 +254,7 @@ def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> 
     """What is streamed with every observation; all finite."""
     found = {
         "distance": accumulator.distance,
-        "route_progress": accumulator.s - accumulator.start_s,
+        "route_progress": accumulator.s - accumulator.cut - accumulator.start_s,
         "lateral_offset": accumulator.offset,
         "collisions": float(accumulator.collisions),
         "at_fault_collisions": float(sum(accumulator.at_fault.values())),

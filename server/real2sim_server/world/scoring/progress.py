@@ -22,8 +22,10 @@ def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
 
 
 def progress_along_route(accumulator: MetricAccumulator) -> float:
-    """Way along the route [m]; not what was driven tail first, which is no way to drive there."""
-    return max(accumulator.s - accumulator.tail_first - accumulator.start_s, 0.0)
+    """Way along the route [m]; not what was driven tail first, which is no way to drive there, nor
+    what was left out by a short cut."""
+    driven = accumulator.s - accumulator.tail_first - accumulator.cut
+    return max(driven - accumulator.start_s, 0.0)
 
 
 def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:

@@ -29,6 +29,10 @@ HUGSIM_TTC = 1.0
 HUGSIM_REACHED = 3.0
 """Distance from the route within which a point of it counts as reached [m]."""
 
+BEND, SHORT_CUT = 3.0, 10.0
+"""Inside a bend way along the route is at most this many times the way driven; jumps of the nearest
+point at a corner are shorter than this [m]."""
+
 
 def begin_accumulator(instant: Instant, context: ScoringContext) -> MetricAccumulator:
     """The accumulator at step 0."""
@@ -74,14 +78,16 @@ def update_accumulator(
     accumulator = _with_contacts(_with_pushes(accumulator, instant, context), instant, context)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=accumulator.hit)
     comfort = accumulator.comfort.updated(ego.speed, ego.yaw, dt)
+    way = math.hypot(ego.x - before.x, ego.y - before.y)
+    left_out = _left_out(ego.s - before.s, way)
+    gain, cut = ego.s - before.s - left_out, accumulator.cut + left_out
     backward, oncoming = windowed_sum(
-        accumulator.backward, max(before.s - ego.s, 0.0), max(round(ONCOMING_WINDOW_S / dt), 1)
+        accumulator.backward, max(-gain, 0.0), max(round(ONCOMING_WINDOW_S / dt), 1)
     )
     lane_run = accumulator.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
     backing = ego.speed < 0 and math.cos(ego.yaw - ego.path_yaw) < 0
-    tail_first = accumulator.tail_first + (max(ego.s - before.s, 0.0) if backing else 0.0)
+    tail_first = accumulator.tail_first + (max(gain, 0.0) if backing else 0.0)
     limit = context.speed_limit
-    way = math.hypot(ego.x - before.x, ego.y - before.y)
     distance = accumulator.distance + way
     return evolved(
         accumulator,
@@ -91,7 +97,8 @@ def update_accumulator(
         outside=accumulator.outside + (0.0 if context.in_lane(ego) else way),
         s=ego.s,
         tail_first=tail_first,
-        furthest=max(accumulator.furthest, ego.s - tail_first)
+        cut=cut,
+        furthest=max(accumulator.furthest, ego.s - tail_first - cut)
         if abs(ego.offset) < HUGSIM_REACHED
         else accumulator.furthest,
         offset=ego.offset,
@@ -111,6 +118,12 @@ def update_accumulator(
         ego=ego,
         states=_updated_states(accumulator, instant, context),
     )
+
+
+def _left_out(gain: float, way: float) -> float:
+    """What of a step's gain along the route [m] was not driven, but left out by a short cut; below
+    0 where the ego has come back over one."""
+    return gain - math.copysign(way, gain) if abs(gain) > BEND * way + SHORT_CUT else 0.0
 
 
 def _updated_states(
