@@ -426,6 +426,12 @@ class ContactSpec(Model):
         description="impacts take the time that masses and structures need, about a tenth of a "
         "second; false: all at once, as in episodes recorded before this option was there",
     )
+    residual_crush: bool = Field(
+        default=True,
+        description="what an impact has crushed pushes no more until it is crushed further, force "
+        "acts in the middle of what yields, and vehicles turn by published inertias; false: as in "
+        "episodes recorded before this option was there",
+    )
     dents: bool = Field(
         default=True,
         description="images show struck objects deformed, by the material point method",

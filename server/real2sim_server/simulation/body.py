@@ -92,6 +92,9 @@ class DeformableBody:
         angular_velocity: [3] world axes [rad/s].
         tyres: when it stands on wheels.
         shape: what earlier deformation has left; None for none.
+
+    Attributes:
+        acceleration: [3] of the centre of mass in the last step of deforming; zero else [m/s^2].
     """
 
     def __init__(
@@ -140,6 +143,7 @@ class DeformableBody:
         self.rebound: Rebound | None = None
         self._added_inertia = added_inertia(particles.masses, particles.volumes, cell=cell)
         self._carried = np.zeros(3)
+        self.acceleration: Float = np.zeros(3)
         self._velocity_before = self.motion.velocity
         self._hull = _hull(particles.positions)
         self._shell = _shell(particles.positions, self.spacing)
@@ -475,9 +479,9 @@ class DeformableBody:
         turning = float(np.linalg.norm(self.motion.angular_velocity))
         settled = self.residual_speed() < max(SETTLED_SPEED, SETTLED_FRACTION * speed)
         # In the middle of an impact a stiff body hardly deforms either.
-        jolt = float(np.linalg.norm(self.motion.velocity - self._velocity_before))
+        self.acceleration = (self.motion.velocity - self._velocity_before) / duration
         self._velocity_before = self.motion.velocity
-        settled = settled and jolt < JOLT * duration
+        settled = settled and float(np.linalg.norm(self.acceleration)) < JOLT
         slow = speed + turning < SLEEP_SPEED
         self._deforming_time += duration
         self._settle_time = self._settle_time + duration if settled else 0.0
@@ -514,6 +518,7 @@ class DeformableBody:
             m, rotation=pose[:3, :3], inertia=back @ m.world_inertia @ pose[:3, :3]
         )
         self._stored_energy = s.elastic
+        self.acceleration = np.zeros(3)
         self.state, self.mode, self._settle_time = None, BodyMode.RIGID, 0.0
 
     @property

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..physics.errors import ParticleError
+from .structure import VEHICLES
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,25 @@ CLASS_MASSES = {
 }
 """Typical figures for want of better ones; give a mass where it is known."""
 OTHER = ClassMass(100.0, "between empty furniture and wood; no better guess")
+
+
+YAW_RADIUS = 0.261
+"""Radius of gyration of vehicles about the vertical, over their length: 1538.9 kg m^2 of a Ford
+Escort of 1225.9 kg and 4.298 m (CommonRoad vehicle models). The particles of a car have 0.262, a
+box of even mass 0.31."""
+
+
+def yaw_inertia(category: str, mass: float, size: Sequence[float]) -> float:
+    """Inertia of an object about the vertical [kg m^2].
+
+    Args:
+        category: of the object.
+        mass: [kg].
+        size: (length, width, ...) of its box [m].
+    """
+    if category in VEHICLES:
+        return mass * (YAW_RADIUS * size[0]) ** 2
+    return mass * (size[0] * size[0] + size[1] * size[1]) / 12
 
 
 def default_mass(category: str, size: Sequence[float]) -> float:

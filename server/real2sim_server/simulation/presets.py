@@ -66,6 +66,10 @@ class Preset:
     Attributes:
         name: ``paper`` or ``vehicle``.
         spacing: of particles [m]; cells are twice as large.
+        vehicle_spacing: the same where only vehicles take part: zones of a vehicle are so large
+            that they fold alike on coarser cells.
+        cfl: fraction of a cell that waves may cross in a substep; what is damped is as stable with
+            longer substeps as elastic bodies are with shorter ones.
         friction: of surfaces against each other and the ground.
         wheels: whether vehicles stand on tyres.
         clearance: height under vehicles on tyres that is wheels, not body [m].
@@ -76,6 +80,8 @@ class Preset:
 
     name: str
     spacing: float
+    vehicle_spacing: float
+    cfl: float
     friction: float
     wheels: bool
     clearance: float
@@ -101,6 +107,8 @@ PRESETS = {
     "paper": Preset(
         name="paper",
         spacing=0.1,
+        vehicle_spacing=0.1,
+        cfl=0.4,
         friction=0.5,
         wheels=False,
         clearance=0.0,
@@ -110,6 +118,8 @@ PRESETS = {
     "vehicle": Preset(
         name="vehicle",
         spacing=0.1,
+        vehicle_spacing=0.125,
+        cfl=0.6,
         friction=0.4,
         wheels=True,
         clearance=0.12,

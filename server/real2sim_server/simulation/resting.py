@@ -23,6 +23,8 @@ from .surroundings import clearance
 
 GENTLE = 0.3
 """Contacts in which nothing approaches faster carry without deforming, nor bounce [m/s]."""
+STEADY = 2.0
+"""What is pushed away faster has not come to rest against it but is about to bounce [m/s^2]."""
 SWEEPS = 30
 """Passes over all contacts in a step."""
 DRIFT = 0.1
@@ -143,7 +145,7 @@ class Resting:
             if not self.holds(body, other.name):
                 found.append(((body.name, other.name), _on_body(body, other)))
         touching = {pair: touches for pair, touches in found if touches}
-        if any(_closing(t) > GENTLE for touches in touching.values() for t in touches):
+        if any(_strikes(t) for touches in touching.values() for t in touches):
             return False
         self._touches |= touching
         return True if self.partners(body) else None
@@ -261,6 +263,12 @@ def _closing(touch: Touch) -> float:
     if isinstance(touch.other, DeformableBody):
         velocity = velocity - touch.other.motion.velocity_at(own)
     return -float(velocity @ normal)
+
+
+def _strikes(touch: Touch) -> bool:
+    """Whether this is an impact: too fast for rigid contact, or in the midst of being stopped."""
+    _, normal, _, _ = touch.place()
+    return _closing(touch) > GENTLE or float(touch.body.acceleration @ normal) > STEADY
 
 
 @dataclass(frozen=True, eq=False)

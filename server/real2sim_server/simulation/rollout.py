@@ -151,6 +151,7 @@ def simulate_bodies(
         gravity=options.gravity,
         backend=options.backend,
         brake_after_hit=options.brake_after_hit,
+        cfl=preset_of(options.preset).cfl,
     )
     frames = max(round(options.duration * options.frame_rate), 1)
     recorder = TrajectoryRecorder(simulator)

@@ -26,7 +26,7 @@ TOUCH_CELLS = 0.25
 and costs next to nothing. It is more than what the front of a body moves in a step beyond its
 centre."""
 ROAD_CELLS = 0.4
-"""On its wheels a body is near the road all the time; contact begins when springs are through."""
+"""On its wheels a body is near the road all the time; what strikes it is this near and deforms."""
 LAG = 0.01
 """Particles whose turning lags behind by more than this at the surface are made to catch up [m/s].
 """
@@ -52,6 +52,7 @@ class HybridSimulator:
         gravity: [3] [m/s^2].
         backend: of the solver.
         brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
+        cfl: fraction of a cell that waves may cross in a substep of the solver.
 
     Attributes:
         bodies, colliders: as they are now.
@@ -70,6 +71,7 @@ class HybridSimulator:
         gravity: ArrayLike,
         backend: str,
         brake_after_hit: float,
+        cfl: float = SolverOptions.cfl,
     ) -> None:
         self.bodies = list(bodies)
         self.colliders = list(colliders)
@@ -81,10 +83,12 @@ class HybridSimulator:
         self._road = frozenset(road)
         self._backend = backend
         self._brake_after_hit = brake_after_hit
+        self._cfl = cfl
         self._names = {b.name for b in bodies}
         self._solver: Solver | None = None
         self._solved: list[str] = []
         self._resting = Resting()
+        self._floors: dict[str, float] = {}
         for body in self.bodies:
             if not (np.any(body.motion.velocity) or np.any(body.motion.angular_velocity)):
                 self._put_to_sleep(body)
@@ -181,7 +185,12 @@ class HybridSimulator:
         self._solver = Solver(
             [b.solver_body() for b in deforming],
             [*self.colliders, *boxes],
-            SolverOptions(dx=deforming[0].cell, gravity=tuple(self.gravity), backend=self._backend),
+            SolverOptions(
+                dx=deforming[0].cell,
+                gravity=tuple(self.gravity),
+                backend=self._backend,
+                cfl=self._cfl,
+            ),
         )
         self._solved = names + [box.name for box in boxes]
         self.contact_log.start_solver()
@@ -282,16 +291,22 @@ class HybridSimulator:
         return not asleep and self._strikes_through(body, duration)
 
     def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
-        """Whether springs of a body on wheels no longer keep its floor off the road."""
+        """Whether springs of a body on wheels no longer keep its floor from striking the road.
+
+        What comes down gently does not deform: springs and rigid contacts carry it.
+        """
         if body.tyres is None:
             return False
         gap, approach = body.gap_to_colliders(self.road)
-        return gap < ROAD_CELLS * body.cell + max(approach, 0) * duration
+        self._floors[body.name] = gap
+        return approach > GENTLE and gap < ROAD_CELLS * body.cell + approach * duration
 
     def _may_be_rigid(self, body: DeformableBody) -> bool:
         """Whether a deforming body that has settled is free, or lies on what does not deform any
         more; then rigid contacts carry it from now on."""
         fixed = [c for c in self._walls(body) if not c.moving]
+        if body.tyres is not None and body.gap_to_colliders(self.road)[0] < body.spacing / 2:
+            fixed += [c for c in self.road if not c.moving]
         others = [b for b in self.bodies if b is not body and _near(body, b)]
         moving = [c for c in self._walls(body) if c.moving]
         if body.meets(moving, within=NEAR_CELLS * body.cell, ahead=STEP):
@@ -314,10 +329,12 @@ class HybridSimulator:
     def _touch_more(self) -> None:
         """Let bodies that lie on something be carried by what else they have come to touch."""
         for body in self.bodies:
-            held = self._resting.partners(body)
+            held, near = self._resting.partners(body), body.spacing / 2
+            if body.mode == BodyMode.RIGID and self._floors.get(body.name, np.inf) < near:
+                road = [c for c in self.road if not c.moving and c.name not in held]
+                self._resting.begin(body, road, [])
             if body.mode != BodyMode.RIGID or not held:
                 continue
-            near = body.spacing / 2
             walls = [
                 c
                 for c in self._walls(body)
@@ -358,10 +375,7 @@ class HybridSimulator:
         gap, approach = body.gap_to_colliders(self._walls(body))
         if gap < _touch_distance(body) and (approach > 0 or body.tyres is None):
             return False
-        if body.tyres is None:
-            return True
-        gap, approach = body.gap_to_colliders(self.road)
-        return gap > ROAD_CELLS * body.cell + max(approach, 0) * STEP
+        return not self._strikes_through(body, STEP)
 
     def _is_near_bodies(
         self, body: DeformableBody, others: Iterable[DeformableBody], duration: float

@@ -127,6 +127,7 @@ def _subjects(
 
 def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int) -> Preset:
     """The preset with particles so far apart that boxes full of them would hold ``most``."""
+    preset = spaced_for(preset, subjects)
     sizes = np.array([s.scaled_size for s in subjects])
     spacing = max(preset.spacing, float(np.cbrt(sizes.prod(axis=1).sum() / most)))
     needed = int(np.ceil(sizes.prod(axis=1).sum() / preset.spacing**3))
@@ -139,6 +140,13 @@ def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int
                 "max_particles"
             )
     return replace(preset, spacing=spacing)
+
+
+def spaced_for(preset: Preset, subjects: Sequence[PlacedObject]) -> Preset:
+    """The preset with its particles as far apart as these objects need."""
+    if all(subject.category in VEHICLES for subject in subjects):
+        return replace(preset, spacing=preset.vehicle_spacing)
+    return preset
 
 
 def require_separation(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba import njit
 
+from real2sim_server.physics.numerics.device import square_root
 from real2sim_server.physics.numerics.matrices import eigen_symmetric, least_minor
 
 SIX = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
@@ -31,3 +33,19 @@ def test_eigenvectors_are_those_of_numpy(symmetric):
         turn = np.array(vectors).reshape(3, 3)
         np.testing.assert_allclose(turn @ np.diag(values) @ turn.T, m, atol=1e-6)
         np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-6)
+
+
+def test_square_roots_of_kernels_are_instructions_that_loops_take_many_at_a_time():
+    """A call of the C library for each number would keep flow from being vector code."""
+
+    @njit
+    def rooted(values):
+        for k in range(16):
+            values[k] = square_root(values[k])
+
+    values = np.arange(16, dtype=np.float32)
+    rooted(values)
+    np.testing.assert_allclose(values, np.sqrt(np.arange(16)), rtol=1e-7)
+    (code,) = rooted.inspect_llvm().values()
+    assert "llvm.sqrt" in code
+    assert "@sqrtf" not in code

@@ -22,6 +22,8 @@ from real2sim_server.physics import (
     box_particles,
     model,
 )
+from real2sim_server.physics.contact.node import resolve_node_pair
+from real2sim_server.physics.contact.surface import face_score
 
 from .scenes import SOFT, at, cube, ground, solve
 
@@ -97,6 +99,29 @@ def test_bodies_that_overlap_from_the_start_stay_calm():
     run.step(0.1)
     assert run.measure.finite
     assert run.energies().total < 1e-3
+
+
+def test_a_face_inside_what_has_been_crushed_is_stopped():
+    """Crushed, a body is all around the nodes next to its surface, and its moments tell nothing."""
+    dx = 0.2
+    cell = dx**3
+    face = np.array([-0.2 * cell, 0.0, 0.0, 0.5 * cell])
+    crushed = np.array([0.0, 0.06 * cell, 0.0, 3.0 * cell])
+    a, b = np.array([1.0, 0.0, 0.0, 2.0]), np.array([0.0, 0.0, 0.0, 2.0])
+    resolve_node_pair(a, b, face, crushed, 0.0, dx, np.zeros(3), np.zeros(8), np.zeros(8))
+    assert a[0] == b[0] == pytest.approx(0.5)
+    assert face_score(0.06, 3.0) < face_score(0.2, 0.5)
+
+
+def test_surfaces_that_look_past_each_other_do_not_touch():
+    dx = 0.2
+    cell = dx**3
+    face = np.array([-0.2 * cell, 0.0, 0.0, 0.5 * cell])
+    beside = np.array([0.0, 0.2 * cell, 0.0, 0.5 * cell])
+    a, b = np.array([1.0, 0.0, 0.0, 2.0]), np.array([0.0, 0.0, 0.0, 2.0])
+    resolve_node_pair(a, b, face, beside, 0.0, dx, np.zeros(3), np.zeros(8), np.zeros(8))
+    assert a[0] == 1.0
+    assert b[0] == 0.0
 
 
 def test_the_energies_add_up_and_nothing_is_gained():

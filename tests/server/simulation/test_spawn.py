@@ -12,7 +12,7 @@ from real2sim_server.physics import PhysicsError, Plane
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.presets import ObjectPhysics, preset_of
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
-from real2sim_server.simulation.spawn import object_particles, spawn_bodies
+from real2sim_server.simulation.spawn import object_particles, spaced_for, spawn_bodies
 from real2sim_server.simulation.tyres import track_of
 
 GROUND = Plane(name="ground", friction=0.7)
@@ -136,3 +136,12 @@ def test_its_structure_does_not_move_the_centre_of_mass_of_a_vehicle(tiny_scene)
     )
     height = object_particles(tiny_scene, red, preset, 0).centre_of_mass[2]
     assert body.rest.centre_of_mass[2] == pytest.approx(height, abs=1e-3)
+
+
+def test_particles_of_vehicles_alone_are_further_apart(tiny_scene):
+    preset = preset_of("vehicle")
+    red = next(o for o in ScenarioState.of(tiny_scene).visible if o.object_id == "car_red")
+    cone = replace(red, category="cone")
+    assert spaced_for(preset, [red, red]).spacing == preset.vehicle_spacing > preset.spacing
+    assert spaced_for(preset, [red, cone]).spacing == preset.spacing
+    assert spaced_for(preset_of("paper"), [red]).spacing == preset_of("paper").spacing

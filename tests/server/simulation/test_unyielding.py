@@ -11,6 +11,7 @@ from real2sim_server.physics import Box, FixedCorotated, Foam, Plane, box_partic
 from real2sim_server.physics.materials import Structure
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
+from real2sim_server.simulation.presets import preset_of
 from real2sim_server.simulation.simulator import STEP, HybridSimulator
 from real2sim_server.simulation.structure import vehicle_structure
 from real2sim_server.simulation.tyres import Tyres
@@ -54,10 +55,9 @@ def cone(mass=3.0, speed=0.0):
     return body("cone", (0.4, 0.4, 0.6), mass, pose, material=FOAM, velocity=(speed, 0.0, 0.0))
 
 
-def simulator(*bodies, colliders=(), gravity=(0.0, 0.0, 0.0)):
-    return HybridSimulator(
-        bodies, colliders, road=["ground"], gravity=gravity, backend="cpu", brake_after_hit=1.0
-    )
+def simulator(*bodies, colliders=(), gravity=(0.0, 0.0, 0.0), **options):
+    options = {"backend": "cpu", "brake_after_hit": 1.0, **options}
+    return HybridSimulator(bodies, colliders, road=["ground"], gravity=gravity, **options)
 
 
 def run(world, seconds):
@@ -137,12 +137,12 @@ def test_colliders_move_once_a_step_beside_wheels():
     assert world.colliders[1].T_world_box[0, 3] == pytest.approx(2 * STEP * 2.0)
 
 
-def vehicle(category, size, mass, pose, *, name=None, velocity=REST, brake=0.0):
+def vehicle(category, size, mass, pose, *, name=None, velocity=REST, brake=0.0, spacing=0.1):
     """A vehicle of the preset on its wheels, a box of particles from 12 cm above the road on."""
     length, width, height = size
-    particles = box_particles((length, width, height - 0.12), spacing=0.1, density=100.0)
+    particles = box_particles((length, width, height - 0.12), spacing=spacing, density=100.0)
     particles = particles.moved(at(0, 0, 0.06)).with_mass(mass)
-    materials, regions, particles = vehicle_structure(category, particles, spacing=0.1)
+    materials, regions, particles = vehicle_structure(category, particles, spacing=spacing)
     particles = particles.with_centre_height(0.4 * height - height / 2)
     return DeformableBody(
         name or category,
@@ -150,7 +150,7 @@ def vehicle(category, size, mass, pose, *, name=None, velocity=REST, brake=0.0):
         materials,
         regions,
         friction=0.4,
-        cell=0.2,
+        cell=2 * spacing,
         T_world_object=pose,
         velocity=np.array(velocity),
         angular_velocity=np.zeros(3),
@@ -165,6 +165,55 @@ GROUND, GRAVITY = (Plane(name="ground"),), (0.0, 0.0, -9.81)
 def truck_and_cone():
     ahead = body("cone", (0.4, 0.4, 0.7), 3.0, at(5.0, 0.2, 0.35), material=FOAM)
     return vehicle("truck", TRUCK, 2e4, at(0, 0, 1.5), velocity=(8.0, 0.0, 0.0)), ahead
+
+
+def low_car(height: float, fall: float = 0.0):
+    """A car on its wheels whose floor hangs ``height`` [m] above the road, as after a crash."""
+    car = vehicle("car", (3.0, 1.6, 1.2), 1000.0, at(0, 0, 0.6), velocity=(8.0, 0.0, -fall))
+    lowered = car.rest.moved(at(0, 0, height - 0.12))
+    return DeformableBody(
+        "car",
+        lowered,
+        car.materials,
+        car.regions,
+        friction=0.4,
+        cell=0.2,
+        T_world_object=at(0, 0, 0.6),
+        velocity=car.motion.velocity,
+        angular_velocity=np.zeros(3),
+        tyres=car.tyres,
+    )
+
+
+@pytest.mark.parametrize("height", [0.02, -0.02])
+def test_a_floor_that_hangs_low_or_drags_does_not_deform(height):
+    car = low_car(height)
+    world = simulator(car, colliders=GROUND, gravity=GRAVITY)
+    assert run(world, 0.2) == set()
+    assert car.motion.velocity[0] > 5.0
+    floor = car.hull_points()[:, 2].min() - car.spacing / 2
+    assert abs(floor - height) < 0.03
+
+
+def test_a_floor_that_strikes_the_road_deforms():
+    assert run(simulator(low_car(0.02, fall=2.0), colliders=GROUND, gravity=GRAVITY), 0.01)
+
+
+@pytest.mark.slow
+def test_two_cars_cost_seconds():
+    """Two seconds of a crash: eight of two cores."""
+    turned = at(2.5, 0.5, 0.75)
+    turned[:2, :2] *= -1
+    preset, size = preset_of("vehicle"), (4.5, 1.8, 1.5)
+    options = {"spacing": preset.vehicle_spacing}
+    cars = (
+        vehicle("car", size, 1500.0, at(-2.5, 0, 0.75), name="a", velocity=(15.0, 0, 0), **options),
+        vehicle("car", size, 1500.0, turned, name="b", **options),
+    )
+    world = simulator(*cars, colliders=GROUND, gravity=GRAVITY, cfl=preset.cfl)
+    begin = time.process_time()
+    run(world, 2.0)
+    assert time.process_time() - begin < 16.0
 
 
 @pytest.mark.slow

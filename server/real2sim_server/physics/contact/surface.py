@@ -38,6 +38,8 @@ def _half_space_tables() -> Any:
 SURFACE, FLAT_MOMENT = _half_space_tables()
 OPPOSED = F32(0.5)
 """Surfaces are in contact only where the cosine between their normals is beyond this."""
+INSIDE = F32(0.25)
+"""A body whose centroid is this near a node is all around it, and has no normal there [cells]."""
 
 
 @device_function
@@ -72,7 +74,8 @@ def face_score(moment: Any, filled: Any) -> Any:
     index = min(int(scaled), _ENTRIES - 1)
     fraction = scaled - F32(index)
     flat = FLAT_MOMENT[index] + fraction * (FLAT_MOMENT[index + 1] - FLAT_MOMENT[index])
-    likeness = moment / max(flat, F32(1e-3))
+    # More than a face is no face: what is packed has large moments and is filled more than whole.
+    likeness = min(moment / max(flat, F32(1e-3)), ONE)
     return likeness * likeness * moment
 
 

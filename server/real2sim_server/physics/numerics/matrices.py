@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-from .device import HALF, ONE, TINY, ZERO, device_function
+from .device import HALF, ONE, TINY, ZERO, device_function, square_root
 
 POLAR_STEPS = 16
 JACOBI_SWEEPS = 8
@@ -147,10 +146,10 @@ def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
     # Without branches, so that it can be vector code.
     small = abs(pq) < TINY
     theta = HALF * (qq - pp) / (ONE + ZERO * pq if small else pq)
-    t = ONE / (abs(theta) + math.sqrt(theta * theta + ONE))
+    t = ONE / (abs(theta) + square_root(theta * theta + ONE))
     t = -t if theta < ZERO else t
     t = ZERO * t if small else t
-    c = ONE / math.sqrt(t * t + ONE)
+    c = ONE / square_root(t * t + ONE)
     return t, c, t * c
 
 

@@ -12,7 +12,7 @@ from ...scene import Scene
 from ..playback import PlacedObject, PlacedObjects
 from ..presets import ObjectPhysics, preset_of
 from ..rollout import SimulateOptions
-from ..spawn import object_particles
+from ..spawn import object_particles, spaced_for
 from ..structure import VEHICLES
 from .crashes import CRASHES
 from .setup import Experiment, Request, beside, level, others_near, scene_road, viewer
@@ -210,6 +210,6 @@ def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
 
     Tracked boxes are not that exact: particles reaches up to a voxel out of them.
     """
-    preset = preset_of(request.preset)
+    preset = spaced_for(preset_of(request.preset), [subject])
     particles = object_particles(request.scene, subject, preset, request.start_us).positions
     return particles.min(axis=0) - preset.spacing / 2, particles.max(axis=0) + preset.spacing / 2

@@ -9,7 +9,7 @@ from typing import Self
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ...edit import ObjectState
-from ...simulation.masses import default_mass
+from ...simulation.masses import default_mass, yaw_inertia
 from ...simulation.structure import stiffness_of
 from ..driving import vehicle_parameters
 from ..ego.box import REAR_OVERHANG
@@ -53,7 +53,8 @@ class ImpactedObject:
 def object_properties(
     subject: ObjectState, contact: ContactSpec, *, friction: float, size: tuple[float, ...]
 ) -> BodyProperties:
-    """An object as a rigid body: a box of even mass; cars with axles at 0.3 of their length."""
+    """An object as a rigid body: a box, of even mass if it is no vehicle; cars have their axles at
+    0.3 of their length."""
     length, width = size[0], size[1]
     given = subject.physics
     mass = contact.masses.get(subject.object_id, given.mass if given else None)
@@ -62,9 +63,10 @@ def object_properties(
     if given is not None and given.friction is not None:
         friction = given.friction
     rolls = subject.category in ROLLING
+    turns_as = subject.category if contact.residual_crush else ""
     return BodyProperties(
         mass=mass,
-        inertia=mass * (length * length + width * width) / 12,
+        inertia=yaw_inertia(turns_as, mass, size),
         length=length,
         width=width,
         axles=(0.3 * length, 0.3 * length) if rolls else None,

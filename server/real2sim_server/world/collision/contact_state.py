@@ -22,7 +22,8 @@ from .impact import Impact
 from .obstacles import ObstacleGrid
 from .overlaps import EgoContacts, ego_contacts
 from .pulse import Pulse
-from .solver import CollisionStep, solve_collisions
+from .solver import solve_collisions
+from .solver_state import CollisionStep
 from .sweep import StepStart, swept_contacts
 
 WIDEN = 0.3

@@ -105,11 +105,24 @@ def overlap_patch(
         part = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
         double += part
         mx, my = mx + part * (ax + bx - 2 * x0), my + part * (ay + by - 2 * y0)
-    across = [y * nx - x * ny for x, y in shape]
-    width = max(across) - min(across)
+    low, high = span_across(shape, nx, ny)
+    width = high - low
     if double <= 1e-12 or width <= 0.0:
         return None
     return x0 + mx / (3 * double), y0 + my / (3 * double), double / 2 / width, width
+
+
+def overlap_span(
+    first: list[Corner], second: list[Corner], nx: float, ny: float
+) -> tuple[float, float]:
+    """From where to where across a unit normal two overlapping quadrilaterals overlap [m]."""
+    return span_across(_clipped(first, second), nx, ny)
+
+
+def span_across(shape: list[Corner], nx: float, ny: float) -> tuple[float, float]:
+    """From where to where a shape reaches across a unit normal [m]."""
+    across = [y * nx - x * ny for x, y in shape]
+    return min(across), max(across)
 
 
 def corners(body: BodyState, properties: BodyProperties) -> list[Corner]:

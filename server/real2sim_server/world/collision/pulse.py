@@ -4,7 +4,8 @@ While they approach, a force pushes them apart that grows with the depth to whic
 are crushed; once they do not, a part of it remains until the impulse of restitution is given
 (Poisson's hypothesis). So collinear impacts exchange what a sudden impulse would, over the time
 that their masses and structures take. Crush is never given back: who comes again meets what is
-already crushed, which yields no further before as much force acts on it.
+already crushed, which yields no further before as much force acts on it; and two whose boxes still
+overlap when it is over do not push each other until they come nearer than they were then.
 """
 
 from __future__ import annotations
@@ -17,8 +18,12 @@ from .manifold import (
     Body,
     ContactImpulse,
     ContactManifold,
+    Corner,
     contact_impulse,
+    overlap_patch,
+    overlap_span,
     relative_motion,
+    span_across,
 )
 from .rigid_body import BodyState
 
@@ -53,6 +58,7 @@ class Pulse(NamedTuple):
         width: of the contact there [m].
         loading: whether the two still come nearer to each other.
         kept: part of the depth by which they are shorter already [m].
+        settled: depth at which they were when it was over [m].
     """
 
     normal: float
@@ -63,6 +69,11 @@ class Pulse(NamedTuple):
     width: float = 0.0
     loading: bool = True
     kept: float = 0.0
+    settled: float = 0.0
+
+    def has_settled(self, patch: Patch) -> bool:
+        """Whether the impact is over and the two are no deeper in one another than at its end."""
+        return self.over and patch.depth <= self.settled
 
     @property
     def over(self) -> bool:
@@ -80,6 +91,25 @@ def mutual_stiffness(bodies: Bodies, nx: float, ny: float) -> float:
         return own
     other = _face_stiffness(second, nx, ny)
     return own * other / (own + other)
+
+
+def yielding_patch(first: list[Corner], second: list[Corner], nx: float, ny: float) -> Patch | None:
+    """Where two boxes reach into one another, with the middle of what yields there; None where they
+    do not.
+
+    Structure yields beside the contact, too, but not beyond an edge: a place at the edge of a face
+    is pushed back from further inside.
+    """
+    found = overlap_patch(first, second, nx, ny)
+    if found is None:
+        return None
+    patch = Patch(*found)
+    low, high = overlap_span(first, second, nx, ny)
+    edges = [span_across(shape, nx, ny) for shape in (first, second)]
+    begin = max(low - SPREAD / 2, *(edge[0] for edge in edges))
+    end = min(high + SPREAD / 2, *(edge[1] for edge in edges))
+    aside = (begin + end - low - high) / 2
+    return patch._replace(x=patch.x - aside * ny, y=patch.y + aside * nx)
 
 
 def contact_width(bodies: Bodies, width: float, nx: float, ny: float) -> float:
@@ -120,7 +150,7 @@ def advance_pulse(
     if loading < push:
         pulse = pulse._replace(compression=pulse.compression + loading, loading=True)
         return pulse, motion.limited(loading, friction)
-    pulse = pulse._replace(loading=False)
+    pulse = pulse._replace(loading=False, settled=patch.depth)
     if pulse.restored == 0.0:
         pulse = pulse._replace(compression=pulse.compression + push)
     left = pulse.restitution * pulse.compression - pulse.restored

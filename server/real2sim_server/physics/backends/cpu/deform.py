@@ -70,8 +70,11 @@ SWEEPS = 4
 """Of Jacobi's method in a batch; what has not converged then goes one by one."""
 FLOWN = TWO
 """Marks lanes in _OFF whose flow has been found."""
-FEW = 4
+FEW = 2
 """So many lanes that flow cost less one by one than all of a batch together."""
+
+# Beyond what LLVM takes over by itself, and what is called is no vector code.
+sweep: Any = inner(forceinline=True)(jacobi_sweep)
 
 
 @inner()
@@ -275,7 +278,7 @@ def flow_batch(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
             s[(_VECTORS + c) * BATCH + lane] = ONE if c % 4 == 0 else ZERO
     for _ in range(SWEEPS):
         for lane in range(BATCH):
-            b, v = jacobi_sweep(lane_symmetric(s, lane), lane_matrix(s, _VECTORS, lane))
+            b, v = sweep(lane_symmetric(s, lane), lane_matrix(s, _VECTORS, lane))
             for c in range(6):
                 s[(_SYMMETRIC + c) * BATCH + lane] = b[c]
             for c in range(9):

@@ -16,7 +16,7 @@ from ...colliders import Box, Collider, HeightField, Plane
 from ...constitutive import material_row
 from ...contact.node import ON_FACE, THIN_MARGIN
 from ...contact.particle import MISSES, SINK, TOUCHING
-from ...contact.surface import FLAT_MOMENT, OPPOSED, STICKS, SURFACE
+from ...contact.surface import FLAT_MOMENT, INSIDE, OPPOSED, STICKS, SURFACE
 from ...errors import ColliderError
 from ..base import is_thin
 from .stress import stress_update
@@ -231,9 +231,9 @@ def _resolve_body_contact(
     for a in range(len(fields)):
         for b in range(a + 1, len(fields)):
             ma, mb = mass[a], mass[b]
-            n, opposed = _normal(moment[a] / params.dx**3, moment[b] / params.dx**3)
+            n, facing = _normal(moment[a] / params.dx**3, moment[b] / params.dx**3)
             gap = surface_offset(_depth(moment[a], -n)) + surface_offset(_depth(moment[b], n))
-            closed = (ma > 0) & (mb > 0) & opposed & (gap <= 0)
+            closed = (ma > 0) & (mb > 0) & facing & (gap <= 0)
             relative = fields[b] - fields[a]
             friction = (params.friction[a] * params.friction[b]).sqrt()
             change = coulomb(relative, n, friction, separable=True) - relative
@@ -250,19 +250,24 @@ def _resolve_body_contact(
 
 
 def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Contact normals [U, 3] from a to b, and where [U] the surfaces face each other."""
+    """Contact normals [U, 3] from a to b, and where [U] the surfaces face each other or one body is
+    all around."""
     size_a, size_b = moment_a[:, :3].norm(dim=-1), moment_b[:, :3].norm(dim=-1)
     out_of_a = -moment_a[:, :3] / size_a.clamp(min=1e-30)[:, None]
     into_b = moment_b[:, :3] / size_b.clamp(min=1e-30)[:, None]
     from_a = _face_score(size_a, moment_a[:, 3]) > _face_score(size_b, moment_b[:, 3])
     n = torch.where(from_a[:, None], out_of_a, into_b)
-    return n, (out_of_a * into_b).sum(-1) >= float(OPPOSED)
+    inside_a, inside_b = (
+        size <= float(INSIDE) * moment[:, 3]
+        for size, moment in ((size_a, moment_a), (size_b, moment_b))
+    )
+    return n, ((out_of_a * into_b).sum(-1) >= float(OPPOSED)) | inside_a | inside_b
 
 
 def _face_score(size: Tensor, fraction: Tensor) -> Tensor:
     """How well first moments tell normals; see ``contact.surface``."""
     flat = _interpolate(FLAT_TABLE, fraction).clamp(min=1e-3)
-    return (size / flat) ** 2 * size
+    return (size / flat).clamp(max=1) ** 2 * size
 
 
 def _resolve_collider_contact(
