@@ -30,8 +30,9 @@ def film(
     """Draw film.mp4 and strip.png of a simulation without simulating it again."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
+    from ..simulation.ego import EGO, with_ego
     from ..simulation.experiments import FilmPlan, views, write_film
-    from ..simulation.playback import Playback
+    from ..simulation.playback import PlacedObjects, Playback
     from ..simulation.result import SimulationResult
 
     names = {"near": ["near"], "scene": ["scene"], "both": ["scene", "near"]}
@@ -40,7 +41,10 @@ def film(
     backend = chosen_backend(backend, device)
     plan, result = FilmPlan.load(run), SimulationResult.load(run / "simulation")
     loaded = load_scene(scene)
-    playback = Playback(loaded, ScenarioState.of(loaded), result)
+    state: PlacedObjects = ScenarioState.of(loaded)
+    if EGO in result.objects:
+        loaded, state = with_ego(loaded, state)
+    playback = Playback(loaded, state, result)
     folder = run if out is None else out
     folder.mkdir(parents=True, exist_ok=True)
     with staged_progress() as report:

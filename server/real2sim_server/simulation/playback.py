@@ -115,7 +115,8 @@ class Playback:
                 continue
             cloud = fragment_cloud(broken, time_s, self.scene.ground.height_at)
             if cloud is not None:
-                found.append(_placed(cloud, None, subject))
+                here = cloud.to(self.scene.background.device)
+                found.append(_placed(here, None, subject))
         return found
 
     def time_us(self, frame: int) -> int:

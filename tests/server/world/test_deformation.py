@@ -193,6 +193,7 @@ def test_what_broke_lies_on_the_road_unless_the_episode_is_from_before(crash_sce
     assert len(drawn[True]) == len(drawn[False]) + 1
     fragments = drawn[True][-1]
     assert fragments.instance_id == drawn[True][1].instance_id
+    assert fragments.semantic == drawn[True][1].semantic
     means = fragments.cloud.means.numpy()
     assert (means[:, 2] > scene.ground.height_at(means[:, :2])).all()
     assert bits(drawn[True][1].cloud) != bits(drawn[False][1].cloud)

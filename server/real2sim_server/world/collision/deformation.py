@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from real2sim_proto.semantics import semantic_class
+
 from ...edit import ObjectState
 from ...edit.compose import cloud_of
 from ...geometry.rotation import Float, yaw_quaternion
@@ -152,7 +154,9 @@ class DeformationTracker:
             cloud = fragment_cloud(damage.broken, t_us * 1e-6, self.scene.ground.height_at)
             if cloud is not None:
                 cloud = cloud.to(self.scene.background.device)
-                found.append(Instance(cloud, None, deformed.origin.subject.instance_id))
+                subject = deformed.origin.subject
+                semantic = semantic_class(subject.category)
+                found.append(Instance(cloud, None, subject.instance_id, semantic=semantic))
         return found
 
     def _before_impact(
