@@ -111,7 +111,7 @@ class BatchObservation:
     Examples:
         >>> client = real2sim.connect()
         >>> with client.batch(scene="street", worlds=2) as batch:
-        ...     obs = batch.reset(seeds=[1, 2], action="control")
+        ...     obs = batch.reset(sensors=["front"], seeds=[1, 2], action="control")
         >>> obs.step.tolist(), obs.route.shape
         ([0, 0], (2, 20, 2))
     """

@@ -166,7 +166,8 @@ def test_a_step_that_finds_the_engine_busy_may_be_asked_for_again(site, planner,
         raise QueueFullError("64 jobs wait")
 
     with monkeypatch.context() as patch:
-        patch.setattr(site.worker.engine, "call", busy)
+        for call in ("call", "call_together"):
+            patch.setattr(site.worker.engine, call, busy)
         answer = planner.act(0)
         assert (answer["code"], answer["retryable"]) == ("QUEUE_FULL", True)
     assert planner.act(0)["step"] == 1
