@@ -97,7 +97,7 @@ def ego_cloud(size: tuple[float, float, float]) -> GaussianCloud:
     return GaussianCloud(
         means=torch.from_numpy(points),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        scales=torch.full((n, 3), 0.45 * STEP),
+        scales=torch.full((n, 3), 0.65 * STEP),
         opacities=torch.full((n,), 0.95),
         sh=torch.from_numpy((colours - 0.5) / SH_DC)[:, None],
     )
