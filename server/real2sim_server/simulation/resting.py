@@ -266,9 +266,13 @@ def _closing(touch: Touch) -> float:
 
 
 def _strikes(touch: Touch) -> bool:
-    """Whether this is an impact: too fast for rigid contact, or in the midst of being stopped."""
-    _, normal, _, _ = touch.place()
-    return _closing(touch) > GENTLE or float(touch.body.acceleration @ normal) > STEADY
+    """Whether this is an impact: too fast for rigid contact, or in the midst of being stopped.
+
+    Bodies that carry each other jolt each other as they settle, so that only colliders stop.
+    """
+    if _closing(touch) > GENTLE or isinstance(touch.other, DeformableBody):
+        return _closing(touch) > GENTLE
+    return float(touch.body.acceleration @ touch.place()[1]) > STEADY
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,6 +225,7 @@ OFFSET: dict[str, tuple[Start, Start]] = {
 DELTA_V, YAW = 0.1, 0.2
 """By how much the two may differ in velocity and in yaw rate."""
 OTHERWISE = {
+    "head on, 50 % offset": (DELTA_V, 0.25),
     "oblique, 60 degrees": (0.2, 0.6),
     "T-bone, front": (0.14, YAW),
     "T-bone, rear": (0.14, YAW),
