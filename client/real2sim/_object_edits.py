@@ -12,11 +12,15 @@ from real2sim_proto.base import Pose, Track
 from real2sim_proto.operations import (
     AddCollider,
     BoxShape,
+    CapsuleShape,
+    ColliderShape,
+    CylinderShape,
     Delete,
     Duplicate,
     EraseRegion,
     GroundShape,
     Insert,
+    MeshShape,
     Operation,
     PlaneShape,
     Replace,
@@ -192,22 +196,41 @@ class ObjectEdits(Generic[R]):
         *,
         mass: float | None = None,
         material: str | None = None,
+        young: float | None = None,
+        poisson: float | None = None,
+        density: float | None = None,
+        yield_stress: float | None = None,
         friction: float | None = None,
         restitution: float | None = None,
+        grid: int | None = None,
     ) -> R:
         """Say what it is for the physics; what is left out goes back to its default.
 
         Args:
             mass: [kg].
             material: ``rigid``, ``metal``, ``foam``, ``rubber``, ``jelly``, ``sand`` or ``snow``.
+            young, poisson: E [Pa] and nu of one material throughout, ``jelly`` unless named.
+            density: rho [kg/m^3] of what it is filled with; instead of ``mass``.
+            yield_stress: [Pa]; of ``metal`` (unless named) or ``foam``.
             friction: Coulomb coefficient.
             restitution: 0 to 1, fraction of the approach speed that is left after a bounce.
+            grid: cells along twice its longest edge, as the paper counts them.
 
         Examples:
             >>> result = car.set_physics(material="metal", mass=1200.0, friction=0.6)
+            >>> result = car.set_physics(young=2e6, poisson=0.4, density=200.0, grid=50)
         """
         return self._make(
-            SetPhysics, mass=mass, material=material, friction=friction, restitution=restitution
+            SetPhysics,
+            mass=mass,
+            material=material,
+            young=young,
+            poisson=poisson,
+            density=density,
+            yield_stress=yield_stress,
+            friction=friction,
+            restitution=restitution,
+            grid=grid,
         )
 
     def set_velocity(
@@ -303,6 +326,77 @@ class ScenarioEdits(Generic[R]):
         shape = checked(BoxShape, position=position, quaternion=quaternion, size=size)
         return self._collider(shape, friction, collider_id)
 
+    def add_cylinder(
+        self,
+        *,
+        position: Vector,
+        radius: float,
+        height: float,
+        quaternion: Quaternion = UPRIGHT,
+        friction: float | None = None,
+        collider_id: str | None = None,
+    ) -> R:
+        """Add an invisible post or drum about its own z axis, for the physics.
+
+        Examples:
+            >>> result = scenario.add_cylinder(position=(20, 0, 1.5), radius=0.1, height=3.0)
+        """
+        shape = checked(
+            CylinderShape, position=position, quaternion=quaternion, radius=radius, height=height
+        )
+        return self._collider(shape, friction, collider_id)
+
+    def add_capsule(
+        self,
+        *,
+        position: Vector,
+        radius: float,
+        length: float = 0.0,
+        quaternion: Quaternion = UPRIGHT,
+        friction: float | None = None,
+        collider_id: str | None = None,
+    ) -> R:
+        """Add all within ``radius`` of a line along its own z axis, for the physics; or a ball.
+
+        Examples:
+            >>> result = scenario.add_capsule(position=(20, 0, 0.5), radius=0.5)
+        """
+        shape = checked(
+            CapsuleShape, position=position, quaternion=quaternion, radius=radius, length=length
+        )
+        return self._collider(shape, friction, collider_id)
+
+    def add_mesh(
+        self,
+        *,
+        vertices: Sequence[Vector],
+        triangles: Sequence[tuple[int, int, int]],
+        thickness: float | None = None,
+        position: Vector = (0.0, 0.0, 0.0),
+        quaternion: Quaternion = UPRIGHT,
+        friction: float | None = None,
+        collider_id: str | None = None,
+    ) -> R:
+        """Add a closed body of triangles, or a sheet with a ``thickness`` [m], for the physics.
+
+        Triangles list vertices counter-clockwise seen from outside.
+
+        Examples:
+            >>> ramp = [(20, -2, 0), (20, 2, 0), (26, -2, 1), (26, 2, 1)]
+            >>> result = scenario.add_mesh(
+            ...     vertices=ramp, triangles=[(0, 2, 3), (0, 3, 1)], thickness=0.1
+            ... )
+        """
+        shape = checked(
+            MeshShape,
+            position=position,
+            quaternion=quaternion,
+            vertices=list(vertices),
+            triangles=list(triangles),
+            thickness=thickness,
+        )
+        return self._collider(shape, friction, collider_id)
+
     def add_plane(
         self,
         *,
@@ -368,7 +462,7 @@ class ScenarioEdits(Generic[R]):
 
     def _collider(
         self,
-        shape: PlaneShape | BoxShape | GroundShape,
+        shape: ColliderShape,
         friction: float | None,
         collider_id: str | None,
     ) -> R:

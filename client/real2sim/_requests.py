@@ -12,7 +12,7 @@ from typing import Any
 
 from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.episode import SensorSpec
-from real2sim_proto.jobs import ExportRequest, JobInfo, JobList, SimulateRequest
+from real2sim_proto.jobs import CalibrateRequest, ExportRequest, JobInfo, JobList, SimulateRequest
 from real2sim_proto.operations import Operation
 from real2sim_proto.scenarios import (
     History,
@@ -178,6 +178,12 @@ def import_scenario(document: ScenarioDocument) -> Call[ScenarioInfo]:
 def simulate(scenario_id: str, body: SimulateRequest) -> Call[JobInfo]:
     return Call(
         post(f"{_scenario(scenario_id)}/simulate", body, long_timeout=True), model_of(JobInfo)
+    )
+
+
+def calibrate(scenario_id: str, body: CalibrateRequest) -> Call[JobInfo]:
+    return Call(
+        post(f"{_scenario(scenario_id)}/calibrate", body, long_timeout=True), model_of(JobInfo)
     )
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .base import Identifier, Microseconds, Model, one_of
+from .base import Identifier, Microseconds, Model, Quaternion, Vector3, one_of
 from .errors import Problem
+from .operations import PhysicsValues, Size3
 from .scenes import Reply
 
 
@@ -27,7 +28,7 @@ class JobState(StrEnum):
 OVER = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED})
 """States that last."""
 
-JobKind = Literal["load_scene", "simulate", "export"]
+JobKind = Literal["load_scene", "simulate", "calibrate", "export"]
 
 
 class JobFile(Reply):
@@ -89,10 +90,116 @@ class SimulateRequest(Model):
         description="whether walls, poles, trees and all else that stands in the background "
         "stops what hits it; default: true. figures.background of the result says what was taken",
     )
-    preset: Literal["vehicle", "paper"] = Field(
-        default="vehicle", description="how objects become bodies: crumpling cars, or soft ones"
+    preset: Literal["vehicle", "paper"] | None = Field(
+        default=None,
+        description="how objects become bodies: crumpling cars (default), or soft ones (default "
+        "of the paper's experiments)",
+    )
+    physics: dict[Identifier | Literal["*"], PhysicsValues] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="by object, for this rollout alone: what is given goes before set_physics; "
+        "'*' stands for all that take part",
+    )
+    gravity: Vector3 | None = Field(
+        default=None, description="[m/s^2]; default: (0, 0, -9.81), none in the experiment pair"
+    )
+    max_particles: int | None = Field(
+        default=None, ge=100, le=4_000_000, description="of all bodies together; default: 400,000"
+    )
+    experiment: Literal["wall", "pair", "drop", "frontal", "t_bone", "pole", "roof"] | None = Field(
+        default=None,
+        description="of the paper: one of objects against a wall, the first half of objects into "
+        "the others, or objects raised and let fall; or a crash test. It brings its own colliders "
+        "and duration",
+    )
+    speed: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        default=None, description="of an experiment [m/s]; default: the paper's"
     )
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+
+    @model_validator(mode="after")
+    def _speed_is_an_experiments(self) -> SimulateRequest:
+        if self.speed is not None and self.experiment is None:
+            raise ValueError("speed is of an experiment; give an object one with set_velocity")
+        return self
+
+
+Sigma = Annotated[float, Field(gt=0, le=100)]
+
+
+class ObservedBox(Model):
+    """Where a tracker saw an object."""
+
+    t_us: Microseconds
+    position: Vector3 = Field(description="of the box centre, world [m]")
+    quaternion: Quaternion | None = Field(default=None, description="default: not known")
+    size: Size3 | None = Field(
+        default=None, description="of the box as it was seen then [m]; default: not known"
+    )
+
+
+class SeenPoint(Model):
+    """Where a marked point was seen."""
+
+    t_us: Microseconds
+    position: Vector3 = Field(description="world [m]")
+
+
+class ObservedPoint(Model):
+    """A point of an object that was followed; left out at times when it was not seen."""
+
+    place: Vector3 = Field(description="on the object before anything happens, object frame [m]")
+    seen: list[SeenPoint] = Field(min_length=1, max_length=1000)
+
+
+class ObservedImage(Model):
+    """A picture of a camera of the scene, from where the recording vehicle was."""
+
+    t_us: Microseconds
+    camera: Identifier
+    image: str = Field(max_length=2_000_000, description="PNG or JPEG as base64; of any size")
+
+
+class Observations(Model):
+    """What was seen of an object; all of it is taken together."""
+
+    recorded: bool = Field(
+        default=False, description="the boxes of its own recorded track, in the simulated span"
+    )
+    boxes: list[ObservedBox] = Field(default_factory=list, max_length=2000)
+    points: list[ObservedPoint] = Field(default_factory=list, max_length=256)
+    images: list[ObservedImage] = Field(default_factory=list, max_length=64)
+    position_sigma: Sigma = Field(default=0.05, description="of boxes [m]")
+    heading_sigma: Sigma = Field(default=0.02, description="of boxes [rad]")
+    size_sigma: Sigma = Field(default=0.05, description="of boxes [m]")
+    point_sigma: Sigma = Field(default=0.02, description="of points [m]")
+    image_sigma: Sigma = Field(default=0.05, description="of pixels, as a fraction of white")
+
+    @model_validator(mode="after")
+    def _saw_something(self) -> Observations:
+        if not (self.recorded or self.boxes or self.points or self.images):
+            raise ValueError("nothing was observed: give recorded, boxes, points or images")
+        return self
+
+
+CalibratedName = Literal["stiffness", "yield_stress", "viscosity", "friction", "speed"]
+
+
+class CalibrateRequest(Model):
+    """Body of `POST /v1/scenarios/{id}/calibrate`: values of an object from what was seen of it."""
+
+    object_id: Identifier
+    parameters: list[CalibratedName] = Field(
+        min_length=1, max_length=5, description="to be found, as factors on what is given"
+    )
+    observations: Observations
+    simulate: SimulateRequest = Field(
+        default_factory=SimulateRequest,
+        description="what is simulated, with initial values; `objects` is the object alone unless "
+        "given, and the end follows from the observations",
+    )
+    steps: int = Field(default=12, ge=1, le=60, description="of the search at most")
 
 
 class ExportRequest(Model):

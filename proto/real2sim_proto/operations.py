@@ -39,6 +39,7 @@ Size3 = tuple[
     Annotated[float, Field(gt=0, le=1000.0)],
     Annotated[float, Field(gt=0, le=1000.0)],
 ]
+Length = Annotated[float, Field(ge=1e-4, le=1000.0)]
 Friction = Annotated[float, Field(ge=0, le=10.0)]
 Speed = Annotated[float, Field(ge=-200.0, le=200.0)]
 Vector3Speed = tuple[Speed, Speed, Speed]
@@ -267,19 +268,63 @@ class EraseRegion(Model):
     size: Size3 = Field(description="[m]")
 
 
-class SetPhysics(Model):
-    """Say what an object is for the physics. What is left out goes back to its default."""
+YIELDING: tuple[MaterialName, ...] = ("metal", "foam")
+"""Materials that have a yield stress."""
 
-    op: Literal["set_physics"] = "set_physics"
-    object_id: ObjectId
+
+class PhysicsValues(Model):
+    """What an object is for the physics; what is left out has its default.
+
+    `young`, `poisson`, `density` or `yield_stress` make it of one material throughout, instead of
+    what its category is built of: `material` with these values in place of its own.
+    """
+
     mass: Annotated[float, Field(gt=0, le=1e7)] | None = Field(
-        default=None, description="[kg]; default: by category and size"
+        default=None, description="[kg]; default: by category and size, or by density"
     )
-    material: MaterialName | None = Field(default=None, description="default: by category")
+    material: MaterialName | None = Field(
+        default=None,
+        description="default: by category; jelly where values of a material are given, metal where "
+        "a yield stress is among them",
+    )
+    young: Annotated[float, Field(gt=0, le=1e12)] | None = Field(
+        default=None, description="Young's modulus E [Pa]"
+    )
+    poisson: Annotated[float, Field(gt=-1, lt=0.5)] | None = Field(
+        default=None, description="Poisson's ratio nu; 0.5 would be incompressible, take 0.45"
+    )
+    density: Annotated[float, Field(ge=1, le=3e4)] | None = Field(
+        default=None, description="rho [kg/m^3] of what it is filled with; instead of mass"
+    )
+    yield_stress: Annotated[float, Field(gt=0, le=1e12)] | None = Field(
+        default=None, description="[Pa]; of metal and foam"
+    )
     friction: Friction | None = Field(default=None, description="Coulomb coefficient")
     restitution: Annotated[float, Field(ge=0, le=1)] | None = Field(
         default=None, description="fraction of the approach speed that is left after a bounce"
     )
+    grid: Annotated[int, Field(ge=16, le=1000)] | None = Field(
+        default=None,
+        description="cells along twice its longest edge, as the paper counts them (50, 200); all "
+        "that a simulation moves share the finest cells asked for; default: cells of 0.2 m",
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> PhysicsValues:
+        if self.mass is not None and self.density is not None:
+            raise ValueError("give mass or density, not both: one follows from the other")
+        if self.yield_stress is not None and self.material not in (None, *YIELDING):
+            raise ValueError(
+                f"material {self.material!r} has no yield_stress; {' and '.join(YIELDING)} have one"
+            )
+        return self
+
+
+class SetPhysics(PhysicsValues):
+    """Say what an object is for the physics. What is left out goes back to its default."""
+
+    op: Literal["set_physics"] = "set_physics"
+    object_id: ObjectId
 
 
 class SetVelocity(Model):
@@ -314,6 +359,48 @@ class BoxShape(Model):
     size: Size3 = Field(description="[m]")
 
 
+class CylinderShape(Model):
+    """A solid post or drum with flat ends; its axis is the z axis of its pose."""
+
+    kind: Literal["cylinder"] = "cylinder"
+    position: Vector3 = Field(description="centre [m]")
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    radius: Length = Field(description="[m]")
+    height: Length = Field(description="along its axis [m]")
+
+
+class CapsuleShape(Model):
+    """All within a radius of a line along the z axis of its pose; a ball where length is 0."""
+
+    kind: Literal["capsule"] = "capsule"
+    position: Vector3 = Field(description="middle of the line [m]")
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    radius: Length = Field(description="[m]")
+    length: Annotated[float, Field(ge=0, le=1000.0)] = Field(
+        default=0.0, description="of the line, without the round ends [m]"
+    )
+
+
+VertexIndex = Annotated[int, Field(ge=0, lt=4096)]
+
+
+class MeshShape(Model):
+    """A body of triangles; or a sheet of them with a thickness."""
+
+    kind: Literal["mesh"] = "mesh"
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="of its origin [m]")
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    vertices: list[Vector3] = Field(min_length=3, max_length=4096, description="in its frame [m]")
+    triangles: list[tuple[VertexIndex, VertexIndex, VertexIndex]] = Field(
+        min_length=1,
+        max_length=8192,
+        description="indices of vertices, counter-clockwise seen from outside",
+    )
+    thickness: Length | None = Field(
+        default=None, description="of a sheet that is not closed [m]; closed without it"
+    )
+
+
 class GroundShape(Model):
     """The recorded ground, moved up or down."""
 
@@ -321,12 +408,18 @@ class GroundShape(Model):
     offset: Metres = Field(default=0.0, description="[m]")
 
 
+ColliderShape = Annotated[
+    PlaneShape | BoxShape | CylinderShape | CapsuleShape | MeshShape | GroundShape,
+    Field(discriminator="kind"),
+]
+
+
 class AddCollider(Model):
     """Add something invisible that does not yield, for the physics."""
 
     op: Literal["add_collider"] = "add_collider"
     collider_id: Identifier | None = Field(default=None, description="default: collider_<n>")
-    shape: Annotated[PlaneShape | BoxShape | GroundShape, Field(discriminator="kind")]
+    shape: ColliderShape
     friction: Friction | None = Field(default=None, description="default: that of what touches it")
 
 

@@ -71,6 +71,7 @@ MODELS: dict[str, type[BaseModel]] = {
         jobs.JobInfo,
         jobs.JobList,
         jobs.SimulateRequest,
+        jobs.CalibrateRequest,
         jobs.ExportRequest,
         scenarios.ScenarioCreate,
         scenarios.ScenarioFork,

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from real2sim_proto.jobs import SimulateRequest
-from real2sim_proto.operations import Operation
+from real2sim_proto.jobs import CalibrateRequest, Observations, SimulateRequest
+from real2sim_proto.operations import Operation, PhysicsValues
 from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
 from real2sim_proto.scenes import ObjectInfo
 
@@ -203,7 +203,12 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
         end_us: int | None = None,
         frame_us: int = 50_000,
         objects: Sequence[str] | None = None,
-        preset: str = "vehicle",
+        preset: str | None = None,
+        physics: Mapping[str, Mapping[str, Any] | PhysicsValues] | None = None,
+        gravity: tuple[float, float, float] | None = None,
+        max_particles: int | None = None,
+        experiment: str | None = None,
+        speed: float | None = None,
         backend: str = "auto",
         background: bool | None = None,
     ) -> Job:
@@ -214,7 +219,14 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             frame_us: from one kept frame to the next.
             objects: what the physics moves; default: what has a velocity or physics of its own.
                 ``ego`` is the recording vehicle.
-            preset: how objects become bodies: ``vehicle`` or ``paper``.
+            preset: how objects become bodies: ``vehicle`` (default) or ``paper`` (default of the
+                paper's experiments).
+            physics: by object, or ``"*"`` for all: values as in ``set_physics``, for this rollout.
+            gravity: [m/s^2]; default: 9.81 downwards.
+            max_particles: of all bodies together.
+            experiment: ``wall``, ``pair``, ``drop`` of the paper, ``frontal``, ``t_bone``, ``pole``
+                or ``roof``.
+            speed: of an experiment [m/s].
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
             background: whether walls, poles and trees of the scene stop what hits them; default:
                 true. The job's ``figures.background`` says which.
@@ -238,10 +250,57 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             frame_us=frame_us,
             objects=None if objects is None else list(objects),
             preset=preset,
+            physics=dict(physics or {}),
+            gravity=gravity,
+            max_particles=max_particles,
+            experiment=experiment,
+            speed=speed,
             backend=backend,
             background=background,
         )
         info = self._transport.send(_requests.simulate(self.scenario_id, body))
+        return Job(self._transport, info)
+
+    def calibrate(
+        self,
+        object_id: str,
+        *,
+        parameters: Sequence[str],
+        observations: Mapping[str, Any] | Observations,
+        simulate: Mapping[str, Any] | SimulateRequest | None = None,
+        steps: int = 12,
+    ) -> Job:
+        """Start to find values of an object with which physics shows what was seen of it.
+
+        Args:
+            object_id: whose values are found.
+            parameters: out of ``stiffness``, ``yield_stress``, ``viscosity``, ``friction`` and
+                ``speed``: factors on what it is given.
+            observations: ``boxes``, ``points``, ``images``, or ``recorded`` for its own track.
+            simulate: what is simulated, as of :meth:`simulate`, with initial values.
+            steps: of the search at most.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> places = [{"t_us": t, "position": (20.0, 0.0, 0.8)} for t in (100_000, 200_000)]
+            >>> job = scenario.calibrate(
+            ...     "car_red", parameters=["speed"], observations={"boxes": places}
+            ... )
+            >>> job.info.kind
+            'calibrate'
+            >>> job = job.cancel()
+        """
+        body = checked(
+            CalibrateRequest,
+            object_id=object_id,
+            parameters=list(parameters),
+            observations=observations,
+            simulate=simulate or {},
+            steps=steps,
+        )
+        info = self._transport.send(_requests.calibrate(self.scenario_id, body))
         return Job(self._transport, info)
 
     def fork(self, *, name: str | None = None, revision: int | None = None) -> Scenario:

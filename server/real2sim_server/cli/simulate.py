@@ -13,9 +13,12 @@ from .command import command
 from .options import JsonFile, SceneBundle
 
 if TYPE_CHECKING:
+    from real2sim_proto.operations import PhysicsValues
+
     from ..scene import Scene
     from ..simulation.experiments import Experiment
     from ..simulation.playback import PlacedObjects
+    from ..simulation.presets import ObjectPhysics
     from ..simulation.result import SimulationResult
 
 
@@ -27,6 +30,18 @@ def simulate(
     experiment: Annotated[
         str | None,
         typer.Option(help="Of the paper: wall, pair, drop; crashes: frontal, t_bone, pole, roof."),
+    ] = None,
+    physics: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--physics",
+            help="[OBJECT:]NAME=VALUE,..., e.g. young=2e6,poisson=0.4,density=200,grid=50 for all, "
+            "car_3:friction=0.2 for one; repeat it. Names: mass, material, young, poisson, "
+            "density, yield_stress, friction, restitution, grid.",
+        ),
+    ] = None,
+    gravity: Annotated[
+        float | None, typer.Option(min=0, max=100, help="Downwards [m/s^2].")
     ] = None,
     preset: Annotated[
         str | None, typer.Option(help="paper (soft) or vehicle (kilograms, crush, tyres).")
@@ -61,16 +76,32 @@ def simulate(
     from ..simulation.playback import Playback
     from ..simulation.rollout import simulate
 
+    values = values_of(physics or [])
     loaded = load_scene(scene)
     state: PlacedObjects = ScenarioState.of(loaded)
     taking_part = tuple(objects or ())
     if EGO in taking_part:
         loaded, state = with_ego(loaded, state)
     if experiment is None:
-        setup = _continue_driving(loaded, state, taking_part, frame, preset=preset or "vehicle")
+        setup = continue_driving(loaded, state, taking_part, frame, preset=preset or "vehicle")
     else:
-        setup = set_up(experiment, loaded, state, preset=preset, speed=speed, objects=taking_part)
-    options = replace(setup.options, backend=backend, background=background and not experiment)
+        setup = set_up(
+            experiment,
+            loaded,
+            state,
+            preset=preset,
+            speed=speed,
+            objects=taking_part,
+            grids=[v.grid for v in values.values() if v.grid is not None],
+        )
+    options = replace(
+        setup.options,
+        backend=backend,
+        background=background and not experiment,
+        objects=changed(setup, values),
+    )
+    if gravity is not None:
+        options = replace(options, gravity=(0.0, 0.0, -gravity))
     if duration is not None:
         options = replace(options, duration=duration)
     if max_particles is not None:
@@ -102,7 +133,53 @@ def simulate(
     write_json(json, figures)
 
 
-def _continue_driving(
+def values_of(given: list[str]) -> dict[str, PhysicsValues]:
+    """What is given for each object, and for all as "*"."""
+    from pydantic import ValidationError
+
+    from real2sim_proto.operations import PhysicsValues
+
+    fields: dict[str, dict[str, str]] = {}
+    for text in given:
+        subject, colon, pairs = text.partition(":")
+        own = fields.setdefault(subject if colon else "*", {})
+        for pair in (pairs if colon else text).split(","):
+            name, equals, value = pair.partition("=")
+            if not equals or name.strip() not in PhysicsValues.model_fields:
+                allowed = ", ".join(PhysicsValues.model_fields)
+                raise CommandError(
+                    f"--physics {text}: {pair.strip()!r} is no NAME=VALUE with a name out of "
+                    f"{allowed}"
+                )
+            own[name.strip()] = value.strip()
+    values = {}
+    for subject, own in fields.items():
+        try:
+            values[subject] = PhysicsValues.model_validate(own, strict=False)
+        except ValidationError as problem:
+            first = problem.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise CommandError(f"--physics {where or 'values'}: {first['msg']}") from problem
+    return values
+
+
+def changed(setup: Experiment, values: dict[str, PhysicsValues]) -> dict[str, ObjectPhysics]:
+    """What takes part, with what was given for all and for each."""
+    from ..simulation.values import with_values
+
+    objects = setup.options.objects
+    unknown = sorted(values.keys() - objects.keys() - {"*"})
+    if unknown:
+        raise CommandError(
+            f"--physics is given for {unknown[0]!r}, which takes no part; taking part: "
+            f"{', '.join(objects)}"
+        )
+    return {
+        name: with_values(own, values.get("*"), values.get(name)) for name, own in objects.items()
+    }
+
+
+def continue_driving(
     scene: Scene, state: PlacedObjects, objects: tuple[str, ...], frame: int, *, preset: str
 ) -> Experiment:
     """Everything named goes on from where and how fast it was driving."""

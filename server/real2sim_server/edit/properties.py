@@ -9,11 +9,14 @@ from real2sim_proto.operations import (
     AddCollider,
     Delete,
     EraseRegion,
+    MeshShape,
     SetPhysics,
     SetTime,
     SetVelocity,
 )
 
+from ..physics.errors import ColliderError
+from ..physics.triangle_mesh import TriangleSurface
 from .operation import (
     AppliedOperation,
     invalid_operation,
@@ -64,6 +67,16 @@ def erase_region(state: ScenarioState, operation: EraseRegion) -> AppliedOperati
 @operation(AddCollider)
 def add_collider(state: ScenarioState, operation: AddCollider) -> AppliedOperation:
     """Add what does not yield."""
+    if isinstance(operation.shape, MeshShape):
+        mesh = operation.shape
+        try:
+            TriangleSurface(mesh.vertices, mesh.triangles, mesh.thickness)
+        except ColliderError as problem:
+            raise invalid_operation(
+                str(problem),
+                hint="triangles list vertices counter-clockwise seen from outside; a sheet needs a "
+                "thickness",
+            ) from problem
     collider_id = new_id(state, operation.collider_id, "collider_")
     named = operation.model_copy(update={"collider_id": collider_id})
     colliders = MappingProxyType(dict(state.colliders) | {collider_id: named})

@@ -2,7 +2,7 @@
 
 from .body import Body
 from .calibration import Calibration, calibrate
-from .colliders import Box, Collider, HeightField, Plane
+from .colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid
 from .errors import (
     ColliderError,
     MaterialError,
@@ -15,15 +15,18 @@ from .materials import FixedCorotated, Foam, Material, Metal, NearRigid, NeoHook
 from .particles import Particles, ball_particles, box_particles
 from .restitution import RestitutionFit, fit_restitution
 from .solver import BodyState, ContactTotals, Energies, Solver, SolverOptions, StepReport
+from .triangle_mesh import TriangleMesh, TriangleSurface
 
 __all__ = [
     "Body",
     "BodyState",
     "Box",
     "Calibration",
+    "Capsule",
     "Collider",
     "ColliderError",
     "ContactTotals",
+    "Cylinder",
     "Energies",
     "FixedCorotated",
     "Foam",
@@ -40,10 +43,13 @@ __all__ = [
     "RestitutionFit",
     "Sand",
     "Snow",
+    "Solid",
     "Solver",
     "SolverError",
     "SolverOptions",
     "StepReport",
+    "TriangleMesh",
+    "TriangleSurface",
     "UnstableError",
     "ball_particles",
     "box_particles",

@@ -17,6 +17,7 @@ from .backends.reference.step import TorchParameters, TorchState, substep, with_
 from .colliders import Collider
 from .constitutive import material_row
 from .errors import SolverError
+from .fitting import COARSER, continued
 from .solver import Solver
 
 PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")
@@ -44,8 +45,11 @@ class Calibration:
 
     Attributes:
         factors: by parameter, on the value the solver was given.
-        uncertainty: by parameter, what one factor may be wrong by, as a fraction, when observations
-            are wrong by ``residual[-1]``; infinite for what they say nothing about.
+        uncertainty: by parameter, what one factor may be wrong by, as a fraction: when observations
+            are wrong by ``residual[-1]``, and by ``discretisation``; infinite for what they say
+            nothing about.
+        discretisation: by parameter, the part of it that is due to cells: how far the result moves
+            on coarser ones, continued to none (Richardson 1911, first order).
         residual: root mean square distance to what was observed [m], at the start and after each
             step that was kept; it never rises.
         rejected: steps that were taken back since they raised the residual.
@@ -53,6 +57,7 @@ class Calibration:
 
     factors: dict[str, float]
     uncertainty: dict[str, float]
+    discretisation: dict[str, float]
     residual: tuple[float, ...]
     rejected: int
 
@@ -108,7 +113,37 @@ def calibrate(
         if last == 0 and wider <= len(SPANS):
             J, damping = _secants(path, logs, SPANS[wider - 1]), DAMPING
     factors = dict(zip(names, logs.exp().tolist(), strict=True))
-    return Calibration(factors, _uncertainty(J, names, history[-1]), tuple(history), rejected)
+    open_ = _uncertainty(J, names, history[-1])
+    cells = _discretisation(solver, names, logs, J, target, dt=dt, every=every)
+    total = {name: math.hypot(open_[name], cells[name]) for name in names}
+    return Calibration(factors, total, cells, tuple(history), rejected)
+
+
+def _discretisation(
+    solver: Solver,
+    names: Sequence[str],
+    logs: Tensor,
+    J: Tensor,
+    target: Tensor,
+    *,
+    dt: float,
+    every: int,
+) -> dict[str, float]:
+    """How far logarithms are from those on cells of no size, by those on coarser ones."""
+    scale = _scale(J)
+    scaled = J / scale
+    inverse = torch.linalg.pinv(scaled) / scale[:, None]
+    moved: dict[float, Float] = {}
+    for coarser in COARSER:
+        options = replace(solver.options, dx=coarser * solver.dx)
+        coarse = Solver(solver.bodies, solver.colliders, options)
+        path = rollout(coarse, names, dt=dt, every=every, observations=len(target))
+        step = -(inverse @ (path(logs) - target).reshape(-1))
+        if bool(torch.isfinite(step).all()):
+            moved[coarser] = step.clamp(-LONGEST_STEP, LONGEST_STEP).numpy()
+    if not moved:
+        return dict.fromkeys(names, math.inf)
+    return dict(zip(names, continued(moved).tolist(), strict=True))
 
 
 def _checked(solver: Solver, observed: Float, names: Sequence[str]) -> Tensor:

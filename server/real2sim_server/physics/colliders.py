@@ -1,10 +1,14 @@
-"""Things that do not yield: ground planes, boxes, height fields, moving boxes."""
+"""Things that do not yield: ground planes, height fields, and solids at rest or in motion.
+
+A solid is closed: a box, a cylinder, a capsule, or a ``triangle_mesh``.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..geometry.rotation import Float
 from ..geometry.transform import is_rigid
 from .errors import ColliderError
-
-PLANE, BOX, HEIGHT_FIELD = range(3)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,30 +82,43 @@ class Plane(Collider):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Box(Collider):
-    """A solid oriented box, at rest or moving as a rigid body.
+class Solid(Collider):
+    """What has an inside, at rest or moving as a rigid body. Its pose is the field POSE names.
 
     Attributes:
-        T_world_box: [4, 4] pose; origin at the centre of the box.
-        size: [3] edge lengths [m].
-        velocity: [3] of its centre [m/s].
-        angular_velocity: [3] about its centre, world axes [rad/s].
+        velocity: [3] of the origin of its frame [m/s].
+        angular_velocity: [3] about that origin, world axes [rad/s].
     """
 
-    T_world_box: ArrayLike
-    size: ArrayLike
+    POSE: ClassVar[str]
+
     velocity: ArrayLike = (0.0, 0.0, 0.0)
     angular_velocity: ArrayLike = (0.0, 0.0, 0.0)
 
     def _check(self) -> None:
-        pose = np.array(self.T_world_box, dtype=np.float64)
+        pose = np.array(getattr(self, self.POSE), dtype=np.float64)
         if not is_rigid(pose):
-            raise ColliderError(f"T_world_box of {self.name!r} must be rigid [4, 4]: {pose!r}")
-        object.__setattr__(self, "T_world_box", pose)
-        for name in ("size", "velocity", "angular_velocity"):
+            raise ColliderError(f"{self.POSE} of {self.name!r} must be rigid [4, 4]: {pose!r}")
+        object.__setattr__(self, self.POSE, pose)
+        for name in ("velocity", "angular_velocity"):
             object.__setattr__(self, name, _vector(self, name))
-        if (np.asarray(self.size) <= 0).any():
-            raise ColliderError(f"size of box {self.name!r} must be positive: {self.size!r}")
+
+    @property
+    def pose(self) -> Float:
+        """[4, 4] its frame to the world."""
+        pose: Float = getattr(self, self.POSE)
+        return pose
+
+    @property
+    def bounds(self) -> tuple[Float, Float]:
+        """Lowest and highest corner [3] of the box about it in its own frame [m]."""
+        raise NotImplementedError
+
+    @property
+    def thickness(self) -> float:
+        """Least extent across it [m]."""
+        low, high = self.bounds
+        return float((high - low).min())
 
     @cached_property
     def moving(self) -> bool:
@@ -113,18 +128,113 @@ class Box(Collider):
     @cached_property
     def fastest_point(self) -> float:
         """Speed [m/s] that no point of it exceeds."""
-        reach = float(np.linalg.norm(self.size)) / 2
+        low, high = self.bounds
+        reach = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
         spin = float(np.linalg.norm(self.angular_velocity))
         return float(np.linalg.norm(self.velocity)) + reach * spin
 
-    def after(self, duration: float) -> Box:
-        """The box ``duration`` [s] later, moved at its velocities."""
+    def velocity_at(self, point: Float) -> Float:
+        """Velocity [3] of its material at a point [3] of the world [m/s]."""
+        turning = np.cross(np.asarray(self.angular_velocity), point - self.pose[:3, 3])
+        velocity: Float = np.asarray(self.velocity) + turning
+        return velocity
+
+    def at_rest(self) -> Self:
+        """The same, where it is, standing still."""
+        return replace(self, velocity=np.zeros(3), angular_velocity=np.zeros(3))
+
+    def after(self, duration: float) -> Self:
+        """The solid ``duration`` [s] later, moved at its velocities."""
         if not self.moving:
             return self
-        pose = np.array(self.T_world_box)
+        pose = np.array(self.pose)
         pose[:3, 3] += duration * np.asarray(self.velocity)
         pose[:3, :3] = _rotation(np.asarray(self.angular_velocity) * duration) @ pose[:3, :3]
-        return replace(self, T_world_box=pose)
+        moved: dict[str, Any] = {self.POSE: pose}
+        return replace(self, **moved)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Box(Solid):
+    """A solid oriented box, at rest or moving as a rigid body.
+
+    Attributes:
+        T_world_box: [4, 4] pose; origin at the centre of the box.
+        size: [3] edge lengths [m].
+        velocity: [3] of its centre [m/s].
+        angular_velocity: [3] about its centre, world axes [rad/s].
+    """
+
+    POSE: ClassVar[str] = "T_world_box"
+
+    T_world_box: ArrayLike
+    size: ArrayLike
+
+    def _check(self) -> None:
+        super()._check()
+        object.__setattr__(self, "size", _vector(self, "size"))
+        if (np.asarray(self.size) <= 0).any():
+            raise ColliderError(f"size of box {self.name!r} must be positive: {self.size!r}")
+
+    @property
+    def bounds(self) -> tuple[Float, Float]:  # noqa: D102
+        half = np.asarray(self.size) / 2
+        return -half, half
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cylinder(Solid):
+    """A solid round post or drum with flat ends, about the z axis of its frame.
+
+    Attributes:
+        T_world_cylinder: [4, 4] pose; origin at the centre.
+        radius: [m], > 0.
+        height: along its axis [m], > 0.
+    """
+
+    POSE: ClassVar[str] = "T_world_cylinder"
+
+    T_world_cylinder: ArrayLike
+    radius: float
+    height: float
+
+    def _check(self) -> None:
+        super()._check()
+        _require_length(self, "radius")
+        _require_length(self, "height")
+
+    @property
+    def bounds(self) -> tuple[Float, Float]:  # noqa: D102
+        half = np.array([self.radius, self.radius, self.height / 2])
+        return -half, half
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Capsule(Solid):
+    """All that is within ``radius`` of a line along the z axis of its frame; a ball for length 0.
+
+    Attributes:
+        T_world_capsule: [4, 4] pose; origin at the middle of the line.
+        radius: [m], > 0.
+        length: of the line, without the round ends [m], >= 0.
+    """
+
+    POSE: ClassVar[str] = "T_world_capsule"
+
+    T_world_capsule: ArrayLike
+    radius: float
+    length: float
+
+    def _check(self) -> None:
+        super()._check()
+        _require_length(self, "radius")
+        if self.length != 0:
+            _require_length(self, "length")
+
+    @property
+    def bounds(self) -> tuple[Float, Float]:  # noqa: D102
+        half = np.array([self.radius, self.radius, self.length / 2 + self.radius])
+        return -half, half
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,6 +270,13 @@ def _vector(collider: Collider, name: str, length: int = 3) -> Float:
     if value.shape != (length,) or not np.isfinite(value).all():
         raise ColliderError(f"{name} of {collider.name!r} must be {length} numbers, not {value!r}")
     return value
+
+
+def _require_length(collider: Collider, name: str) -> None:
+    value = getattr(collider, name)
+    if not (math.isfinite(value) and value > 0):
+        kind = type(collider).__name__.lower()
+        raise ColliderError(f"{name} of {kind} {collider.name!r} must be positive [m]: {value!r}")
 
 
 def _rotation(rotation_vector: Float) -> Float:

@@ -27,6 +27,7 @@ from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
+from .jobs.calibrations import Calibrations
 from .jobs.jobs import Jobs
 from .jobs.simulations import Simulations
 from .library.assets import AssetLibrary
@@ -74,6 +75,7 @@ class Worker:
     assets: AssetLibrary
     jobs: Jobs
     simulations: Simulations
+    calibrations: Calibrations
     idempotency: Idempotency
     kernels: KernelWarmUp
     renderer: Renderer
@@ -141,6 +143,7 @@ class Worker:
             assets=assets,
             jobs=jobs,
             simulations=Simulations(jobs, scenarios, scene_cache),
+            calibrations=Calibrations(jobs, scenarios, scene_cache),
             idempotency=Idempotency(store),
             kernels=kernels,
             renderer=renderer,

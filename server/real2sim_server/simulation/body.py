@@ -18,14 +18,14 @@ from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform
 from ..physics.body import Body
-from ..physics.colliders import Box, Collider
+from ..physics.colliders import Collider, Solid
 from ..physics.materials import Material
 from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .result import Rebound
 from .rigid import RigidMotion, added_inertia, best_rotation, cross_matrix, inertia_about
 from .rolling import advance_on_wheels
-from .surroundings import box_gaps, closest, packed
+from .surroundings import closest, packed, solid_gaps
 from .tyres import TyreReaction, Tyres
 
 NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
@@ -222,7 +222,7 @@ class DeformableBody:
     def gap_to_colliders(self, colliders: Sequence[Collider]) -> tuple[float, float]:
         """Distance [m] to the nearest collider, and the speed of approach there [m/s].
 
-        Boxes further away than NEAR_MAX are infinitely far.
+        Solids further away than NEAR_MAX are infinitely far.
         """
         gap, approach, _ = self._closest(colliders, within=NEAR_MAX, ahead=0.0)
         return gap, approach
@@ -237,28 +237,28 @@ class DeformableBody:
     ) -> tuple[float, float, bool]:
         """See ``surroundings.closest``.
 
-        Outermost particles are what meets ground; a box may meet any place of a flat side.
+        Outermost particles are what meets ground; a solid may meet any place of a flat side.
         """
-        smooth = [c for c in colliders if not isinstance(c, Box)]
+        smooth = [c for c in colliders if not isinstance(c, Solid)]
         hull = np.inf, 0.0, False
         if smooth:
             hull = closest(self.hull_points(), self.motion, smooth, within=within, ahead=ahead)
-        boxes = [c for c in colliders if isinstance(c, Box)]
-        boxes = self._within_reach(boxes, within, ahead) if boxes else boxes
-        if not boxes:
+        solids = [c for c in colliders if isinstance(c, Solid)]
+        solids = self._within_reach(solids, within, ahead) if solids else solids
+        if not solids:
             return hull
-        shell = closest(self.shell_points(), self.motion, boxes, within=within, ahead=ahead)
+        shell = closest(self.shell_points(), self.motion, solids, within=within, ahead=ahead)
         gap, approach, _ = min(hull, shell)
         return gap, approach, hull[2] or shell[2]
 
-    def _within_reach(self, boxes: Sequence[Box], within: float, ahead: float) -> list[Box]:
+    def _within_reach(self, solids: Sequence[Solid], within: float, ahead: float) -> list[Solid]:
         """Those so near the box about the body that their surfaces must be compared."""
-        gaps, speeds = box_gaps(*self.box(), boxes)
+        gaps, speeds = solid_gaps(*self.box(), solids)
         m = self.motion
         speed = float(np.linalg.norm(m.velocity))
         speed += self.reach * float(np.linalg.norm(m.angular_velocity))
         near = gaps < within + (speed + speeds) * ahead
-        return [box for box, is_near in zip(boxes, near.tolist(), strict=True) if is_near]
+        return [solid for solid, is_near in zip(solids, near.tolist(), strict=True) if is_near]
 
     @property
     def _local_centre(self) -> Float:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.rotation import Float
-from ..physics.colliders import Box, Collider
+from ..physics.colliders import Collider, Solid
 from ..physics.solver import ContactTotals
 from .body import BodyMode, DeformableBody
 from .rigid import RigidMotion
@@ -364,12 +364,7 @@ def _ease(motion: RigidMotion, lever: Float, normal: Float) -> float:
 
 def _velocity(collider: Collider, point: Float) -> Float:
     """Of a collider at a point [m/s]."""
-    if not isinstance(collider, Box):
-        return np.zeros(3)
-    centre = np.asarray(collider.T_world_box)[:3, 3]
-    turning = np.cross(np.asarray(collider.angular_velocity), point - centre)
-    velocity: Float = np.asarray(collider.velocity) + turning
-    return velocity
+    return collider.velocity_at(point) if isinstance(collider, Solid) else np.zeros(3)
 
 
 def _rounded(value: Any) -> Any:

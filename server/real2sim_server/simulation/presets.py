@@ -14,6 +14,8 @@ from ..physics.materials import FixedCorotated, Foam, Material
 from ..physics.particles import Particles
 from .structure import VEHICLES, vehicle_structure
 
+GRID_MIN, GRID_MAX = 16, 1000
+
 Build = tuple[Sequence[Material], NDArray[np.int64], Particles]
 
 
@@ -23,6 +25,7 @@ class ObjectPhysics:
 
     Attributes:
         mass: [kg].
+        density: of what it is filled with [kg/m^3], where ``mass`` is not given.
         material: of the whole object, instead of the preset's regions.
         friction: Coulomb coefficient of its surface.
         restitution: wanted rebound from a rigid wall, reached by added viscosity.
@@ -31,12 +34,14 @@ class ObjectPhysics:
         T_world_object: [4, 4] where it starts; where the recording has it when None.
         brake: fraction of the wheels' grip that is braked, 0 to 1; when None, standing vehicles are
             braked, moving ones roll until they are hit.
+        grid: cells along twice its longest edge, as the paper counts them; the preset's when None.
 
     Raises:
-        PhysicsError: for a mass, friction, restitution or brake out of its range.
+        PhysicsError: for a value out of its range.
     """
 
     mass: float | None = None
+    density: float | None = None
     material: Material | None = None
     friction: float | None = None
     restitution: float | None = None
@@ -44,6 +49,7 @@ class ObjectPhysics:
     angular_velocity: ArrayLike | None = None
     T_world_object: ArrayLike | None = None
     brake: float | None = None
+    grid: int | None = None
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -55,8 +61,14 @@ class ObjectPhysics:
             if value is not None and not low <= value <= high:
                 bounds = "not be negative" if high == math.inf else f"be in [{low:g}, {high:g}]"
                 raise PhysicsError(f"{name} of an object must {bounds}: {value!r}")
-        if self.mass is not None and not (math.isfinite(self.mass) and self.mass > 0):
-            raise PhysicsError(f"mass of an object must be positive [kg], not {self.mass!r}")
+        for name, unit in (("mass", "kg"), ("density", "kg/m^3")):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise PhysicsError(f"{name} of an object must be positive [{unit}], not {value!r}")
+        if self.grid is not None and not GRID_MIN <= self.grid <= GRID_MAX:
+            raise PhysicsError(
+                f"grid of an object must be in [{GRID_MIN}, {GRID_MAX}], not {self.grid!r}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.rotation import Float
-from ..physics.colliders import Box, Collider, Plane
+from ..physics.colliders import Collider, Plane, Solid
 from ..physics.restitution import fit_restitution
 from ..physics.solver import SolverOptions
 from .body import DeformableBody
@@ -118,7 +118,7 @@ def first_touch(
         trial.motion = motion
         shell = trial.shell_points()
         for collider in now:
-            if isinstance(collider, Box) and _is_far(collider, motion.centre, body.reach):
+            if isinstance(collider, Solid) and _is_far(collider, motion.centre, body.reach):
                 continue
             distance, normals = clearance(collider, shell)
             k = int(distance.argmin())
@@ -134,10 +134,12 @@ def first_touch(
     return None
 
 
-def _is_far(box: Box, centre: Float, reach: float) -> bool:
-    """Whether a box is further from a point than ``reach`` [m] and a body's surface."""
-    away = float(np.linalg.norm(np.asarray(box.T_world_box)[:3, 3] - centre))
-    return away - float(np.linalg.norm(np.asarray(box.size))) / 2 > 2 * reach
+def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
+    """Whether a solid is further from a point than ``reach`` [m] and a body's surface."""
+    low, high = solid.bounds
+    extent = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
+    away = float(np.linalg.norm(solid.pose[:3, 3] - centre))
+    return away - extent > 2 * reach
 
 
 def _still(body: DeformableBody) -> Any:
@@ -147,14 +149,10 @@ def _still(body: DeformableBody) -> Any:
 
 def _approach(motion: RigidMotion, collider: Collider, point: Float, normal: Float) -> float:
     velocity = motion.velocity
-    if isinstance(collider, Box):
-        centre = np.asarray(collider.T_world_box)[:3, 3]
-        turning = np.cross(np.asarray(collider.angular_velocity), point - centre)
-        velocity = velocity - np.asarray(collider.velocity) - turning
+    if isinstance(collider, Solid):
+        velocity = velocity - collider.velocity_at(point)
     return -float(velocity @ normal)
 
 
 def _at_rest(collider: Collider) -> Collider:
-    if isinstance(collider, Box):
-        return replace(collider, velocity=np.zeros(3), angular_velocity=np.zeros(3))
-    return collider
+    return collider.at_rest() if isinstance(collider, Solid) else collider

@@ -41,6 +41,7 @@ class SimulateOptions:
         start_us: scene time [us].
         duration: [s].
         frame_rate: frames kept per second.
+        times_s: instants of the frames after the start [s], rising, instead of both of these.
         gravity: [3] [m/s^2].
         backend: of the solver.
         brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
@@ -57,6 +58,7 @@ class SimulateOptions:
     start_us: int = 0
     duration: float = 2.0
     frame_rate: float = 30.0
+    times_s: Sequence[float] | None = None
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     backend: str = "auto"
     brake_after_hit: float = 1.0
@@ -106,7 +108,7 @@ def simulate(
     gravity = np.array(options.gravity, dtype=np.float64)
     if gravity.shape != (3,) or not np.isfinite(gravity).all():
         raise PhysicsError(f"gravity must be 3 finite numbers [m/s^2], not {options.gravity!r}")
-    solid = _solid_background(scene, state, options) if options.background else []
+    solid = solid_background(scene, state, options) if options.background else []
     options = replace(options, colliders=[*options.colliders, *solid])
     bodies = spawn_bodies(
         scene,
@@ -127,7 +129,7 @@ def simulate(
     return result
 
 
-def _solid_background(scene: Scene, state: PlacedObjects, options: SimulateOptions) -> list[Box]:
+def solid_background(scene: Scene, state: PlacedObjects, options: SimulateOptions) -> list[Box]:
     """What of the background the objects may come to."""
     starts = starts_of(state, options.objects, options.start_us)
     cleared = [Cleared(s.T_world_object, np.array(s.size)) for s in starts]
@@ -153,12 +155,14 @@ def simulate_bodies(
         brake_after_hit=options.brake_after_hit,
         cfl=preset_of(options.preset).cfl,
     )
-    frames = max(round(options.duration * options.frame_rate), 1)
+    ends = options.times_s
+    if ends is None:
+        frames = max(round(options.duration * options.frame_rate), 1)
+        ends = [frame / options.frame_rate for frame in range(1, frames + 1)]
     recorder = TrajectoryRecorder(simulator)
     recorder.record(0.0)
     stopped = "done"
-    for frame in range(1, frames + 1):
-        end = frame / options.frame_rate
+    for frame, end in enumerate(ends, 1):
         while simulator.time < end - 1e-9 and stopped == "done":
             if cancelled is not None and cancelled():
                 stopped = "cancelled"
@@ -169,7 +173,7 @@ def simulate_bodies(
             break
         recorder.record(end)
         if on_progress is not None:
-            on_progress(frame, frames)
+            on_progress(frame, len(ends))
     return recorder.result(options.start_us, stopped, _figures(options, simulator))
 
 

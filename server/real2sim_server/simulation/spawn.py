@@ -10,9 +10,10 @@ import numpy as np
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, is_rigid
-from ..physics.colliders import Box, Collider
+from ..physics.colliders import Collider, Solid
 from ..physics.errors import PhysicsError
 from ..physics.particles import Particles
+from ..physics.triangle_mesh import TriangleMesh
 from ..scene import Scene
 from .body import DeformableBody
 from .embedding import stretched
@@ -58,7 +59,7 @@ def spawn_bodies(
             one another, and as ``fill_object``.
     """
     subjects = _subjects(state, wanted, start_us)
-    preset = _limit_particles(preset, subjects, max_particles)
+    preset = filled_as_wanted(preset, subjects, list(wanted.values()), max_particles)
     bodies = [
         _spawn_body(
             scene,
@@ -125,6 +126,41 @@ def _subjects(
     return subjects
 
 
+def filled_as_wanted(
+    preset: Preset,
+    subjects: Sequence[PlacedObject],
+    wanted: Sequence[ObjectPhysics],
+    most: int = 10**12,
+) -> Preset:
+    """The preset with particles as far apart as the finest grid that is asked for has them.
+
+    Raises:
+        PhysicsError: for a grid that is too coarse for an object, or takes more than ``most``.
+    """
+    asked = [
+        (max(s.scaled_size) / w.grid, s.object_id, w.grid)
+        for s, w in zip(subjects, wanted, strict=True)
+        if w.grid is not None
+    ]
+    if not asked:
+        return _limit_particles(preset, subjects, most)
+    spacing, finest, grid = min(asked)
+    sizes = np.array([s.scaled_size for s in subjects])
+    needed = int(np.ceil(sizes.prod(axis=1).sum() / spacing**3))
+    if needed > most:
+        raise PhysicsError(
+            f"grid {grid} of {finest!r} puts particles {spacing:.2g} m apart: {needed:,} of them, "
+            f"more than {most:,}; take a smaller grid, fewer objects, or raise max_particles"
+        )
+    for subject, size in zip(subjects, sizes, strict=True):
+        if size.min() < COARSEST * spacing:
+            raise PhysicsError(
+                f"grid {grid} of {finest!r} puts particles {spacing:.2g} m apart, too coarse for "
+                f"{subject.object_id!r} of {size.min():.2g} m; take a larger grid"
+            )
+    return replace(preset, spacing=spacing)
+
+
 def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int) -> Preset:
     """The preset with particles so far apart that boxes full of them would hold ``most``."""
     preset = spaced_for(preset, subjects)
@@ -187,16 +223,23 @@ def require_separation(
 def _depth_inside(body: DeformableBody, collider: Collider) -> float:
     """How far a body would have to be moved to leave a collider [m]; at most 0 where it is outside.
 
-    No particle is deep inside a post, so of a box that holds a particle the overlap counts.
+    No particle is deep inside a post, so of a solid that holds a particle the overlap of the box
+    about it counts, and of a mesh the shorter way off the place where the body touches it.
     """
     depth = -body.gap_to_colliders([collider])[0]
-    if not isinstance(collider, Box):
+    if not isinstance(collider, Solid):
         return depth
     points = apply_transform(body.T_world_object, body.shape.positions)
-    if depth <= 0 and float(clearance(collider, points)[0].min()) > body.spacing / 2:
+    distance, normals = clearance(collider, points)
+    if depth <= 0 and float(distance.min()) > body.spacing / 2:
         return depth
-    pose, size = np.asarray(collider.T_world_box), np.asarray(collider.size)
-    return float(box_penetration(*body.box(), pose, size))
+    if isinstance(collider, TriangleMesh):
+        nearest = int(distance.argmin())
+        along = (points - points[nearest]) @ normals[nearest]
+        return max(depth, min(float(along.max()), -float(along.min())))
+    pose, (low, high) = np.array(collider.pose), collider.bounds
+    pose[:3, 3] += pose[:3, :3] @ ((low + high) / 2)
+    return float(box_penetration(*body.box(), pose, high - low))
 
 
 def _particles_overlap(a: DeformableBody, b: DeformableBody) -> bool:
@@ -226,9 +269,11 @@ def _spawn_body(
         materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
     # A structure has moved mass between its zones.
     particles = _with_centre(particles, subject, preset)
-    if preset.by_density and physics.mass is None:
-        volume = object_volume(scene, subject, start_us)
-        particles = particles.with_mass(materials[0].density * volume)
+    density = physics.density
+    if density is None and preset.by_density:
+        density = materials[0].density
+    if density is not None and physics.mass is None:
+        particles = particles.with_mass(density * object_volume(scene, subject, start_us))
     pose = _pose(subject, physics, start_us)
     velocity, spin = _velocities(subject, physics, start_us)
     tyres = None

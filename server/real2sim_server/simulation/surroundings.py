@@ -15,7 +15,7 @@ import numpy as np
 from .._numba import kernel
 from ..geometry.rotation import Float
 from ..physics.backends.base import pack_colliders
-from ..physics.colliders import Box, Collider, HeightField, Plane
+from ..physics.colliders import Box, Collider, HeightField, Plane, Solid
 from ..physics.contact.collider_distance import collider_distance, collider_velocity
 from .rigid import RigidMotion
 
@@ -87,19 +87,19 @@ def _closest(
     return least, closing, meets
 
 
-def box_gaps(pose: Float, size: Float, boxes: Sequence[Box]) -> tuple[Float, Float]:
-    """How far boxes are at least from an oriented box, and how fast they are at most.
+def solid_gaps(pose: Float, size: Float, solids: Sequence[Solid]) -> tuple[Float, Float]:
+    """How far solids are at least from an oriented box, and how fast they are at most.
 
     Args:
         pose: [4, 4] of the one box.
         size: [3] of it [m].
-        boxes: the others, K of them.
+        solids: K of them.
 
     Returns:
-        [K] lower bounds of the distance, along the faces of these; below 0 where boxes may overlap
-        [m]; and [K] speeds that no point of them exceeds [m/s].
+        [K] lower bounds of the distance, along the faces of the boxes about these; below 0 where
+        they may overlap [m]; and [K] speeds that no point of them exceeds [m/s].
     """
-    centres, turns, halves, speeds = _boxes(tuple(boxes))
+    centres, turns, halves, speeds = _boxes_about(tuple(solids))
     between = np.abs((turns @ (pose[:3, 3] - centres)[:, :, None])[:, :, 0])
     reach = np.abs(turns @ pose[:3, :3]) @ (size / 2)
     gaps: Float = (between - halves - reach).max(axis=1)
@@ -107,12 +107,15 @@ def box_gaps(pose: Float, size: Float, boxes: Sequence[Box]) -> tuple[Float, Flo
 
 
 @functools.lru_cache(maxsize=64)
-def _boxes(boxes: tuple[Box, ...]) -> tuple[Float, Float, Float, Float]:
+def _boxes_about(solids: tuple[Solid, ...]) -> tuple[Float, Float, Float, Float]:
     """Centres [K, 3], rotations box from world [K, 3, 3], halves of sizes [K, 3], speeds [K]."""
-    poses = np.array([b.T_world_box for b in boxes])
-    halves = np.array([b.size for b in boxes]) / 2
-    speeds = np.array([b.fastest_point for b in boxes])
-    return poses[:, :3, 3], poses[:, :3, :3].transpose(0, 2, 1), halves, speeds
+    poses = np.array([s.pose for s in solids])
+    bounds = np.array([s.bounds for s in solids])
+    speeds = np.array([s.fastest_point for s in solids])
+    halves = (bounds[:, 1] - bounds[:, 0]) / 2
+    middles = (bounds[:, 0] + bounds[:, 1]) / 2
+    centres = poses[:, :3, 3] + (poses[:, :3, :3] @ middles[:, :, None])[:, :, 0]
+    return centres, poses[:, :3, :3].transpose(0, 2, 1), halves, speeds
 
 
 def clearance(collider: Collider, points: Float) -> tuple[Float, Float]:
@@ -127,7 +130,21 @@ def clearance(collider: Collider, points: Float) -> tuple[Float, Float]:
         return _box(collider, points)
     if isinstance(collider, HeightField):
         return _heights(collider, points)
+    if isinstance(collider, Solid):
+        rows, data = packed((collider,))
+        distances, normals = np.empty(len(points)), np.empty((len(points), 3))
+        _clearances(rows[0], data, np.ascontiguousarray(points), distances, normals)
+        return distances, normals
     raise TypeError(f"unknown collider {type(collider).__name__}")
+
+
+@kernel
+def _clearances(row: Any, data: Any, points: Any, distances: Any, normals: Any) -> None:
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        distance, n = collider_distance(row, data, x, y, z)
+        distances[k] = distance
+        normals[k, 0], normals[k, 1], normals[k, 2] = n
 
 
 def nearest(colliders: Sequence[Collider], points: Float) -> tuple[Float, Float]:

@@ -58,6 +58,19 @@ def test_yield_stress_is_recovered_too():
         assert found.factors[name] == pytest.approx(TRUE[name], rel=0.01), name
 
 
+@pytest.mark.slow
+def test_what_was_observed_on_finer_cells_is_found_within_the_uncertainty():
+    names = ["stiffness", "speed"]
+    body = pressed(SOFT).bodies[0]
+    fine = solve([body], [ground(separable=False)], backend="reference", dx=0.075)
+    found = calibrate(
+        pressed(SOFT), observed(fine, names), parameters=names, dt=DT, every=EVERY, steps=10
+    )
+    for name in names:
+        assert abs(found.factors[name] / TRUE[name] - 1) < 2 * found.uncertainty[name], name
+    assert found.discretisation["stiffness"] > 0.01
+
+
 def test_residuals_never_rise_and_blown_up_steps_are_taken_back():
     start = observed(pressed(SOFT), ["speed"])
     # A hundred times too stiff is far beyond what this substep can take.

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.physics import Box, HeightField, Plane
+from real2sim_server.physics import Box, Capsule, Cylinder, HeightField, Plane, TriangleMesh
 from real2sim_server.physics.backends.base import pack_colliders
 from real2sim_server.physics.backends.layout import distances
 from real2sim_server.physics.contact.collider_distance import collider_distance
+
+from .shapes import half_pipe
 
 TURNED = np.array([[0.6, -0.8, 0, 1.0], [0.8, 0.6, 0, -0.5], [0, 0, 1, 0.2], [0, 0, 0, 1]])
 
@@ -33,4 +35,21 @@ def test_distances_of_many_points_are_those_of_each(collider):
     points = np.random.default_rng(1).uniform(-2, 2, (60, 3))
     each = [collider_distance(rows[1], heights, *p)[0] for p in points]
     assert min(each) < 0 < max(each)
-    assert distances(rows[1], heights, points) == pytest.approx(np.array(each), abs=1e-12)
+    found = distances(collider, rows[1], heights, points)
+    assert found == pytest.approx(np.array(each), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        Cylinder(name="post", T_world_cylinder=TURNED, radius=0.3, height=1.5),
+        Capsule(name="rod", T_world_capsule=TURNED, radius=0.3, length=1.5),
+        TriangleMesh(name="pipe", T_world_mesh=TURNED, surface=half_pipe(0.8, 1.5)),
+    ],
+    ids=lambda c: c.name,
+)
+def test_solids_are_never_nearer_than_they_are_looked_for(solid):
+    rows, data = pack_colliders([solid], 0.1)
+    points = np.random.default_rng(1).uniform(-2, 2, (60, 3))
+    each = np.array([collider_distance(rows[0], data, *p)[0] for p in points])
+    assert (distances(solid, rows[0], data, points) <= each + 1e-12).all()

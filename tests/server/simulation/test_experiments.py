@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from real2sim_proto.operations import Duplicate
+from real2sim_server.edit import apply_operations
 from real2sim_server.edit.state import ScenarioState
+from real2sim_server.geometry.box import box_penetration
 from real2sim_server.physics import PhysicsError
 from real2sim_server.simulation.experiments import FilmPlan, set_up, views
 from real2sim_server.simulation.experiments.film import FilmView, draw, look_at
@@ -48,6 +51,21 @@ def test_runners_meet_those_they_run_into_after_a_metre_and_a_half(experiment, r
     assert made.options.gravity == (0.0, 0.0, 0.0)
     result = rollout(made, 0.5)
     assert first_touch(result, other="car_blue") == pytest.approx(1.5 / 3.5, abs=0.04)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8])
+def test_any_number_of_vehicles_run_into_as_many_and_none_begins_within_another(tiny_scene, count):
+    copies = [Duplicate(object_id="car_red", new_id=f"copy_{k}", x=5.0 * k) for k in range(7)]
+    state = apply_operations(ScenarioState.of(tiny_scene), copies).state
+    names = ("car_red", "car_blue", *(f"copy_{k}" for k in range(7)))[:count]
+    made = set_up("pair", tiny_scene, state, objects=names)
+    speeds = {n: np.linalg.norm(o.velocity) for n, o in made.options.objects.items()}
+    assert sorted(speeds) == sorted(names)
+    assert [speeds[n] > 0 for n in names] == [True] * (count // 2) + [False] * (count - count // 2)
+    there = {o.object_id: o for o in state.visible}
+    boxes = [(o.T_world_object, there[n].scaled_size) for n, o in made.options.objects.items()]
+    for k, box in enumerate(boxes):
+        assert all(box_penetration(*box, *other) < 0.05 for other in boxes[:k])
 
 
 @pytest.mark.parametrize("preset", ["paper", "vehicle"])

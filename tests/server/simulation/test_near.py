@@ -7,7 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.physics import Box, FixedCorotated, PhysicsError, box_particles
+from real2sim_server.physics import (
+    Box,
+    Capsule,
+    Cylinder,
+    FixedCorotated,
+    PhysicsError,
+    TriangleMesh,
+    TriangleSurface,
+    box_particles,
+)
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
 from real2sim_server.simulation.simulator import HybridSimulator
@@ -39,6 +48,48 @@ def simulator(body: DeformableBody, *colliders: Box) -> HybridSimulator:
 
 def post(x: float, y=0.0, width=0.05, **options) -> Box:
     return Box(name="post", T_world_box=at(x, y, 0), size=(width, width, 2.0), **options)
+
+
+FENCE = TriangleSurface(
+    [[0, -2, -1], [0, 2, -1], [0, 2, 1], [0, -2, 1]], [[0, 1, 2], [0, 2, 3]], 0.02
+)
+SHAPES = {
+    "cylinder": lambda T: Cylinder(name="post", T_world_cylinder=T, radius=0.04, height=2),
+    "capsule": lambda T: Capsule(name="post", T_world_capsule=T, radius=0.04, length=2),
+    "mesh": lambda T: TriangleMesh(name="post", T_world_mesh=T, surface=FENCE),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_round_posts_and_fences_are_met_refused_within_and_carry(shape):
+    body = block(speed=10.0)
+    simulated = simulator(body, SHAPES[shape](at(1.0, 0.22, 0)))
+    for _ in range(20):
+        simulated.advance(0.005)
+    assert [r.other for r in simulated.contact_log.records({"block": body.motion.mass})] == ["post"]
+    assert body.motion.velocity[0] < 3.0
+
+    still = block()
+    with pytest.raises(PhysicsError, match="inside collider 'post'"):
+        require_separation([still], [(still.T_world_object, SIZE)], [SHAPES[shape](at(0, 0.03, 0))])
+    require_separation([still], [(still.T_world_object, SIZE)], [SHAPES[shape](at(0.68, 0.03, 0))])
+
+
+def test_what_is_let_fall_on_a_sheet_comes_to_rest_on_it():
+    flat = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
+    table = TriangleMesh(
+        name="table",
+        T_world_mesh=at(0, 0, 0),
+        surface=TriangleSurface(flat, [[0, 1, 2], [0, 2, 3]], 0.05),
+    )
+    body = block((0, 0, 0.35), speed=0.01)
+    simulated = HybridSimulator(
+        [body], [table], road=(), gravity=(0, 0, -9.81), backend="cpu", brake_after_hit=1.0
+    )
+    for _ in range(160):
+        simulated.advance(0.005)
+    assert body.motion.centre[2] == pytest.approx(SIZE[2] / 2 + 0.025, abs=0.06)
+    assert np.linalg.norm(body.motion.velocity) < 0.05
 
 
 @pytest.mark.parametrize("side", [-0.31, 0.04, 0.22])

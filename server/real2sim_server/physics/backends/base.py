@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from ..colliders import Box, Collider, HeightField, Plane
+from ..colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid
 from ..constitutive import material_row
 from ..constitutive.law import law_of_code
 from ..contact import collider_distance as collider_rows
 from ..contact.particle import THIN_CELLS
 from ..contact.surface import STICKS
+from ..triangle_mesh import TriangleMesh
 
 TOTALS = 8
 """Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
@@ -170,11 +171,11 @@ class SolverBackend(Protocol):
 
 def is_thin(collider: Collider, dx: float) -> bool:
     """Whether too few nodes of a grid of ``dx`` [m] lie in a collider to stop anything."""
-    return isinstance(collider, Box) and float(np.min(collider.size)) < THIN_CELLS * dx
+    return isinstance(collider, Solid) and collider.thickness < THIN_CELLS * dx
 
 
 def pack_colliders(colliders: Sequence[Collider], dx: float) -> tuple[Float, Float]:
-    """Rows [K, COLLIDER_ROW] and the heights [H] of all height fields, as kernels read them."""
+    """Rows [K, COLLIDER_ROW], and numbers [H] of height fields and meshes, as kernels read them."""
     rows = np.zeros((len(colliders), collider_rows.COLLIDER_ROW))
     heights: list[Float] = []
     stored = 0
@@ -187,8 +188,11 @@ def pack_colliders(colliders: Sequence[Collider], dx: float) -> tuple[Float, Flo
             row[collider_rows.KIND] = collider_rows.PLANE
             row[collider_rows.POINT : collider_rows.POINT + 3] = collider.point
             row[collider_rows.AXES : collider_rows.AXES + 3] = collider.normal
-        elif isinstance(collider, Box):
-            _pack_box(row, collider)
+        elif isinstance(collider, Solid):
+            _pack_solid(row, collider)
+            if isinstance(collider, TriangleMesh):
+                row[collider_rows.FIRST_NODE] = stored
+                heights.append(collider.surface.packed)
         elif isinstance(collider, HeightField):
             row[collider_rows.KIND] = collider_rows.HEIGHT_FIELD
             row[collider_rows.POINT : collider_rows.POINT + 2] = collider.origin
@@ -196,18 +200,29 @@ def pack_colliders(colliders: Sequence[Collider], dx: float) -> tuple[Float, Flo
             row[collider_rows.COUNT_X], row[collider_rows.COUNT_Y] = collider.heights.shape
             row[collider_rows.SPACING] = collider.spacing
             heights.append(collider.heights.ravel())
-            stored += collider.heights.size
+        stored = sum(len(h) for h in heights)
     return rows, np.concatenate(heights) if heights else np.zeros(0)
 
 
-def _pack_box(row: Float, box: Box) -> None:
-    pose = np.asarray(box.T_world_box)
-    row[collider_rows.KIND] = collider_rows.BOX
+def _pack_solid(row: Float, solid: Solid) -> None:
+    pose, size = solid.pose, slice(collider_rows.HALF_SIZE, collider_rows.HALF_SIZE + 3)
     row[collider_rows.POINT : collider_rows.POINT + 3] = pose[:3, 3]
     row[collider_rows.AXES : collider_rows.AXES + 9] = pose[:3, :3].ravel()
-    row[collider_rows.HALF_SIZE : collider_rows.HALF_SIZE + 3] = np.asarray(box.size) / 2
-    row[collider_rows.SPIN : collider_rows.SPIN + 3] = box.angular_velocity
-    row[collider_rows.SPEED : collider_rows.SPEED + 3] = box.velocity
+    row[collider_rows.SPIN : collider_rows.SPIN + 3] = solid.angular_velocity
+    row[collider_rows.SPEED : collider_rows.SPEED + 3] = solid.velocity
+    if isinstance(solid, Box):
+        row[collider_rows.KIND] = collider_rows.BOX
+        row[size] = np.asarray(solid.size) / 2
+    elif isinstance(solid, Cylinder):
+        row[collider_rows.KIND] = collider_rows.CYLINDER
+        row[size] = solid.radius, solid.height / 2, 0.0
+    elif isinstance(solid, Capsule):
+        row[collider_rows.KIND] = collider_rows.CAPSULE
+        row[size] = solid.radius, solid.length / 2, 0.0
+    elif isinstance(solid, TriangleMesh):
+        row[collider_rows.KIND] = collider_rows.MESH
+        row[collider_rows.NODES] = solid.surface.nodes
+        row[collider_rows.HALF_THICKNESS] = (solid.surface.thickness or 0.0) / 2
 
 
 class SolverDiverged(Exception):

@@ -17,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from ..colliders import Collider, HeightField
+from ..colliders import Collider, HeightField, Solid
 from ..contact.collider_distance import (
     AXES,
-    BOX,
     COUNT_X,
     COUNT_Y,
     FIRST_HEIGHT,
-    HALF_SIZE,
     KIND,
     PLANE,
     POINT,
@@ -213,25 +211,32 @@ def _near_colliders(
         # Distance to a height field is measured along one normal, which misses nearby slopes.
         slack = BLOCK_REACH if isinstance(colliders[k], HeightField) else 0.0
         far = (reach + COLLIDER_MARGIN + slack) * dx
-        near[:, k] = distances(rows[k], heights, centres) < far
+        near[:, k] = distances(colliders[k], rows[k], heights, centres) < far
     start = np.append(0, np.cumsum(near.sum(axis=1)))
     # Strided, as nonzero leaves it, it would have kernels compiled once more.
     return start, np.ascontiguousarray(np.nonzero(near)[1])
 
 
-def distances(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:
-    """Signed distances [N] [m] of points [N, 3] to a collider, as ``collider_distance`` of each."""
-    kind = int(row[KIND])
-    if kind == PLANE:
+def distances(
+    collider: Collider, row: Float, heights: Float, points: NDArray[np.floating[Any]]
+) -> Float:
+    """Lower bounds [N] of signed distances [m] of points [N, 3] to a collider."""
+    if isinstance(collider, Solid):
+        return _distances_to_bounds(collider, points)
+    if int(row[KIND]) == PLANE:
         from_plane: Float = (points - row[POINT : POINT + 3]) @ row[AXES : AXES + 3]
         return from_plane
-    if kind == BOX:
-        local = (points - row[POINT : POINT + 3]) @ row[AXES : AXES + 9].reshape(3, 3)
-        over = np.abs(local) - row[HALF_SIZE : HALF_SIZE + 3]
-        outside = np.linalg.norm(np.maximum(over, 0.0), axis=1)
-        to_box: Float = outside + np.minimum(over.max(axis=1), 0.0)
-        return to_box
     return _above_ground(row, heights, points)
+
+
+def _distances_to_bounds(solid: Solid, points: NDArray[np.floating[Any]]) -> Float:
+    """Signed distances [N] [m] of points [N, 3] to the box about a solid."""
+    low, high = solid.bounds
+    local = (points - solid.pose[:3, 3]) @ solid.pose[:3, :3] - (low + high) / 2
+    over = np.abs(local) - (high - low) / 2
+    outside = np.linalg.norm(np.maximum(over, 0.0), axis=1)
+    to_box: Float = outside + np.minimum(over.max(axis=1), 0.0)
+    return to_box
 
 
 def _above_ground(row: Float, heights: Float, points: NDArray[np.floating[Any]]) -> Float:

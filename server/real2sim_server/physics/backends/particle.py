@@ -99,7 +99,7 @@ class StepParameters(NamedTuple):
         gravity: [3] [m/s^2], in the state's precision.
         friction: [B] float64.
         collider_rows: [C, COLLIDER_ROW] float64.
-        heights: [H] float64.
+        heights: [H] float64, of height fields and meshes.
     """
 
     table: NDArray[Any]
@@ -148,8 +148,9 @@ def obstructed(
         for contact in range(first, end):
             row = params.collider_rows[layout.thin_collider[contact]]
             v = resolve_particle_collider(
-                row, dt, params.friction[body], state.volume[p], x, v, m, totals[contact]
-            )
+                row, params.heights, dt, params.friction[body], state.volume[p], x, v, m,
+                totals[contact],
+            )  # fmt: skip
     return v
 
 

@@ -17,7 +17,6 @@ from .collider_distance import (
     FRICTION,
     SEPARABLE,
     THIN,
-    box_distance,
     collider_distance,
     collider_velocity,
     unit,
@@ -25,11 +24,12 @@ from .collider_distance import (
 from .surface import INSIDE, OPPOSED, coulomb, face_score, surface_offset
 
 ON_FACE = 1e-4
-"""A node this near to a face of a thin box, or to half a cell beyond its edges, lies in it [cells]:
-centroids are known up to rounding, and nodes often lie on faces."""
+"""A node this near to a face of a thin solid, or to half a cell beyond its edges, lies in it
+[cells]: centroids are known up to rounding, and nodes often lie on faces."""
 THIN_MARGIN = 0.2
-"""Nodes stop a body this much before it meets a thin box [cells]: on the way to rest it still sinks
-by up to a third of a cell, and what particles must stop themselves loses its elastic energy."""
+"""Nodes stop a body this much before it meets a thin solid [cells]: on the way to rest it still
+sinks by up to a third of a cell, and what particles must stop themselves loses its elastic
+energy."""
 
 
 @device_function
@@ -39,7 +39,7 @@ def resolve_node_collider(
     """Contact of one body's node at ``at`` with one collider, where surfaces have met."""
     margin = 0.0
     if row[THIN] > 0.5:
-        distance, n = distance_behind(row, dx, at, moment)
+        distance, n = distance_behind(row, heights, dx, at, moment)
         margin = THIN_MARGIN
     else:
         distance, n = collider_distance(row, heights, at[0], at[1], at[2])
@@ -54,19 +54,20 @@ def resolve_node_collider(
 
 
 @device_function
-def distance_behind(row: Any, dx: Any, at: Any, moment: Any) -> Any:
-    """Distance [m] of a node to the face of a thin box that the body near it looks at; the normal.
+def distance_behind(row: Any, heights: Any, dx: Any, at: Any, moment: Any) -> Any:
+    """Distance [m] of a node to the face of a thin solid that the body looks at; the normal.
 
-    A node of the grid may lie beyond a thin box and still stand for what is before it. The centroid
-    of the body's volume near the node tells the side, and the box counts as thick behind the face
-    there, as far across as half a cell beyond its edges.
+    A node of the grid may lie beyond a thin solid and still stand for what is before it. The
+    centroid of the body's volume near the node tells the side, and the solid counts as thick behind
+    the face there, or the plane that touches it there, as far across as half a cell beyond its
+    edges.
     """
     per_volume = dx / moment[3]
     out = (moment[0] * per_volume, moment[1] * per_volume, moment[2] * per_volume)
-    distance, n = box_distance(row, at[0] + out[0], at[1] + out[1], at[2] + out[2])
+    distance, n = collider_distance(row, heights, at[0] + out[0], at[1] + out[1], at[2] + out[2])
     distance -= out[0] * n[0] + out[1] * n[1] + out[2] * n[2] + ON_FACE * dx
-    across, _ = box_distance(
-        row, at[0] - distance * n[0], at[1] - distance * n[1], at[2] - distance * n[2]
+    across, _ = collider_distance(
+        row, heights, at[0] - distance * n[0], at[1] - distance * n[1], at[2] - distance * n[2]
     )
     if across > (0.5 + ON_FACE) * dx:
         distance = across

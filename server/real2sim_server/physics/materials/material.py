@@ -153,12 +153,20 @@ def register_material(name: str, **typical: float) -> Callable[[_Kind], _Kind]:
     return register
 
 
-def named_material(name: str) -> Material:
-    """The material that a name stands for.
+def named_material(name: str, **values: float) -> Material:
+    """The material that a name stands for, with these values in place of its own.
 
     Raises:
-        MaterialError: for a name nobody registered, with what is allowed.
+        MaterialError: for a name nobody registered, with what is allowed; for a value that the
+            material does not have, or outside its range.
     """
     if name not in MATERIALS:
         raise MaterialError(f"unknown material {name!r}; allowed are {', '.join(MATERIALS)}")
-    return MATERIALS[name]()
+    make = MATERIALS[name]
+    known = {field.name for field in fields(make())}
+    unknown = sorted(values.keys() - known)
+    if unknown:
+        raise MaterialError(
+            f"material {name!r} has no {unknown[0]}; it has {', '.join(sorted(known))}"
+        )
+    return make(**values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, assert_never
@@ -12,22 +12,33 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import SimulateRequest
-from real2sim_proto.operations import AddCollider, BoxShape, GroundShape, PlaneShape
+from real2sim_proto.operations import (
+    AddCollider,
+    BoxShape,
+    CapsuleShape,
+    CylinderShape,
+    GroundShape,
+    MeshShape,
+    PhysicsValues,
+    PlaneShape,
+)
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
-from ...physics.colliders import Box, Collider, HeightField, Plane
-from ...physics.materials import named_material
+from ...physics.colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane
+from ...physics.triangle_mesh import TriangleMesh, TriangleSurface
 from ...render import Instance
 from ...scene import Scene, SceneObject
 from ...simulation.ego import EGO, with_ego
+from ...simulation.experiments.setups import set_up
 from ...simulation.ground import ground_collider
 from ...simulation.playback import PlacedObjects, Playback
 from ...simulation.presets import ObjectPhysics
 from ...simulation.result import ENERGIES, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
+from ...simulation.values import with_values
 from ..http.problems import ServiceError
 
 NEARBY_DISTANCE = 25.0
@@ -69,31 +80,94 @@ def plan_rollout(scene: Scene, state: ScenarioState, request: SimulateRequest) -
     """
     start, end = _span(state, request)
     present = {o.object_id: o for o in state.visible if o.trajectory.covers(start)}
-    has_ego = EGO in (request.objects or ()) and EGO not in present
-    chosen = _chosen(present, request, start, also=[EGO] if has_ego else [])
     complete, resolved_objects = with_assets(scene, state)
-    background = request.background is not False
+    has_ego = EGO in (request.objects or ()) and EGO not in present
+    background = request.background is not False and request.experiment is None
     if background:
         poses = {o.object_id: o.trajectory.transform(start) for o in present.values()}
         complete = replace(complete, background=composed_background(scene, state, poses))
     if has_ego:
         complete, resolved_objects = with_ego(complete, resolved_objects)
-    options = SimulateOptions(
-        preset=request.preset,
-        objects={
-            object_id: _physics(present[object_id], start)
-            if object_id in present
-            else ObjectPhysics()
-            for object_id in chosen
-        },
-        colliders=colliders_of(state),
-        start_us=start,
-        duration=(end - start) * 1e-6,
+    if request.experiment is None or request.objects is not None:
+        named = _chosen(present, request, start, also=[EGO] if has_ego else [])
+    else:
+        named = []
+    if request.experiment is None:
+        options = SimulateOptions(
+            preset=request.preset or "vehicle",
+            objects={
+                object_id: _physics(present[object_id], start)
+                if object_id in present
+                else ObjectPhysics()
+                for object_id in named
+            },
+            colliders=colliders_of(state),
+            start_us=start,
+            duration=(end - start) * 1e-6,
+        )
+    else:
+        asked = request.model_copy(update={"start_us": start})
+        options = _experiment(complete, resolved_objects, present, asked, named)
+    options = replace(
+        options,
+        objects=_with_values(options.objects, request.physics),
         frame_rate=1e6 / request.frame_us,
         backend=request.backend,
         background=background,
+        gravity=request.gravity or options.gravity,
+        max_particles=request.max_particles or options.max_particles,
     )
     return RolloutPlan(complete, state, resolved_objects, options)
+
+
+def _experiment(
+    scene: Scene,
+    resolved_objects: PlacedObjects,
+    present: dict[str, ObjectState],
+    request: SimulateRequest,
+    named: Sequence[str],
+) -> SimulateOptions:
+    """An experiment; objects keep what ``set_physics`` says of them."""
+    setup = set_up(
+        str(request.experiment),
+        scene,
+        resolved_objects,
+        preset=request.preset,
+        speed=request.speed,
+        objects=tuple(named),
+        start_us=request.start_us,
+        grids=[v.grid for v in request.physics.values() if v.grid is not None],
+    )
+    known = {
+        name: given
+        for name in setup.options.objects
+        if name in present and (given := present[name].physics) is not None
+    }
+    objects = _with_values(setup.options.objects, known)
+    if request.end_us is None:
+        return replace(setup.options, objects=objects)
+    span = request.end_us - setup.options.start_us
+    return replace(setup.options, objects=objects, duration=span * 1e-6)
+
+
+def _with_values(
+    objects: Mapping[str, ObjectPhysics], values: Mapping[str, PhysicsValues]
+) -> dict[str, ObjectPhysics]:
+    """What is known of objects with other values in place of those.
+
+    Raises:
+        ServiceError: UNKNOWN_OBJECT for values of one that takes no part.
+    """
+    unknown = [name for name in values if name != "*" and name not in objects]
+    if unknown:
+        raise ServiceError(
+            ErrorCode.UNKNOWN_OBJECT,
+            f"physics is given for {unknown[0]!r}, which takes no part",
+            hint=f"taking part: {', '.join(objects)}; '*' stands for all",
+        )
+    return {
+        name: with_values(own, values.get("*"), values.get(name)) for name, own in objects.items()
+    }
 
 
 def run_rollout(
@@ -262,20 +336,17 @@ def _chosen(
 
 
 def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
-    given, velocity = subject.physics, subject.velocity
+    velocity = subject.velocity
     turn: Float = np.eye(3)
     if velocity is not None and velocity.frame == "object":
         turn = quaternion_to_matrix(subject.trajectory.pose(start)[1])
     linear = velocity.linear if velocity is not None else None
     angular = velocity.angular if velocity is not None else None
-    return ObjectPhysics(
-        mass=given.mass if given else None,
-        material=named_material(given.material) if given and given.material else None,
-        friction=given.friction if given else None,
-        restitution=given.restitution if given else None,
+    own = ObjectPhysics(
         velocity=None if linear is None else turn @ np.array(linear),
         angular_velocity=None if angular is None else turn @ np.array(angular),
     )
+    return own if subject.physics is None else with_values(own, subject.physics)
 
 
 def colliders_of(state: ScenarioState) -> list[Collider]:
@@ -296,6 +367,29 @@ def _collider(state: ScenarioState, given: AddCollider) -> Collider:
         case BoxShape() as box:
             pose = transform_from(box.position, box.quaternion)
             return Box(name=name, T_world_box=pose, size=box.size, friction=given.friction)
+        case CylinderShape() as post:
+            return Cylinder(
+                name=name,
+                T_world_cylinder=transform_from(post.position, post.quaternion),
+                radius=post.radius,
+                height=post.height,
+                friction=given.friction,
+            )
+        case CapsuleShape() as round_ended:
+            return Capsule(
+                name=name,
+                T_world_capsule=transform_from(round_ended.position, round_ended.quaternion),
+                radius=round_ended.radius,
+                length=round_ended.length,
+                friction=given.friction,
+            )
+        case MeshShape() as mesh:
+            return TriangleMesh(
+                name=name,
+                T_world_mesh=transform_from(mesh.position, mesh.quaternion),
+                surface=TriangleSurface(mesh.vertices, mesh.triangles, mesh.thickness),
+                friction=given.friction,
+            )
         case GroundShape() as ground:
             return _ground(state, offset=ground.offset, friction=given.friction)
         case _:

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
-from real2sim_proto.jobs import JobInfo, SimulateRequest
+from real2sim_proto.jobs import CalibrateRequest, JobInfo, SimulateRequest
 from real2sim_proto.scenarios import (
     History,
     OperationBatch,
@@ -230,6 +230,28 @@ async def simulate(  # noqa: PLR0917, one parameter for each part of the request
         info = await worker.simulations.start(
             scenario_id, body or SimulateRequest(), who=who, idempotent=idempotent
         )
+        return info_response(info, status=202, headers=accepted_headers(info))
+
+
+@router.post("/{scenario_id}/calibrate", status_code=202, response_model=JobInfo)
+async def calibrate(  # noqa: PLR0917, one parameter for each part of the request
+    worker: WorkerOf,
+    scenario_id: Identifier,
+    request: Request,
+    body: CalibrateRequest,
+    idempotency_key: IdempotencyKey = None,
+    who: ClientName = "",
+) -> Response:
+    """Find values of an object with which a simulation shows what was seen of it; a job.
+
+    Its result has `factors` on what was given, `uncertainty` of each (what observations leave open
+    and what cells do, together), `values` where a factor makes one, and in `untold` the parameters
+    that these observations say nothing about.
+    """
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await worker.calibrations.start(scenario_id, body, who=who, idempotent=idempotent)
         return info_response(info, status=202, headers=accepted_headers(info))
 
 

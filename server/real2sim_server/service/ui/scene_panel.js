@@ -34,6 +34,12 @@ export function scenePanel() {
           onclick: collide,
         }),
         el("button", {
+          textContent: "Make it a post",
+          title: "A solid, invisible upright cylinder for the physics, as wide as the box",
+          id: "post",
+          onclick: post,
+        }),
+        el("button", {
           textContent: "Flat ground",
           title: "The physics gets a level plane at the box's bottom",
           id: "plane",
@@ -49,13 +55,13 @@ export function scenePanel() {
       "Colliders",
       colliders.map((c) => [
         c.collider_id,
-        c.shape.kind === "box" ? place(c.shape.position) : c.shape.kind,
+        c.shape.position ? place(c.shape.position, c.shape.kind) : c.shape.kind,
       ]),
     ),
   ];
 }
 const tenth = (v) => Math.round(v * 10) / 10;
-const place = ([x, y]) => `box at ${tenth(x)}, ${tenth(y)} m`;
+const place = ([x, y], kind = "box") => `${kind} at ${tenth(x)}, ${tenth(y)} m`;
 
 function ahead() {
   const {
@@ -100,6 +106,14 @@ const copy = () => ({ position: [...model.box.position], size: [...model.box.siz
 const erase = () =>
   edit([{ op: "erase_region", pose: { position: copy().position }, size: copy().size }]);
 const collide = () => edit([{ op: "add_collider", shape: { kind: "box", ...copy() } }]);
+function post() {
+  const {
+    position,
+    size: [length, width, height],
+  } = copy();
+  const radius = Math.min(length, width) / 2;
+  return edit([{ op: "add_collider", shape: { kind: "cylinder", position, radius, height } }]);
+}
 function plane() {
   const {
     position: [x, y, z],

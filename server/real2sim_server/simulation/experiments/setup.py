@@ -59,6 +59,7 @@ class Request:
         start_us: scene time [us].
         preset: of the materials.
         speed: [m/s]; None for the experiment's own.
+        grids: that objects will be given, see ``ObjectPhysics.grid``.
     """
 
     scene: Scene
@@ -68,6 +69,7 @@ class Request:
     start_us: int
     preset: str
     speed: float | None
+    grids: tuple[int, ...] = ()
 
 
 def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
+from ...geometry.box import box_penetration
 from ...geometry.rotation import Float
 from ...physics.colliders import Collider, Plane
 from ...physics.errors import PhysicsError
@@ -27,6 +31,8 @@ DAMPED = FixedCorotated(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
 back up by a third of the height; this much leaves a slight bounce."""
 PAIR_GAP = 1.5
 """Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
+APART, ASIDE_STEP, ASIDE_TRIES = 0.4, 0.5, 400
+"""Room between pairs that collide, steps in which one is moved aside for it, and how many [m]."""
 DEPTH_RANGE = (4.0, 45.0)
 
 
@@ -38,17 +44,23 @@ def set_up(
     preset: str | None = None,
     speed: float | None = None,
     objects: tuple[str, ...] = (),
+    start_us: int | None = None,
+    grids: Sequence[int] = (),
 ) -> Experiment:
     """An experiment on a scene.
 
     Args:
-        name: ``wall``: one vehicle against a virtual wall; ``pair``: two vehicles into standing
+        name: ``wall``: one vehicle against a virtual wall; ``pair``: vehicles into as many standing
             ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground;
             ``frontal``, ``t_bone``, ``pole``, ``roof``: see ``crashes``.
         preset: of the materials; ``paper`` for its experiments and ``vehicle`` for crashes unless
             told.
         speed: [m/s]; the experiment's own by default.
-        objects: ids to take; by default vehicles in view, those seen best where it hits.
+        objects: ids to take; by default vehicles in view, those seen best where it hits. For
+            ``pair`` any number from two on: the first half runs into the others, and of an odd
+            number the last one stands where it is.
+        start_us: [us]; the first frame by default.
+        grids: that will be asked for, see ``ObjectPhysics.grid``: how far particles reach out.
 
     Raises:
         PhysicsError: unknown name or objects, or no vehicles in view.
@@ -60,13 +72,13 @@ def set_up(
     unknown = [o for o in objects if o not in there]
     if unknown:
         raise PhysicsError(f"no objects {unknown}; there are {sorted(there)}")
-    start_us = int(scene.frame_times_us[0])
+    start_us = int(scene.frame_times_us[0]) if start_us is None else start_us
     chosen = [there[o] for o in objects] or most_visible(scene, state, start_us)
     if not chosen:
         raise PhysicsError(f"no vehicles in view at {start_us} us; name some with objects")
     preset = preset or ("vehicle" if name in CRASHES else "paper")
     return builders[name](
-        Request(scene, state, tuple(chosen), bool(objects), start_us, preset, speed)
+        Request(scene, state, tuple(chosen), bool(objects), start_us, preset, speed, tuple(grids))
     )
 
 
@@ -138,8 +150,8 @@ def _pair(request: Request) -> Experiment:
     speed, start_us = 3.5 if request.speed is None else request.speed, request.start_us
     chosen = request.chosen
     if len(chosen) < 2:
-        raise PhysicsError("two vehicles in view are needed; name four or two with objects")
-    count = min(len(chosen) // 2, 2)
+        raise PhysicsError("two vehicles in view are needed; name two or more with objects")
+    count = len(chosen) // 2 if request.named else min(len(chosen) // 2, 2)
     if request.named:
         runners, standing = chosen[:count], chosen[count : 2 * count]
     else:
@@ -149,14 +161,24 @@ def _pair(request: Request) -> Experiment:
         standing = tuple(sorted(rest, key=lambda s: -visibilities[s.object_id].rear)[:count])
     objects: dict[str, ObjectPhysics] = {}
     midpoints = []
+    placed: list[tuple[Float, Float]] = []
+    if request.named and len(chosen) % 2:
+        last = chosen[-1]
+        pose = last.trajectory.transform(start_us)
+        placed.append((pose, np.asarray(last.scaled_size)))
+        objects[last.object_id] = ObjectPhysics(velocity=(0, 0, 0), T_world_object=pose)
     for k, (runner, hit) in enumerate(zip(runners, standing, strict=True)):
         own = runner.trajectory.transform(start_us)
         forward = level(own[:3, 0])
         away = _reach(request, runner)[1][0] + PAIR_GAP - _reach(request, hit)[0][0]
         target = np.array(own)
         target[:3, 3] += away * forward
-        target[:3, 3] += (0.25 - 0.5 * k) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
+        target[:3, 3] += (0.25 - 0.5 * (k % 2)) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
         target[2, 3] += (hit.scaled_size[2] - runner.scaled_size[2]) / 2
+        sizes = np.asarray(runner.scaled_size), np.asarray(hit.scaled_size)
+        shift = _way_aside([(own, sizes[0]), (target, sizes[1])], placed, forward)
+        own, target = _moved(own, shift), _moved(target, shift)
+        placed += [(own, sizes[0]), (target, sizes[1])]
         objects[runner.object_id] = ObjectPhysics(velocity=speed * forward, T_world_object=own)
         objects[hit.object_id] = ObjectPhysics(velocity=(0, 0, 0), T_world_object=target)
         midpoints.append((own[:3, 3] + target[:3, 3]) / 2)
@@ -179,8 +201,30 @@ def _pair(request: Request) -> Experiment:
     )
 
 
+def _way_aside(
+    pair: Sequence[tuple[Float, Float]], placed: Sequence[tuple[Float, Float]], forward: Float
+) -> Float:
+    """Shortest way [3] sideways that frees the boxes of a pair of all that are placed [m]."""
+    side = np.cross([0.0, 0.0, 1.0], forward)
+    for k in range(ASIDE_TRIES):
+        shift: Float = ASIDE_STEP * ((k + 1) // 2) * (1 if k % 2 else -1) * side
+        boxes = [(_moved(pose, shift), size + APART) for pose, size in pair]
+        if not any(box_penetration(*box, *other) > 0 for box in boxes for other in placed):
+            return shift
+    raise PhysicsError(
+        f"no place within {ASIDE_STEP * ASIDE_TRIES / 2:.0f} m for all pairs; name fewer objects"
+    )
+
+
+def _moved(pose: Float, shift: Float) -> Float:
+    moved = np.array(pose)
+    moved[:3, 3] += shift
+    return moved
+
+
 def _drop(request: Request) -> Experiment:
-    subjects, start_us = request.chosen[:3], request.start_us
+    start_us = request.start_us
+    subjects = request.chosen if request.named else request.chosen[:3]
     objects = {}
     for subject in subjects:
         pose = subject.trajectory.transform(start_us)
@@ -211,5 +255,7 @@ def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
     Tracked boxes are not that exact: particles reaches up to a voxel out of them.
     """
     preset = spaced_for(preset_of(request.preset), [subject])
+    if request.grids:
+        preset = replace(preset, spacing=max(subject.scaled_size) / max(request.grids))
     particles = object_particles(request.scene, subject, preset, request.start_us).positions
     return particles.min(axis=0) - preset.spacing / 2, particles.max(axis=0) + preset.spacing / 2

@@ -84,6 +84,63 @@ def test_physics_speed_and_wall_given_by_operations_are_what_the_rollout_has(cli
     assert own["velocities"][-1][0] < 1.0
 
 
+def test_values_of_the_papers_table_can_be_asked_for_and_posts_of_any_shape_are_met(
+    client, scenario
+):
+    post = {"kind": "cylinder", "position": [16.7, -3.0, 1.0], "radius": 0.1, "height": 3.0}
+    table = {"young": 2e6, "poisson": 0.4, "density": 200.0, "friction": 0.0, "grid": 30}
+    edit(
+        client,
+        scenario,
+        {"op": "set_physics", "object_id": "car_red"} | table | {"grid": 40},
+        PUSH,
+        {"op": "add_collider", "collider_id": "pole", "shape": post},
+    )
+    asked = SHORT | {"physics": {"*": {"grid": 30}}, "gravity": [0, 0, 0], "end_us": 200_000}
+    job = finished(client, client.post(f"{scenario}/simulate", json=asked))
+    assert job["state"] == "succeeded", job
+    figures = job["result"]["figures"]
+    car = client.get(f"{scenario}").json()
+    size = next(o["size"] for o in car["objects"] if o["object_id"] == "car_red")
+    assert figures["cell"] == pytest.approx(2 * max(size) / 30)
+    assert figures["gravity"] == [0, 0, 0]
+    assert ("car_red", "pole") in {(c["object_id"], c["other"]) for c in job["result"]["contacts"]}
+    assert [c["shape"]["kind"] for c in car["colliders"]] == ["cylinder"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "code", "words"),
+    [
+        ({"physics": {"post": {"mass": 3}}}, "UNKNOWN_OBJECT", "takes no part"),
+        ({"physics": {"*": {"young": 0}}}, "INVALID_REQUEST", "greater than 0"),
+        ({"physics": {"*": {"mass": 1, "density": 1}}}, "INVALID_REQUEST", "not both"),
+        ({"speed": 3}, "INVALID_REQUEST", "speed is of an experiment"),
+    ],
+)
+def test_values_that_fit_nothing_are_refused(client, scenario, asked, code, words):
+    answer = client.post(f"{scenario}/simulate", json=SHORT | asked)
+    assert answer.status_code in {404, 422}
+    assert answer.json()["code"] == code
+    assert words in answer.text
+
+
+def test_a_mesh_that_is_open_is_refused_with_what_to_do(client, scenario):
+    mesh = {"kind": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "triangles": [[0, 1, 2]]}
+    operations = [{"op": "add_collider", "shape": mesh}]
+    answer = client.post(f"{scenario}/operations", json={"operations": operations})
+    assert (answer.status_code, answer.json()["code"]) == (422, "INVALID_OPERATION")
+    assert "3 edges do not belong to two triangles" in answer.json()["detail"]
+    assert "thickness" in answer.json()["hint"]
+
+
+def test_an_experiment_of_the_paper_is_a_job(client, scenario):
+    asked = {"experiment": "wall", "objects": ["car_red"], "speed": 5, "end_us": 150_000}
+    job = finished(client, client.post(f"{scenario}/simulate", json=asked))
+    assert job["state"] == "succeeded", job
+    assert job["result"]["figures"]["preset"] == "paper"
+    assert ("car_red", "wall") in {(c["object_id"], c["other"]) for c in job["result"]["contacts"]}
+
+
 def test_a_rollout_that_begins_inside_a_collider_fails_with_the_reason(client, scenario):
     inside = {"kind": "box", "position": [14.0, -3.0, 1.0], "size": [1.0, 4.0, 2.0]}
     edit(client, scenario, PUSH, {"op": "add_collider", "collider_id": "in", "shape": inside})
@@ -104,6 +161,12 @@ def test_a_rollout_that_begins_inside_a_collider_fails_with_the_reason(client, s
         ({"op": "set_physics", "object_id": "car_red", "young": -2e6}, "young"),
         ({"op": "set_velocity", "object_id": "car_red", "linear": [1e6, 0, 0]}, "linear"),
         ({"op": "add_collider", "shape": {"kind": "box", "size": [0, 1, 1]}}, "shape"),
+        ({"op": "set_physics", "object_id": "car_red", "grid": 2000}, "grid"),
+        (
+            {"op": "set_physics", "object_id": "car_red", "material": "jelly", "yield_stress": 9.0},
+            "yield_stress",
+        ),
+        ({"op": "add_collider", "shape": {"kind": "cylinder", "radius": 0}}, "radius"),
         (
             {
                 "op": "add_collider",

@@ -12,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...colliders import Box, Collider, HeightField, Plane
+from ...colliders import Collider, Solid
 from ...constitutive import material_row
 from ...contact.node import ON_FACE, THIN_MARGIN
-from ...contact.particle import MISSES, SINK, TOUCHING
 from ...contact.surface import FLAT_MOMENT, INSIDE, OPPOSED, STICKS, SURFACE
-from ...errors import ColliderError
 from ..base import is_thin
+from .distance import collider_distance, first_touch
 from .stress import stress_update
 
 OFFSETS = torch.cartesian_prod(*[torch.arange(3)] * 3)
@@ -287,7 +286,7 @@ def _resolve_collider_contact(
                 distance, n = _distance_behind(collider, nodes, moment[b], params.dx)
                 margin = THIN_MARGIN
             else:
-                distance, n = _distance(collider, nodes)
+                distance, n = collider_distance(collider, nodes)
             gap = distance / params.dx + surface_offset(_depth(moment[b], n))
             closed = (mass[b] > 0) & (distance <= 0) & (gap <= margin)
             friction = params.friction[b]
@@ -303,14 +302,14 @@ def _resolve_collider_contact(
 
 
 def _distance_behind(
-    box: Collider, nodes: Tensor, moment: Tensor, dx: float
+    solid: Collider, nodes: Tensor, moment: Tensor, dx: float
 ) -> tuple[Tensor, Tensor]:
     """Distance [U] of nodes to the face that the body looks at; see ``contact.node``."""
     volume = moment[:, 3:]
     out = dx * moment[:, :3] / torch.where(volume > 0, volume, torch.ones_like(volume))
-    distance, n = _distance(box, nodes + out)
+    distance, n = collider_distance(solid, nodes + out)
     distance = distance - (out * n).sum(-1) - ON_FACE * dx
-    across = _distance(box, nodes - distance[:, None] * n)[0]
+    across = collider_distance(solid, nodes - distance[:, None] * n)[0]
     return torch.where(across > (0.5 + ON_FACE) * dx, across, distance), n
 
 
@@ -330,15 +329,15 @@ def _resolve_thin_colliders(
     thin = [(k, c) for k, c in enumerate(colliders) if is_thin(c, params.dx)]
     half = params.volume ** (1 / 3) / 2
     for _ in range(min(len(thin), 2)):
-        for k, box in thin:
-            assert isinstance(box, Box)
-            u = _material_velocity(box, x)
-            t, n = _first_touch(box, x, dt * (v - u), half)
+        for k, solid in thin:
+            assert isinstance(solid, Solid)
+            u = _material_velocity(solid, x)
+            t, n = first_touch(solid, x, dt * (v - u), half)
             rest = (t * ((v - u) * n).sum(-1))[:, None] * n
             friction = params.friction[params.body][:, None]
-            if box.friction is not None:
-                friction = torch.full_like(friction, min(box.friction, float(STICKS)))
-            after = u + rest + coulomb(v - u - rest, n, friction, box.separable)
+            if solid.friction is not None:
+                friction = torch.full_like(friction, min(solid.friction, float(STICKS)))
+            after = u + rest + coulomb(v - u - rest, n, friction, solid.separable)
             after = torch.where((t <= 1)[:, None], after, v)
             impulse = params.mass[:, None] * (after - v)
             for body in range(len(params.friction)):
@@ -350,76 +349,10 @@ def _resolve_thin_colliders(
     return v
 
 
-def _first_touch(box: Box, x: Tensor, way: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Fraction [N] of each way until a particle touches a box, MISSES where none; normals."""
-    pose = torch.as_tensor(box.T_world_box)
-    size = torch.as_tensor(box.size) / 2
-    q, w = (x - pose[:3, 3]) @ pose[:3, :3], way @ pose[:3, :3]
-    sign = torch.where(q > 0, 1.0, -1.0).to(q.dtype)
-    gap = q.abs() - size - SINK * half[:, None]
-    inward, near = -w * sign, TOUCHING * half[:, None]
-    enters = (gap >= -near) & (inward > 0) & (gap <= inward)
-    t = gap.clamp(min=0) / torch.where(enters, inward, torch.ones_like(inward))
-    if not box.separable:
-        held = gap.abs() <= near
-        enters, t = enters | held, torch.where(held, torch.zeros_like(t), t)
-    there = q[:, None] + t[:, :, None] * w[:, None]
-    within = there.abs() <= size + half[:, None, None]
-    within = (within | torch.eye(3, dtype=torch.bool)).all(-1)
-    t = torch.where(enters & within, t, torch.full_like(t, MISSES))
-    first, axis = t.min(-1)
-    inside = gap.max(-1).values < -near[:, 0]
-    first = torch.where(inside, torch.zeros_like(first), first)
-    axis = torch.where(inside, gap.argmax(-1), axis)
-    face = torch.nn.functional.one_hot(axis, 3).to(q.dtype)
-    return first, (sign * face) @ pose[:3, :3].T
-
-
-def _distance(collider: Collider, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance [U] [m] and outward normal [U, 3]."""
-    if isinstance(collider, Plane):
-        n = torch.as_tensor(collider.normal)
-        return (points - torch.as_tensor(collider.point)) @ n, n.expand_as(points)
-    if isinstance(collider, Box):
-        return _box_distance(collider, points)
-    if isinstance(collider, HeightField):
-        return _height_distance(collider, points)
-    raise ColliderError(f"no distance to a {type(collider).__name__}")
-
-
-def _box_distance(box: Box, points: Tensor) -> tuple[Tensor, Tensor]:
-    pose = torch.as_tensor(box.T_world_box)
-    q = (points - pose[:3, 3]) @ pose[:3, :3]
-    d = q.abs() - torch.as_tensor(box.size) / 2
-    outer = d.clamp(min=0)
-    far = outer.norm(dim=-1)
-    nearest = torch.nn.functional.one_hot(d.argmax(-1), 3).to(q.dtype)
-    outside = (far > 0)[:, None]
-    n = torch.where(outside, outer / far.clamp(min=1e-300)[:, None], nearest)
-    n = torch.copysign(n, q) @ pose[:3, :3].T
-    return torch.where(far > 0, far, d.max(-1).values), n
-
-
-def _height_distance(field: HeightField, points: Tensor) -> tuple[Tensor, Tensor]:
-    heights = torch.as_tensor(field.heights)
-    at = (points[:, :2] - torch.as_tensor(field.origin)) / field.spacing
-    last = torch.tensor(heights.shape) - 1
-    at = torch.minimum(at.clamp(min=0), last.to(at.dtype))
-    i, j = torch.minimum(at.floor().long(), last - 1).unbind(-1)
-    a, b = at[:, 0] - i, at[:, 1] - j
-    h00, h01, h10, h11 = heights[i, j], heights[i, j + 1], heights[i + 1, j], heights[i + 1, j + 1]
-    slope_x = ((h10 - h00) * (1 - b) + (h11 - h01) * b) / field.spacing
-    slope_y = ((h01 - h00) * (1 - a) + (h11 - h10) * a) / field.spacing
-    height = (h00 * (1 - a) + h10 * a) * (1 - b) + (h01 * (1 - a) + h11 * a) * b
-    n = torch.stack([-slope_x, -slope_y, torch.ones_like(a)], dim=-1)
-    n = n / n.norm(dim=-1, keepdim=True)
-    return (points[:, 2] - height) * n[:, 2], n
-
-
 def _material_velocity(collider: Collider, points: Tensor) -> Tensor:
-    if not isinstance(collider, Box):
+    if not isinstance(collider, Solid):
         return torch.zeros_like(points)
-    arm = points - torch.as_tensor(collider.T_world_box)[:3, 3]
+    arm = points - torch.as_tensor(collider.pose)[:3, 3]
     spin = torch.as_tensor(collider.angular_velocity).expand_as(arm)
     velocity: Tensor = torch.as_tensor(collider.velocity) + torch.linalg.cross(spin, arm)
     return velocity
