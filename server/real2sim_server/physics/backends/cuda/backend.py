@@ -33,7 +33,7 @@ from ..layout import (
 from . import records as r
 from .launcher import CudaLauncher, Launch, Launcher
 from .memory import SolverMemory
-from .sequences import arranging, flushing, measuring, substeps
+from .sequences import advancing, arranging, flushing, measuring, substeps
 
 INTERVAL = 16
 """Substeps that are queued at once: the solver checks as often, and sequences of launches that come
@@ -87,7 +87,7 @@ class CudaSimulation:
     def __init__(self, launcher: Launcher, model: Model, colliders: Sequence[Collider]) -> None:
         self._launcher, self._model = launcher, model
         rows, heights = pack_colliders(colliders, model.dx)
-        self._memory = SolverMemory(launcher, model, heights, len(colliders))
+        self._memory = SolverMemory(launcher, model, rows, heights)
         self._memory.upload(self._memory.sets[0], self._loaded(model.start))
         self._report = np.zeros(len(self._memory.report), np.uint8)
         self._keep = False  # Whether sorting leaves particles in the blocks that they are in.
@@ -97,7 +97,7 @@ class CudaSimulation:
         done = 0
         while done == 0:
             begin = [Launch("begin_run", 1), *self._arranged(0)]
-            done = self._told([*begin, Launch("advance_blocks", self._sizes.blocks, r.DEFORMS)], 1)
+            done = self._told([*begin, *advancing(self._sizes, r.DEFORMS)], 1)
 
     @property
     def _sizes(self) -> Any:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....geometry.rotation import Float
+from ...contact.collider_distance import THIN
 from ..base import TOTALS, Model
 from . import records as r
 from .launcher import Launcher
@@ -33,8 +34,9 @@ class SolverMemory:
         report: [bytes] uint8, Held, sums of bodies, and totals of contacts.
     """
 
-    def __init__(self, launcher: Launcher, model: Model, heights: Float, colliders: int) -> None:
+    def __init__(self, launcher: Launcher, model: Model, rows: Float, heights: Float) -> None:
         self._launcher, self._model = launcher, model
+        colliders = len(rows)
         n, bodies = len(model.masses), model.bodies
         self._real = np.dtype(model.dtype).itemsize
         self.pitch = -(-n // 64) * 64
@@ -44,6 +46,7 @@ class SolverMemory:
             particles=n,
             bodies=bodies,
             colliders=colliders,
+            obstructed=bool((rows[:, THIN] > 0).any()),
             laws=len(np.unique(model.table[model.material, 0])),
             sort_blocks=max(1, min(SORT_BLOCKS, n // (16 * r.THREADS))),
             blocks=guess,

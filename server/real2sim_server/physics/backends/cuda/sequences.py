@@ -16,6 +16,7 @@ class Sizes:
 
     Attributes:
         particles, bodies, colliders: numbers of each.
+        obstructed: whether there are thin colliders, which particles touch themselves.
         laws: how many constitutive laws its particles follow.
         sort_blocks: blocks of threads that share the list of particles when it is sorted.
         blocks, fields, contacts, pairs, thins: room on the device, see ``kernels/space.h``.
@@ -24,6 +25,7 @@ class Sizes:
     particles: int
     bodies: int
     colliders: int
+    obstructed: bool
     laws: int
     sort_blocks: int
     blocks: int
@@ -76,13 +78,21 @@ def arranging(sizes: Sizes, *, keep: bool, step: int) -> list[Launch]:
 
 
 def substeps(sizes: Sizes, first: int, end: int) -> list[Launch]:
-    """Substeps of these numbers: one launch, and two for each."""
+    """Substeps of these numbers: one launch, and two for each; more where colliders are thin."""
     groups = _groups(sizes.fields * r.NODES)
-    launches = [Launch("advance_blocks", sizes.blocks, r.SCATTERS | first)]
+    launches = advancing(sizes, r.SCATTERS | first)
     for step in range(first, end):
         does = r.MOVES | r.DEFORMS | (r.SCATTERS if step + 1 < end else 0)
         launches.append(Launch("collect_fields", groups, step))
-        launches.append(Launch("advance_blocks", sizes.blocks, does | step))
+        launches += advancing(sizes, does | step)
+    return launches
+
+
+def advancing(sizes: Sizes, does: int) -> list[Launch]:
+    """Particles of all blocks through what is asked for."""
+    launches = [Launch("advance_blocks", sizes.blocks, does)]
+    if sizes.obstructed:
+        launches.append(Launch("advance_obstructed", sizes.blocks, does))
     return launches
 
 

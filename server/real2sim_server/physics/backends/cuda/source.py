@@ -32,6 +32,7 @@ KERNELS = (
     "fill_lists",
     "find_near",
     "advance_blocks",
+    "advance_obstructed",
     "collect_fields",
     "measure_blocks",
     "measure_bodies",

@@ -1,11 +1,11 @@
-// One substep in two launches: fields collect what blocks have scattered and touch what is there;
+// One substep in two launches, three where colliders are thin: fields collect what blocks have scattered and touch what is there;
 // blocks take it up, move and deform their particles, and scatter for the next substep. No sum is
 // left to the order of threads: a tile is added up particle by particle, as on the CPU.
 #pragma once
 
 #include "layout.h"
 
-// What advance_blocks does, above the number of the substep.
+// What advance_blocks and advance_obstructed do, above the number of the substep.
 constexpr uint32 MOVES = 1u << 16, DEFORMS = 1u << 17, SCATTERS = 1u << 18;
 constexpr uint32 STEP_MASK = (1u << 16) - 1;
 // Lines of a tile in shared memory are apart so that 27 nodes lie in different banks, but two.
@@ -14,7 +14,7 @@ constexpr uint32 PADDED = SIDE * PLANE_ROW;
 // Particles that are staged at once.
 constexpr uint32 CHUNK = sizeof(real) == 4 ? THREADS : THREADS / 2;
 // Blocks of threads that a multiprocessor can hold: so many registers are left to each.
-constexpr int RESIDENT = sizeof(real) == 4 ? 3 : 2;
+constexpr int RESIDENT = sizeof(real) == 4 ? 3 : 2, RESIDENT_OBSTRUCTED = 2;
 constexpr real LOWEST = real(-0.5), HIGHEST = real(5.5);
 
 __device__ __forceinline__ int padded_node(int i, int j, int k) {
@@ -205,8 +205,9 @@ __device__ __forceinline__ Numbers<real, 6> deform(
 }
 
 // One particle through a substep, as far as `does` says; staged for its tile where it scatters.
+template <bool OBSTRUCTED>
 __device__ __forceinline__ void advance_particle(
-    const Space& space, const Particles& all, uint32 p, uint32 block, uint32 does, bool obstructed,
+    const Space& space, const Particles& all, uint32 p, uint32 block, uint32 does,
     const real (*velocities)[PADDED], Staged& staged) {
     const real dx = real(space.dx);
     const real dt = does & (MOVES | SCATTERS) ? real(space.step->dt) : real(0);
@@ -221,7 +222,7 @@ __device__ __forceinline__ void advance_particle(
         L = all.several<9>(GRADIENT, p);
     } else {
         gather(velocities, place_of(xi), dx, v, L);
-        if (obstructed) hold_particle(space, all, p, block, step, xi, v);
+        if constexpr (OBSTRUCTED) hold_particle(space, all, p, block, step, xi, v);
         const real stride = dt / dx;
         for (int axis = 0; axis < 3; ++axis) {
             xi[axis] += stride * v[axis];
@@ -261,17 +262,15 @@ __device__ __forceinline__ void scatter_moments(
     store_tile(tile, space.moments + uint64(block) * TILE);
 }
 
-// Particles of a block through a substep.
-extern "C" __global__ void __launch_bounds__(THREADS, RESIDENT) advance_blocks(
-    const Space* given, uint32 does) {
-    __shared__ real velocities[3][PADDED], tile[4][PADDED];
-    __shared__ Staged staged;
-    const Space& space = *given;
+// Particles of a block through a substep; of those near thin colliders, or of the others.
+template <bool OBSTRUCTED> __device__ __forceinline__ void advance_block(
+    const Space& space, uint32 does, real (*velocities)[PADDED], real (*tile)[PADDED],
+    Staged& staged) {
     const uint32 block = blockIdx.x;
     if (block >= space.held->blocks || is_halted(space, does & STEP_MASK)) return;
+    if (OBSTRUCTED != (space.thin_start[block] < space.thin_start[block + 1])) return;
     const Particles all = particles_of(space);
     const uint32 begin = space.block_start[block], end = space.block_start[block + 1];
-    const bool obstructed = space.thin_start[block] < space.thin_start[block + 1];
     if (does & MOVES) {
         load_velocities(space, block, velocities);
         if (block == 0 && threadIdx.x == 0) space.held->done = (does & STEP_MASK) + 1;
@@ -281,7 +280,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, RESIDENT) advance_blocks(
     for (uint32 first = begin; first < end; first += CHUNK) {
         const uint32 p = first + threadIdx.x;
         if (threadIdx.x < CHUNK && p < end)
-            advance_particle(space, all, p, block, does, obstructed, velocities, staged);
+            advance_particle<OBSTRUCTED>(space, all, p, block, does, velocities, staged);
         __syncthreads();
         if (does & SCATTERS) add_staged(tile, staged, min(end - first, CHUNK));
         __syncthreads();
@@ -289,6 +288,21 @@ extern "C" __global__ void __launch_bounds__(THREADS, RESIDENT) advance_blocks(
     if (!(does & SCATTERS)) return;
     store_tile(tile, space.tiles + uint64(block) * TILE);
     if (space.block_near[block]) scatter_moments(space, all, block, tile, staged);
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, RESIDENT) advance_blocks(
+    const Space* given, uint32 does) {
+    __shared__ real velocities[3][PADDED], tile[4][PADDED];
+    __shared__ Staged staged;
+    advance_block<false>(*given, does, velocities, tile, staged);
+}
+
+// A kernel of its own, as what thin colliders do takes registers that all others would miss.
+extern "C" __global__ void __launch_bounds__(THREADS, RESIDENT_OBSTRUCTED) advance_obstructed(
+    const Space* given, uint32 does) {
+    __shared__ real velocities[3][PADDED], tile[4][PADDED];
+    __shared__ Staged staged;
+    advance_block<true>(*given, does, velocities, tile, staged);
 }
 
 __device__ __forceinline__ void add(Real4& sum, const Real4& other) {
@@ -369,7 +383,7 @@ __device__ __forceinline__ void touch_colliders(
 }
 
 // Tiles to the fields of one group: sums, gravity, contact. Nodes do not know each other.
-extern "C" __global__ void __launch_bounds__(THREADS) collect_fields(
+extern "C" __global__ void __launch_bounds__(THREADS, 3) collect_fields(
     const Space* given, uint32 step) {
     const Space& space = *given;
     const uint32 group = thread_number() / NODES, node = threadIdx.x % NODES;
