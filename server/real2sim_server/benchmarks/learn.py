@@ -7,6 +7,7 @@ single world, small images beside those of all Gaussians, many sessions beside o
 from __future__ import annotations
 
 import contextlib
+import selectors
 import tempfile
 import time
 from collections.abc import Callable
@@ -34,7 +35,7 @@ from ..scene.io import read_packed
 from ..world import World
 from ..world.batch import BatchWorld
 from .batch_probe import BatchProbe
-from .drive_probe import DriveProbe, action
+from .drive_probe import ANSWER_S, DriveProbe, action
 
 Figures = dict[str, Any]
 
@@ -226,18 +227,24 @@ def _sessions(url: str, count: int, steps: int) -> float:
     with real2sim.connect(url) as client, contextlib.ExitStack() as open_sockets:
         client.wait_ready()
         infos = [client.sessions.create(scene="street") for _ in range(count)]
-        probes = [open_sockets.enter_context(DriveProbe(info)) for info in infos]
-        seen = [probe.reset([], dt_us=SHORT_STEP_US)[0] for probe in probes]
+        waiting = open_sockets.enter_context(selectors.DefaultSelector())
+        for info in infos:
+            probe = open_sockets.enter_context(DriveProbe(info))
+            obs, _ = probe.reset([], dt_us=SHORT_STEP_US)
+            waiting.register(probe.socket.socket, selectors.EVENT_READ, probe)
+            probe.send(action(obs))
 
         def step() -> int:
-            for probe, obs in zip(probes, seen, strict=True):
-                probe.send(action(obs))
-            for k, probe in enumerate(probes):
-                seen[k] = decode(bytes(probe.socket.recv(60.0)))
-            return count
+            """Planners answer each on their own, as soon as an observation is there."""
+            answered = 0
+            for key, _ in waiting.select():
+                probe: DriveProbe = key.data
+                probe.send(action(decode(bytes(probe.socket.recv(ANSWER_S)))))
+                answered += 1
+            return answered
 
         step()
-        rate = _rate(step, steps)
+        rate = _rate_until(step, count * steps)
         for info in infos:
             client.sessions.delete(info.session_id)
     return rate
@@ -255,6 +262,14 @@ def _rate(call: Callable[[], int], times: int) -> float:
     """What calls say that they did, a second."""
     started = time.perf_counter()
     done = sum(call() for _ in range(times))
+    return done / (time.perf_counter() - started)
+
+
+def _rate_until(call: Callable[[], int], wanted: int) -> float:
+    """The same, called until that much is done."""
+    started, done = time.perf_counter(), 0
+    while done < wanted:
+        done += call()
     return done / (time.perf_counter() - started)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.episode import ResetSpec
 
+from ..edit import ObjectState
 from ..edit.tracks import sample
 from ..scene import Scene
 from .agents import Agents
@@ -21,6 +22,7 @@ from .ego.reference import PlannedTrajectory
 from .episode import EpisodeClock
 from .events import Event
 from .path import LoggedPath, PathPoint
+from .per_object import per_object
 from .scoring import EgoSample, ObjectSamples, ScoringContext
 from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES
@@ -142,11 +144,18 @@ def ego_sample(motion: Motion, near: PathPoint, z: float, *, laps: float = 0.0) 
 
 def object_samples(agents: Agents) -> ObjectSamples:
     """Objects for the scores."""
+    ids, categories = _named(agents.objects)
     return ObjectSamples(
-        ids=tuple([o.object_id for o in agents.objects]),
-        categories=tuple([o.category for o in agents.objects]),
+        ids=ids,
+        categories=categories,
         centres=agents.positions,
         yaws=headings(agents.quaternions),
         sizes=agents.sizes,
         velocities=np.ascontiguousarray(agents.velocities[:, :2]),
     )
+
+
+@per_object
+def _named(objects: tuple[ObjectState, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Ids and categories; the same tuple of objects comes with many steps."""
+    return tuple([o.object_id for o in objects]), tuple([o.category for o in objects])

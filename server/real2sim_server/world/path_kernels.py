@@ -153,7 +153,7 @@ def next_in_strip(knots, s, box, bodies, own):
         [m/s].
     """
     offset, length, width = box
-    strip = _strip(knots, s, offset)
+    strip = strip_ahead(knots, s, offset)
     gap, speed = math.inf, 0.0
     for k in range(len(bodies)):
         if k == own:
@@ -175,7 +175,7 @@ def next_in_strip(knots, s, box, bodies, own):
 
 
 @kernel
-def _strip(knots, s, offset):
+def strip_ahead(knots, s, offset):
     """Places x, y [m] and heading [rad] [REACH, 3] one metre apart from ``s`` on, ``offset`` to the
     left of the path: what :func:`point_at` gives, whose search each place would begin anew."""
     found = np.empty((REACH, 3))

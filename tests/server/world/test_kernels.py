@@ -23,7 +23,7 @@ from real2sim_server.world.collision import sweep_kernels
 from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.reference import PlannedTrajectory
 from real2sim_server.world.scoring import comfort_kernels, hazard_kernels, road_kernels
-from real2sim_server.world.scoring.comfort import plans_agree
+from real2sim_server.world.scoring.comfort import ComfortAccumulator, plans_agree
 from real2sim_server.world.warm_up import warm_up_planning
 
 NOW, SECOND = 4_000_000, 1_000_000
@@ -302,6 +302,26 @@ def test_derivatives_are_weighted_sums():
 
     found = comfort_kernels.derivatives(weights, samples)
     np.testing.assert_allclose(found, [speed, acceleration, jerk, rate, yaw_acceleration])
+
+
+@pytest.mark.parametrize("history", [0, 3, 40])
+def test_comfort_looked_at_once_is_that_of_both(history):
+    dt, numbers = 0.1, np.random.default_rng(history).normal(size=(60 + history, 2))
+    with_history = ComfortAccumulator()
+    for speed, yaw in numbers[:history].tolist():
+        with_history = with_history.updated(speed, yaw, dt)
+    shared = alone = (ComfortAccumulator(), with_history)
+    for speed, yaw in numbers[history:].tolist():
+        shared = shared[0].updated_beside(shared[1], speed, yaw, dt)
+        alone = tuple(comfort.updated(speed, yaw, dt) for comfort in alone)
+        for one, other in zip(shared, alone, strict=True):
+            assert (one.samples == other.samples).all()
+            assert (one.newest, one.worst, one.comfortable) == (
+                other.newest,
+                other.worst,
+                other.comfortable,
+            )
+    assert shared[0].samples is shared[1].samples
 
 
 @compiling

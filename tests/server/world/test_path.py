@@ -11,6 +11,7 @@ from real2sim_server.geometry.rotation import multiply_quaternions, yaw_quaterni
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import LoggedPath
 from real2sim_server.world.ego.route import command_ahead, route_ahead
+from real2sim_server.world.path_kernels import strip_ahead
 
 
 def along(xyz: list[tuple[float, float, float]], quaternions: np.ndarray) -> Trajectory:
@@ -117,3 +118,14 @@ def test_headings_that_wrap_are_no_turn():
     path = LoggedPath(along(np.stack([x, 0 * x, 0 * x], axis=1), yaw_quaternion(yaw)))
 
     assert command_ahead(path, 90.0) == "straight"
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.7])
+@pytest.mark.parametrize("s", [-3.0, 0.0, 11.3, 60.0])
+def test_places_ahead_are_those_of_the_path_to_the_bit(s, offset):
+    path = LoggedPath(circle(50, 1.5))
+    found = strip_ahead(path.knots, s, offset)
+    for i, (x, y, yaw) in enumerate(found.tolist()):
+        px, py, _, heading = path.at(s + i)
+        expected = (px - offset * math.sin(heading), py + offset * math.cos(heading), heading)
+        assert (x, y, yaw) == expected

@@ -15,6 +15,7 @@ from real2sim_server.world.batch import BatchWorld
 from real2sim_server.world.driving import VEHICLE_MODELS
 from real2sim_server.world.ego.controller import EgoController
 from real2sim_server.world.ego.motion import Motion
+from real2sim_server.world.ego.reference import PlannedTrajectory
 from real2sim_server.world.recording.stored_spec import stored_spec
 
 BEHIND, ASIDE = 11.0, 2.5
@@ -197,3 +198,12 @@ def test_egos_of_the_versions_before_have_no_reverse_gear():
     assert stored_spec({"ego": {}}).ego.max_reverse_speed == 0.0
     assert stored_spec({}).ego.max_reverse_speed == 0.0
     assert EgoSpec().max_reverse_speed == 5.0
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.4, math.pi])
+def test_a_plan_leads_forwards_or_not_whichever_way_that_is_found(turned):
+    frame, times = (3.0, -7.0, 2.5), range(1, 9)
+    rows = [(0.5 * k, 0.1 * k, turned) for k in times]
+    found = PlannedTrajectory.of(list(times), rows, frame)
+    again = PlannedTrajectory(found.times_us, found.poses)
+    assert found.is_clear == found.leads_forwards == again.leads_forwards == (turned < 1)

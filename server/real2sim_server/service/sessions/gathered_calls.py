@@ -83,19 +83,26 @@ class GatheredCalls(Generic[T, R]):
     def _end(
         self, calls: Sequence[tuple[T, asyncio.Future[R]]], results: Sequence[R | Exception]
     ) -> None:
-        self._begin()
-        for (argument, outcome), result in zip(calls, results, strict=True):
-            if outcome.done():
-                continue
-            if isinstance(result, Exception):
-                outcome.set_exception(result)
-                continue
-            try:
-                self._on_result(argument, result)
-            except Exception as error:
-                outcome.set_exception(error)
-            else:
-                outcome.set_result(result)
+        try:
+            for (argument, outcome), result in zip(calls, results, strict=True):
+                self._settle(argument, outcome, result)
+        finally:
+            # After the answers: each is a call of the system, from which this thread would come
+            # back only when the other, were it at work, gives the interpreter up.
+            self._begin()
+
+    def _settle(self, argument: T, outcome: asyncio.Future[R], result: R | Exception) -> None:
+        if outcome.done():
+            return
+        if isinstance(result, Exception):
+            outcome.set_exception(result)
+            return
+        try:
+            self._on_result(argument, result)
+        except Exception as error:
+            outcome.set_exception(error)
+        else:
+            outcome.set_result(result)
 
 
 def attempt(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R | Exception:

@@ -37,9 +37,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple, TypeVar
-
-from prometheus_client import Histogram
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
@@ -211,7 +210,6 @@ class StepPipeline:
         self._metrics = metrics
         self._deformation = deformation
         self._max_pixels = max_pixels
-        self._stages: dict[str, Histogram] = {}
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
         self._steps: GatheredCalls[Transition, EncodedObservation] = GatheredCalls(
             self._compute_together, self._worlds, on_result=self.send
@@ -402,13 +400,11 @@ class StepPipeline:
     ) -> list[EncodedObservation | Exception]:
         """All phases of steps without images; where one fails, the others go on."""
         if len(transitions) == 1:
-            return [_counted(self._compute_blind, transitions[0])]
-        return [
-            world
-            if isinstance(world, Exception)
-            else _counted(self._encode_blind, transition, world)
-            for transition, world in zip(transitions, self._worlds_of(transitions), strict=True)
-        ]
+            return _counted(self._compute_blind, [(transitions[0],)])
+        worlds = self._worlds_of(transitions)
+        pairs = zip(transitions, worlds, strict=True)
+        encoded = iter(_counted(self._encode_blind, [p for p in pairs if isinstance(p[1], World)]))
+        return [next(encoded) if isinstance(world, World) else world for world in worlds]
 
     async def run_seeing(
         self, transitions: Sequence[Transition]
@@ -459,7 +455,7 @@ class StepPipeline:
         ]
 
     def _worlds_of(self, transitions: Sequence[Transition]) -> list[World | Exception]:
-        worlds = [_counted(self._advance_and_evaluate, transition) for transition in transitions]
+        worlds = _counted(self._advance_and_evaluate, [(transition,) for transition in transitions])
         moved = [t for t, w in zip(transitions, worlds, strict=True) if isinstance(w, World)]
         unrecorded = self._record(moved)
         return [unrecorded.get(t, w) for t, w in zip(transitions, worlds, strict=True)]
@@ -683,17 +679,26 @@ class StepPipeline:
 
     def _count(self, observation: EncodedObservation) -> None:
         for stage, ms in observation.timing_ms.items():
-            if (found := self._stages.get(stage)) is None:
-                found = self._stages[stage] = self._metrics.stages.labels(stage)
-            found.observe(ms / 1e3)
+            self._metrics.stages.labels(stage).observe(ms / 1e3)
         for frame in observation.frames:
             self._metrics.frames.labels("drive", frame.codec).inc()
 
 
-def _counted(fn: Callable[..., T], transition: Transition, *args: Any) -> T | Exception:
-    """A part of a step on the thread of worlds, its time counted for whoever asked for it; the
-    transaction of several steps counts for nobody."""
-    return attempt(counted_world_time, transition.account, fn, transition, *args)
+def _counted(fn: Callable[..., T], calls: Iterable[tuple[Any, ...]]) -> list[T | Exception]:
+    """A part of several steps on the thread of worlds, its time counted for whoever asked for it;
+    the transaction of several steps counts for nobody.
+
+    ``calls`` are arguments of ``fn``, the transition first. Those of one account in a row are
+    counted in one go: every look at the clock of the processor is a call of the system.
+    """
+    found: list[T | Exception] = []
+    for account, run in groupby(calls, key=lambda call: call[0].account):
+        found += counted_world_time(account, _attempts, fn, list(run))
+    return found
+
+
+def _attempts(fn: Callable[..., T], calls: Sequence[tuple[Any, ...]]) -> list[T | Exception]:
+    return [attempt(fn, *call) for call in calls]
 
 
 def _seen(world: World) -> Seen:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
+from itertools import chain
 from typing import Any
 
 import sqlalchemy as sa
@@ -298,7 +299,9 @@ class Store:
     def _append(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> Write:
         if self.database.is_file:
             values = [(session, *vars(entry).values()) for session, log in logs for entry in log]
-            return Write(_APPEND, values)
+            if len(values) > MOST_ROWS:
+                return Write(_append_of(1), values)
+            return Write(_append_of(len(values)), [tuple(chain.from_iterable(values))])
         rows = [{"session_id": session} | vars(entry) for session, log in logs for entry in log]
         return _insert_rows(t.session_log, *rows)
 
@@ -398,12 +401,20 @@ def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
     return Write(_insert(table), [dict(row) for row in rows])
 
 
-_APPEND = (
-    "INSERT INTO session_log (session_id, seq, kind, step, payload, created_us) "
-    "VALUES (?, ?, ?, ?, ?, ?)"
-)
-"""Of an entry, for SQLite, in the order of :class:`SessionEntry`. Every step of a session makes
-one: to have the statement put together by SQLAlchemy takes as long as the append."""
+MOST_ROWS = 32
+"""Entries that one statement appends; more of them take turns."""
+
+
+@cache
+def _append_of(rows: int) -> str:
+    """The statement that appends entries, for SQLite, in the order of :class:`SessionEntry`.
+
+    Every step of a session makes one: to have the statement put together by SQLAlchemy takes as
+    long as the append. Of many in one go the driver gives the interpreter up but once, not for
+    every row, and other threads keep it longer than a row takes.
+    """
+    columns = "session_id, seq, kind, step, payload, created_us"
+    return f"INSERT INTO session_log ({columns}) VALUES " + ", ".join(["(?, ?, ?, ?, ?, ?)"] * rows)
 
 
 @cache

@@ -10,9 +10,9 @@ from .entries import (
     advance_vehicle,
     curve_at,
     driver_command,
+    placed_poses,
     plan_curve,
     prepare_schedule,
-    world_poses,
 )
 from .state import Command, PlanarState
 from .trackers import HOLD, ILQR, KINDS, LQR, PLANNING_AHEAD, PURSUIT
@@ -38,9 +38,9 @@ __all__ = [
     "advance_vehicle",
     "curve_at",
     "driver_command",
+    "placed_poses",
     "plan_curve",
     "prepare_schedule",
     "vehicle_parameters",
     "wheel_load",
-    "world_poses",
 ]

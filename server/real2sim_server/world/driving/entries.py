@@ -28,7 +28,7 @@ NO_SCHEDULE = _NOTHING, _NOTHING, _NOTHING, _NOTHING
 """Of trackers that do not plan ahead."""
 
 
-@kernel
+@func
 def world_poses(poses, frame):
     """Poses x, y [m], yaw [rad] of a frame in the world.
 
@@ -47,6 +47,21 @@ def world_poses(poses, frame):
         moved[k, 0], moved[k, 1] = x + cos * px - sin * py, y + sin * px + cos * py
         moved[k, 2] = yaw + poses[k, 2]
     return moved
+
+
+@kernel
+def placed_poses(poses, frame, clearly):
+    """Poses of a frame in the world, see :func:`world_poses`; and whether each lies ahead of the
+    one before by ``clearly`` [m] along the sum of their headings."""
+    moved, ahead = world_poses(poses, frame), True
+    cos, sin = math.cos(moved[0, 2]), math.sin(moved[0, 2])
+    for k in range(1, len(moved)):
+        before = cos, sin
+        cos, sin = math.cos(moved[k, 2]), math.sin(moved[k, 2])
+        along = (moved[k, 0] - moved[k - 1, 0]) * (before[0] + cos)
+        along += (moved[k, 1] - moved[k - 1, 1]) * (before[1] + sin)
+        ahead &= along >= clearly
+    return moved, ahead
 
 
 @kernel

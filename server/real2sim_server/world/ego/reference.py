@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.episode import EgoSpec
 
-from ..driving import NO_POSE, curve_at, plan_curve, vehicle_parameters, world_poses
+from ..driving import NO_POSE, curve_at, placed_poses, plan_curve, vehicle_parameters
 from ..path import Float
 from ..seam import Seam
 from .motion import ControlLaw, Motion
@@ -38,27 +38,31 @@ class PlannedTrajectory:
     Attributes:
         times_us: [N] int64, increasing [us].
         poses: [N, 3] float64, x, y [m], yaw [rad], world.
+        is_clear: whether it is known already to lead forwards.
     """
 
     times_us: NDArray[np.int64]
     poses: Float
+    is_clear: bool = False
 
     @staticmethod
     def of(
         times_us: Sequence[int], poses: Sequence[Pose], frame: Pose | None = None
     ) -> PlannedTrajectory:
         """The trajectory through poses of a frame, given by its pose in the world; None: world."""
-        numbers = np.array(poses, np.float64)
+        numbers, is_clear = np.array(poses, np.float64), False
         if frame is not None:
-            numbers = world_poses(numbers, frame)
-        return PlannedTrajectory(np.array(times_us, np.int64), numbers)
+            numbers, is_clear = placed_poses(numbers, frame, CLEARLY)
+        return PlannedTrajectory(np.array(times_us, np.int64), numbers, is_clear)
 
     @cached_property
     def leads_forwards(self) -> bool:
         """Whether no pose lies behind the one before, as both head."""
         if len(self.poses) < 2:
             return False
-        return _leads_ahead(self.poses) or float(ways_along(self.poses).min()) >= 0.0
+        return (
+            self.is_clear or _leads_ahead(self.poses) or float(ways_along(self.poses).min()) >= 0.0
+        )
 
     def after(self, t_us: int) -> PlannedTrajectory:
         """What of it is still to come: its end, at once, where all of it is over."""

@@ -90,11 +90,22 @@ class ComfortAccumulator:
 
     def updated(self, speed: float, yaw: float, dt: float) -> ComfortAccumulator:
         """After one more clock step."""
-        window = comfort_window(dt)
-        samples = push_sample(self.samples, speed, yaw, window)
-        if len(samples) < window:
+        return self._with(*_newest(self.samples, speed, yaw, dt))
+
+    def updated_beside(
+        self, other: ComfortAccumulator, speed: float, yaw: float, dt: float
+    ) -> tuple[ComfortAccumulator, ComfortAccumulator]:
+        """This one and another that has got the same samples since this one began: after one more
+        clock step. What both hold is kept, and looked at, once."""
+        samples, sample = _newest(self.samples, speed, yaw, dt)
+        # A window that is full has room for nothing older.
+        shared = other.samples is self.samples or sample is not None
+        after = other._with(samples, sample) if shared else other.updated(speed, yaw, dt)
+        return self._with(samples, sample), after
+
+    def _with(self, samples: Float, sample: ComfortSample | None) -> ComfortAccumulator:
+        if sample is None:
             return ComfortAccumulator(samples, self.comfortable, self.worst)
-        sample = comfort_sample(samples, dt)
         worst = tuple(
             [a if a > w else w for w, a in zip(self.worst, map(abs, sample), strict=True)]
         )
@@ -102,6 +113,16 @@ class ComfortAccumulator:
         return ComfortAccumulator(samples, comfortable, worst, sample)
 
 
+def _newest(
+    samples: Float, speed: float, yaw: float, dt: float
+) -> tuple[Float, ComfortSample | None]:
+    """Samples with one more at their end, and what they say once the window is full."""
+    window = comfort_window(dt)
+    samples = push_sample(samples, speed, yaw, window)
+    return samples, comfort_sample(samples, dt) if len(samples) == window else None
+
+
+@lru_cache(maxsize=16)
 def comfort_window(dt: float) -> int:
     """Samples in a window; odd, at least five."""
     return max(2 * round(WINDOW_S / dt / 2) - 1, 5) if dt < WINDOW_S / 4 else 5

@@ -48,6 +48,11 @@ def _begun(
 ) -> MetricAccumulator:
     """The accumulator at the instant from which on steps count."""
     ego = instant.ego
+    comfort = ComfortAccumulator().updated(ego.speed, ego.yaw, context.dt)
+    if len(with_history.samples):
+        with_history = with_history.updated(ego.speed, ego.yaw, context.dt)
+    else:
+        with_history = comfort
     return MetricAccumulator(
         start_s=ego.s,
         s=ego.s,
@@ -55,8 +60,8 @@ def _begun(
         offset=ego.offset,
         ego=ego,
         states={m.name: m.begin(instant, context) for m in METRICS.values() if m.begin},
-        comfort=ComfortAccumulator().updated(ego.speed, ego.yaw, context.dt),
-        comfort_with_history=with_history.updated(ego.speed, ego.yaw, context.dt),
+        comfort=comfort,
+        comfort_with_history=with_history,
         feasibility=Feasibility(Window((ego, 0.0))),
     )
 
@@ -77,7 +82,9 @@ def update_accumulator(
     off_lane = off_road or bool(_in_several_lanes(ego, context))
     accumulator = _with_contacts(_with_pushes(accumulator, instant, context), instant, context)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=accumulator.hit)
-    comfort = accumulator.comfort.updated(ego.speed, ego.yaw, dt)
+    comfort, comfort_with_history = accumulator.comfort.updated_beside(
+        accumulator.comfort_with_history, ego.speed, ego.yaw, dt
+    )
     way = math.hypot(ego.x - before.x, ego.y - before.y)
     left_out = _left_out(ego.s - before.s, way)
     gain, cut = ego.s - before.s - left_out, accumulator.cut + left_out
@@ -107,7 +114,7 @@ def update_accumulator(
         ttc=ttc,
         min_ttc=min(accumulator.min_ttc, ttc),
         comfort=comfort,
-        comfort_with_history=accumulator.comfort_with_history.updated(ego.speed, ego.yaw, dt),
+        comfort_with_history=comfort_with_history,
         backward=backward,
         oncoming=max(accumulator.oncoming, oncoming),
         lane_run=lane_run,

@@ -1,0 +1,35 @@
+"""The histograms that the event loop counts into."""
+
+from __future__ import annotations
+
+from prometheus_client import CollectorRegistry, Histogram
+from prometheus_client.exposition import generate_latest
+
+from real2sim_server.service.http.metrics import FAST_BUCKETS, LoopHistogram
+
+SECONDS = (0.0, 0.0005, 0.00051, 0.3, 10.0, 11.0)
+
+
+def exposed(registry: CollectorRegistry) -> list[str]:
+    """Lines of all samples but the time at which the library's metric was made."""
+    return [
+        line for line in generate_latest(registry).decode().splitlines() if "created" not in line
+    ]
+
+
+def test_a_histogram_of_the_loop_is_exposed_like_one_of_the_library():
+    ours, theirs = CollectorRegistry(), CollectorRegistry()
+    histogram = LoopHistogram("a_seconds", "text", "stage", buckets=FAST_BUCKETS, registry=ours)
+    other = Histogram("a_seconds", "text", ("stage",), buckets=FAST_BUCKETS, registry=theirs)
+    for seconds in SECONDS:
+        for stage in ("render", "queue"):
+            histogram.labels(stage).observe(seconds)
+            other.labels(stage).observe(seconds)
+    assert exposed(ours) == exposed(theirs)
+
+
+def test_a_histogram_without_a_label_is_there_before_anything_is_counted():
+    ours, theirs = CollectorRegistry(), CollectorRegistry()
+    LoopHistogram("a_seconds", "text", buckets=FAST_BUCKETS, registry=ours).labels()
+    Histogram("a_seconds", "text", buckets=FAST_BUCKETS, registry=theirs)
+    assert exposed(ours) == exposed(theirs)
