@@ -87,7 +87,7 @@ class SolverMemory:
     def grow(self, wanted: dict[str, int]) -> None:
         """Make room for so many of each, and a quarter more; lists must be made anew."""
         held = {name: getattr(self.sizes, name) for name in r.CAPACITIES}
-        more = {n: c + c // 4 for n, c in wanted.items() if c > held[n]}
+        more: dict[str, Any] = {n: c + c // 4 for n, c in wanted.items() if c > held[n]}
         self.sizes = replace(self.sizes, **more)
         for name, nbytes in self._bytes().items():
             self._reserve(name, nbytes)
