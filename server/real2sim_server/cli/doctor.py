@@ -343,11 +343,26 @@ def _report(report: _Report, json: Path | None) -> None:
             table.add_row(str(row["name"]), "yes" if row["met"] else "no", str(row["found"]))
         console.print(table)
     if report.kernels:
-        columns = list(report.kernels[0])
-        table = Table(*columns, title="kernels", title_justify="left")
-        for row in report.kernels:
-            table.add_row(*(f"{row[name]}" for name in columns))
-        console.print(table)
+        console.print(_kernels_table(report.kernels))
     for line in report.advice:
         console.print(f"to mend: {line}", highlight=False, soft_wrap=True, markup=False)
     write_json(json, asdict(report))
+
+
+def _kernels_table(rows: list[dict[str, object]]) -> Table:
+    """A line a kernel: registers of a thread on each architecture, and in brackets the share of
+    threads that can be at work at once."""
+    architectures = list(dict.fromkeys(str(row["architecture"]) for row in rows))
+    table = Table("kernel", *architectures, "shared [bytes]", title="registers of kernels")
+    table.title_justify = "left"
+    cells: dict[str, dict[str, str]] = {}
+    shared: dict[str, object] = {}
+    for row in rows:
+        share = row["occupancy"]
+        known = f" ({share:.0%})" if isinstance(share, float) else ""
+        kernel = str(row["kernel"])
+        cells.setdefault(kernel, {})[str(row["architecture"])] = f"{row['registers']}{known}"
+        shared[kernel] = row["shared"]
+    for kernel, found in cells.items():
+        table.add_row(kernel, *(found.get(a, "") for a in architectures), f"{shared[kernel]}")
+    return table

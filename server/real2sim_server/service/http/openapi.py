@@ -58,6 +58,12 @@ BODIES: dict[str, Any] = {
         ]
     },
     "SimulateRequest": {"start_us": 0, "end_us": 2_000_000, "objects": ["car_0", "van_0"]},
+    "CalibrateRequest": {
+        "object_id": "car_0",
+        "parameters": ["friction", "speed"],
+        "observations": {"recorded": True},
+        "simulate": {"start_us": 0, "end_us": 2_000_000},
+    },
     "ExportRequest": {"scenario": "sc_0123456789abcdef", "camera": "front", "fps": 10},
     "SessionCreate": {"reset": {"seed": 0, "dt_us": 100_000}},
     "ResetSpec": {"seed": 0, "dt_us": 100_000},

@@ -1,6 +1,7 @@
 // The map from above: world x to the right, y up. Drag moves, the handle ahead of a box turns it.
 import { model, on, emit, object, poseOf, select, edit, draftOperations } from "./model.js";
-import { yawOf, poseAt, present, rotate } from "./poses.js";
+import { yawOf, poseAt, present } from "./poses.js";
+import { fromAbove } from "./colliders.js";
 
 const COLOURS = {
   car: "#5aa9ff",
@@ -74,17 +75,11 @@ function draw() {
     box(region.pose, region.size, "#ff7b72", false);
   }
   for (const { shape } of model.scenario.colliders) {
-    if (shape.kind === "box") {
-      box(shape, shape.size, "#8a97a8", false);
-    } else if (shape.kind === "cylinder" || shape.kind === "capsule") {
-      const across = 2 * shape.radius;
-      box(shape, [across, across, shape.height ?? shape.length + across], "#8a97a8", false);
-    } else if (shape.kind === "mesh") {
-      for (const triangle of shape.triangles) {
-        const corners = [...triangle, triangle[0]].map((k) => inWorld(shape, shape.vertices[k]));
-        line(corners, "#8a97a880", 1);
-      }
+    const { size, lines = [] } = fromAbove(shape);
+    if (size) {
+      box(shape, size, "#8a97a8", false);
     }
+    lines.forEach((corners) => line(corners, "#8a97a880", 1));
   }
   if (!model.selected && model.box) {
     pen.setLineDash([4, 4]);
@@ -145,9 +140,6 @@ function grid() {
     pen.lineTo(w, sy);
     pen.stroke();
   }
-}
-function inWorld({ position, quaternion }, vertex) {
-  return rotate(quaternion, vertex).map((v, axis) => v + position[axis]);
 }
 function line(points, colour, width) {
   pen.strokeStyle = colour;
