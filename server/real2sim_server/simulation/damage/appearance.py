@@ -37,12 +37,16 @@ CRAZED = 0.55
 """Of a cracked windscreen that is crazed."""
 DROOP, DROOP_TIME = 0.16, 0.35
 """Angle by which a loose bumper hangs down at one end [rad], and in what time [s]."""
+HANGS_STILL = 3 * DROOP_TIME
+"""After so long a loose bumper has come to rest [s]: it would sink by less than 0.1 mm more."""
 LOOSE = 0.25
 """How far its loose end stands off, against how far it hangs down."""
 CLEARANCE = 0.04
 """Of a loose bumper above the road [m]."""
-LEAST_MOVED = 5e-3
-"""Particles that have moved less than this leave Gaussians where they are [m]."""
+LEAST_MOVED = 8e-3
+"""Particles that have moved less than this leave Gaussians where they are [m]: a body hit hard
+bends elastically by several millimetres all along, and the slowest impact that deforms at all
+dents by more than twice as much."""
 SPLIT = 1.5
 """Gaussians stretched by more are drawn as two, side by side."""
 
@@ -177,7 +181,7 @@ class DamagedVehicle:
         side = 1.0 if (self._seed >> 3) % 2 else -1.0
         arm = places[:, 1] * side
         arm = arm - arm.min()
-        fallen = 1 - np.exp(-3 * age / DROOP_TIME)
+        fallen = 1 - np.exp(-3 * min(age, HANGS_STILL) / DROOP_TIME)
         sunk = np.tan(DROOP) * fallen * arm
         sunk = np.minimum(sunk, places[:, 2] + self._size[2] / 2 - CLEARANCE)
         sunk = np.maximum(sunk, 0.0)

@@ -12,6 +12,7 @@ from ...geometry.rotation import Float
 from ...scene import GaussianCloud
 from ...simulation import impact as crash
 from ...simulation.damage import Breakage, BreakageLog, DamagedVehicle
+from ...simulation.damage.appearance import HANGS_STILL
 from ...simulation.damage.parts import Part
 from .impact import Impact
 
@@ -30,6 +31,13 @@ class VehicleDamage:
 
     most: Float
     broken: tuple[Breakage, ...] = ()
+
+    def hanging(self, t_us: int) -> int:
+        """The instant at which what hangs loose is drawn [us]: none after it hangs still."""
+        fell = [b.time_s for b in self.broken if b.kind == "bumper"]
+        if not fell:
+            return 0
+        return min(t_us, math.ceil((max(fell) + HANGS_STILL) * 1e6))
 
     def cloud(self, vehicle: DamagedVehicle, displacements: Float, t_us: int) -> GaussianCloud:
         """What is drawn with particles displaced [N, 3] [m]."""

@@ -342,8 +342,7 @@ class _DeformedObject:
             return self.before.cloud(t_us) if self.before is not None else None
         damage = self.damage(t_us)
         # A bumper hangs farther down for a while.
-        loose = damage is not None and any(b.kind == "bumper" for b in damage.broken)
-        key = (len(frames), t_us if loose else 0)
+        key = (len(frames), 0 if damage is None else damage.hanging(t_us))
         with self.origin.lock:
             if self._shown is None or self._shown[0] != key:
                 if damage is None:
