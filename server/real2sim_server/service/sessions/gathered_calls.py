@@ -83,13 +83,10 @@ class GatheredCalls(Generic[T, R]):
     def _end(
         self, calls: Sequence[tuple[T, asyncio.Future[R]]], results: Sequence[R | Exception]
     ) -> None:
-        try:
-            for (argument, outcome), result in zip(calls, results, strict=True):
-                self._settle(argument, outcome, result)
-        finally:
-            # After the answers: each is a call of the system, from which this thread would come
-            # back only when the other, were it at work, gives the interpreter up.
-            self._begin()
+        # Before the answers, so that the other thread has work while these leave.
+        self._begin()
+        for (argument, outcome), result in zip(calls, results, strict=True):
+            self._settle(argument, outcome, result)
 
     def _settle(self, argument: T, outcome: asyncio.Future[R], result: R | Exception) -> None:
         if outcome.done():
