@@ -113,6 +113,17 @@ def test_a_face_inside_what_has_been_crushed_is_stopped():
     assert face_score(0.06, 3.0) < face_score(0.2, 0.5)
 
 
+def test_what_slides_over_a_face_is_not_stopped_by_its_own_end():
+    """Near its end a body is all around a node yet ends to one side: that is no normal."""
+    dx = 0.2
+    cell = dx**3
+    face = np.array([0.0, 0.0, -0.03 * cell, 0.03 * cell])
+    sliding = np.array([0.1 * cell, 0.0, 0.0, 0.9 * cell])
+    a, b = np.array([0.0, 0.0, 0.5, 2.0]), np.array([-3.0, 0.0, -0.5, 2.0])
+    resolve_node_pair(a, b, face, sliding, 0.0, dx, np.zeros(3), np.zeros(8), np.zeros(8))
+    assert (a[0], b[0]) == (0.0, -3.0)
+
+
 def test_surfaces_that_look_past_each_other_do_not_touch():
     dx = 0.2
     cell = dx**3

@@ -21,7 +21,7 @@ from .collider_distance import (
     collider_velocity,
     unit,
 )
-from .surface import INSIDE, OPPOSED, coulomb, face_score, surface_offset
+from .surface import CRUSHED, INSIDE, OPPOSED, coulomb, face_score, surface_offset
 
 ON_FACE = 1e-4
 """A node this near to a face of a thin solid, or to half a cell beyond its edges, lies in it
@@ -118,17 +118,21 @@ def resolve_node_pair(
     """Contact of two bodies at a node, where their surfaces have met.
 
     The normal is that of the body that shows more of a face, or edges would plough through faces;
-    surfaces that do not look at each other pass by, unless one body is all around the node and so
-    has no surface there. Each surface lies where a half-space with that centroid has it.
+    surfaces that do not look at each other pass by, unless one body has been crushed and is all
+    around the node, and so has no surface there. Each surface lies where a half-space with that
+    centroid has it.
     """
     ma, mb = node_a[3], node_b[3]
     volume_a, volume_b = moment_a[3], moment_b[3]
     into_b, size_b = unit(moment_b[0], moment_b[1], moment_b[2])
     out_of_a, size_a = unit(-moment_a[0], -moment_a[1], -moment_a[2])
     facing = into_b[0] * out_of_a[0] + into_b[1] * out_of_a[1] + into_b[2] * out_of_a[2]
-    if facing < OPPOSED and min(size_a / volume_a, size_b / volume_b) > INSIDE:
-        return
     per_cell = 1.0 / (dx * dx * dx)
+    if facing < OPPOSED:
+        around_a = size_a <= INSIDE * volume_a and volume_a * per_cell >= CRUSHED
+        around_b = size_b <= INSIDE * volume_b and volume_b * per_cell >= CRUSHED
+        if not (around_a or around_b):
+            return
     score_a = face_score(size_a * per_cell, volume_a * per_cell)
     score_b = face_score(size_b * per_cell, volume_b * per_cell)
     n = out_of_a if score_a > score_b else into_b

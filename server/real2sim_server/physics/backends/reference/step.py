@@ -15,7 +15,7 @@ from torch import Tensor
 from ...colliders import Collider, Solid
 from ...constitutive import material_row
 from ...contact.node import ON_FACE, THIN_MARGIN
-from ...contact.surface import FLAT_MOMENT, INSIDE, OPPOSED, STICKS, SURFACE
+from ...contact.surface import CRUSHED, FLAT_MOMENT, INSIDE, OPPOSED, STICKS, SURFACE
 from ..base import is_thin
 from .distance import collider_distance, first_touch
 from .stress import stress_update
@@ -257,7 +257,7 @@ def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
     from_a = _face_score(size_a, moment_a[:, 3]) > _face_score(size_b, moment_b[:, 3])
     n = torch.where(from_a[:, None], out_of_a, into_b)
     inside_a, inside_b = (
-        size <= float(INSIDE) * moment[:, 3]
+        (size <= float(INSIDE) * moment[:, 3]) & (moment[:, 3] >= float(CRUSHED))
         for size, moment in ((size_a, moment_a), (size_b, moment_b))
     )
     return n, ((out_of_a * into_b).sum(-1) >= float(OPPOSED)) | inside_a | inside_b
