@@ -40,7 +40,7 @@ OPPOSED = F32(0.5)
 """Surfaces are in contact only where the cosine between their normals is beyond this."""
 INSIDE = F32(0.25)
 """A body whose centroid is this near a node is all around it, and has no normal there [cells]."""
-CRUSHED = F32(1.5)
+CRUSHED = F32(1.1)
 """Volumes at rest that what has been crushed has in a cell, at least; a whole body that slides past
 a node is all around it too, but as dense as it was."""
 
