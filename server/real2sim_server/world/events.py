@@ -4,19 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
-EventType = Literal[
-    "collision",
-    "left_log",
-    "off_road",
-    "agents_react",
-    "deadline_missed",
-    "horizon",
-    "edited",
-    "stopped",
-    "looped",
-]
+from real2sim_proto.drive import EventType
 
 
 @dataclass(frozen=True)
