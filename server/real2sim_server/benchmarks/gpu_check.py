@@ -38,13 +38,14 @@ from ..reconstruct.training.densify import DensifyOptions
 from ..reconstruct.training.schedule import TrainOptions
 from ..reconstruct.training.trainer import Trainer
 from ..render import Instance, RigView, encode_rgb, render_rigs, select_backend
-from ..render.backends.base import Backend
+from ..render.backends.base import Backend, device_of
+from ..render.jpeg import JpegEncoder, jpeg_encoder_for
 from ..scene import Camera, Sky
 from ..scene.camera import T_VEHICLE_OPTICAL
 from ..synthetic import CameraSpec, SyntheticConfig, generate_log
 from .gaussian_street import StreetScene, street_scene
 
-DISTRIBUTIONS = ("real2sim", "torch", "gsplat", "numba-cuda", "cuda-core")
+DISTRIBUTIONS = ("real2sim", "torch", "gsplat", "numba-cuda", "cuda-core", "nvidia-nvimgcodec-cu13")
 STREET_GAUSSIANS = 100_000
 """The fewest that make a street; fewer are picked from it."""
 DISTANCES = (0.0, 2_000.0, 10_000.0)
@@ -263,9 +264,11 @@ def _frames(devices: Devices, scale: Scale) -> Iterator[Finding]:
         )
         yield _timed(name, times, None if case.jpeg else case.wanted_ms)
         if case.jpeg:
+            jpeg, why = jpeg_encoder_for(device_of(serving))
             with ThreadPoolExecutor(case.cameras) as encoders:
-                encoded = _times_ms(partial(_draw_jpegs, view, serving, encoders), scale.repeats)
-            yield _timed(f"{name.partition(':')[0]}: jpeg", encoded, case.wanted_ms)
+                make = partial(_draw_jpegs, view, serving, encoders, jpeg)
+                encoded = _times_ms(make, scale.repeats)
+            yield _timed(f"{name.partition(':')[0]}: jpeg by {why}", encoded, case.wanted_ms)
 
 
 def _physics(devices: Devices, scale: Scale) -> Iterator[Finding]:
@@ -404,9 +407,11 @@ def _camera(index: int, case: FrameCase) -> Camera:
     return Camera(f"camera {index}", case.width, case.height, K, pose)
 
 
-def _draw_jpegs(view: RigView, serving: Backend, encoders: ThreadPoolExecutor) -> list[bytes]:
+def _draw_jpegs(
+    view: RigView, serving: Backend, encoders: ThreadPoolExecutor, jpeg: JpegEncoder
+) -> list[bytes]:
     [frames] = render_rigs([view], modalities=("rgb",), backend=serving)
-    return list(encoders.map(lambda frame: encode_rgb(frame.rgb, "jpeg"), frames))
+    return list(encoders.map(lambda frame: encode_rgb(frame.rgb, "jpeg", jpeg=jpeg), frames))
 
 
 def _falling_block(particles: int, backend: str) -> Solver:

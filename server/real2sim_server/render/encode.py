@@ -1,4 +1,4 @@
-"""Images to bytes. Pure functions of arrays; they run on any thread and never touch the device."""
+"""Images to bytes. Pure functions of arrays; they run on any thread."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from .jpeg import JpegEncoder, turbo_jpeg
 from .types import RenderError
 
 RGB_CODECS = ("raw", "jpeg", "png")
@@ -36,8 +37,15 @@ class EncodedImage:
     shape: tuple[int, ...]
 
 
-def encode_rgb(image: NDArray[np.uint8], codec: str, *, quality: int = 90) -> bytes:
-    """RGB [H, W, 3] uint8 as raw bytes, jpeg (4:4:4, no loss beyond ``quality``) or png."""
+def encode_rgb(
+    image: NDArray[np.uint8], codec: str, *, quality: int = 90, jpeg: JpegEncoder = turbo_jpeg
+) -> bytes:
+    """RGB [H, W, 3] uint8 as raw bytes, jpeg (4:4:4, no loss beyond ``quality``) or png.
+
+    Raises:
+        RenderError: another codec, an image of another dtype or shape, or a quality outside 1 to
+            100.
+    """
     _check_codec("rgb", codec, RGB_CODECS)
     _check_array("rgb", image, np.uint8, 3)
     contiguous = np.ascontiguousarray(image)
@@ -47,10 +55,7 @@ def encode_rgb(image: NDArray[np.uint8], codec: str, *, quality: int = 90) -> by
         return _png(contiguous[..., ::-1])
     if not 1 <= quality <= 100:
         raise RenderError(f"quality must be 1 to 100, not {quality!r}")
-    import simplejpeg
-
-    encoded: bytes = simplejpeg.encode_jpeg(contiguous, quality, "RGB", "444")
-    return encoded
+    return jpeg(contiguous, quality)
 
 
 def encode_depth(depth: NDArray[np.float32], codec: str, *, name: str = "depth") -> bytes:

@@ -43,7 +43,7 @@ def test_pictures_and_times_are_checked_and_told_as_a_table(
     assert check.right
     text = check.markdown()
     assert text.startswith(f"Checked on {check.date}: pretended\n\n| Part |")
-    assert ": jpeg | p50 " in text
+    assert ": jpeg by libjpeg-turbo" in text
     assert "10 km from the origin | 0 | 0 (holds) |" in text
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import simplejpeg
+import torch
 
 from real2sim_server.render import (
     RenderError,
@@ -13,6 +14,13 @@ from real2sim_server.render import (
     encode_image,
     encode_instance,
     encode_rgb,
+)
+from real2sim_server.render.jpeg import (
+    CPU_ONLY,
+    NvjpegEncoder,
+    disproof,
+    jpeg_encoder_for,
+    turbo_jpeg,
 )
 
 GENERATOR = np.random.default_rng(0)
@@ -113,3 +121,53 @@ def test_what_cannot_be_encoded_is_refused_with_a_reason(
 def test_quality_out_of_range_is_refused(quality: int) -> None:
     with pytest.raises(RenderError, match="quality"):
         encode_rgb(RGB, "jpeg", quality=quality)
+
+
+def test_nvjpeg_s_library_makes_jpegs_of_the_same_colours() -> None:
+    pytest.importorskip("nvidia.nvimgcodec")
+    smooth = cv2.GaussianBlur(RGB, (0, 0), 3)
+    encoder = NvjpegEncoder(CPU_ONLY)
+    data = encode_rgb(smooth, "jpeg", quality=95, jpeg=encoder)
+    assert simplejpeg.decode_jpeg_header(data)[3] == "444"
+    by_turbo = simplejpeg.decode_jpeg(encode_rgb(smooth, "jpeg", quality=95)).astype(int)
+    assert np.abs(simplejpeg.decode_jpeg(data) - by_turbo).max() <= 8
+    assert disproof(encoder) is None
+
+
+def test_an_image_that_nvjpeg_cannot_encode_is_encoded_by_turbo(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("nvidia.nvimgcodec")
+
+    def lost(self: NvjpegEncoder, image: object, quality: int) -> bytes:
+        raise RenderError("nvJPEG failed: out of memory")
+
+    monkeypatch.setattr(NvjpegEncoder, "encode", lost)
+    encoder = NvjpegEncoder(CPU_ONLY)
+    assert [encode_rgb(RGB, "jpeg", jpeg=encoder) for _ in range(2)] == 2 * [
+        encode_rgb(RGB, "jpeg")
+    ]
+    assert [record.getMessage() for record in caplog.records] == [
+        "jpegs are made by libjpeg-turbo where nvJPEG failed: out of memory"
+    ]
+
+
+def test_jpegs_are_made_on_the_cpu_where_nothing_is_drawn_on_a_gpu() -> None:
+    assert jpeg_encoder_for(torch.device("cpu"))[0] is turbo_jpeg
+
+
+@pytest.mark.parametrize("wrong", ["swapped", "nothing"])
+def test_an_encoder_whose_sample_comes_back_wrong_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, wrong: str
+) -> None:
+    pytest.importorskip("nvidia.nvimgcodec")
+
+    def encode(self: NvjpegEncoder, image: np.ndarray, quality: int) -> bytes:
+        if wrong == "nothing":
+            raise RenderError("nvJPEG gave nothing")
+        return turbo_jpeg(np.ascontiguousarray(image[..., ::-1]), quality)
+
+    monkeypatch.setattr(NvjpegEncoder, "encode", encode)
+    encoder, why = jpeg_encoder_for(torch.device("cuda"))
+    assert encoder is turbo_jpeg
+    assert why.startswith("libjpeg-turbo: nvJPEG ")

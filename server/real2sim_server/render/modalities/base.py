@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..encode import EncodedImage
+from ..encode import EncodedImage, encode_rgb
+from ..jpeg import JpegEncoder, turbo_jpeg
 from ..types import RasterOptions, RenderError, RenderOutput
 
 SWITCHES = ("depth", "instance", "median_depth")
@@ -106,7 +107,12 @@ def modalities_drawn(options: RasterOptions) -> tuple[str, ...]:
 
 
 def encode_image(
-    image: NDArray[Any], modality: str, codec: str, *, quality: int = 90
+    image: NDArray[Any],
+    modality: str,
+    codec: str,
+    *,
+    quality: int = 90,
+    jpeg: JpegEncoder = turbo_jpeg,
 ) -> EncodedImage:
     """Encode an image of a modality; lossless ones become png where jpeg is asked for.
 
@@ -116,6 +122,7 @@ def encode_image(
         modality: name of a registered one.
         codec: ``raw``, ``jpeg`` or ``png``.
         quality: of jpeg, 1 to 100.
+        jpeg: makes the bytes of a jpeg.
 
     Raises:
         RenderError: unknown modality or codec, or an image of another kind.
@@ -123,6 +130,9 @@ def encode_image(
     kind = modality_of(modality)
     if codec == "jpeg" and codec not in kind.codecs:
         codec = "png"
-    data = kind.encode(image, codec, quality)
+    if codec == "jpeg":
+        data = encode_rgb(image, codec, quality=quality, jpeg=jpeg)
+    else:
+        data = kind.encode(image, codec, quality)
     dtype = kind.encoded_dtypes.get(codec, kind.dtype.name)
     return EncodedImage(data, codec, dtype, image.shape)

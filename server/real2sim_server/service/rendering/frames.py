@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from real2sim_proto import encode
 from real2sim_proto.episode import SensorSpec
 
+from ...render.jpeg import JpegEncoder, turbo_jpeg
 from ...render.modalities import encode_image, modality_of
 from ...scene import Camera
 
@@ -91,14 +92,14 @@ class EncodedFrame:
         return self.header.fields | {"data": bytes(self.data)}
 
 
-def encode_frame(image: RenderedImage) -> EncodedFrame:
+def encode_frame(image: RenderedImage, *, jpeg: JpegEncoder = turbo_jpeg) -> EncodedFrame:
     """The frame of an image; raw ones are views of its pixels. On any thread."""
     image.ready()
     fields = _place_fields(image.sensor, image.modality, image.t_us, image.T_world_sensor, image.K)
     if image.sensor.codec == "raw":
         return with_pixels(_raw_header(fields, image.pixels.shape[:2]), image.pixels)
     encoded = encode_image(
-        image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality
+        image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality, jpeg=jpeg
     )
     fields |= {"codec": encoded.codec, "dtype": encoded.dtype, "shape": list(encoded.shape)}
     return EncodedFrame(_frame_header(fields, len(encoded.data)), encoded.data)

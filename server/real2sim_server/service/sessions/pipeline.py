@@ -59,7 +59,6 @@ from ..rendering.frames import (
     EncodedFrame,
     FrameHeader,
     RenderedImage,
-    encode_frame,
     raw_headers,
     with_pixels,
 )
@@ -668,7 +667,7 @@ class StepPipeline:
     ) -> EncodedObservation:
         """The observation encoded, and counted once the answer is on its way."""
         if isinstance(observation, RenderedObservation):
-            frames = await self._renderer.on_encoders(encode_frame, observation.images)
+            frames = await self._renderer.encode(observation.images)
             (observation,) = await self._renderer.on_encoders(
                 lambda rendered: _with_frames(rendered, frames), [observation]
             )
