@@ -14,12 +14,16 @@ from .command import command
 from .device import chosen_backend
 from .options import (
     JsonFile,
+    LogCameras,
+    LogEvery,
     LogFolder,
     LogFormat,
+    LogFrames,
     Overwrite,
     RenderBackend,
     RenderDevice,
     Sequence,
+    log_selection,
 )
 
 if TYPE_CHECKING:
@@ -48,26 +52,33 @@ def reconstruct(
     ] = 0.0,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
+    frames: LogFrames = ":",
+    cameras: LogCameras = None,
+    every: LogEvery = 1,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
     """Turn a driving log into a scene of Gaussians."""
-    from ..logs import open_log
+    from ..logs import open_log, select_from_log
     from ..reconstruct import ReconstructOptions, reconstruct
     from ..reconstruct.training.schedule import preset as training_preset
 
     refuse_existing(out, overwrite=overwrite)
+    selection = log_selection(frames, cameras, every)
     drawn_by = chosen_backend(backend, device)
     training = training_preset(preset)
     if iterations:
         training = replace(training, iterations=iterations)
     if width is not None:
         training = replace(training, width=width, max_width=width)
+    opened = open_log(log, format=log_format, sequence=sequence)
+    if not selection.is_whole:
+        opened = select_from_log(opened, selection)
     with staged_progress() as report:
         result = reconstruct(
-            open_log(log, format=log_format, sequence=sequence),
+            opened,
             out,
             ReconstructOptions(
                 training=training if iterations else None, box_noise=box_noise, backend=drawn_by

@@ -116,10 +116,10 @@ def _write_image(frame: Frame, modality: str, out: Path) -> None:
 def _compare(
     scene: Scene, log_path: Path, frame: int, camera: str, *, backend: str
 ) -> dict[str, float]:
-    from ..logs.open import open_log
+    from ..logs import open_log, same_part
     from ..reconstruct.evaluation import evaluate_views
 
-    log = open_log(log_path)
+    log = same_part(open_log(log_path), scene.provenance)
     console.print(
         f"comparing with {log.name}, frame {frame}, over all pixels and over those that LiDAR "
         "covers"

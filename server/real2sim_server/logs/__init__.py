@@ -8,6 +8,7 @@ from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTr
 from .inspect import CameraReport, LogReport, inspect_log
 from .native_writer import write_native_log
 from .open import open_log
+from .selection import LogSelection, same_part, select_from_log
 
 __all__ = [
     "CameraReport",
@@ -16,9 +17,12 @@ __all__ = [
     "LidarSweep",
     "LogError",
     "LogReport",
+    "LogSelection",
     "ObjectTrack",
     "check_log",
     "inspect_log",
     "open_log",
+    "same_part",
+    "select_from_log",
     "write_native_log",
 ]

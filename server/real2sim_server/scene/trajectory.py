@@ -148,6 +148,23 @@ class Trajectory:
         velocity: Float = (self.positions[after] - self.positions[after - 1]) / span
         return velocity
 
+    def between(self, start_us: int, end_us: int) -> Trajectory:
+        """The part within [start_us, end_us]; where it is cut a pose is added.
+
+        Raises:
+            TimeOutOfRangeError: nothing of it lies there.
+        """
+        if start_us > end_us or end_us < self.start_us or start_us > self.end_us:
+            raise TimeOutOfRangeError(
+                f"[{start_us}, {end_us}] holds nothing of this trajectory's range "
+                f"[{self.start_us}, {self.end_us}]"
+            )
+        first, last = max(start_us, self.start_us), min(end_us, self.end_us)
+        inside = self.times_us[(self.times_us > first) & (self.times_us < last)]
+        times_us = np.unique([first, *inside.tolist(), last])
+        positions, quaternions = zip(*(self.pose(int(t_us)) for t_us in times_us), strict=True)
+        return Trajectory(times_us, np.array(positions), np.array(quaternions))
+
     def moved(self, T_new_fixed: ArrayLike) -> Trajectory:
         """The same motion in another fixed frame, by ``T_new_fixed`` [4, 4]."""
         matrix = np.asarray(T_new_fixed, dtype=np.float64)

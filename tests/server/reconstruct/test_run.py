@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.logs import open_log, write_native_log
+from real2sim_server.logs import LogSelection, open_log, select_from_log, write_native_log
 from real2sim_server.reconstruct import (
     InitialiseOptions,
     ReconstructError,
@@ -60,6 +60,9 @@ def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
     )
     assert again.training.steps == 0
     assert again.training.psnr == pytest.approx(report.training.psnr)
+    part = select_from_log(open_log(tmp_path / "log"), LogSelection(first=1))
+    with pytest.raises(ReconstructError, match=r"begun on the whole log, not on frames 1:7:1"):
+        reconstruct(part, tmp_path / "out.r2s", options, resume=True, overwrite=True)
 
 
 def test_without_training_there_is_nothing_to_resume(tmp_path):

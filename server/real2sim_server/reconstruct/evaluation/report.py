@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..._files import atomic_file
-from ...logs import DrivingLog
+from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
 from ..training.data import image_time
@@ -91,6 +91,7 @@ def write_report(
         LogError: images that cannot be read.
     """
     options = options or EvaluateOptions()
+    log = same_part(log, scene.provenance)
     cameras = select_cameras(scene, log, options.width)
     subject = _ReportContext(scene, log, evaluation, find_truth(log), options.backend)
     frames = _spread(evaluation.frames, SHOWN_FRAMES)

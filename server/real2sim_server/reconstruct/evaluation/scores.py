@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...logs import DrivingLog
+from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
 from ..options import ReconstructError
@@ -169,13 +169,15 @@ def evaluate_scene(
     """Render logged views, compare them with images and LiDAR, time it, render shifted views.
 
     Every view is rendered when its image was taken, by the scene's own calibration and objects'
-    poses, which training may have refined. Where moving objects are is taken from the log.
+    poses, which training may have refined. Where moving objects are is taken from the log. Of a
+    scene that was made of a part of the log that part is taken, and its frames count from 0.
 
     Raises:
         ReconstructError: the scene and the log do not belong together, or no frame is left.
         LogError: images or sweeps that cannot be read.
     """
     options = options or EvaluateOptions()
+    log = same_part(log, scene.provenance)
     timing_s: dict[str, float] = {}
     stages = Stages(on_progress, timing_s)
     chosen = select_frames(scene, log, options.frames)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...logs import DrivingLog, check_log
+from ...logs.selection import SELECTION
 from ...render.backends import Backend
 from ...render.picture_file import write_png
 from ...scene import Scene
@@ -124,7 +126,13 @@ def _first_scene(
     if resume:
         if not (folder / CHECKPOINT).is_dir():
             raise ReconstructError(f"{folder}: holds no checkpoint to resume; start without resume")
-        return load_scene(folder / INITIAL)
+        begun = load_scene(folder / INITIAL)
+        if begun.provenance.get(SELECTION) != log.provenance.get(SELECTION):
+            raise ReconstructError(
+                f"{folder}: was begun on {_part(begun.provenance)}, not on "
+                f"{_part(log.provenance)}; resume with the same frames and cameras"
+            )
+        return begun
     seen = training_log(log, options.hold_out)
     if options.refine_poses:
         seen = smoothed_boxes(seen)
@@ -133,6 +141,15 @@ def _first_scene(
     )
     scene = replace(scene, frame_times_us=log.frame_times_us)
     return save_scene(scene, folder / INITIAL, overwrite=True)
+
+
+def _part(provenance: Mapping[str, Any]) -> str:
+    part = provenance.get(SELECTION)
+    if not isinstance(part, dict):
+        return "the whole log"
+    frames = ":".join(str(number) for number in part["frames"])
+    cameras = part["cameras"]
+    return f"frames {frames}" + ("" if cameras is None else f" of {', '.join(cameras)}")
 
 
 def _combined(

@@ -19,7 +19,7 @@ from real2sim_server.reconstruct.evaluation.scores import logged_mask
 from real2sim_server.reconstruct.evaluation.selection import select_frames
 from real2sim_server.reconstruct.evaluation.shifted import evaluate_shifts, true_view
 from real2sim_server.reconstruct.evaluation.truth import find_truth
-from real2sim_server.scene.io import save_scene
+from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
 from ..conftest import painted_log
@@ -179,6 +179,31 @@ def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
     assert f"{values['psnr']:.2f}" in html
     assert html.count("90th percentile [m]") == 2
     assert f"<td>{values['depth_error_p90_m']:.3f}</td>" in html
+
+
+def test_a_scene_of_a_part_of_the_log_is_compared_with_that_part(on_disk, tmp_path):
+    scene, figures = tmp_path / "part.r2s", tmp_path / "figures.json"
+    part = ["--frames", "2:5", "--cameras", "front"]
+    commands = [
+        ["reconstruct", on_disk / "log", "--out", scene, *part],
+        ["evaluate", scene, on_disk / "log", "--frames", "all", "--shifts", "none",
+         "--json", figures],
+    ]  # fmt: skip
+    for arguments in commands:
+        result = CliRunner().invoke(app, [str(a) for a in arguments])
+        assert result.exit_code == 0, result.output
+    made, log = load_scene(scene), open_log(on_disk / "log")
+    assert made.frame_times_us.tolist() == log.frame_times_us[2:5].tolist()
+    assert made.provenance["selection"] == {"frames": [2, 5, 1], "cameras": ["front"]}
+    assert json.loads(figures.read_text())["frames"] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("frames", ["5", "a:b", "-1:3"])
+def test_a_stretch_that_is_none_is_refused(on_disk, tmp_path, frames):
+    arguments = ["reconstruct", on_disk / "log", "--out", tmp_path / "x.r2s", "--frames", frames]
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exit_code == 1
+    assert "first:stop such as 50:100" in result.output
 
 
 def test_the_command_says_what_frames_may_be(on_disk):
