@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..scene import Trajectory
+from ..scene import Camera, Trajectory
+from ..scene.io.document import OpticsPart
 from .driving_log import DrivingLog, LogError
 from .images import write_image
 from .readers.native import FORMAT, MANIFEST, VERSION
@@ -93,6 +94,13 @@ def _report(done: int, total: int, on_progress: Callable[[int, int], None] | Non
     return done + 1
 
 
+def _recorded(camera: Camera) -> dict[str, Any]:
+    """What the camera really is, where that is known."""
+    if camera.recorded is None:
+        return {}
+    return {"recorded": OpticsPart.of(camera.recorded).model_dump(mode="json")}
+
+
 def _manifest(log: DrivingLog, has_lidar: bool) -> dict[str, Any]:
     return {
         "format": FORMAT,
@@ -106,6 +114,7 @@ def _manifest(log: DrivingLog, has_lidar: bool) -> dict[str, Any]:
                 "height": camera.height,
                 "K": camera.K.tolist(),
                 "T_vehicle_camera": camera.T_vehicle_camera.tolist(),
+                **_recorded(camera),
             }
             for camera in log.rig
         ],

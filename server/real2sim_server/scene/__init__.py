@@ -5,6 +5,7 @@ Knows neither the passing of time nor HTTP.
 
 from .asset import Asset
 from .camera import Camera, CameraRig
+from .camera_motion import CameraMotion
 from .cloud import GaussianCloud
 from .colour import TimeColour
 from .errors import (
@@ -15,21 +16,30 @@ from .errors import (
     UnknownObjectError,
 )
 from .ground import Ground
+from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .scene import Scene, SceneObject
+from .shutter import Shutter
 from .sky import Sky
 from .trajectory import Trajectory
 
 __all__ = [
     "Asset",
+    "BrownConrady",
     "BundleError",
     "BundleTooLargeError",
     "Camera",
+    "CameraMotion",
     "CameraRig",
+    "FTheta",
+    "Fisheye",
     "GaussianCloud",
     "Ground",
+    "Lens",
+    "Omnidirectional",
     "Scene",
     "SceneError",
     "SceneObject",
+    "Shutter",
     "Sky",
     "TimeColour",
     "TimeOutOfRangeError",

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform, is_rigid
 from .errors import SceneError
+from .lens import Lens
+from .shutter import GLOBAL, Shutter
 
 T_VEHICLE_OPTICAL = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64
@@ -19,18 +21,36 @@ T_VEHICLE_OPTICAL = np.array(
 
 
 @dataclass(frozen=True, eq=False)
+class Optics:
+    """What a camera's images were before they were freed of distortion; sizes are the camera's.
+
+    Attributes:
+        K: [3, 3] float64 [px].
+        lens, shutter: as of :class:`Camera`.
+    """
+
+    K: NDArray[np.float64]
+    lens: Lens | None = None
+    shutter: Shutter = GLOBAL
+
+
+@dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated pinhole camera on the vehicle, free of distortion.
+    """A calibrated camera on the vehicle: a pinhole, unless it has a lens.
 
     Attributes:
         name: unique on its rig.
         width, height: image size [px].
         K: [3, 3] float64, intrinsics [px]; pixel centres lie at +0.5.
         T_vehicle_camera: [4, 4] float64; camera frame is OpenCV (x right, y down, z forward).
+        lens: distortion; None for the pinhole.
+        shutter: how images are read out.
+        recorded: what the device really is whose images a log holds free of distortion; None
+            where nothing else is known.
 
     Raises:
-        SceneError: for sizes below 1, a K without positive focal lengths, or a pose that is no
-            rigid transform.
+        SceneError: for sizes below 1, a K without positive focal lengths, a pose that is no
+            rigid transform, or a lens that does not reach what its image shows.
     """
 
     name: str
@@ -38,6 +58,9 @@ class Camera:
     height: int
     K: NDArray[np.float64]
     T_vehicle_camera: Float
+    lens: Lens | None = None
+    shutter: Shutter = GLOBAL
+    recorded: Optics | None = None
 
     def __post_init__(self) -> None:
         k = np.array(self.K, dtype=np.float64)
@@ -54,16 +77,81 @@ class Camera:
             raise SceneError(f"camera {self.name!r}: T_vehicle_camera is not a rigid transform")
         object.__setattr__(self, "K", k)
         object.__setattr__(self, "T_vehicle_camera", pose)
+        if self.lens is not None:
+            self._check_lens(self.lens)
+        if self.recorded is not None:
+            self.as_recorded()
+
+    def _check_lens(self, lens: Lens) -> None:
+        """Perspective images show something everywhere, others at least in their middle."""
+        try:
+            reach = lens.reach
+        except SceneError as error:
+            raise SceneError(f"camera {self.name!r}: {error}") from error
+        column, row = np.linspace(0, self.width, 33), np.linspace(0, self.height, 33)
+        edge = [np.stack([column, np.full(33, y)], -1) for y in (0, self.height)]
+        edge += [np.stack([np.full(33, x), row], -1) for x in (0, self.width)]
+        middle = np.array([[self.width / 2, self.height / 2]])
+        seen = self.unproject(np.concatenate(edge) if lens.perspective else middle)[1]
+        if not seen.all():
+            raise SceneError(
+                f"camera {self.name!r}: its {lens.model} lens is valid up to "
+                f"{np.degrees(reach):.1f} degrees from its axis, but the image of "
+                f"{self.width}x{self.height} reaches beyond; give a smaller image or a calibration "
+                "that holds for all of it"
+            )
+
+    def as_recorded(self) -> Camera:
+        """The device itself, with the distortion and the shutter that its images had; the same
+        camera where nothing else is known."""
+        if self.recorded is None:
+            return self
+        optics = self.recorded
+        return replace(self, K=optics.K, lens=optics.lens, shutter=optics.shutter, recorded=None)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether it has neither lens nor rolling shutter."""
+        return self.lens is None and not self.shutter.rolls
+
+    @property
+    def shows_ranges(self) -> bool:
+        """Whether its depth images hold distances along rays rather than depths along z."""
+        return self.lens is not None and not self.lens.perspective
+
+    def project(self, points: Float) -> tuple[Float, NDArray[np.bool_]]:
+        """Image positions [..., 2] [px] of points [..., 3] in the camera frame, and whether the
+        lens sees them; they may lie beside the image. What is not seen lies anywhere."""
+        points = np.asarray(points, dtype=np.float64)
+        if self.lens is not None:
+            plane, valid = self.lens.distort(points)
+        else:
+            valid = points[..., 2] > 0
+            plane = points[..., :2] / np.where(valid, points[..., 2], 1.0)[..., None]
+        return plane @ self.K[:2, :2].T + self.K[:2, 2], valid
+
+    def unproject(self, pixels: Float) -> tuple[Float, NDArray[np.bool_]]:
+        """Unit directions [..., 3] in the camera frame of image positions [..., 2] [px], and
+        whether the lens sees any there."""
+        plane = (np.asarray(pixels, dtype=np.float64) - self.K[:2, 2]) @ np.linalg.inv(
+            self.K[:2, :2]
+        ).T
+        if self.lens is not None:
+            return self.lens.undistort(plane)
+        rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], -1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        return rays, np.ones(plane.shape[:-1], bool)
 
     def resized(self, width: int) -> Camera:
         """The same camera at another image width [px]; the height follows the aspect ratio."""
         if width == self.width:
             return self
         height = max(1, round(self.height * width / self.width))
-        k = self.K.copy()
-        k[0] *= width / self.width
-        k[1] *= height / self.height
-        return replace(self, width=width, height=height, K=k)
+        scale = np.array([[width / self.width], [height / self.height], [1.0]])
+        recorded = self.recorded
+        if recorded is not None:
+            recorded = replace(recorded, K=recorded.K * scale)
+        return replace(self, width=width, height=height, K=self.K * scale, recorded=recorded)
 
     def viewmat(self, T_world_vehicle: Float) -> Float:
         """``T_camera_world`` [4, 4] when the vehicle stands at ``T_world_vehicle``."""

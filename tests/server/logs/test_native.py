@@ -13,6 +13,12 @@ from real2sim_server.logs import LogError, open_log, write_native_log
 from real2sim_server.logs.images import write_image
 from real2sim_server.synthetic import SyntheticLog
 
+DEVICE = {
+    "K": [[60.0, 0, 48], [0, 60, 32], [0, 0, 1]],
+    "lens": {"model": "fisheye", "k": [0.1, 0, 0, 0], "max_angle": None},
+    "shutter": {"direction": "top_to_bottom", "readout_us": 20_000},
+}
+
 
 def test_round_trip_keeps_every_bit(tiny_log: SyntheticLog, written_native: Path) -> None:
     back = open_log(written_native)
@@ -38,6 +44,22 @@ def test_round_trip_keeps_cameras_and_tracks(tiny_log: SyntheticLog, written_nat
         np.testing.assert_allclose(
             one.trajectory.quaternions, two.trajectory.quaternions, atol=1e-15
         )
+
+
+def test_round_trip_keeps_what_a_camera_really_is(native_folder: Path, tmp_path: Path) -> None:
+    _edit(native_folder, lambda m: m["cameras"][0].update(recorded=DEVICE))
+    camera = next(iter(open_log(native_folder).rig))
+    assert camera.is_pinhole
+    assert camera.as_recorded().shutter.readout_us == 20_000
+    again = write_native_log(open_log(native_folder), tmp_path / "again")
+    assert json.loads((again / "log.json").read_text())["cameras"][0]["recorded"] == DEVICE
+
+
+def test_a_lens_that_is_none_is_refused(native_folder: Path) -> None:
+    wrong = {**DEVICE, "lens": {"model": "fisheye", "k": [1.0]}}
+    _edit(native_folder, lambda m: m["cameras"][0].update(recorded=wrong))
+    with pytest.raises(LogError, match="k must be 4 finite numbers"):
+        open_log(native_folder)
 
 
 def test_progress_counts_up_to_the_total(tiny_log: SyntheticLog, tmp_path: Path) -> None:

@@ -11,9 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from ..._npy import read_entries, read_npy
 from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ...scene.camera import Optics
+from ...scene.io.document import OpticsPart
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image
 from .formats.tables import check_ego_covers, check_frame_times, check_images
@@ -150,8 +153,9 @@ def _read_rig(content: _JsonSection) -> CameraRig:
             raise LogError(f"{entry.where}: 'name' must be usable as a folder name, not {name!r}")
         k, pose = entry.numbers("K", (3, 3)), entry.numbers("T_vehicle_camera", (4, 4))
         try:
-            cameras.append(Camera(name, entry.get("width", int), entry.get("height", int), k, pose))
-        except SceneError as error:
+            size = entry.get("width", int), entry.get("height", int)
+            cameras.append(Camera(name, *size, k, pose, recorded=_read_optics(entry)))
+        except (SceneError, ValidationError) as error:
             raise LogError(f"{entry.where}: {error}") from error
     if not cameras:
         raise LogError(f"{content.where}: 'cameras' must name at least one camera")
@@ -159,6 +163,12 @@ def _read_rig(content: _JsonSection) -> CameraRig:
         return CameraRig(tuple(cameras))
     except SceneError as error:
         raise LogError(f"{content.where}: {error}") from error
+
+
+def _read_optics(entry: _JsonSection) -> Optics | None:
+    """What a camera really is; the key may be left out. Raises SceneError or ValidationError."""
+    given = entry.content.get("recorded")
+    return None if given is None else OpticsPart.model_validate(given).build()
 
 
 def _read_trajectory(section: _JsonSection) -> Trajectory:

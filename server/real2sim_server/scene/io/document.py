@@ -7,12 +7,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from ..camera import Camera, CameraRig
+from ..camera import Camera, CameraRig, Optics
+from ..lens import lens_from, lens_values
+from ..shutter import GLOBAL, Shutter
 from ..trajectory import Trajectory
 
 Count = Annotated[int, Field(ge=0)]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
 Bounds = tuple[Vector3, Vector3]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
@@ -46,34 +49,94 @@ class TrajectoryPart(_Part):
         )
 
 
+class ShutterPart(_Part):
+    """How a camera reads out; see :class:`~real2sim_server.scene.Shutter`."""
+
+    direction: str
+    readout_us: Count
+
+
+class OpticsPart(_Part):
+    """What a camera really is; see :class:`~real2sim_server.scene.camera.Optics`."""
+
+    K: Matrix3
+    lens: dict[str, Any] | None = None
+    shutter: ShutterPart | None = None
+
+    @classmethod
+    def of(cls, optics: Optics) -> OpticsPart:
+        """The part that describes ``optics``, exact to the last bit."""
+        shutter = optics.shutter
+        part = ShutterPart(direction=shutter.direction, readout_us=shutter.readout_us)
+        return cls(
+            K=optics.K.tolist(),
+            lens=lens_values(optics.lens),
+            shutter=part if shutter.rolls else None,
+        )
+
+    def build(self) -> Optics:
+        """The optics. Raises SceneError for values that lens or shutter refuse."""
+        shutter = GLOBAL if self.shutter is None else Shutter(**self.shutter.model_dump())
+        return Optics(np.array(self.K, dtype=np.float64), lens_from(self.lens), shutter)
+
+    @model_serializer(mode="wrap")
+    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {k: v for k, v in handler(self).items() if v is not None}
+
+
 class CameraPart(_Part):
-    """A camera; see :class:`~real2sim_server.scene.Camera`."""
+    """A camera; see :class:`~real2sim_server.scene.Camera`.
+
+    Attributes:
+        lens, shutter, recorded: left out of the JSON where the camera is a pinhole with a global
+            shutter, and known to be nothing else, as versions 1 to 3 of the format ask.
+    """
 
     name: str
     width: int
     height: int
-    K: tuple[Vector3, Vector3, Vector3]
+    K: Matrix3
     T_vehicle_camera: tuple[Vector4, Vector4, Vector4, Vector4]
+    lens: dict[str, Any] | None = None
+    shutter: ShutterPart | None = None
+    recorded: OpticsPart | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {k: v for k, v in handler(self).items() if v is not None}
+
+    @property
+    def has_optics(self) -> bool:
+        """Whether it says more than a pinhole needs."""
+        return any(part is not None for part in (self.lens, self.shutter, self.recorded))
 
     @classmethod
     def of(cls, camera: Camera) -> CameraPart:
         """The part that describes ``camera``, exact to the last bit."""
+        own = OpticsPart.of(Optics(camera.K, camera.lens, camera.shutter))
         return cls(
             name=camera.name,
             width=camera.width,
             height=camera.height,
-            K=camera.K.tolist(),
+            K=own.K,
             T_vehicle_camera=camera.T_vehicle_camera.tolist(),
+            lens=own.lens,
+            shutter=own.shutter,
+            recorded=None if camera.recorded is None else OpticsPart.of(camera.recorded),
         )
 
     def build(self) -> Camera:
         """The camera. Raises SceneError like its constructor."""
+        own = OpticsPart(K=self.K, lens=self.lens, shutter=self.shutter).build()
         return Camera(
             self.name,
             self.width,
             self.height,
-            np.array(self.K, dtype=np.float64),
+            own.K,
             np.array(self.T_vehicle_camera, dtype=np.float64),
+            own.lens,
+            own.shutter,
+            None if self.recorded is None else self.recorded.build(),
         )
 
 
@@ -165,6 +228,8 @@ class SceneContent(_Part):
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
+        if any(camera.has_optics for camera in self.cameras):
+            return 4
         if self.ground is not None:
             return 3
         return 2 if any(o.colour is not None for o in self.objects) else 1

@@ -8,14 +8,18 @@ import torch
 
 from real2sim_server.scene import (
     Asset,
+    BrownConrady,
     BundleError,
     Camera,
     CameraRig,
+    Fisheye,
     GaussianCloud,
     Scene,
+    Shutter,
     Sky,
     Trajectory,
 )
+from real2sim_server.scene.camera import Optics
 from real2sim_server.scene.io import (
     load_asset,
     load_scene,
@@ -24,6 +28,7 @@ from real2sim_server.scene.io import (
     save_scene,
 )
 
+CAMERA_KEYS = {"name", "width", "height", "K", "T_vehicle_camera"}
 CLOUD_FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -131,6 +136,25 @@ def test_equal_scenes_have_equal_hashes_wherever_they_lie(scene, tmp_path):
 def test_saving_what_was_loaded_keeps_the_hash(bundle, tmp_path):
     loaded = load_scene(bundle)
     assert save_scene(loaded, tmp_path / "again").content_hash == loaded.content_hash
+
+
+def test_lenses_and_shutters_come_back_bit_for_bit(scene, tmp_path):
+    lens, shutter = Fisheye((0.1, -0.01, 0.0, 1 / 3), 1.6), Shutter("right_to_left", 20_000)
+    known = Optics(scene.rig["rear"].K * [[1.1], [1.1], [1]], BrownConrady(), shutter)
+    front, rear = scene.rig
+    rig = CameraRig((replace(front, lens=lens, shutter=shutter), replace(rear, recorded=known)))
+    save_scene(replace(scene, rig=rig), tmp_path / "lens.r2s")
+    read = load_scene(tmp_path / "lens.r2s").rig
+    assert (read["front"].lens, read["front"].shutter) == (lens, shutter)
+    assert (read["rear"].lens, read["rear"].shutter) == (None, Shutter())
+    np.testing.assert_array_equal(read["rear"].recorded.K, known.K)
+    assert (read["rear"].recorded.lens, read["rear"].recorded.shutter) == (known.lens, shutter)
+
+
+def test_pinholes_are_written_as_before_lenses_were_known(bundle):
+    document = json.loads((bundle / "scene.json").read_text())
+    assert document["version"] < 4
+    assert all(set(c) == CAMERA_KEYS for c in document["content"]["cameras"])
 
 
 def test_the_order_of_keys_in_the_json_does_not_matter(scene, bundle):
