@@ -19,5 +19,6 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``upkeep``: leftovers and what has been kept long enough go by themselves.
 - ``worker``: all of it put together once.
 - ``routes``: calls and sockets; ``ui`` is the studio that they serve as files.
-- ``app``, ``serve``: the ASGI application, and the server that runs it.
+- ``app``, ``garbage``, ``serve``: the ASGI application, how seldom its process looks for garbage,
+  and the server that runs it.
 """

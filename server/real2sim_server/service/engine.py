@@ -456,9 +456,12 @@ class Engine:
         except BaseException as error:
             if _loses_device(error):
                 self._lose_device(error)
+            self._charge()
             for job in jobs:
                 job.future.set_exception(error)
         else:
+            # Before anybody is woken: who has an answer finds its time counted.
+            self._charge()
             for job, result in zip(jobs, results, strict=True):
                 self._hand_over(job, result)
         finally:

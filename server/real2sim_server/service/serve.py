@@ -23,6 +23,7 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from ..console import is_expected
 from ..settings import Settings
 from .app import create_app
+from .garbage import search_seldom, spare_what_is_there
 from .http.auth import check_bind
 from .http.protocol import LimitedHttpProtocol
 from .http.websocket import ScatterGatherProtocol
@@ -72,6 +73,8 @@ def run(settings: Settings) -> int:
     server = DrainingServer(server_config(app, settings), worker)
     # A lost device poisons the process: it ends, so that its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
+    search_seldom()
+    worker.on_ready = spare_what_is_there
     # The server stops gracefully at a signal and then raises it once more for us.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt), _start_errors_told_once(worker):

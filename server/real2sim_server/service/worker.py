@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -62,6 +62,7 @@ class Worker:
         waiting_for: what has to happen before the worker is ready.
         draining: whether the worker is on its way out.
         start_error: why it did not start.
+        on_ready: called on the event loop when all is there that the worker starts with.
     """
 
     settings: Settings
@@ -86,6 +87,7 @@ class Worker:
     waiting_for: set[str] = field(default_factory=lambda: {"start"})
     draining: bool = False
     start_error: Exception | None = None
+    on_ready: Callable[[], object] = lambda: None
 
     @classmethod
     def build(cls, settings: Settings) -> Worker:
@@ -278,6 +280,7 @@ class Worker:
             log.exception("warm-up failed")
             self.waiting_for = {f"warm-up failed: {error}"}
             return
+        self.on_ready()
         self.waiting_for = set()
         seconds = round(time.perf_counter() - started, 2)
         log.info("ready", backend=self.backend.name, warm_up_s=seconds)

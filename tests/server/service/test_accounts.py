@@ -15,6 +15,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.service import accounts as accounts_module
+from real2sim_server.service import engine as engine_module
 from real2sim_server.service.accounts import (
     PAYER,
     Account,
@@ -124,7 +125,6 @@ def test_time_on_the_engine_goes_to_whoever_asked(engine):
         await asyncio.gather(ask(alice, 0.05), ask(bob, 0.15))
 
     asyncio.run(both())
-    engine.call_sync(int)  # Time is counted after the answer is on its way.
     assert 0.05 <= alice.engine_seconds < bob.engine_seconds >= 0.15
 
 
@@ -147,8 +147,32 @@ def test_what_runs_within_a_long_job_is_not_counted_to_it(engine):
         await asyncio.gather(first, ask(bob, lambda: time.sleep(0.3), Lane.DRIVE))
 
     asyncio.run(both())
-    engine.call_sync(int)
     assert alice.engine_seconds < 0.3 <= bob.engine_seconds
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_time_on_the_engine_is_counted_before_anybody_is_woken(engine, monkeypatch, fails):
+    alice, seen = Account("alice"), []
+    wake = engine_module._LoopFuture._on_loop
+
+    def observed(future, resolve, value) -> None:
+        seen.append(alice.engine_seconds)
+        wake(future, resolve, value)
+
+    monkeypatch.setattr(engine_module._LoopFuture, "_on_loop", observed)
+
+    def work() -> None:
+        time.sleep(0.01)
+        if fails:
+            raise KeyError("on purpose")
+
+    async def ask() -> None:
+        PAYER.set(Payer(alice))
+        with contextlib.suppress(KeyError):
+            await engine.call(work)
+
+    asyncio.run(ask())
+    assert [seconds >= 0.01 for seconds in seen] == [True]
 
 
 def test_who_has_had_their_time_on_the_engine_is_refused_and_a_job_waits(engine, monkeypatch):

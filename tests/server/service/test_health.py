@@ -48,8 +48,11 @@ def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypa
         assert response.status_code == 503
         assert "warming up kernels" in response.json()["reasons"]
         assert "Retry-After" in response.headers
+        told = []
+        client.app.state.worker.on_ready = lambda: told.append(client.app.state.worker.waiting_for)
         warm.set()
         wait_until_ready(client)
+        assert told == [{"warming up kernels"}]
 
 
 def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):

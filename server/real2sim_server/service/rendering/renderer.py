@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import TypeVar, get_args
 
 import numpy as np
@@ -117,6 +117,8 @@ class Renderer:
         self.jpeg: JpegEncoder = turbo_jpeg
         self._engine = engine
         self._backend = backend
+        # Whether an object has members takes longer to look up than much of a step.
+        self._draws_together = cache(partial(draws_together, backend))
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._encoders = ThreadPoolExecutor(encoder_threads(), thread_name_prefix="encode")
@@ -208,8 +210,8 @@ class Renderer:
             sensors: and their cameras, in the same order.
             cameras: at the sizes that the sensors name.
         """
-        modalities = {name for sensor in sensors for name in sensor.modalities}
-        return draws_together(self._backend, modalities) or all(
+        modalities = frozenset(name for sensor in sensors for name in sensor.modalities)
+        return self._draws_together(modalities) or all(
             uses_levels(self._backend, camera.width, camera.height, sensor.detail)
             for sensor, camera in zip(sensors, cameras, strict=True)
         )

@@ -230,9 +230,9 @@ class StepPipeline:
 
         No session waits for the deformations of another.
         """
-        if world.deformation is not None and world.deformation.has_impacts:
-            return None
         sensors = world.spec.sensors
+        if not sensors or (world.deformation is not None and world.deformation.has_impacts):
+            return None
         sizes = [cameras[sensor.camera] for sensor in sensors]
         return world.scene if self._renderer.draws_together(sensors, sizes) else None
 

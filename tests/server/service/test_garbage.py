@@ -1,0 +1,37 @@
+"""How seldom a worker's process looks for garbage."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+
+from real2sim_server.service.garbage import search_seldom, spare_what_is_there
+
+
+@pytest.fixture(autouse=True)
+def settings_of_before():
+    before = gc.get_threshold()
+    yield
+    gc.set_threshold(*before)
+    gc.unfreeze()
+
+
+def test_what_was_there_at_the_start_is_searched_through_no_more():
+    there = [[] for _ in range(1000)]
+    spare_what_is_there()
+    assert gc.get_freeze_count() >= len(there)
+
+
+def test_many_steps_pass_between_searches_and_later_garbage_is_found_still():
+    class Knot:
+        """Refers to itself."""
+
+        def __init__(self) -> None:
+            self.own = self
+
+    search_seldom()
+    assert gc.get_threshold()[0] > 100 * 100
+    spare_what_is_there()
+    Knot()
+    assert gc.collect() > 0
