@@ -90,7 +90,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         )
     for name in ("counts", "prior_counts"):
         state[name] = tuple(state[name])
-    return Checkpoint(**state, tensors=tensors)
+    return Checkpoint(**state, tensors=_with_tilts(tensors))
 
 
 def _upgraded(values: Any) -> Any:
@@ -99,6 +99,16 @@ def _upgraded(values: Any) -> Any:
         return values
     renamed = {KEYS_OF_VERSION_3.get(key, key): _upgraded(v) for key, v in values.items()}
     return renamed | ({"version": VERSION} if "version" in renamed else {})
+
+
+def _with_tilts(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Roll and pitch of boxes that were upright, where a run of a release before had none."""
+    added = {}
+    for name, yaws in tensors.items():
+        group, _, key = name.rpartition(".")
+        if key == "pose_yaw" and f"{group}.pose_tilt" not in tensors:
+            added[f"{group}.pose_tilt"] = yaws.new_zeros(len(yaws), 2)
+    return tensors | added
 
 
 def _upgraded_name(tensor: str) -> str:

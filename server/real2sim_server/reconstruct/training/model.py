@@ -91,6 +91,7 @@ class SceneModel:
             "sky": self.sky,
             "pose_translation": self.poses.shifts,
             "pose_yaw": self.poses.yaws,
+            "pose_tilt": self.poses.tilts,
             "exposure": self.exposure,
             "camera": self.cameras,
         }
@@ -102,6 +103,7 @@ class SceneModel:
         self.sky = packing.leaf(tensors["sky"], self.device)
         self.poses.shifts = packing.leaf(tensors["pose_translation"], self.device)
         self.poses.yaws = packing.leaf(tensors["pose_yaw"], self.device)
+        self.poses.tilts = packing.leaf(tensors["pose_tilt"], self.device)
         self.exposure = packing.leaf(tensors["exposure"], self.device)
         self.cameras = packing.leaf(tensors["camera"], self.device)
 

@@ -52,8 +52,9 @@ class KeyPoses:
 class ObjectPoses:
     """Poses of all objects with their corrections.
 
-    At a key time ``T_world_object = T_given [Rz(yaw) | shift]``; in between positions and
-    corrections are linear and rotations slerped, as in Trajectory.
+    At a key time ``T_world_object = T_given [Rz(yaw) Ry(pitch) Rx(roll) | shift]``; in between
+    positions and corrections are linear and rotations slerped, as in Trajectory. Boxes are mostly
+    labelled upright, while roads are steep and vehicles pitch when they brake.
 
     Args:
         scene: its trajectories are where refinement starts.
@@ -82,6 +83,7 @@ class ObjectPoses:
         self._given = [Trajectory(k.times_us, k.positions, k.quaternions) for k in self.keys]
         self.shifts = torch.zeros(row, 3, device=device, requires_grad=True)
         self.yaws = torch.zeros(row, 1, device=device, requires_grad=True)
+        self.tilts = torch.zeros(row, 2, device=device, requires_grad=True)
 
     def at(self, t_us: int) -> tuple[list[int], Tensor]:
         """Indices of the objects that exist at ``t_us``, K of them, and their ``T_world_object``
@@ -96,11 +98,13 @@ class ObjectPoses:
         rows = [torch.from_numpy(first + key).to(device) for key in (before, after)]
         later = torch.tensor(fractions, dtype=torch.float64, device=device)[:, None]
         weights = (1 - later).float(), later.float()
-        shift = self.shifts[rows[0]] * weights[0] + self.shifts[rows[1]] * weights[1]
-        yaw = self.yaws[rows[0]] * weights[0] + self.yaws[rows[1]] * weights[1]
+        shift, yaw, tilt = (
+            held[rows[0]] * weights[0] + held[rows[1]] * weights[1]
+            for held in (self.shifts, self.yaws, self.tilts)
+        )
         poses = [self._given[index].pose(t_us) for index in present]
         given = transform_from(*(np.array(part) for part in zip(*poses, strict=True)))
-        corrections = _corrections(shift.double(), yaw[:, 0].double())
+        corrections = _corrections(shift.double(), torch.cat([tilt, yaw], dim=1).double())
         return present, torch.from_numpy(given).to(device) @ corrections
 
     def roughness(self) -> Tensor:
@@ -114,8 +118,9 @@ class ObjectPoses:
         ]
         return torch.stack(terms).mean() if terms else self.shifts.sum() * 0
 
-    def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor]:
-        """World positions [T, 3] about their mean and unwrapped yaws [T, 1], float32."""
+    def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor, Tensor]:
+        """World positions [T, 3] about their mean, unwrapped yaws [T, 1] and corrections of roll
+        and pitch [T, 2], float32."""
         device = self.shifts.device
         rotations = quaternion_to_matrix(key.quaternions).astype(np.float32)
         turns = torch.from_numpy(rotations).to(device)
@@ -124,25 +129,42 @@ class ObjectPoses:
         heading = np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
         given = torch.from_numpy(heading.astype(np.float32)).to(device)
         yaws = given[:, None] + self.yaws[key.rows]
-        return positions, yaws
+        return positions, yaws, self.tilts[key.rows]
 
     def trajectory(self, index: int) -> Trajectory:
         """The refined trajectory of object ``index``."""
         key = self.keys[index]
         shift = self.shifts.detach()[key.rows].cpu().double().numpy()
         yaw = self.yaws.detach()[key.rows, 0].cpu().double().numpy()
+        roll, pitch = self.tilts.detach()[key.rows].cpu().double().numpy().T
         rotations = quaternion_to_matrix(key.quaternions)
         positions = key.positions + np.einsum("tij,tj->ti", rotations, shift)
         quaternions = multiply_quaternions(key.quaternions, yaw_quaternion(yaw))
+        for axis, angle in ((1, pitch), (0, roll)):
+            quaternions = multiply_quaternions(quaternions, _about(axis, angle))
         return Trajectory(key.times_us, positions, quaternions)
 
 
-def _corrections(shift: Tensor, yaw: Tensor) -> Tensor:
-    """``[Rz(yaw) | shift]`` [K, 4, 4] of shifts [K, 3] and yaws [K]."""
-    c, s, (x, y, z) = yaw.cos(), yaw.sin(), shift.unbind(1)
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    rows = (c, -s, zero, x), (s, c, zero, y), (zero, zero, one, z), (zero, zero, zero, one)
+def _corrections(shift: Tensor, angles: Tensor) -> Tensor:
+    """``[Rz(yaw) Ry(pitch) Rx(roll) | shift]`` [K, 4, 4] of shifts [K, 3] and of roll, pitch and
+    yaw [K, 3]."""
+    (cr, cp, cy), (sr, sp, sy) = angles.cos().unbind(1), angles.sin().unbind(1)
+    x, y, z = shift.unbind(1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y),
+        (-sp, cp * sr, cp * cr, z),
+        (zero, zero, zero, one),
+    )
     return torch.stack([value for row in rows for value in row], dim=1).reshape(-1, 4, 4)
+
+
+def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions [T, 4] wxyz of turns by ``angle`` [T] about one axis."""
+    quaternions = np.zeros((len(angle), 4))
+    quaternions[:, 0], quaternions[:, 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
+    return quaternions
 
 
 def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -> NDArray[np.int64]:

@@ -28,6 +28,7 @@ class LearningRates:
         sky: of the cube map.
         pose_translation: of object boxes [m].
         pose_yaw: of object boxes [rad].
+        pose_tilt: of their roll and pitch [rad].
         camera: of camera poses [m, rad]; 0 leaves them as calibrated.
         exposure: of each camera's affine colour; 0 leaves colours as they are.
 
@@ -43,6 +44,7 @@ class LearningRates:
     sky: tuple[float, float] = (0.01, 1e-4)
     pose_translation: tuple[float, float] = (5e-3, 5e-5)
     pose_yaw: tuple[float, float] = (1e-3, 1e-5)
+    pose_tilt: tuple[float, float] = (1e-3, 1e-5)
     camera: float = 0.0
     exposure: float = 0.0
 
@@ -227,6 +229,7 @@ def learning_rates_at(
         "sky": exponential_decay(rates.sky, fraction),
         "pose_translation": poses_move * exponential_decay(rates.pose_translation, fraction),
         "pose_yaw": poses_move * exponential_decay(rates.pose_yaw, fraction),
+        "pose_tilt": poses_move * exponential_decay(rates.pose_tilt, fraction),
         "exposure": rates.exposure,
         "camera": rates.camera,
     }

@@ -208,7 +208,7 @@ class Trainer:
             visible[part] = (radii > 0).any(0)
         masks = {name: visible for name in FIELDS if name not in OBJECT_FIELDS}
         masks |= dict.fromkeys(OBJECT_FIELDS, visible[gaussians.counts[0] :])
-        for name in ("pose_translation", "pose_yaw", "exposure", "camera"):
+        for name in ("pose_translation", "pose_yaw", "pose_tilt", "exposure", "camera"):
             gradient = parameters[name].grad
             if gradient is not None:
                 masks[name] = gradient.reshape(len(gradient), -1).any(1)

@@ -64,6 +64,14 @@ def test_version_3_is_read_under_the_names_of_today(tmp_path):
     check_same(read_checkpoint(folder), CHECKPOINT)
 
 
+def test_boxes_of_a_run_of_before_are_upright(tmp_path):
+    yaws = {f"{group}.pose_yaw": torch.ones(4, 1) for group in ("model", "adam.first")}
+    write_checkpoint(replace(CHECKPOINT, tensors=yaws), tmp_path / "checkpoint")
+    read = read_checkpoint(tmp_path / "checkpoint").tensors
+    for group in ("model", "adam.first"):
+        assert torch.equal(read[f"{group}.pose_tilt"], torch.zeros(4, 2))
+
+
 def test_other_versions_are_refused(tmp_path):
     folder = tmp_path / "checkpoint"
     write_checkpoint(CHECKPOINT, folder)
