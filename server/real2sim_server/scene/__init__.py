@@ -11,12 +11,14 @@ from .colour import TimeColour
 from .errors import (
     BundleError,
     BundleTooLargeError,
+    LidarError,
     SceneError,
     TimeOutOfRangeError,
     UnknownObjectError,
 )
 from .ground import Ground
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
+from .lidar import Beams, Detection, Lidar
 from .scene import Scene, SceneObject
 from .shutter import Shutter
 from .sky import Sky
@@ -24,17 +26,21 @@ from .trajectory import Trajectory
 
 __all__ = [
     "Asset",
+    "Beams",
     "BrownConrady",
     "BundleError",
     "BundleTooLargeError",
     "Camera",
     "CameraMotion",
     "CameraRig",
+    "Detection",
     "FTheta",
     "Fisheye",
     "GaussianCloud",
     "Ground",
     "Lens",
+    "Lidar",
+    "LidarError",
     "Omnidirectional",
     "Scene",
     "SceneError",

@@ -3,6 +3,7 @@
 SceneError
 ├── TimeOutOfRangeError   a pose was asked for outside a trajectory
 ├── UnknownObjectError    an object id the scene does not have
+├── LidarError            a LiDAR that cannot be, or a name that the catalogue does not have
 └── BundleError           a file that is not a readable scene or splat file
     └── BundleTooLargeError   one that would take more memory than it may
 """
@@ -23,6 +24,10 @@ class UnknownObjectError(SceneError, KeyError):
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""
+
+
+class LidarError(SceneError, ValueError):
+    """A LiDAR out of range or unknown; the message says what was given and what is allowed."""
 
 
 class BundleError(SceneError, ValueError):

@@ -1,0 +1,17 @@
+"""LiDAR from Gaussians: rays followed in 3D, one origin and pose for each instant of a sweep.
+
+``cast`` gives what the light of each ray meets (an :class:`Echo`), ``detect`` what the sensor makes
+of it (a :class:`Sweep`). Nothing here is compiled before the first call.
+"""
+
+from .call import cast, select_caster
+from .types import CastBackend, CastRequest, Echo, Return
+
+__all__ = [
+    "CastBackend",
+    "CastRequest",
+    "Echo",
+    "Return",
+    "cast",
+    "select_caster",
+]

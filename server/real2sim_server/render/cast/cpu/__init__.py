@@ -1,0 +1,1 @@
+"""The CPU backend of cast(): Numba kernels on all cores."""

@@ -1,0 +1,250 @@
+"""From the Gaussians of one body to records of those that rays may meet, and where they do.
+
+The sensor moves while it turns: for each Gaussian the instant at which it is looked at is found
+first. Where the sweep begins and ends the same place is seen twice, a turn apart; what lies there
+becomes two records, one for the tiles of either half of the sweep.
+"""
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from ...._numba import PARALLEL_LOOPS
+from ...backends.cpu.kernel import inlined, kernel
+from ...backends.cpu.lanes import LANES
+from ...backends.cpu.records import CHUNK
+from ...backends.cpu.simd import lowest_bit
+from .layout import AZIMUTH_BIN, AZIMUTH_BINS, ELEVATION_BIN, ELEVATION_BINS
+from .prepare_lanes import ARC, prepare_eight, prepare_eight_deformed
+from .records import (
+    BODY,
+    FRAME,
+    GAIN,
+    HIGH,
+    LEFT,
+    LOSS,
+    LOW,
+    MEAN,
+    MEMBER,
+    OPACITY,
+    PREPARATION,
+    RANGE,
+    RECORD,
+    REFLECTIVITY,
+    RIGHT,
+    SHAPE,
+)
+
+F32 = np.float32
+PI, HALF_PI, TURN = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi)
+A0, A1, A2, A3, A4, A5 = (F32(a) for a in ARC)
+ROUNDS = 2
+"""Times the instant at which a place is looked at is improved; each leaves a fiftieth."""
+NO_SEAM = 3.5
+FIELDS = tuple(field for field in range(RECORD) if field not in {BODY, MEMBER, REFLECTIVITY, LOSS})
+
+
+@kernel(parallel=PARALLEL_LOOPS, fastmath={"contract", "nsz", "arcp"})
+def prepare_body(body, sensor, layout, base, records):
+    """Write records of those Gaussians of one Body that rays may meet.
+
+    Args:
+        base: first chunk of this body; each has two regions of CHUNK records.
+        records: Records of the rasterizer, written from region ``2 base`` on.
+    """
+    # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
+    values, footprints = records.values, records.footprints
+    depths, counts = records.depths, records.counts
+    total = body.means.shape[0]
+    for chunk in prange((total + CHUNK - 1) // CHUNK):
+        planes = np.zeros(PREPARATION * LANES, np.float32)
+        region = 2 * (base + chunk)
+        slot, second = region * CHUNK, (region + 1) * CHUNK
+        stop = min(total, (chunk + 1) * CHUNK)
+        for first in range(chunk * CHUNK, stop, LANES):
+            count = min(stop - first, LANES)
+            gather(body, first, count, planes)
+            pending, seamless = np.int64((1 << count) - 1), layout.seam >= NO_SEAM
+            seamless = seamless or (body.speed == 0 and body.turn == 0)
+            for side in range(3):
+                look(body, layout, count, side, planes)
+                lanes = run(body, sensor, pending, planes)
+                if side == 0:
+                    pending = np.int64(0) if seamless else near_seam(layout, sensor, lanes, planes)
+                    lanes &= ~pending
+                place = second if side == 2 else slot
+                place = write(
+                    body, layout, first, lanes, side, planes, values, footprints, depths, place
+                )
+                if side == 2:
+                    second = place
+                else:
+                    slot = place
+                if pending == 0:
+                    break
+        counts[region] = slot - region * CHUNK
+        counts[region + 1] = second - (region + 1) * CHUNK
+
+
+@inlined()
+def gather(body, first, count, planes):
+    """Lay Gaussians side by side in the planes, their centres in the frame of the sweep."""
+    for lane in range(count):
+        i = first + lane
+        planes[OPACITY * LANES + lane] = body.opacities[i]
+        x, y, z = (
+            np.float64(body.means[i, 0]),
+            np.float64(body.means[i, 1]),
+            np.float64(body.means[i, 2]),
+        )
+        for k in range(3):
+            row = body.linear[k]
+            placed = row[0] * x + row[1] * y + row[2] * z + body.offset[k]
+            planes[(MEAN + k) * LANES + lane] = F32(placed)
+        if body.covars.shape[0] > 0:
+            covar, plane = body.covars[i], SHAPE * LANES + lane
+            for row_index in range(3):
+                for column in range(row_index, 3):
+                    planes[plane] = covar[row_index, column]
+                    plane += LANES
+        else:
+            for k in range(4):
+                planes[(SHAPE + k) * LANES + lane] = body.quats[i, k]
+            for k in range(3):
+                planes[(SHAPE + 4 + k) * LANES + lane] = body.scales[i, k]
+
+
+@inlined()
+def look(body, layout, count, side, planes):
+    """Put the sensor's frame at the instant it looks at each centre into the planes.
+
+    ``side`` 1 looks only in the first half of the sweep, 2 in the second, 0 in both.
+    """
+    slots = body.frames.shape[0]
+    low = 0 if side != 2 else slots - slots // 2
+    high = slots - 1 if side != 1 else slots // 2 - 1
+    for lane in range(count):
+        slot = (low + high) // 2
+        if body.speed > 0 or body.turn > 0:
+            mx, my = planes[MEAN * LANES + lane], planes[(MEAN + 1) * LANES + lane]
+            mz = planes[(MEAN + 2) * LANES + lane]
+            if side == 1:
+                slot = 0
+            elif side == 2:
+                slot = slots - 1
+            for _ in range(ROUNDS):
+                f = body.frames[slot]
+                x = f[0] * mx + f[1] * my + f[2] * mz + f[3]
+                y = f[4] * mx + f[5] * my + f[6] * mz + f[7]
+                bin_ = np.int64((angle_of(y, x) + PI) * F32(1 / AZIMUTH_BIN))
+                found = np.int64(layout.slot_of[min(max(bin_, 0), AZIMUTH_BINS - 1)])
+                if side == 1 and found > high:
+                    found = 0
+                elif side == 2 and found < low:
+                    found = slots - 1
+                slot = found
+        for k in range(12):
+            planes[(FRAME + k) * LANES + lane] = body.frames[slot, k]
+
+
+@inlined()
+def run(body, sensor, lanes, planes):
+    """Bits of the lanes that remain, see prepare_lanes."""
+    if body.covars.shape[0] > 0:
+        return prepare_eight_deformed(planes, lanes, sensor, body)
+    return prepare_eight(planes, lanes, sensor, body)
+
+
+@inlined()
+def near_seam(layout, sensor, lanes, planes):
+    """Bits of those that may be met both where the sweep begins and where it ends."""
+    bits = np.int64(0)
+    for lane in range(LANES):
+        if (lanes >> lane) & 1:
+            left, right = planes[LEFT * LANES + lane], planes[RIGHT * LANES + lane]
+            moved = planes[GAIN * LANES + lane] * sensor.duration
+            middle, half = F32(0.5) * (left + right), F32(0.5) * (right - left) + moved
+            away = abs(F32(layout.seam) - middle)
+            away = min(away, abs(TURN - away))
+            if half < PI and away <= half:
+                bits |= np.int64(1) << lane
+    return bits
+
+
+@inlined()
+def write(body, layout, first, lanes, side, planes, values, footprints, depths, slot):
+    """Write the records of those lanes whose angles hold rays; the next free slot."""
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes &= lanes - 1
+        footprint = footprint_of(layout, lane, planes, side)
+        if footprint >= 0:
+            out = values[slot]
+            for field in FIELDS:
+                out[field] = planes[field * LANES + lane]
+            out[BODY] = body.number
+            out[MEMBER] = F32(first + lane)
+            known = body.attributes.shape[0] > 0
+            out[REFLECTIVITY] = body.attributes[first + lane, 0] if known else F32(0.5)
+            out[LOSS] = body.attributes[first + lane, 1] if known else F32(0)
+            footprints[slot] = footprint
+            depths[slot] = planes[RANGE * LANES + lane]
+            slot += 1
+    return slot
+
+
+@inlined()
+def footprint_of(layout, lane, planes, side):
+    """Bands, bins of azimuth and side as one number, or -1 where no ray passes.
+
+    From the low bits on: first and last band (8 bits each), first and last bin (13 bits each; the
+    last may lie beyond the end, which wraps), side (2 bits).
+    """
+    low = elevation_bin(planes[LOW * LANES + lane])
+    high = elevation_bin(planes[HIGH * LANES + lane])
+    if layout.rows_until[high] <= layout.rows_before[low]:
+        return np.int64(-1)
+    band, last_band = np.int64(layout.first_bands[low]), np.int64(layout.last_bands[high])
+    if band > last_band:
+        return np.int64(-1)
+    left, right = planes[LEFT * LANES + lane], planes[RIGHT * LANES + lane]
+    if right - left >= TURN:
+        first_bin, last_bin = np.int64(0), np.int64(AZIMUTH_BINS - 1)
+    else:
+        if left < -PI:
+            left, right = left + TURN, right + TURN
+        elif left >= PI:
+            left, right = left - TURN, right - TURN
+        first_bin = np.int64((left + PI) * F32(1 / AZIMUTH_BIN))
+        first_bin = min(max(first_bin, 0), AZIMUTH_BINS - 1)
+        last_bin = np.int64((right + PI) * F32(1 / AZIMUTH_BIN))
+        last_bin = min(max(last_bin, first_bin), first_bin + AZIMUTH_BINS - 1)
+    packed = band | (last_band << 8) | (first_bin << 16) | (last_bin << 29)
+    return packed | (np.int64(side) << 42)
+
+
+@inlined()
+def elevation_bin(angle):
+    """Bin of an elevation; angles beyond the poles go to the last ones."""
+    bin_ = np.int64((angle + HALF_PI) * F32(1 / ELEVATION_BIN) + F32(1)) - 1
+    return min(max(bin_, 0), ELEVATION_BINS - 1)
+
+
+@inlined()
+def angle_of(y, x):
+    """Angle of (x, y), to 2e-6."""
+    ax, ay = abs(x), abs(y)
+    ratio = min(ax, ay) / max(ax, ay, F32(1e-12))
+    s = ratio * ratio
+    angle = ratio * (A0 + s * (A1 + s * (A2 + s * (A3 + s * (A4 + s * A5)))))
+    if ay > ax:
+        angle = HALF_PI - angle
+    if x < 0:
+        angle = PI - angle
+    return math.copysign(angle, y)

@@ -1,0 +1,247 @@
+"""LiDARs: which way each ray of a sweep leaves the sensor and when, and what the detector sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..geometry.rotation import Float
+from ..geometry.transform import is_rigid
+from .errors import LidarError
+
+MAX_RAYS = 1 << 19
+"""Rays of one sweep; the densest sensors sold today fire less than half as many."""
+MAX_SLOTS = 2048
+"""Instants of a sweep at which poses are taken: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
+MAX_RANGE_M = 2000.0
+MAX_DIVERGENCE = 0.1
+ReturnMode = Literal["median", "first", "strongest", "last"]
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """The rays of one sweep in the sensor's frame (x forward, y left, z up).
+
+    Attributes:
+        azimuth: [...] float64 [rad], from x towards y.
+        elevation: [...] float64 [rad], from the horizontal plane upwards.
+        time_us: [...] float64, when each ray is fired, relative to the sweep's time stamp [us].
+
+    The shape is [B, C] (row of the sensor, column of the turn) for spinning sensors and [R] for
+    tables; results of a cast have the same.
+
+    Raises:
+        LidarError: shapes that differ, values that are not finite, elevations beyond 90 degrees,
+            no ray, or more than MAX_RAYS.
+    """
+
+    azimuth: Float
+    elevation: Float
+    time_us: Float
+
+    def __post_init__(self) -> None:
+        arrays = {
+            name: np.array(getattr(self, name), dtype=np.float64)
+            for name in ("azimuth", "elevation", "time_us")
+        }
+        shapes = {name: array.shape for name, array in arrays.items()}
+        if len(set(shapes.values())) != 1:
+            raise LidarError(f"azimuth, elevation and time_us must be of one shape, not {shapes}")
+        count = arrays["azimuth"].size
+        if not 1 <= count <= MAX_RAYS:
+            raise LidarError(f"a sweep of {count:,} rays; allowed are 1 to {MAX_RAYS:,}")
+        for name, array in arrays.items():
+            bad = int((~np.isfinite(array)).sum())
+            if bad:
+                raise LidarError(f"{bad:,} of {count:,} values of {name} are not finite")
+        steepest = float(np.abs(arrays["elevation"]).max())
+        if steepest > np.pi / 2 + 1e-9:
+            raise LidarError(
+                f"elevations reach {np.degrees(steepest):.1f} degrees; allowed are -90 to 90"
+            )
+        for name, array in arrays.items():
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def spinning(
+        cls,
+        elevation: ArrayLike,
+        *,
+        columns: int,
+        rate_hz: float = 10.0,
+        azimuth_offset: ArrayLike = 0.0,
+        clockwise: bool = True,
+        start: float = np.pi,
+        field_of_view: float = 2 * np.pi,
+    ) -> Beams:
+        """Rows that turn about the sensor's z axis.
+
+        Args:
+            elevation: [B] of each row [rad].
+            columns: azimuth steps of a sweep, C.
+            rate_hz: turns per second; a sweep takes a whole turn.
+            azimuth_offset: [B] or one number, of the rows against the column's azimuth [rad].
+            clockwise: as seen from above.
+            start: azimuth at which the first column begins [rad].
+            field_of_view: azimuth covered by the columns [rad]; less than a turn looks about the
+                middle of the turn. The time stamp of a sweep is the middle of the turn.
+
+        Raises:
+            LidarError: counts or numbers out of range, named.
+        """
+        rows = np.atleast_1d(np.asarray(elevation, dtype=np.float64))
+        offsets = np.broadcast_to(np.asarray(azimuth_offset, dtype=np.float64), rows.shape)
+        if not 1 <= len(rows) * int(columns) <= MAX_RAYS or columns < 1:
+            raise LidarError(
+                f"{len(rows)} rows of {columns:,} columns; allowed are 1 to {MAX_RAYS:,} rays"
+            )
+        _check_range("rate_hz", rate_hz, 0.1, 1000.0)
+        _check_range("field_of_view", field_of_view, 1e-3, 2 * np.pi + 1e-9)
+        part = field_of_view / (2 * np.pi)
+        step = (np.arange(columns) + 0.5) / columns
+        turn = 0.5 + (step - 0.5) * part
+        direction = -1.0 if clockwise else 1.0
+        azimuth = start + direction * 2 * np.pi * turn
+        time_us = (turn - 0.5) * 1e6 / rate_hz
+        shape = (len(rows), columns)
+        return cls(
+            wrapped(azimuth[None] + offsets[:, None]),
+            np.broadcast_to(rows[:, None], shape),
+            np.broadcast_to(time_us[None], shape),
+        )
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of all arrays and of a cast's results."""
+        return tuple(self.azimuth.shape)
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return int(self.azimuth.size)
+
+    @cached_property
+    def directions(self) -> Float:
+        """[..., 3] unit vectors in the sensor's frame."""
+        flat = np.cos(self.elevation)
+        x, y = flat * np.cos(self.azimuth), flat * np.sin(self.azimuth)
+        return np.stack([x, y, np.sin(self.elevation)], axis=-1)
+
+    @cached_property
+    def slots(self) -> tuple[Float, NDArray[np.int32]]:
+        """Instants [S] [us] at which poses are taken, increasing, and the slot of each ray [...].
+
+        Every instant of its own where there are few enough, as with columns; else MAX_SLOTS evenly
+        spread ones.
+        """
+        times, index = np.unique(self.time_us.ravel(), return_inverse=True)
+        if len(times) > MAX_SLOTS:
+            step = (times[-1] - times[0]) / MAX_SLOTS
+            index = np.minimum((self.time_us.ravel() - times[0]) / step, MAX_SLOTS - 1)
+            times = times[0] + (np.arange(MAX_SLOTS) + 0.5) * step
+        return times, index.astype(np.int32).reshape(self.shape)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What the detector needs for a return.
+
+    Attributes:
+        range_m, reflectivity: a diffuse surface of this reflectivity, in (0, 1], at this distance
+            is just seen. Power falls with the square of the distance.
+        loss: share of rays lost whatever they meet, 0 to 1.
+        softness: width of the passage from seen to lost, as a share of the limiting power.
+
+    Raises:
+        LidarError: a value out of range.
+    """
+
+    range_m: float = 120.0
+    reflectivity: float = 0.1
+    loss: float = 0.0
+    softness: float = 0.25
+
+    def __post_init__(self) -> None:
+        _check_range("detection range_m", self.range_m, 0.1, MAX_RANGE_M)
+        _check_range("detection reflectivity", self.reflectivity, 1e-6, 1.0)
+        _check_range("detection loss", self.loss, 0.0, 1.0)
+        _check_range("detection softness", self.softness, 1e-6, 10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Lidar:
+    """A LiDAR on the vehicle.
+
+    Attributes:
+        name: unique on its vehicle.
+        beams: which way and when.
+        T_vehicle_lidar: [4, 4] float64, sensor frame x forward, y left, z up.
+        min_range, max_range: of returns; what is nearer is not seen and hides nothing [m].
+        divergence: (horizontal, vertical) full angle of a beam at 1/e^2 of its power [rad]; its
+            standard deviation on a surface is a quarter of its diameter there.
+        returns: 1 (the median of the light), 2 (first and last) or 3 (and the strongest).
+        pulse: echoes nearer to each other along the ray are one return [m].
+        range_noise: standard deviation of a measured range [m].
+        detection: what is seen.
+        source: where the numbers come from.
+
+    Raises:
+        LidarError: a value out of range, named with what is allowed.
+    """
+
+    name: str
+    beams: Beams
+    T_vehicle_lidar: Float = field(default_factory=lambda: np.eye(4))
+    min_range: float = 0.5
+    max_range: float = 120.0
+    divergence: tuple[float, float] = (0.0, 0.0)
+    returns: int = 1
+    pulse: float = 0.4
+    range_noise: float = 0.0
+    detection: Detection = field(default_factory=Detection)
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        what = f"lidar {self.name!r}: "
+        pose = np.array(self.T_vehicle_lidar, dtype=np.float64)
+        if not is_rigid(pose):
+            raise LidarError(f"{what}T_vehicle_lidar is not a rigid transform")
+        object.__setattr__(self, "T_vehicle_lidar", pose)
+        _check_range(f"{what}min_range", self.min_range, 0.0, MAX_RANGE_M)
+        _check_range(f"{what}max_range", self.max_range, 0.1, MAX_RANGE_M)
+        if self.min_range >= self.max_range:
+            raise LidarError(
+                f"{what}min_range {self.min_range} m must be below max_range {self.max_range} m"
+            )
+        if len(self.divergence) != 2:
+            raise LidarError(f"{what}divergence must be (horizontal, vertical) in rad")
+        for angle in self.divergence:
+            _check_range(f"{what}divergence", angle, 0.0, MAX_DIVERGENCE)
+        if self.returns not in (1, 2, 3):
+            raise LidarError(f"{what}returns must be 1, 2 or 3, not {self.returns!r}")
+        _check_range(f"{what}pulse", self.pulse, 0.01, 10.0)
+        _check_range(f"{what}range_noise", self.range_noise, 0.0, 10.0)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a cast's results: [B, C] or [R]."""
+        return self.beams.shape
+
+    def placed(self, T_vehicle_lidar: ArrayLike) -> Lidar:
+        """The same sensor elsewhere on the vehicle."""
+        return replace(self, T_vehicle_lidar=np.asarray(T_vehicle_lidar, dtype=np.float64))
+
+
+def wrapped(angle: Float) -> Float:
+    """Angles [rad] brought to [-pi, pi)."""
+    turned: Float = (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    return turned
+
+
+def _check_range(what: str, value: float, low: float, high: float) -> None:
+    if not (isinstance(value, (int, float)) and low <= value <= high):
+        raise LidarError(f"{what} must be from {low:g} to {high:g}, not {value!r}")
