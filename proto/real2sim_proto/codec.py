@@ -66,7 +66,7 @@ def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]
     if len(data) > max_bytes:
         raise CodecError(f"message of {len(data)} bytes is larger than the allowed {max_bytes}")
     try:
-        message = msgpack.unpackb(data, raw=False, strict_map_key=True, ext_hook=_unpack_array)
+        message = unpack(data)
     except CodecError:
         raise
     except (
@@ -80,6 +80,16 @@ def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]
         raise CodecError(f"a message must be a map, not {type(message).__name__}")
     _check_values(message, MAX_DEPTH)
     return message
+
+
+def unpack(data: bytes) -> Any:
+    """What is in ``data``, for a reader that looks at every value itself; see :func:`decode`.
+
+    Raises:
+        CodecError: an unknown ext type, or an array whose parts disagree.
+        ValueError, TypeError, RecursionError: not msgpack.
+    """
+    return msgpack.unpackb(data, raw=False, strict_map_key=True, ext_hook=_unpack_array)
 
 
 def _pack_array(value: object) -> msgpack.ExtType:

@@ -1,0 +1,78 @@
+"""Messages of clients: actions are read by a way of their own, with the same outcome."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from real2sim_proto import encode
+from real2sim_proto.codec import encode as encode_arrays
+from real2sim_proto.drive import CLIENT_MESSAGE
+from real2sim_server.service.sessions import messages
+from real2sim_server.service.sessions.messages import BadMessageError, read_as, read_message
+
+TRAJECTORY = {"kind": "trajectory", "times_us": [1, 2], "poses": [[1.0, 0.0, 0.0], [2, 0, 0]]}
+ACTION: dict[str, Any] = {"v": 1, "id": 7, "type": "action", "step": 3, "plan": TRAJECTORY}
+
+
+def outcome(read, data: bytes) -> object:
+    try:
+        return read(data)
+    except BadMessageError as error:
+        return (error.message_id, error.fatal, vars(error.error))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"slot": 1},
+        {"plan": {"kind": "control", "acceleration": 1, "steering": 0.0}},
+        {"plan": {"kind": "pose", "x": 1, "y": 2, "yaw": 0.5}},
+        {"plan": TRAJECTORY | {"frame": "world"}},
+        {"plan": TRAJECTORY | {"times_us": np.array([1, 2]), "poses": np.zeros((2, 3))}},
+    ],
+)
+def test_an_action_is_read_at_once_and_as_any_message_is(monkeypatch, changes):
+    data = encode_arrays(ACTION | changes)
+    slowly = read_as(CLIENT_MESSAGE, data)
+    monkeypatch.setattr(messages, "read_as", None)
+    quickly = read_message(data)
+    assert quickly.message == slowly
+    assert repr(quickly.message) == repr(slowly)
+    assert quickly.message.model_fields_set == slowly.model_fields_set
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xc1",
+        encode(ACTION)[:-1],
+        encode(ACTION) + b"\x00",
+        msgpack.packb([ACTION]),
+        encode(ACTION | {"v": True}),
+        encode(ACTION | {"v": 2}),
+        encode(ACTION | {"v": [1]}),
+        encode(ACTION | {"id": -1}),
+        encode(ACTION | {"type": ["action"]}),
+        encode(ACTION | {"more": 1}),
+        encode({k: v for k, v in ACTION.items() if k != "v"}),
+        encode(ACTION | {"plan": TRAJECTORY | {"times_us": [2, 1]}}),
+        encode(ACTION | {"plan": TRAJECTORY | {"poses": [[float("nan"), 0.0, 0.0]] * 2}}),
+        msgpack.packb(ACTION | {"step": msgpack.Timestamp(3)}),
+        msgpack.packb(ACTION | {"step": msgpack.ExtType(9, b"")}),
+        msgpack.packb(ACTION | {b"more": 1}),
+        encode({"v": 1, "id": 1, "type": "bye"}),
+    ],
+)
+def test_whatever_else_comes_is_answered_as_before(data):
+    def slowly(data: bytes) -> object:
+        message = read_as(CLIENT_MESSAGE, data)
+        content = b"" if message.type != "action" else messages.plan_payload(message.plan)
+        return messages.ReceivedMessage(message, content)
+
+    assert outcome(read_message, data) == outcome(slowly, data)
