@@ -24,6 +24,7 @@ ROOTS = {
 LAYERS = (
     "_numba",
     "_files",
+    "_nvrtc",
     "_confined",
     "_npy",
     "console",

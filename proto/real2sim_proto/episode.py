@@ -432,6 +432,12 @@ class ContactSpec(Model):
         "acts in the middle of what yields, and vehicles turn by published inertias; false: as in "
         "episodes recorded before this option was there",
     )
+    distributed: bool = Field(
+        default=True,
+        description="force between two bodies acts wherever along their faces they still come "
+        "nearer to each other, and its normal turns with the body whose face was struck; false: "
+        "all of it at one place, as in episodes recorded before this option was there",
+    )
     dents: bool = Field(
         default=True,
         description="images show struck objects deformed, by the material point method",

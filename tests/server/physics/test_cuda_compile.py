@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from real2sim_server._nvrtc import KernelSource
 from real2sim_server.physics import SolverError
 from real2sim_server.physics.backends.cuda import compile as compiling
 from real2sim_server.physics.backends.cuda import translate
@@ -46,12 +47,12 @@ def test_what_was_compiled_is_kept_by_precision_and_architecture(
 ) -> None:
     made: list[tuple[str, str]] = []
 
-    def compile_one(precision: str, architecture: str) -> tuple[bytes, str]:
-        made.append((precision, architecture))
+    def compile_one(source: KernelSource, architecture: str) -> tuple[bytes, str]:
+        made.append((source.kept_as.removeprefix("solver-"), architecture))
         return architecture.encode(), ""
 
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
-    monkeypatch.setattr(compiling, "_compile", compile_one)
+    monkeypatch.setattr(KernelSource, "_compile", compile_one)
     asked = [("single", "sm_90"), ("double", "sm_90"), ("single", "sm_80"), ("single", "sm_90")]
     for one in asked:
         assert compiling.compiled_kernels(*one) == one[1].encode()

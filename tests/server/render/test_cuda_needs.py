@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from real2sim_server._nvrtc import kernels_folder
 from real2sim_server.render import RenderError, select_backend
 from real2sim_server.render.backends import select
 from real2sim_server.render.backends.cuda import gsplat_build, needs
@@ -44,7 +45,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]:
 
 
 def have_built(*architectures: str) -> None:
-    folder = gsplat_build.kernels_folder() / f"{gsplat_build._key()}-{'_'.join(architectures)}"
+    folder = kernels_folder() / f"{gsplat_build._key()}-{'_'.join(architectures)}"
     folder.mkdir(parents=True)
     (folder / gsplat_build.LIBRARY).touch()
     record = {"architectures": list(architectures)}

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from real2sim_server import _nvrtc
+from real2sim_server._nvrtc import KernelSource
 from real2sim_server.render import RenderError
 from real2sim_server.render.backends.nvrtc import compile as compiling
 from real2sim_server.render.backends.nvrtc.needs import compiler_needs, unmet_need
@@ -39,16 +41,16 @@ def test_what_was_compiled_is_kept_by_source_and_architecture(
 ) -> None:
     made: list[str] = []
 
-    def compile_one(architecture: str) -> tuple[bytes, str]:
+    def compile_one(_: KernelSource, architecture: str) -> tuple[bytes, str]:
         made.append(architecture)
         return architecture.encode(), ""
 
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
-    monkeypatch.setattr(compiling, "_compile", compile_one)
+    monkeypatch.setattr(KernelSource, "_compile", compile_one)
     for name in ("sm_90", "sm_80", "sm_90"):
         assert compiling.compiled_kernels(name) == name.encode()
     assert made == ["sm_90", "sm_80"]
-    monkeypatch.setattr(compiling, "nvrtc_version", lambda: "99.0")
+    monkeypatch.setattr(_nvrtc, "nvrtc_version", lambda: "99.0")
     compiling.compiled_kernels("sm_90")
     assert made == ["sm_90", "sm_80", "sm_90"]
 

@@ -14,11 +14,11 @@ from ..numerics.device import F32, HALF, ONE, THREE, TWO, ZERO, device_function
 from ..numerics.matrices import (
     det,
     eigen_symmetric,
-    gram,
     multiply,
     polar_rotation,
     recompose,
     symmetric_times,
+    times_transposed,
 )
 from .material_row import (
     COROTATED,
@@ -64,7 +64,7 @@ def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
     if law == NEO_HOOKEAN:
         tau, energy = neo_hookean(F, row[MU], row[LAMBDA])
         return F, tau, energy, history
-    squares, vectors = eigen_symmetric(gram(F))
+    squares, vectors = eigen_symmetric(times_transposed(F, F))
     stretch = (stretch_of(squares[0]), stretch_of(squares[1]), stretch_of(squares[2]))
     if SNOW <= law <= CRUSH:
         left, tau, energy, history = snow(stretch, history, row)
@@ -124,7 +124,7 @@ def neo_hookean(F: Any, mu: Any, lam: Any) -> Any:
 @device_function
 def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
     """The same where ln J is known."""
-    b = gram(F)
+    b = times_transposed(F, F)
     pressure = lam * log_volume - mu
     tau = (
         mu * b[0] + pressure, mu * b[1] + pressure, mu * b[2] + pressure,

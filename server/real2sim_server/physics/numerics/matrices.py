@@ -53,19 +53,6 @@ def multiply(a: Any, b: Any) -> Any:
 
 
 @device_function
-def gram(a: Any) -> Any:
-    """a a^T, symmetric."""
-    return (
-        a[0] * a[0] + a[1] * a[1] + a[2] * a[2],
-        a[3] * a[3] + a[4] * a[4] + a[5] * a[5],
-        a[6] * a[6] + a[7] * a[7] + a[8] * a[8],
-        a[0] * a[3] + a[1] * a[4] + a[2] * a[5],
-        a[0] * a[6] + a[1] * a[7] + a[2] * a[8],
-        a[3] * a[6] + a[4] * a[7] + a[5] * a[8],
-    )
-
-
-@device_function
 def symmetric_times(s: Any, a: Any) -> Any:
     """s a of a symmetric s."""
     return multiply((s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]), a)

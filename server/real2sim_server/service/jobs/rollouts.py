@@ -27,7 +27,7 @@ from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
-from ...physics.colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane
+from ...physics.colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid
 from ...physics.triangle_mesh import TriangleMesh, TriangleSurface
 from ...render import Instance
 from ...scene import Scene, SceneObject
@@ -361,39 +361,32 @@ def colliders_of(state: ScenarioState) -> list[Collider]:
 
 def _collider(state: ScenarioState, given: AddCollider) -> Collider:
     name = given.collider_id or "collider"
-    match given.shape:
-        case PlaneShape() as plane:
-            return Plane(name=name, point=plane.point, normal=plane.normal, friction=given.friction)
-        case BoxShape() as box:
-            pose = transform_from(box.position, box.quaternion)
-            return Box(name=name, T_world_box=pose, size=box.size, friction=given.friction)
-        case CylinderShape() as post:
-            return Cylinder(
-                name=name,
-                T_world_cylinder=transform_from(post.position, post.quaternion),
-                radius=post.radius,
-                height=post.height,
-                friction=given.friction,
-            )
-        case CapsuleShape() as round_ended:
-            return Capsule(
-                name=name,
-                T_world_capsule=transform_from(round_ended.position, round_ended.quaternion),
-                radius=round_ended.radius,
-                length=round_ended.length,
-                friction=given.friction,
-            )
-        case MeshShape() as mesh:
-            return TriangleMesh(
-                name=name,
-                T_world_mesh=transform_from(mesh.position, mesh.quaternion),
-                surface=TriangleSurface(mesh.vertices, mesh.triangles, mesh.thickness),
-                friction=given.friction,
-            )
-        case GroundShape() as ground:
-            return _ground(state, offset=ground.offset, friction=given.friction)
+    shape, friction = given.shape, given.friction
+    if isinstance(shape, GroundShape):
+        return _ground(state, offset=shape.offset, friction=friction)
+    if isinstance(shape, PlaneShape):
+        return Plane(name=name, point=shape.point, normal=shape.normal, friction=friction)
+    kind, own = _solid(shape)
+    own[kind.POSE] = transform_from(shape.position, shape.quaternion)
+    return kind(name=name, friction=friction, **own)
+
+
+def _solid(
+    shape: BoxShape | CylinderShape | CapsuleShape | MeshShape,
+) -> tuple[type[Solid], dict[str, Any]]:
+    """Which solid a shape is, with the members of its own."""
+    match shape:
+        case BoxShape():
+            return Box, {"size": shape.size}
+        case CylinderShape():
+            return Cylinder, {"radius": shape.radius, "height": shape.height}
+        case CapsuleShape():
+            return Capsule, {"radius": shape.radius, "length": shape.length}
+        case MeshShape():
+            surface = TriangleSurface(shape.vertices, shape.triangles, shape.thickness)
+            return TriangleMesh, {"surface": surface}
         case _:
-            assert_never(given.shape)
+            assert_never(shape)
 
 
 def _ground(state: ScenarioState, *, offset: float, friction: float | None) -> HeightField:

@@ -96,7 +96,11 @@ def overlap_patch(
 ) -> tuple[float, float, float, float] | None:
     """Centroid x, y of the overlap of two convex quadrilaterals, its mean depth along the normal
     and its width across it [m]; None where there is none."""
-    shape = _clipped(first, second)
+    return patch_of(overlap_shape(first, second), nx, ny)
+
+
+def patch_of(shape: list[Corner], nx: float, ny: float) -> tuple[float, float, float, float] | None:
+    """The same of an overlap as it is."""
     if len(shape) < 3:
         return None
     x0, y0 = shape[0]
@@ -116,7 +120,7 @@ def overlap_span(
     first: list[Corner], second: list[Corner], nx: float, ny: float
 ) -> tuple[float, float]:
     """From where to where across a unit normal two overlapping quadrilaterals overlap [m]."""
-    return span_across(_clipped(first, second), nx, ny)
+    return span_across(overlap_shape(first, second), nx, ny)
 
 
 def span_across(shape: list[Corner], nx: float, ny: float) -> tuple[float, float]:
@@ -156,7 +160,7 @@ def contact_manifold(first: list[Corner], second: list[Corner]) -> ContactManifo
                 best = (depth, nx * outward, ny * outward)
     assert best is not None
     depth, nx, ny = best
-    overlap = _clipped(first, second)
+    overlap = overlap_shape(first, second)
     if not overlap:
         return None
     x = sum(p[0] for p in overlap) / len(overlap)
@@ -164,8 +168,8 @@ def contact_manifold(first: list[Corner], second: list[Corner]) -> ContactManifo
     return ContactManifold(x, y, nx, ny, depth)
 
 
-def _clipped(subject: list[Corner], clip: list[Corner]) -> list[Corner]:
-    """Corners of the overlap (Sutherland & Hodgman 1974)."""
+def overlap_shape(subject: list[Corner], clip: list[Corner]) -> list[Corner]:
+    """Corners of the overlap of two convex quadrilaterals (Sutherland & Hodgman 1974)."""
     shape = subject
     for k in range(4):
         (ax, ay), (bx, by) = clip[k], clip[(k + 1) % 4]

@@ -31,6 +31,8 @@ SPREAD = 0.5
 """By how much wider than the place of contact a structure is that yields there [m]."""
 KEPT = 0.38
 """Of the largest crush that stays: 0.26 of 0.68 m in the barrier test of the 2015 Malibu."""
+SQUARE = 1e-6
+"""Faces across a normal lie so well across it, as a sine."""
 LEAST_LENGTH = 1.0
 """Of a body that has been crushed [m]."""
 LEAST_WIDTH = 0.1
@@ -50,8 +52,8 @@ class Pulse(NamedTuple):
     """An impact under way.
 
     Attributes:
-        normal: direction of the unit normal, out of the second body, less the second body's yaw
-            [rad]: the face that was struck turns with it.
+        normal: direction of the unit normal, out of the second body, less the yaw of the body whose
+            face it belongs to [rad]: the face turns with it.
         restitution: of the impulse of compression that comes back.
         compression, restored: impulses along the normal until now [N s].
         depth: to which the two were crushed together, at most until now [m].
@@ -59,6 +61,7 @@ class Pulse(NamedTuple):
         loading: whether the two still come nearer to each other.
         kept: part of the depth by which they are shorter already [m].
         settled: depth at which they were when it was over [m].
+        face: whose face the normal belongs to, 0 or 1.
     """
 
     normal: float
@@ -70,6 +73,13 @@ class Pulse(NamedTuple):
     loading: bool = True
     kept: float = 0.0
     settled: float = 0.0
+    face: int = 1
+
+    def along(self, bodies: Bodies) -> tuple[float, float]:
+        """The unit normal as it is now."""
+        owner = bodies[self.face]
+        angle = self.normal + (owner[0].yaw if owner is not None else 0.0)
+        return math.cos(angle), math.sin(angle)
 
     def has_settled(self, patch: Patch) -> bool:
         """Whether the impact is over and the two are no deeper in one another than at its end."""
@@ -81,6 +91,15 @@ class Pulse(NamedTuple):
         return (
             not self.loading and self.restored >= (1 - 1e-9) * self.restitution * self.compression
         )
+
+
+def face_owner(bodies: Bodies, nx: float, ny: float) -> int:
+    """Which of two bodies has a face across a normal: 0 or 1, which is where both have one."""
+    first, second = bodies
+    if second is None:
+        return 1
+    off = [min(abs(u) for u in _along(body, nx, ny)) for body in (first[0], second[0])]
+    return 0 if off[0] < off[1] - SQUARE else 1
 
 
 def mutual_stiffness(bodies: Bodies, nx: float, ny: float) -> float:
@@ -133,9 +152,7 @@ def advance_pulse(
         h: [s].
         friction: tangential per normal impulse at most.
     """
-    second = bodies[1]
-    angle = pulse.normal + (second[0].yaw if second is not None else 0.0)
-    nx, ny = math.cos(angle), math.sin(angle)
+    nx, ny = pulse.along(bodies)
     if patch.depth > pulse.depth:
         pulse = pulse._replace(depth=patch.depth, width=patch.width)
     width = contact_width(bodies, pulse.width, nx, ny)

@@ -14,7 +14,13 @@ BEFORE: Mapping[str, Any] = {
         "max_reverse_speed": 0.0,
         "tracker_version": 1,
     },
-    "contact": {"swept": False, "pulse": False, "residual_crush": False, "breakage": False},
+    "contact": {
+        "swept": False,
+        "pulse": False,
+        "residual_crush": False,
+        "distributed": False,
+        "breakage": False,
+    },
 }
 """How episodes ran before members had their present defaults, or before there were such members.
 

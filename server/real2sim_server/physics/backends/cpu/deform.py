@@ -44,7 +44,6 @@ from ...constitutive.stress import (
 from ...numerics.device import ONE, TWO, ZERO
 from ...numerics.matrices import (
     det,
-    gram,
     is_diagonal,
     jacobi_sweep,
     least_minor,
@@ -271,7 +270,8 @@ def snow_batch(dt: Any, s: Any) -> None:
 def flow_batch(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
     """Snow and structure by their principal stretches, in those lanes that are off."""
     for lane in range(BATCH):
-        b = gram(lane_matrix(s, _F, lane))
+        F = lane_matrix(s, _F, lane)
+        b = times_transposed(F, F)
         for c in range(6):
             s[(_SYMMETRIC + c) * BATCH + lane] = b[c]
         for c in range(9):

@@ -24,6 +24,7 @@ from pathlib import Path
 import torch
 
 from ...._files import atomic_folder
+from ...._nvrtc import kernels_folder
 from ...types import RenderError
 
 LIBRARY = "csrc.so"
@@ -49,13 +50,6 @@ class BuiltKernels:
         """Whether a device of that compute capability can run it: same major, no later minor."""
         pairs = [tuple(map(int, name.split("."))) for name in self.architectures]
         return any(major == capability[0] and minor <= capability[1] for major, minor in pairs)
-
-
-def kernels_folder() -> Path:
-    """Where kernels are kept: ``$TORCH_EXTENSIONS_DIR``, or below the user's cache folder."""
-    given = os.environ.get("TORCH_EXTENSIONS_DIR")
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(given) if given else cache / "real2sim"
 
 
 def built_kernels() -> list[BuiltKernels]:

@@ -31,7 +31,8 @@ def _cuda_core() -> Need:
 def _nvrtc() -> Need:
     if installed_version("cuda-core") is None:
         return Need("NVRTC", False, "NVRTC is called through cuda-core", INSTALL)
-    from .compile import ARCHITECTURES, cubin_path, nvrtc_version
+    from ...._nvrtc import nvrtc_version
+    from .compile import ARCHITECTURES, cubin_path
 
     try:
         version = nvrtc_version()
