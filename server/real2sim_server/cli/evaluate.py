@@ -33,7 +33,7 @@ def evaluate(
     ] = "held-out",
     width: Annotated[int | None, typer.Option(min=16, max=8192, help="Of images [px].")] = None,
     shifts: Annotated[
-        str, typer.Option(help="Metres beside the path, for synthetic logs; or none.")
+        str, typer.Option(help="Metres beside the path, for images where truth is, or roads.")
     ] = "1,2,3",
     around: Annotated[
         bool, typer.Option("--around", help="Also see vehicles from all sides (synthetic logs).")
@@ -104,11 +104,14 @@ def _table(result: Evaluation) -> dict[str, object]:
         "psnr_objects [dB]": result.psnr_objects,
         "depth_error_m [m]": result.depth_error_m,
         "depth_error_p90_m [m]": result.depth_error_p90_m,
+        "depth_error_mean_m [m]": result.depth_error_mean_m,
         "box_error_m [m]": result.box_error_m,
         "frames_per_second": result.frames_per_second,
     }
     for shift in result.shifted:
         figures[f"psnr from {shift.shift_m:g} m beside [dB]"] = shift.psnr
+    for band in result.lane_band:
+        figures[f"road from {band.shift_m:g} m beside [dB]"] = band.psnr
     if result.around is not None:
         figures |= {
             "vehicles' seen sides [dB]": result.around.psnr_seen,

@@ -86,6 +86,15 @@ def median_error(errors: NDArray[np.float64]) -> float:
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
+def mean_error(errors: NDArray[np.float64]) -> float:
+    """Mean over the points that are no holes [m]; nan where there are none.
+
+    What a median hides shows here: surfaces that are haze have long tails.
+    """
+    finite = errors[np.isfinite(errors)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
 def error_p90(errors: NDArray[np.float64]) -> float:
     """90th percentile [m]: the smallest error that nine of ten do not exceed.
 

@@ -18,7 +18,8 @@ from ..training.data import image_time, resized
 from .around import AroundScore, evaluate_around
 from .box_error import box_error
 from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
-from .lidar_depth import depth_errors, error_p90, median_error, points_in_camera
+from .lane_band import LaneBandScore, evaluate_lane_band
+from .lidar_depth import depth_errors, error_p90, mean_error, median_error, points_in_camera
 from .object_regions import moving_mask, moving_tracks
 from .rendering import measure_rate, render_view
 from .selection import select_cameras, select_frames
@@ -33,7 +34,8 @@ class EvaluateOptions:
     Attributes:
         frames: ``held-out``, ``all`` or indices; see :func:`.selection.select_frames`.
         width: of the compared images [px]; as logged by default.
-        shifts: distances beside the recorded path [m], where truth exists.
+        shifts: distances beside the recorded path [m]: of whole images where truth exists, of the
+            road by LiDAR and other images on every log.
         shifted_frames: at most so many frames, evenly spread, are rendered from there.
         repeats: timed renders.
         backend: of the renderer.
@@ -102,6 +104,7 @@ class CameraScore:
     psnr_objects: float
     depth_error_m: float
     depth_error_p90_m: float
+    depth_error_mean_m: float
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ class Evaluation:
         psnr_objects: mean over the views that show moving objects, within their boxes [dB].
         depth_error_m: median over all compared LiDAR points of all views [m].
         depth_error_p90_m: 90th percentile over the same points [m].
+        depth_error_mean_m: mean over those of them at which anything is rendered [m].
         box_error_m: median over moving objects and their times of how far their centres are from
             those of the log's boxes [m]; nan where the log has none of the scene's objects.
         frames_per_second: camera images drawn per second, see :class:`.rendering.RenderRate`.
@@ -125,6 +129,7 @@ class Evaluation:
         views: one score each, camera by camera within a frame.
         shifted: views from beside the path; empty where no truth exists.
         no_shifted: why it is empty; empty where it is not.
+        lane_band: the road from beside the path against what other images show of it.
         around: vehicles from all sides; None unless asked for, or where no truth exists.
     """
 
@@ -138,6 +143,7 @@ class Evaluation:
     psnr_objects: float
     depth_error_m: float
     depth_error_p90_m: float
+    depth_error_mean_m: float
     box_error_m: float
     frames_per_second: float
     width: int
@@ -146,6 +152,7 @@ class Evaluation:
     views: tuple[LoggedViewScore, ...]
     shifted: tuple[ShiftScore, ...] = ()
     no_shifted: str = ""
+    lane_band: tuple[LaneBandScore, ...] = ()
     around: AroundScore | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
@@ -197,6 +204,8 @@ def evaluate_scene(
         shifted, missing = _shifted(
             scene, log, cameras, times, options=options, report_step=report_step
         )
+    with stages("lane_band"):
+        lane_band = _lane_band(scene, log, cameras[0], chosen.frames, options)
     with stages("around"):
         around = _around(scene, log) if options.around else None
     return Evaluation(
@@ -213,6 +222,7 @@ def evaluate_scene(
         views=tuple(views),
         shifted=shifted,
         no_shifted=missing,
+        lane_band=lane_band,
         around=around,
         timing_s=timing_s,
         **asdict(_summary(views, errors)),
@@ -291,6 +301,20 @@ def _shifted(
     return scores, ""
 
 
+def _lane_band(
+    scene: Scene,
+    log: DrivingLog,
+    camera: Camera,
+    frames: Sequence[int],
+    options: EvaluateOptions,
+) -> tuple[LaneBandScore, ...]:
+    if not options.shifts:
+        return ()
+    count = min(options.shifted_frames, len(frames))
+    chosen = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, count)]
+    return evaluate_lane_band(scene, log, camera, chosen, options.shifts, backend=options.backend)
+
+
 def _around(scene: Scene, log: DrivingLog) -> AroundScore | None:
     truth = find_truth(log).log
     return None if truth is None else evaluate_around(scene, truth)
@@ -317,6 +341,7 @@ def _summary(
         psnr_objects=mean_psnr(view.psnr_objects for view in views),
         depth_error_m=median_error(all_errors),
         depth_error_p90_m=error_p90(all_errors),
+        depth_error_mean_m=mean_error(all_errors),
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from ...geometry.rotation import Float
 from .points import PointSet
 from .surfels import Surfels
+from .vehicle_body import VehicleBody
 
 GAP = 0.25
 """The generic body fills where no measured point is this near [m]."""
@@ -43,7 +44,12 @@ def underside(size: tuple[float, float, float], *, spacing: float = 0.08) -> Sur
 
 
 def complete_body(
-    measured: PointSet, size: tuple[float, float, float], category: str, *, spacing: float = 0.06
+    measured: PointSet,
+    size: tuple[float, float, float],
+    category: str,
+    *,
+    body: VehicleBody | None = None,
+    spacing: float = 0.06,
 ) -> PointSet:
     """Measured points together with a generic body where nothing was measured.
 
@@ -56,12 +62,16 @@ def complete_body(
         measured: points in the object frame.
         size: (length, width, height) [m].
         category: class of the object.
+        body: of a vehicle, taken instead of the generic one.
         spacing: distance between points of the body [m]; larger for large objects.
     """
     from scipy.spatial import cKDTree
 
     spacing = max(spacing, 0.012 * size[0])
-    added = _with_profile(_box_surface(np.array(size), spacing), np.array(size), category)
+    if body is not None:
+        added = body.points
+    else:
+        added = _with_profile(_box_surface(np.array(size), spacing), np.array(size), category)
     typical = float(np.median(measured.intensity)) if len(measured) else 0.3
     if len(measured):
         distance, _ = cKDTree(measured.points).query(added, workers=-1)

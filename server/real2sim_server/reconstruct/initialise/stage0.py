@@ -23,6 +23,7 @@ from .points import PointSet, path_distance, thin_to, voxel_levels, well_support
 from .sky_map import SkySamples
 from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
+from .vehicle_body import VehicleBody, faced, fitted_body
 from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
 
@@ -35,6 +36,8 @@ FEATURE_HEIGHT = 0.3
 """And from this height over the ground on [m]: road has LiDAR, and reflections lie below it."""
 UNDERSIDE_COLOUR = 0.06
 SKY_FRAMES = 15
+FACED_FRAMES = 20
+"""Of so many frames cameras are asked which sides of a vehicle they faced."""
 WALL_FRAMES = 16
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
@@ -55,6 +58,7 @@ class _SurfelSet:
     is_underside: NDArray[np.bool_]
     ground_count: int
     walls: slice
+    bodies: tuple[VehicleBody | None, ...] = ()
 
     def without(self, dropped: NDArray[np.int64]) -> _SurfelSet:
         """Without the walls at these indices."""
@@ -67,6 +71,7 @@ class _SurfelSet:
             self.is_underside[kept],
             self.ground_count,
             slice(self.walls.start, self.walls.stop - len(dropped)),
+            self.bodies,
         )
 
 
@@ -166,8 +171,11 @@ def _shape(
     intensity.append(np.zeros(len(walls), np.float32))
     instance = [np.zeros(standing + len(walls), np.uint16)]
     is_underside = [np.zeros(standing + len(walls), np.bool_)]
+    bodies = []
     for index, track in enumerate(log.tracks):
-        points = _object_points(measured.objects[track.object_id], track, options)
+        returns = measured.objects[track.object_id]
+        bodies.append(fitted_body(returns.points, track.size, track.category))
+        points = _object_points(returns, track, bodies[-1], options)
         body = fit_surfels(points.points, largest=0.1, smallest=0.004)
         plate = underside(track.size)
         surfels += [body, plate]
@@ -181,6 +189,7 @@ def _shape(
         np.concatenate(is_underside),
         len(ground),
         slice(standing, standing + len(walls)),
+        tuple(bodies),
     )
 
 
@@ -214,12 +223,14 @@ def _beyond_lidar(
     return features.select((distance > LIDAR_REACH) & above)
 
 
-def _object_points(points: PointSet, track: ObjectTrack, options: InitialiseOptions) -> PointSet:
+def _object_points(
+    points: PointSet, track: ObjectTrack, body: VehicleBody | None, options: InitialiseOptions
+) -> PointSet:
     """Thinned points of an object, its unobserved parts completed."""
     thinned = thin_to(points, options.object_voxel, options.max_object // 2)
     if track.size[0] >= VEHICLE_LENGTH:
         thinned = mirrored(thinned, voxel=options.object_voxel)
-    completed = complete_body(thinned, track.size, track.category)
+    completed = complete_body(thinned, track.size, track.category, body=body)
     return thin_to(completed, options.object_voxel, options.max_object)
 
 
@@ -311,16 +322,44 @@ def _inpaint_objects(
     prior = ColourPrior(
         relative[every], parts.intensity[every], colours[every], known[every], OBJECT_HEIGHTS
     )
-    for mine in members:
-        points = parts.surfels.points[mine]
-        mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
+    frames = chosen_frames(log, FACED_FRAMES)
+    for track, mine, shape in zip(log.tracks, members, parts.bodies, strict=True):
+        points, seen = parts.surfels.points[mine], known[mine]
+        if shape is not None:
+            # A side seen edge on has the colours of what lies beside its outline.
+            places = points.astype(np.float64)
+            normals = shape.normals[shape.nearest(places)]
+            seen = seen & faced(log, track, places, normals, frames)
+        mirrored, now_known = fill_from_mirror(points, colours[mine], seen)
         likely = prior.colour(relative[mine], parts.intensity[mine])
-        body = body_color(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
-        colours[mine] = fill_from_neighbours(
-            points, mirrored, now_known, body, trust_reach=BODY_COLOR_REACH
-        )
+        if shape is None:
+            body = body_color(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
+            colours[mine] = fill_from_neighbours(
+                points, mirrored, now_known, body, trust_reach=BODY_COLOR_REACH
+            )
+            continue
+        colours[mine] = paint_colours(points, mirrored, now_known, shape, likely=likely)
     colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
     return colours
+
+
+def paint_colours(
+    points: NDArray[np.float32],
+    colours: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    body: VehicleBody,
+    *,
+    likely: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Colours [N, 3] where ``known`` [N], else those of the body's parts and one even paint.
+
+    Args:
+        points: [N, 3] in the object frame [m].
+        likely: [N, 3], the paint where too little of it was seen.
+    """
+    part, is_part = body.part_colours(points)
+    paint = body_color(points[:, 2], colours, known & ~is_part, likely, ())
+    return np.where(known[:, None], colours, np.where(is_part[:, None], part, paint))
 
 
 def _median_colour(colours: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..options import InitialiseOptions, ReconstructError
 from .densify import STRATEGIES, DensifyOptions
+from .direction_options import DirectionOptions
 from .losses import LossWeights
 
 COLOUR_BASES = ("cosine", "real_dft")
@@ -75,7 +76,7 @@ class TrainOptions:
         log_every, preview_every, checkpoint_every: iterations between lines of metrics, preview
             pictures and checkpoints; 0 for none but the last.
         initialise: of stage 0.
-        learning_rates, losses, densify: see there.
+        learning_rates, losses, densify, directions: see there.
 
     Raises:
         ReconstructError: for a value out of range.
@@ -106,6 +107,7 @@ class TrainOptions:
     learning_rates: LearningRates = field(default_factory=LearningRates)
     losses: LossWeights = field(default_factory=LossWeights)
     densify: DensifyOptions = field(default_factory=DensifyOptions)
+    directions: DirectionOptions = field(default_factory=DirectionOptions)
 
     def __post_init__(self) -> None:
         _check_range(self, "iterations", 1, 10_000_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,13 @@ from ...logs import DrivingLog
 from ...render.backends import Backend
 from ...scene import Scene
 from ...scene.spherical_harmonics import SH_C0
+from ..initialise.vehicle_body import VehicleBody, fitted_body
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .data import TrainingView, TrainingViews, held_out_frames, image_time
 from .densify import STRATEGIES, ScreenSums, TrainingStep
+from .directions import plain_lobes, unseen_sides, viewing_directions
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
 from .model import RenderedView, SceneModel
@@ -71,7 +74,12 @@ class Trainer:
         )
         self.strategy.initialize_state(len(self.model.gaussians))
         self.occlusion_pruning = OcclusionPruning(
-            options.densify, options.iterations, self.views.sample_viewpoints
+            options.densify,
+            options.iterations,
+            self.views.sample_viewpoints,
+            unseen=partial(unseen_sides, bodies=_bodies(scene))
+            if options.directions.sides
+            else None,
         )
         self.iteration = 0
         self.running = RunningMeans()
@@ -234,6 +242,15 @@ class Trainer:
         if self.occlusion_pruning.step(model, optimizer, step.iteration):
             strategy.initialize_state(len(model.gaussians))
         strategy.step_end(model.gaussians, optimizer, step.iteration)
+        self._settle_colours(step.iteration + 1)
+
+    def _settle_colours(self, done: int) -> None:
+        """After the last step: objects' colours in directions from which none shows them."""
+        options = self.options.directions
+        if done == self.options.iterations and options.lobe_prior > 0 and self.model.scene.objects:
+            viewpoints = self.views.sample_viewpoints(options.views)
+            seen = viewing_directions(self.model, viewpoints, objects_only=True)
+            plain_lobes(self.model, seen, prior=options.lobe_prior)
 
     def _report(
         self, terms: dict[str, float], clock: RateMeter, on_progress: OnTraining | None
@@ -311,6 +328,14 @@ class Trainer:
         )
         if self.metrics is not None:
             self.metrics.cut(held.iteration)
+
+
+def _bodies(scene: Scene) -> list[VehicleBody | None]:
+    """What is known of the shape of the objects of stage 0."""
+    return [
+        fitted_body(item.cloud.means.detach().cpu().numpy(), item.size, item.category)
+        for item in scene.objects.values()
+    ]
 
 
 def _on_host(*values: Tensor) -> list[float]:

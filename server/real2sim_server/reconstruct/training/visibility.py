@@ -135,7 +135,7 @@ def unoccluded_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
 
     0 for Gaussians whose centre is not on the image.
     """
-    to_camera = _to_camera(instance, viewmat)
+    to_camera = camera_from_object(instance, viewmat)
     rotation, cloud = to_camera[:3, :3], instance.cloud
     x, y, z = (cloud.means @ rotation.T + to_camera[:3, 3]).unbind(-1)
     ahead = z > NEAR
@@ -181,11 +181,11 @@ def hidden_sky(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Tensor:
 
 def _depths(instance: Instance, viewmat: Tensor) -> Tensor:
     """[N] of the centres along the optical axis [m]."""
-    to_camera = _to_camera(instance, viewmat)
+    to_camera = camera_from_object(instance, viewmat)
     return instance.cloud.means @ to_camera[2, :3] + to_camera[2, 3]
 
 
-def _to_camera(instance: Instance, viewmat: Tensor) -> Tensor:
+def camera_from_object(instance: Instance, viewmat: Tensor) -> Tensor:
     """``T_camera_object`` [4, 4] float32."""
     device = instance.cloud.device
     pose = torch.eye(4, dtype=torch.float64, device=device)
@@ -210,7 +210,12 @@ def prune_hidden(
 
 
 def occluded_priors(
-    model: SceneModel, first: SceneModel, viewpoints: list[Viewpoint], *, limit: float
+    model: SceneModel,
+    first: SceneModel,
+    viewpoints: list[Viewpoint],
+    *,
+    limit: float,
+    wanted: Tensor | None = None,
 ) -> Gaussians:
     """Gaussians of stage 0 that ``model`` occludes; they are drawn and do not learn.
 
@@ -223,6 +228,7 @@ def occluded_priors(
         first: of stage 0, with the same objects.
         viewpoints: training views.
         limit: visible fraction up to which a Gaussian of the background was hidden in stage 0.
+        wanted: [N] bool, Gaussians of ``first`` that are taken even where they are visible.
     """
     hidden = visibility(first, viewpoints).fractions <= limit
     offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
@@ -232,6 +238,8 @@ def occluded_priors(
     model.gaussians, is_prior = concatenate(trained, faint)
     behind = visibility(model, viewpoints).fractions[is_prior] <= PRIOR_FRACTION
     model.gaussians = trained
+    if wanted is not None:
+        behind |= wanted[offered]
     return priors.select(behind.nonzero()[:, 0])
 
 
@@ -242,6 +250,8 @@ class OcclusionPruning:
         options: when that is and what counts as hidden.
         iterations: of the whole training.
         sample: draws so many training views.
+        unseen: of a model, which Gaussians lie on sides that no view shows, see
+            :func:`.directions.unseen_sides`; None knows of no such sides.
     """
 
     def __init__(
@@ -249,8 +259,10 @@ class OcclusionPruning:
         options: DensifyOptions,
         iterations: int,
         sample: Callable[[int], list[Viewpoint]],
+        *,
+        unseen: Callable[[SceneModel, list[Viewpoint]], Tensor] | None = None,
     ) -> None:
-        self._options, self._sample = options, sample
+        self._options, self._sample, self._unseen = options, sample, unseen
         self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
         self._prior_round = round(options.prior_round * iterations)
 
@@ -263,6 +275,9 @@ class OcclusionPruning:
             self._prune(model, optimizer, viewpoints, self._options.object_limits)
         if prior_round:
             viewpoints = self._sample(VISIBILITY_VIEWS)
+            if self._unseen is not None:
+                sides = self._unseen(model, viewpoints)
+                model.gaussians = prune(model.gaussians, optimizer, sides)
             # Priors first: they are to stand behind what is pruned then, too.
             self._insert_priors(model, optimizer, viewpoints)
             self._prune(model, optimizer, viewpoints, self._options.last_object_limits)
@@ -294,4 +309,5 @@ class OcclusionPruning:
         model.sky.data[hidden] = first.sky.data[hidden]
         optimizer.reset_moments("sky")
         limit = self._options.background_limits.fraction
-        model.priors = occluded_priors(model, first, viewpoints, limit=limit)
+        wanted = None if self._unseen is None else self._unseen(first, viewpoints)
+        model.priors = occluded_priors(model, first, viewpoints, limit=limit, wanted=wanted)

@@ -170,9 +170,12 @@ def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
         assert values[key] > 0, key
     assert values["depth_error_p90_m"] >= values["depth_error_m"]
     assert "depth_error_p90_m" in result.output
+    assert values["depth_error_mean_m"] >= values["depth_error_m"]
     assert [v["frame"] for v in values["views"]] == values["frames"] == [2, 3]
     assert [s["shift_m"] for s in values["shifted"]] == [1.0]
     assert "no_shifted" not in values
+    assert [s["shift_m"] for s in values["lane_band"]] == [1.0]
+    assert "road from 1 m beside" in result.output
     html = page.read_text()
     assert html.count("data:image/jpeg;base64,") >= 8
     assert not re.search(r"https?://|<script|<link", html)

@@ -213,6 +213,16 @@ def test_objects_get_back_what_they_hide_though_stage_0_showed_it(model, viewpoi
     assert occluded_priors(trained, first, viewpoints, limit=0.05).counts == (0, 1)
 
 
+def test_a_prior_on_a_side_that_no_image_shows_comes_back_though_visible(model, viewpoints):
+    shown = [ahead(model, 8, 0.2, 0.7)]
+    trained = model_of(model, [ahead(model, 12, 0.2, 0.7)], subject=[ahead(model, 20, 0.2, 0.7)])
+    first = model_of(model, [ahead(model, 12, 0.2, 0.7)], subject=shown)
+    wanted = torch.tensor([False, True])
+    assert occluded_priors(trained, first, viewpoints, limit=0.05).counts == (0, 0)
+    found = occluded_priors(trained, first, viewpoints, limit=0.05, wanted=wanted)
+    assert found.counts == (0, 1)
+
+
 def test_a_prior_stays_away_though_another_stands_before_it(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])

@@ -1,0 +1,21 @@
+"""Options of what follows from the directions in which training images show Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DirectionOptions:
+    """What becomes of objects where training images look from one side alone.
+
+    Attributes:
+        lobe_prior: variance of the directions at which objects keep half of a colour that depends
+            on the direction; 0 leaves colours as they were learnt.
+        sides: whether sides of vehicles that no image shows are taken from initialisation.
+        views: that are asked.
+    """
+
+    lobe_prior: float = 0.03
+    sides: bool = True
+    views: int = 32

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
+from real2sim_server.reconstruct.training import SceneModel
+from real2sim_server.reconstruct.training.directions import (
+    ViewingDirections,
+    plain_lobes,
+    unseen_sides,
+    viewing_directions,
+)
+from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
+from real2sim_server.scene.spherical_harmonics import evaluate_sh
+
+from .conftest import TINY
+
+AHEAD = torch.tensor([1.0, 0, 0])
+
+
+def model_of(sh) -> SimpleNamespace:
+    """One Gaussian of an object."""
+    return SimpleNamespace(gaussians=SimpleNamespace(sh=sh.clone(), counts=(0, 1)))
+
+
+def seen_from(directions: torch.Tensor) -> ViewingDirections:
+    """One Gaussian, seen along directions [V, 3]."""
+    unit = torch.nn.functional.normalize(directions, dim=-1)
+    products = (unit[:, :, None] * unit[:, None]).mean(0)
+    count = torch.tensor([float(len(unit))])
+    return ViewingDirections(count, unit.mean(0)[None], products[None], -torch.ones(1))
+
+
+def colour(model, direction) -> torch.Tensor:
+    return evaluate_sh(model.gaussians.sh, direction[None]) + 0.5
+
+
+def test_a_colour_seen_from_one_direction_is_the_same_from_all():
+    sh = torch.randn(1, 4, 3, generator=torch.Generator().manual_seed(1))
+    model = model_of(sh)
+    shown = colour(model, AHEAD)
+    plain_lobes(model, seen_from(AHEAD[None]))
+    np.testing.assert_allclose(colour(model, AHEAD), shown, atol=1e-5)
+    np.testing.assert_allclose(colour(model, torch.tensor([0.0, 1, 0])), shown, atol=1e-5)
+
+
+def test_a_colour_seen_from_all_sides_stays():
+    sh = torch.randn(1, 4, 3, generator=torch.Generator().manual_seed(1))
+    around = torch.randn(500, 3, generator=torch.Generator().manual_seed(2))
+    model = model_of(sh)
+    plain_lobes(model, seen_from(around))
+    np.testing.assert_allclose(model.gaussians.sh[0], sh[0], atol=0.25)
+
+
+@pytest.fixture
+def model(tiny_scene) -> SceneModel:
+    times = np.array([tiny_scene.start_us, tiny_scene.end_us])
+    return SceneModel(tiny_scene, replace(TINY, refine_poses=False), times, backend="cpu")
+
+
+def test_directions_lead_from_the_camera_to_what_it_sees(model, tiny_scene):
+    camera, t_us = tiny_scene.rig.cameras[0], tiny_scene.start_us
+    seen = viewing_directions(model, [(camera, t_us)])
+    background = slice(0, model.gaussians.counts[0])
+    views, means = seen.views[background], seen.means[background]
+    pose = camera.pose(tiny_scene.ego.transform(t_us))
+    offset = model.gaussians.means.detach()[background] - torch.from_numpy(pose[:3, 3]).float()
+    expected = torch.nn.functional.normalize(offset, dim=-1)
+    assert 0 < int((views > 0).sum()) < len(views)
+    np.testing.assert_allclose(means[views > 0], expected[views > 0], atol=1e-5)
+    assert (means[views == 0] == 0).all()
+
+
+SALOON = (4.7, 1.82, 1.46)
+
+
+def test_of_a_car_seen_from_behind_the_flanks_are_unseen(tiny_scene):
+    body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    times = np.array([tiny_scene.start_us, tiny_scene.end_us])
+    pose = tiny_scene.ego.transform(tiny_scene.start_us) @ np.array(
+        [[1, 0, 0, 12.0], [0, 1, 0, 0], [0, 0, 1, 0.75], [0, 0, 0, 1]]
+    )
+    path = Trajectory.from_transforms(times, np.stack([pose, pose]))
+    places = torch.tensor([[-2.3, 0.0, 0.0], [0.0, 0.89, -0.1], [0.0, -0.89, -0.1], [2.3, 0, 0]])
+    cloud = GaussianCloud(
+        places,
+        torch.tensor([[1.0, 0, 0, 0]]).expand(4, 4),
+        torch.full((4, 3), 0.05),
+        torch.full((4,), 0.9),
+        torch.zeros(4, 1, 3),
+    )
+    car = SceneObject("car", "car", SALOON, cloud, path)
+    scene = replace(tiny_scene, objects={"car": car}, content_hash="")
+    model = SceneModel(scene, replace(TINY, refine_poses=False), times, backend="cpu")
+    viewpoints = [(camera, scene.start_us) for camera in scene.rig]
+    unseen = unseen_sides(model, viewpoints, [body])[-4:]
+    assert unseen.tolist() == [False, True, True, True]
+    assert not unseen_sides(model, viewpoints, [None]).any()
