@@ -12,16 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.semantics import UNLABELED
 
-from ..scene import Camera
+from ..scene import Camera, CameraMotion
 from .backends.base import (
     Backend,
     BatchBackend,
     FrameBackend,
     RasterRequest,
+    check_optics,
     class_behind,
     is_reduced,
 )
 from .backends.select import select_backend
+from .lens_view import LensView, tables_of
 from .modalities import modalities_drawn, modality_of, options_for
 from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
@@ -75,14 +77,17 @@ class RigView:
     Attributes:
         instances: what is in its world.
         cameras: on the vehicle.
-        T_world_vehicle: [4, 4] pose of the vehicle.
+        T_world_vehicle: [4, 4] pose of the vehicle, in the middle of a read-out.
         sky: behind everything.
+        twist: [6] of the vehicle, velocity [m/s] of its origin and angular velocity [rad/s] in the
+            world, for cameras with a rolling shutter; None: it stands.
     """
 
     instances: Sequence[Instance]
     cameras: Sequence[Camera]
     T_world_vehicle: ArrayLike
     sky: Sky | None = None
+    twist: NDArray[np.float64] | None = None
 
 
 def render_cameras(
@@ -95,6 +100,7 @@ def render_cameras(
     modalities: Sequence[str] | None = None,
     backend: str | Backend = "auto",
     between: Callable[[], object] | None = None,
+    twist: NDArray[np.float64] | None = None,
 ) -> list[Frame]:
     """Frames of ``cameras`` in their order; cameras of one size are drawn in one call,
     and all in one where the backend can.
@@ -109,12 +115,13 @@ def render_cameras(
             for rgb and what those switches say.
         backend: draws.
         between: called between pieces of the work, see RasterRequest.
+        twist: of the vehicle, see RigView.
 
     Raises:
         RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for a modality
             that nobody has registered.
     """
-    view = RigView(instances, cameras, T_world_vehicle, sky)
+    view = RigView(instances, cameras, T_world_vehicle, sky, twist)
     return render_rigs(
         [view], options=options, modalities=modalities, backend=backend, between=between
     )[0]
@@ -145,8 +152,10 @@ def render_rigs(
     else:
         options = options_for(modalities, options)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
-    groups = [(v, members) for v, view in enumerate(views) for members in _by_size(view.cameras)]
+    groups = [(v, members) for v, view in enumerate(views) for members in _alike(view.cameras)]
     requests = [_request(views[v], members, options, between) for v, members in groups]
+    for request in requests:
+        check_optics(chosen, request)
     frames: list[dict[int, Frame]] = [{} for _ in views]
     drawn = _drawn(requests, modalities, chosen)
     for (v, members), found in zip(groups, drawn, strict=True):
@@ -179,11 +188,12 @@ def _classes(instances: Sequence[Instance]) -> NDArray[np.uint8]:
     return classes
 
 
-def _by_size(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Indices of cameras of one size each."""
-    groups: dict[tuple[int, int], list[int]] = {}
+def _alike(cameras: Sequence[Camera]) -> list[list[int]]:
+    """Indices of pinholes of one size each, and of every other camera by itself."""
+    groups: dict[tuple[int, ...], list[int]] = {}
     for index, camera in enumerate(cameras):
-        groups.setdefault((camera.width, camera.height), []).append(index)
+        own = () if camera.is_pinhole else (index,)
+        groups.setdefault((camera.width, camera.height, *own), []).append(index)
     return list(groups.values())
 
 
@@ -196,15 +206,33 @@ def _request(
     """Of cameras of one size. Raises RenderError."""
     vehicle = _vehicle_pose(view.T_world_vehicle)
     cameras = [view.cameras[index] for index in members]
+    optics = None if cameras[0].is_pinhole else _optics(view, cameras[0], vehicle)
+    viewmats = (
+        [camera.viewmat(vehicle) for camera in cameras] if optics is None else [optics.viewmat]
+    )
     return checked_request(
         view.instances,
-        np.stack([camera.viewmat(vehicle) for camera in cameras]),
+        np.stack(viewmats),
         np.stack([camera.K for camera in cameras]),
         (cameras[0].width, cameras[0].height),
         sky=view.sky,
         options=options,
         between=between,
+        optics=optics,
     )
+
+
+def _optics(view: RigView, camera: Camera, vehicle: NDArray[np.float64]) -> LensView:
+    """The lens of a camera, and its motion on the vehicle."""
+    pose = camera.pose(vehicle)
+    if view.twist is None or not camera.shutter.rolls:
+        return LensView(camera, CameraMotion.still(pose))
+    if view.twist.shape != (6,) or not np.isfinite(view.twist).all():
+        raise RenderError(f"twist must be six finite numbers, not {view.twist.tolist()}")
+    linear, angular = view.twist[:3], view.twist[3:]
+    linear = linear + np.cross(angular, pose[:3, 3] - vehicle[:3, 3])
+    seconds = camera.shutter.readout_us * 1e-6
+    return LensView(camera, CameraMotion.about(pose, linear, angular, seconds))
 
 
 def _vehicle_pose(given: ArrayLike) -> NDArray[np.float64]:
@@ -241,6 +269,9 @@ def _drawn(
             classes, behind = _classes(request.instances), class_behind(request)
             seen = replace(output, classes=classes, behind=behind)
         images = {name: modality_of(name).pixels(seen) for name in modalities}
+        if request.optics is not None and "semantic" in images:
+            # Where the lens sees nothing there is no sky, either.
+            images["semantic"][0][tables_of(request.optics.camera).blind] = UNLABELED
         yield _Drawn(images, seen.timing_ms)
 
 

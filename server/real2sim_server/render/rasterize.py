@@ -15,8 +15,9 @@ from torch import Tensor
 from ..geometry.rotation import is_rotation
 from ..geometry.transform import are_rigid
 from ..scene import GaussianCloud, TimeColour
-from .backends.base import Backend, BatchBackend, RasterRequest, is_reduced
+from .backends.base import Backend, BatchBackend, RasterRequest, check_optics, is_reduced
 from .backends.select import select_backend
+from .lens_view import LensView
 from .types import (
     Detail,
     Instance,
@@ -67,6 +68,7 @@ def rasterize(
     backend: str | Backend = "auto",
     check_values: bool = True,
     between: Callable[[], object] | None = None,
+    optics: LensView | None = None,
 ) -> RenderOutput:
     """Draw instances from C cameras of one size, with the semantics of gsplat 1.5.3.
 
@@ -90,9 +92,14 @@ def rasterize(
         check_values: False for callers that make new clouds for every call, which would be checked
             each time, and answer for their values themselves.
         between: called between pieces of the work, see RasterRequest.
+        optics: lens, shutter and motion of the one camera given; its viewmat is
+            ``optics.viewmat``, its K and size those of the optics' camera. Gaussians are not
+            projected affinely then: each pixel's ray takes their response where it is largest along
+            it (Moenne-Loccoz et al. 2024), and depths are ranges where the camera says so.
 
     Raises:
-        RenderError: for anything that is not as said above; nothing is drawn then.
+        RenderError: for anything that is not as said above, and for optics that the backend cannot
+            draw; nothing is drawn then.
     """
     request = checked_request(
         instances,
@@ -103,8 +110,10 @@ def rasterize(
         options=options,
         check_values=check_values,
         between=between,
+        optics=optics,
     )
     chosen = select_backend(backend) if isinstance(backend, str) else backend
+    check_optics(chosen, request)
     return chosen.rasterize(request)
 
 
@@ -118,6 +127,7 @@ def checked_request(
     options: RasterOptions = DEFAULT_OPTIONS,
     check_values: bool = True,
     between: Callable[[], object] | None = None,
+    optics: LensView | None = None,
 ) -> RasterRequest:
     """What a backend may trust: the arguments of :func:`rasterize`, ``size`` is width and height.
 
@@ -132,6 +142,7 @@ def checked_request(
         height=size[1],
         sky=sky,
         options=options,
+        optics=optics,
         between=between,
     )
     _check_request(request, check_values=check_values)
@@ -282,6 +293,8 @@ def _joined(outputs: Sequence[RenderOutput]) -> RenderOutput:
 
 def _check_request(request: RasterRequest, *, check_values: bool) -> None:
     _check_cameras(request)
+    if request.optics is not None:
+        _check_optics(request.optics, request)
     _check_options(request.options)
     _check_poses(request.instances, trusted=not check_values)
     for index, instance in enumerate(request.instances):
@@ -316,6 +329,25 @@ def _check_cameras(request: RasterRequest) -> None:
             raise RenderError(
                 f"Ks[{index}] must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], not {K.tolist()}"
             )
+
+
+def _check_optics(optics: LensView, request: RasterRequest) -> None:
+    """One camera, and the same in both."""
+    camera = optics.camera
+    for name, pose in (("start", optics.motion.start), ("end", optics.motion.end)):
+        _check_rigid(pose, f"optics.motion.{name}")
+    given = request.viewmats.detach().cpu().numpy(), request.Ks.detach().cpu().numpy()
+    same = (camera.width, camera.height) == (request.width, request.height)
+    same = same and request.cameras == 1 and np.array_equal(given[1][0], camera.K)
+    if not (same and np.allclose(given[0][0], optics.viewmat, atol=1e-9)):
+        raise RenderError(
+            f"optics are of one camera, {camera.name!r} of {camera.width}x{camera.height}, whose K "
+            "and viewmat in the middle of the read-out must be those given"
+        )
+    for index, instance in enumerate(request.instances):
+        twist = instance.twist
+        if twist is not None and (twist.shape != (6,) or not np.isfinite(twist).all()):
+            raise RenderError(f"instances[{index}].twist must be six finite numbers")
 
 
 def _values(matrix: Tensor | ArrayLike) -> np.ndarray:

@@ -38,6 +38,8 @@ class Instance:
         colour: how the cloud's colours change over time, or None.
         t_us: instant at which ``colour`` is taken [us].
         semantic: value in semantic images; instances of one ``instance_id`` have one.
+        twist: [6] float64, velocity [m/s] of its origin and angular velocity [rad/s] in the world,
+            for cameras with a rolling shutter; None: it stands.
     """
 
     cloud: GaussianCloud
@@ -48,6 +50,7 @@ class Instance:
     colour: TimeColour | None = None
     t_us: int = 0
     semantic: int = STATIC
+    twist: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,12 @@ from torch import Tensor
 
 from real2sim_proto.semantics import SKY, UNLABELED
 
+from ..lens_view import LensView
 from ..types import (
     SMALL_IMAGE_PIXELS,
     Instance,
     RasterOptions,
+    RenderError,
     RenderOutput,
     Sky,
     WorldViews,
@@ -42,6 +44,8 @@ class RasterRequest:
         width, height: size of all images [px].
         sky: what is seen behind everything, or None for ``options.background``.
         options: the rest.
+        optics: lens, shutter and motion of the only camera, whose viewmat is that of the middle of
+            the read-out; None for pinholes.
         between: called between pieces of the work, each of some 10 ms, on the calling thread. It
             may rasterize something else with the same backend. None: the work is done in one go.
     """
@@ -53,6 +57,7 @@ class RasterRequest:
     height: int
     sky: Sky | None
     options: RasterOptions
+    optics: LensView | None = None
     between: Callable[[], object] | None = None
 
     @property
@@ -75,7 +80,8 @@ def needs_gradients(request: RasterRequest) -> bool:
 def is_reduced(request: RasterRequest) -> bool:
     """Whether a backend that can merge Gaussians does so for this request."""
     small = request.width * request.height <= SMALL_IMAGE_PIXELS
-    return request.options.detail == "auto" and small and not needs_gradients(request)
+    plain = request.optics is None
+    return plain and request.options.detail == "auto" and small and not needs_gradients(request)
 
 
 def class_behind(request: RasterRequest) -> int:
@@ -93,7 +99,10 @@ def with_colours(request: RasterRequest) -> RasterRequest:
 
 
 class Backend(Protocol):
-    """One way to rasterize. All members give the same pictures within 1/255."""
+    """One way to rasterize. All members give the same pictures within 1/255.
+
+    A member that draws lenses and rolling shutters has ``draws_lenses = True``.
+    """
 
     name: str
 
@@ -158,6 +167,19 @@ class FrameBackend(Protocol):
         """As :meth:`frames`, but returns when they are drawn: the next ones are drawn while they
         are copied."""
         ...
+
+
+def check_optics(backend: Backend, request: RasterRequest) -> None:
+    """Raises RenderError where ``backend`` cannot draw the request's lens or shutter."""
+    if request.optics is None or getattr(backend, "draws_lenses", False):
+        return
+    camera = request.optics.camera
+    kind = "pinhole" if camera.lens is None else camera.lens.model
+    raise RenderError(
+        f"the backend {backend.name!r} draws pinhole cameras with a global shutter, not camera "
+        f"{camera.name!r} ({kind}, shutter {camera.shutter.direction}); use the backend 'cpu', or "
+        "ask for the pinhole image"
+    )
 
 
 def device_of(backend: Backend) -> torch.device:

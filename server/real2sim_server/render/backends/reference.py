@@ -26,6 +26,7 @@ from .base import (
     place_instances,
     with_colours,
 )
+from .reference_rays import blend_rays
 from .screen import ScreenTracker, ScreenWatch
 
 TILE = 32
@@ -40,6 +41,7 @@ class ReferenceBackend:
     """
 
     name = "reference"
+    draws_lenses = True
 
     def __init__(
         self, dtype: torch.dtype = torch.float64, image_dtype: torch.dtype = torch.float32
@@ -59,7 +61,10 @@ class ReferenceBackend:
         tracker = None
         if options.track_screen and needs_gradients(request):
             tracker = ScreenTracker(request)
-        images = [self._camera(request, placement, c, tracker) for c in range(request.cameras)]
+        if request.optics is None:
+            images = [self._camera(request, placement, c, tracker) for c in range(request.cameras)]
+        else:
+            images = [self._rays(request, placement)]
         rgb, alpha, depth, instance, median = (
             torch.stack([image[k] for image in images]) for k in range(5)
         )
@@ -72,6 +77,17 @@ class ReferenceBackend:
             screen=tracker.statistics if tracker else None,
             median_depth=median.to(self.image_dtype) if options.median_depth else None,
         )
+
+    def _rays(self, request: RasterRequest, placement: Placement) -> tuple[Tensor, ...]:
+        optics = request.optics
+        rgb, *images, seen = blend_rays(request, placement, _covariances, self.dtype)
+        behind = torch.tensor(request.options.background, dtype=self.dtype)
+        if request.sky is not None and optics is not None:
+            turn = torch.from_numpy(optics.motion.middle()[:3, :3]).float()
+            rays = torch.from_numpy(optics.rays())
+            behind = request.sky.sample(torch.where(seen[..., None], rays, 1.0) @ turn.mT)
+        rgb = rgb + (1 - images[0])[..., None] * behind.to(self.dtype)
+        return torch.where(seen[..., None], rgb, 0.0), *images
 
     def _camera(
         self,

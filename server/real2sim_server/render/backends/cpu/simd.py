@@ -52,7 +52,24 @@ def _build_blend(builder: ir.IRBuilder, state: Planes, scalars: list[Any], extra
     """Emit the blending of one record; returns eight bits, set where a pixel goes on."""
     sharpness, offset, rest, *values = (splat(builder, scalar) for scalar in scalars)
     distance = (lane_numbers(builder) + offset) * sharpness
-    exponent = distance.fused(distance, rest)
+    return blend_exponent(builder, state, distance.fused(distance, rest), values, extras)
+
+
+def blend_exponent(
+    builder: ir.IRBuilder, state: Planes, exponent: Lanes, values: list[Lanes], extras: int
+) -> Any:
+    """Emit the blending of one record whose alpha is exp(-EXPONENT_UNIT exponent).
+
+    Args:
+        builder: of the kernel.
+        state: of eight pixels.
+        exponent: of these pixels; NaN or above EXPONENT_LIMIT where it shows nothing.
+        values: red, green, blue, depth, instance.
+        extras: see _blend_intrinsic.
+
+    Returns:
+        Eight bits, set where a pixel goes on.
+    """
     alpha = exponential(exponent)
     alpha = alpha.where(alpha.compare("<", ALPHA_MAX), ALPHA_MAX)
 

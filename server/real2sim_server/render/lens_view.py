@@ -1,0 +1,212 @@
+"""What a camera with a lens or a rolling shutter sees along each pixel, and the way back.
+
+Blending needs the ray of every pixel; finding which pixels a Gaussian may touch needs the way back,
+for any direction, also those that the lens does not see. Both are tables, so that nothing that
+draws knows a model of lens.
+"""
+
+from __future__ import annotations
+
+import functools
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.rotation import Float, quaternion_to_matrix
+from ..geometry.transform import invert_transform
+from ..scene import Camera
+from ..scene.camera_motion import CameraMotion
+
+CELLS = 64
+"""Cells along the edge of a face of the directory."""
+BEYOND = np.radians(5.0)
+"""What lies farther beyond the image is put where a straight continuation leads."""
+STEP = 1e-4
+"""Of finite differences, on a face."""
+
+
+@dataclass(frozen=True, eq=False)
+class LensView:
+    """A camera with a lens or a rolling shutter, where it is while an image is read out.
+
+    Attributes:
+        camera: draws; its own pose on a vehicle is not looked at.
+        motion: of the camera in the world.
+    """
+
+    camera: Camera
+    motion: CameraMotion
+
+    @property
+    def seconds(self) -> float:
+        """How long an image is read out."""
+        return self.camera.shutter.readout_us * 1e-6
+
+    @property
+    def viewmat(self) -> Float:
+        """``T_camera_world`` [4, 4] in the middle of the read-out."""
+        return invert_transform(self.motion.middle())
+
+    @functools.cached_property
+    def moves(self) -> bool:
+        """Whether rays start from different places, or look from different turns."""
+        return self.camera.shutter.rolls
+
+    def lines(self) -> Float:
+        """Time of each row (or column), -0.5 to 0.5 over the read-out."""
+        return self.camera.shutter.line_times(self.camera.width, self.camera.height) - 0.5
+
+    def shift(self) -> Float:
+        """[3] way of the camera over the read-out, in its frame in the middle [m]."""
+        way: Float = self.motion.end[:3, 3] - self.motion.start[:3, 3]
+        return way @ self.motion.middle()[:3, :3]
+
+    def turn(self) -> Float:
+        """[3] rotation vector of the camera over the read-out, in its own frame [rad]."""
+        relative = self.motion.start[:3, :3].T @ self.motion.end[:3, :3]
+        axis = np.array(
+            [
+                relative[2, 1] - relative[1, 2],
+                relative[0, 2] - relative[2, 0],
+                relative[1, 0] - relative[0, 1],
+            ]
+        )
+        sine, cosine = np.linalg.norm(axis) / 2, (np.trace(relative) - 1) / 2
+        angle = np.arctan2(sine, cosine)
+        return axis / (2 * sine) * angle if sine > 1e-12 else axis / 2
+
+    def rays(self) -> NDArray[np.float32]:
+        """[H, W, 3] directions in the camera's frame in the middle of the read-out, of any length;
+        0 where the lens sees nothing."""
+        table = tables_of(self.camera).rays
+        turn = self.turn()
+        if not self.moves or not turn.any():
+            return table
+        angle = float(np.linalg.norm(turn))
+        half = self.lines() * angle / 2
+        quaternions = np.concatenate(
+            [np.cos(half)[:, None], np.sin(half)[:, None] * (turn / angle)], axis=1
+        )
+        turns = quaternion_to_matrix(quaternions).astype(np.float32)
+        if self.camera.shutter.by_row:
+            return np.ascontiguousarray(np.einsum("hij,hwj->hwi", turns, table))
+        return np.ascontiguousarray(np.einsum("wij,hwj->hwi", turns, table))
+
+
+@dataclass(frozen=True, eq=False)
+class LensTables:
+    """What is known of a camera whatever it looks at.
+
+    Attributes:
+        rays: [H, W, 3] float32 unit directions of pixel centres; 0 where the lens sees nothing.
+        blind: [H, W] bool, where that is so.
+        directory: [6, CELLS + 1, CELLS + 1, 6] float32, position x, y [px] and its derivatives
+            x_u, x_v, y_u, y_v at the nodes of the faces of a cube of directions; face 2 k + (s < 0)
+            has component k largest, of sign s, and u, v are the next two over its magnitude.
+        slack: how far interpolated positions may be off on the image [px].
+        bend: how much derivatives change over the image, relative to them [1/rad].
+        reach: largest angle from the axis of a pixel [rad].
+    """
+
+    rays: NDArray[np.float32]
+    blind: NDArray[np.bool_]
+    directory: NDArray[np.float32]
+    slack: float
+    bend: float
+    reach: float
+
+
+_tables: weakref.WeakKeyDictionary[Camera, LensTables] = weakref.WeakKeyDictionary()
+
+
+def tables_of(camera: Camera) -> LensTables:
+    """Tables of a camera; made once, in a tenth of a second."""
+    known = _tables.get(camera)
+    if known is None:
+        known = _tables[camera] = _make_tables(camera)
+    return known
+
+
+def _make_tables(camera: Camera) -> LensTables:
+    width, height = camera.width, camera.height
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays, seen = camera.unproject(np.stack([x, y], -1))
+    rays = np.where(seen[..., None], rays, 0.0)
+    angles = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+    reach = float(angles[seen].max(initial=0.0))
+    position = continued(camera, reach)
+    directory = _directory(position)
+    slack, bend = _precision(camera, position, directory)
+    return LensTables(rays.astype(np.float32), ~seen, directory, slack, bend, reach)
+
+
+def continued(camera: Camera, reach: float) -> Callable[[Float], Float]:
+    """Image positions [..., 2] of any directions [..., 3]: beyond what the lens sees, or BEYOND the
+    image, they go on straight as they did at that edge.
+
+    Args:
+        camera: with its lens.
+        reach: of LensTables [rad].
+    """
+    own = np.pi if camera.lens is None else camera.lens.reach
+    if camera.lens is None or camera.lens.perspective:
+        own = min(own, np.radians(89.0))
+    last = min(reach + float(BEYOND), own - 1e-6)
+
+    def at(angle: Float, across: Float) -> Float:
+        sine = np.sin(angle)[..., None]
+        return camera.project(np.concatenate([across * sine, np.cos(angle)[..., None]], -1))[0]
+
+    def position(directions: Float) -> Float:
+        length = np.hypot(directions[..., 0], directions[..., 1])
+        angle = np.arctan2(length, directions[..., 2])
+        across = directions[..., :2] / np.where(length > 0, length, 1.0)[..., None]
+        # Straight behind any way out will do.
+        across = np.where((length > 0)[..., None], across, [1.0, 0.0])
+        found = at(np.minimum(angle, last), across)
+        edge = np.full_like(angle, last)
+        slope = (at(edge, across) - at(edge - 1e-3, across)) / 1e-3
+        return found + np.maximum(angle - last, 0.0)[..., None] * slope
+
+    return position
+
+
+def _faces(u: Float, v: Float) -> Float:
+    """Directions [6, ..., 3] of face coordinates."""
+    faces = []
+    for k in range(3):
+        for sign in (1.0, -1.0):
+            parts = {k: np.full_like(u, sign), (k + 1) % 3: u, (k + 2) % 3: v}
+            faces.append(np.stack([parts[i] for i in range(3)], -1))
+    return np.stack(faces)
+
+
+def _directory(position: Callable[[Float], Float]) -> NDArray[np.float32]:
+    edge = np.linspace(-1, 1, CELLS + 1)
+    u, v = np.meshgrid(edge, edge, indexing="ij")
+    by_u = (position(_faces(u + STEP, v)) - position(_faces(u - STEP, v))) / (2 * STEP)
+    by_v = (position(_faces(u, v + STEP)) - position(_faces(u, v - STEP))) / (2 * STEP)
+    slopes = np.stack([by_u[..., 0], by_v[..., 0], by_u[..., 1], by_v[..., 1]], -1)
+    table = np.concatenate([position(_faces(u, v)), slopes], -1)
+    return np.ascontiguousarray(table, np.float32)
+
+
+def _precision(
+    camera: Camera, position: Callable[[Float], Float], directory: NDArray[np.float32]
+) -> tuple[float, float]:
+    """``slack`` and ``bend`` of LensTables, from the middles of cells."""
+    middle = (np.arange(CELLS) + 0.5) * (2 / CELLS) - 1
+    u, v = np.meshgrid(middle, middle, indexing="ij")
+    table = directory.astype(np.float64)
+    corners = [table[:, i : i + CELLS, j : j + CELLS] for i in (0, 1) for j in (0, 1)]
+    exact = position(_faces(u, v))
+    on_image = ((exact > -32) & (exact < [camera.width + 32, camera.height + 32])).all(-1)
+    off = np.abs(sum(corner[..., :2] for corner in corners) / 4 - exact).max(-1)
+    slopes = [corner[..., 2:] for corner in corners]
+    scale = np.maximum(np.linalg.norm(sum(slopes) / 4, axis=-1), 1e-9)
+    change = [np.linalg.norm(one - slopes[0], axis=-1) / scale for one in slopes[1:]]
+    bend = np.maximum.reduce(change)[on_image].max(initial=0.0) / (2 / CELLS)
+    return 2 * float(off[on_image].max(initial=0.0)) + 0.05, float(bend)
