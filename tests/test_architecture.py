@@ -39,6 +39,7 @@ LAYERS = (
     "reconstruct",
     "edit",
     "world",
+    "datasets",
     "service",
     "demo",
     "policies",

@@ -6,6 +6,7 @@ SEMANTIC_CLASSES: dict[str, int] = {
     "unlabeled": 0,
     "static": 4,
     "dynamic": 5,
+    "ground": 6,
     "pole": 17,
     "traffic light": 19,
     "traffic sign": 20,
@@ -20,7 +21,8 @@ SEMANTIC_CLASSES: dict[str, int] = {
     "motorcycle": 32,
     "bicycle": 33,
 }
-"""Number in the image by name. ``static`` is the background, ``dynamic`` an object of another
+"""Number in the image by name. ``static`` is the background, ``ground`` the part of it that is
+driven or walked on where that is told apart (exported data sets), ``dynamic`` an object of another
 category, ``unlabeled`` where nothing is and the scene has no sky."""
 
 CLASS_OF_CATEGORY = {
@@ -45,6 +47,7 @@ CLASS_OF_CATEGORY = {
 
 UNLABELED = SEMANTIC_CLASSES["unlabeled"]
 STATIC = SEMANTIC_CLASSES["static"]
+GROUND = SEMANTIC_CLASSES["ground"]
 SKY = SEMANTIC_CLASSES["sky"]
 
 

@@ -9,7 +9,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import feather
 
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.datasets.labels import points_in_boxes
+from real2sim_server.geometry.transform import apply_transform
 from real2sim_server.logs import DrivingLog, LogError, open_log
 from real2sim_server.synthetic import SyntheticLog
 
@@ -93,12 +94,9 @@ def test_sample_has_its_points_in_every_box(sample: DrivingLog, test_data: Path)
         to_world = sample.ego.transform(t_us)
         points = apply_transform(to_world, sample.lidar(frame).points.astype(np.float64))
         here = [r for r in rows if r["timestamp_ns"] // 1000 == t_us]
-        counts = []
-        for row in here:
-            track = tracks[names[row["track_uuid"]]]
-            local = apply_transform(invert_transform(track.trajectory.transform(t_us)), points)
-            size = np.array([row["length_m"], row["width_m"], row["height_m"]])
-            counts.append(int((np.abs(local) <= size / 2).all(axis=1).sum()))
+        poses = [tracks[names[row["track_uuid"]]].trajectory.transform(t_us) for row in here]
+        sizes = [[row["length_m"], row["width_m"], row["height_m"]] for row in here]
+        counts = points_in_boxes(points, poses, sizes)
         assert counts == [r["num_interior_pts"] for r in here]
         sums.append(sum(counts))
     assert sums == [9399, 9289]

@@ -1,0 +1,165 @@
+"""``real2sim export-dataset``: a labelled data set of a scene, a scenario or an episode."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..console import CommandError, console, print_figures, staged_progress, write_json
+from .command import command
+from .device import chosen_backend
+from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle
+
+if TYPE_CHECKING:
+    from ..datasets.drive import Drive
+    from ..edit import AssetLookup, ScenarioState
+    from ..scene import Scene
+
+
+@command("export-dataset")
+def export_dataset(
+    *,
+    scene: SceneBundle,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that does not exist yet.")],
+    format_: Annotated[
+        list[str],
+        typer.Option(
+            "--format", "-f", help="labels, kitti, coco, nuscenes, argoverse2, webdataset, pictures"
+        ),
+    ],
+    operations: Annotated[
+        Path | None, typer.Option(help="JSON list of edits, as scenarios have them.")
+    ] = None,
+    episode: Annotated[
+        Path | None, typer.Option(help="Recorded episode (.r2e) on this scene, instead.")
+    ] = None,
+    assets: Annotated[Path | None, typer.Option(help="Asset library that edits use.")] = None,
+    cameras: Annotated[
+        str | None, typer.Option(help="Such as front,front_left; default: all.")
+    ] = None,
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Of images [px].")] = None,
+    period: Annotated[float, typer.Option(min=0.001, help="Between frames [s].")] = 0.1,
+    start_us: Annotated[int | None, typer.Option(help="First instant [us].")] = None,
+    end_us: Annotated[int | None, typer.Option(help="Last instant [us].")] = None,
+    clip: Annotated[float, typer.Option(min=0.001, help="Length of a clip [s].")] = 20.0,
+    splits: Annotated[str, typer.Option(help="Shares of the clips.")] = "train=1",
+    seed: Annotated[int, typer.Option(min=0, help="Draws the clips of each split.")] = 0,
+    flow: Annotated[bool, typer.Option(help="Whether optical flow is made.")] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say how many frames, bytes and minutes.")
+    ] = False,
+    backend: RenderBackend = "auto",
+    device: RenderDevice = None,
+    json: JsonFile = None,
+) -> None:
+    """Write labelled images of a scene, edited or as an episode went, in public formats.
+
+    Stopped and called again it goes on after the last whole clip, and gives the same bytes.
+    """
+    from ..datasets.export import estimate
+    from ..datasets.export import export_dataset as export
+    from ..datasets.plan import ExportPlan
+    from ..scene.io import load_scene
+
+    backend = chosen_backend(backend, device)
+    plan = ExportPlan(
+        formats=tuple(dict.fromkeys(format_)),
+        cameras=tuple(name.strip() for name in cameras.split(",")) if cameras else (),
+        width=width,
+        period_us=round(period * 1e6),
+        start_us=start_us,
+        end_us=end_us,
+        clip_s=clip,
+        splits=_shares(splits),
+        seed=seed,
+        flow=flow,
+    )
+    loaded = load_scene(scene)
+    drive, made_of = _drive(loaded, operations, episode, assets)
+    if dry_run:
+        guess = estimate(drive, plan, backend=backend)
+        figures: dict[str, Any] = {
+            "frames": guess.frames,
+            "images": guess.images,
+            "bytes": guess.nbytes,
+            "minutes": guess.minutes,
+        }
+    else:
+        with staged_progress() as report:
+            export(drive, plan, out, made_of=made_of, backend=backend, on_progress=report)
+        manifest = json_module.loads((out / "manifest.json").read_bytes())
+        files = manifest["files"].values()
+        figures = {
+            "folder": str(out),
+            "clips": len(manifest["clips"]),
+            "frames": sum(c["frames"] for c in manifest["clips"].values()),
+            "files": len(files),
+            "bytes": sum(file["bytes"] for file in files),
+            "boxes": manifest["statistics"]["boxes"],
+            "licence": manifest["licence"],
+        }
+    print_figures(f"data set of {loaded.name}", figures)
+    if not dry_run:
+        console.print("labels and how they are made: manifest.json and docs/datasets.md")
+    write_json(json, figures)
+
+
+def _drive(
+    scene: Scene, operations: Path | None, episode: Path | None, assets: Path | None
+) -> tuple[Drive, dict[str, Any]]:
+    """What is shown, and what decided on it."""
+    from ..datasets.drive import EpisodeDrive, ScenarioDrive
+    from ..service.library.assets import AssetLibrary
+    from ..world.recording.recording import load_recording
+
+    lookup = AssetLibrary(assets).find if assets is not None else None
+    if episode is not None:
+        if operations is not None:
+            raise CommandError("--episode is exported as it went: leave --operations out")
+        recording = load_recording(episode)
+        return EpisodeDrive.of(recording, scene, assets=lookup), {"episode": recording.digests[-1]}
+    state = _edited(scene, operations, lookup)
+    return ScenarioDrive(scene, state), {"operations": _content(operations)}
+
+
+def _edited(scene: Scene, operations: Path | None, lookup: AssetLookup | None) -> ScenarioState:
+    from pydantic import TypeAdapter, ValidationError
+
+    from real2sim_proto.operations import Operation
+
+    from ..edit import ScenarioState, apply_operations
+
+    state = ScenarioState.of(scene, assets=lookup)
+    if operations is None:
+        return state
+    try:
+        edits = TypeAdapter(list[Operation]).validate_python(_content(operations))
+    except ValidationError as error:
+        raise CommandError(f"{operations}: is no list of edits ({error})") from error
+    return apply_operations(state, edits).state
+
+
+def _content(operations: Path | None) -> Any:
+    if operations is None:
+        return []
+    try:
+        return json_module.loads(operations.read_bytes())
+    except ValueError as error:
+        raise CommandError(f"{operations}: is no JSON file ({error})") from error
+
+
+def _shares(text: str) -> dict[str, float]:
+    """Of ``train=0.8,val=0.2``."""
+    shares = {}
+    for part in text.split(","):
+        name, equals, share = part.partition("=")
+        try:
+            shares[name.strip()] = float(share if equals else "")
+        except ValueError:
+            raise CommandError(
+                f"--splits {text!r}; allowed are shares such as train=0.8,val=0.2"
+            ) from None
+    return shares

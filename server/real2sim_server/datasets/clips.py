@@ -1,0 +1,303 @@
+"""Labelled clips as files: what writers read, and what survives when an export is killed.
+
+A clip is a folder that appears whole: ``labels.json``, and for each camera and frame images as png:
+``rgb``, ``depth`` (1/256 m), ``instance``, ``semantic``, ``flow_forward`` and ``flow_backward``
+(KITTI: u and v times 64 plus 2^15, and whether it is valid), ``occluded_forward`` and
+``occluded_backward``; ``points/NNNNNN.npy`` has the points of a frame.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial as partial_of
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.rotation import Float
+from ..geometry.transform import invert_transform
+from ..render import Backend, encode_image
+from ..scene import Camera
+from .drive import Drive, Moment
+from .labels import (
+    CameraImages,
+    CameraView,
+    ObjectBox,
+    SeenPoints,
+    boxes_at,
+    draw_moment,
+    ego_future,
+    flow_between,
+    futures_at,
+    points_in_boxes,
+    seen_points,
+    views_of,
+)
+from .labels.boxes import in_frame
+from .plan import ExportPlan, PlannedClip
+
+POINT = np.dtype(
+    [
+        ("xyz", "<f4", 3),
+        ("intensity", "<f4"),
+        ("beam", "u1"),
+        ("instance", "<u2"),
+        ("semantic", "u1"),
+        ("velocity", "<f4", 3),
+    ]
+)
+"""A row of ``points``: ego frame [m], [m/s]."""
+
+ENCODERS = 2
+"""Threads that encode."""
+
+FLOW_SCALE, FLOW_ZERO = 64.0, 1 << 15
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledMoment:
+    """A moment with everything that is known of it."""
+
+    moment: Moment
+    boxes: Sequence[ObjectBox]
+    images: Sequence[CameraImages]
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A clip in the store.
+
+    Attributes:
+        folder: of its files.
+        name: four digits.
+        split: that it belongs to.
+        frames: labels of each frame, see ``docs/datasets.md``.
+    """
+
+    folder: Path
+    name: str
+    split: str
+    frames: Sequence[dict[str, Any]]
+
+    @classmethod
+    def open(cls, folder: Path) -> Clip:
+        """The clip in a folder that :func:`write_clip` has made."""
+        content = json.loads((folder / "labels.json").read_bytes())
+        return cls(folder, content["name"], content["split"], content["frames"])
+
+    def file(self, kind: str, camera: str, frame: int) -> Path:
+        """The png of an image of that kind; the first and last frame lack a flow each."""
+        return self.folder / kind / camera / f"{frame:06d}.png"
+
+    def pixels(self, kind: str, camera: str, frame: int) -> NDArray[Any]:
+        """An image as it is in its png; RGB for ``rgb``."""
+        image = cv2.imread(str(self.file(kind, camera, frame)), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise FileNotFoundError(self.file(kind, camera, frame))
+        return np.ascontiguousarray(image[..., ::-1]) if kind == "rgb" else np.asarray(image)
+
+    def points(self, frame: int) -> NDArray[Any]:
+        """Rows of POINT."""
+        rows: NDArray[Any] = np.load(self.folder / "points" / f"{frame:06d}.npy")
+        return rows
+
+
+def write_clip(
+    drive: Drive,
+    plan: ExportPlan,
+    cameras: Sequence[Camera],
+    clip: PlannedClip,
+    folder: Path,
+    *,
+    backend: str | Backend = "auto",
+    on_frame: Callable[[], None] = lambda: None,
+) -> None:
+    """Draw and label a clip into ``folder``, which appears only when it is whole."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    frames = []
+    before: LabelledMoment | None = None
+    with _FileWriter(partial) as files:
+        for index, t_us in enumerate(clip.times_us):
+            moment = drive.at(t_us)
+            images = draw_moment(drive.scene, moment, cameras, backend=backend)
+            here = LabelledMoment(moment, boxes_at(moment.placed), images)
+            views = [views_of(i, here.boxes, moment.instances, backend=backend) for i in images]
+            points = seen_points(images, here.boxes, moment.T_world_ego)
+            frames.append(_frame_labels(drive, here, views, points, index))
+            files.finish()
+            _write_images(files, images, index)
+            files.add("points", "", index, _points_file(points))
+            if before is not None and plan.flow:
+                _write_flow(files, before, here, "forward", index - 1)
+                _write_flow(files, here, before, "backward", index)
+            before = here
+            on_frame()
+    content = {"name": clip.name, "split": clip.split, "frames": frames}
+    (partial / "labels.json").write_text(json.dumps(content), encoding="utf-8")
+    partial.rename(folder)
+
+
+def _frame_labels(
+    drive: Drive,
+    here: LabelledMoment,
+    views: Sequence[CameraView],
+    points: SeenPoints,
+    index: int,
+) -> dict[str, Any]:
+    moment, boxes = here.moment, here.boxes
+    to_ego = invert_transform(moment.T_world_ego)
+    in_ego = [in_frame(box, to_ego) for box in boxes]
+    counts = points_in_boxes(points.points, [pose for pose, _ in in_ego], [b.size for b in boxes])
+    futures = futures_at(drive, moment.t_us, [box.object_id for box in boxes])
+    return {
+        "index": index,
+        "t_us": moment.t_us,
+        "T_world_ego": moment.T_world_ego.tolist(),
+        "ego_future": ego_future(drive, moment.t_us),
+        "objects": [
+            {
+                "object_id": box.object_id,
+                "category": box.category,
+                "instance_id": box.instance_id,
+                "size": list(box.size),
+                "T_world_object": box.T_world_object.tolist(),
+                "T_ego_object": pose.tolist(),
+                "velocity": box.velocity.tolist(),
+                "velocity_ego": velocity.tolist(),
+                "points": count,
+                "future": futures[box.object_id],
+            }
+            for box, (pose, velocity), count in zip(boxes, in_ego, counts, strict=True)
+        ],
+        "views": {view.images.camera.name: _view_labels(view, boxes) for view in views},
+    }
+
+
+def _view_labels(view: CameraView, boxes: Sequence[ObjectBox]) -> list[dict[str, Any]]:
+    to_camera: Float = invert_transform(view.images.T_world_camera)
+    poses = {box.object_id: to_camera @ box.T_world_object for box in boxes}
+    return [
+        {
+            "object_id": seen.object_id,
+            "instance_id": seen.instance_id,
+            "T_camera_object": poses[seen.object_id].tolist(),
+            "box_2d_modal": None if seen.modal_box is None else list(seen.modal_box),
+            "box_2d_amodal": list(seen.amodal_box),
+            "visible_pixels": seen.visible_pixels,
+            "alone_pixels": seen.alone_pixels,
+            "visibility": seen.visibility,
+            "truncation": seen.truncation,
+        }
+        for seen in view.objects
+    ]
+
+
+class _FileWriter:
+    """Encodes and writes files on threads of its own while the next frame is drawn."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._pool = ThreadPoolExecutor(ENCODERS, thread_name_prefix="labels")
+        self._pending: list[Future[None]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=kind is not None)
+        if kind is None:
+            self.finish()
+
+    def add(self, kind: str, camera: str, index: int, encode: Callable[[], bytes]) -> None:
+        """Write what ``encode`` gives; an error of it comes out of :meth:`finish`."""
+        suffix = "npy" if kind == "points" else "png"
+        path = self._folder / kind / camera / f"{index:06d}.{suffix}"
+
+        def write() -> None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(encode())
+
+        self._pending.append(self._pool.submit(write))
+
+    def finish(self) -> None:
+        """Wait for what was added before."""
+        for pending in self._pending:
+            pending.result()
+        self._pending.clear()
+
+
+def _write_images(files: _FileWriter, images: Sequence[CameraImages], index: int) -> None:
+    for image in images:
+        parts: dict[str, NDArray[Any]] = {
+            "rgb": image.rgb,
+            "depth": image.depth,
+            "instance": image.instance,
+            "semantic": image.semantic,
+        }
+        for kind, pixels in parts.items():
+            encode = partial_of(_encoded_image, pixels, kind)
+            files.add(kind, image.camera.name, index, encode)
+
+
+def _encoded_image(pixels: NDArray[Any], kind: str) -> bytes:
+    return encode_image(pixels, kind, "png").data
+
+
+def _points_file(points: SeenPoints) -> Callable[[], bytes]:
+    rows = np.zeros(len(points.points), POINT)
+    rows["xyz"], rows["intensity"], rows["beam"] = points.points, points.intensity, points.beam
+    rows["instance"], rows["semantic"] = points.instance, points.semantic
+    rows["velocity"] = points.velocity
+    file = io.BytesIO()
+    np.save(file, rows)
+    return file.getvalue
+
+
+def _write_flow(
+    files: _FileWriter, start: LabelledMoment, end: LabelledMoment, direction: str, index: int
+) -> None:
+    for here, there in zip(start.images, end.images, strict=True):
+        flow, valid, occluded = flow_between(here, there, start.boxes, end.boxes)
+        name = here.camera.name
+        files.add(f"flow_{direction}", name, index, partial_of(flow_png, flow, valid))
+        files.add(f"occluded_{direction}", name, index, partial_of(_png, occluded))
+
+
+def flow_png(flow: NDArray[np.float32], valid: NDArray[np.bool_]) -> bytes:
+    """Flow [H, W, 2] [px] as KITTI's 16-bit png: u and v times 64 plus 2^15, and validity. Flow
+    beyond 511 px is not valid."""
+    levels = np.rint(flow * FLOW_SCALE) + FLOW_ZERO
+    good = valid & ((levels >= 1) & (levels <= np.iinfo(np.uint16).max)).all(axis=-1)
+    stored = np.zeros((*valid.shape, 3), np.uint16)
+    # OpenCV writes channels from the last to the first.
+    stored[..., 2] = np.where(good, levels[..., 0], 0)
+    stored[..., 1] = np.where(good, levels[..., 1], 0)
+    stored[..., 0] = good
+    return _encoded(stored)
+
+
+def read_flow(stored: NDArray[np.uint16]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Flow [H, W, 2] [px] and validity [H, W] of :meth:`Clip.pixels`."""
+    flow = (stored[..., [2, 1]].astype(np.float32) - FLOW_ZERO) / np.float32(FLOW_SCALE)
+    valid = stored[..., 0] > 0
+    return np.where(valid[..., None], flow, np.float32(0)), valid
+
+
+def _png(mask: NDArray[np.bool_]) -> bytes:
+    return _encoded(mask.astype(np.uint8) * 255)
+
+
+def _encoded(image: NDArray[Any]) -> bytes:
+    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    assert done
+    return bytes(data)

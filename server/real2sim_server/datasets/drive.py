@@ -1,0 +1,151 @@
+"""What is exported: a drive that can be looked at at any of its instants."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
+from ..geometry.rotation import Float
+from ..render.types import Instance
+from ..scene import Scene
+from ..world import World
+from ..world.recording.recording import Recording
+from .errors import DatasetError
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A drive at one instant.
+
+    Attributes:
+        t_us: instant [us].
+        instances: what is drawn.
+        placed: every object that is there.
+        T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
+    """
+
+    t_us: int
+    instances: Sequence[Instance]
+    placed: PlacedObjects[ObjectState]
+    T_world_ego: Float
+
+
+class Drive(Protocol):
+    """A drive, from its first to its last instant."""
+
+    @property
+    def scene(self) -> Scene:
+        """Gives cameras, sky and ground."""
+        ...
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last instant [us]."""
+        ...
+
+    def at(self, t_us: int) -> Moment:
+        """Everything that is drawn at an instant of the span."""
+        ...
+
+    def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
+        """Where the objects are at an instant of the span."""
+        ...
+
+    def ego_at(self, t_us: int) -> Float:
+        """``T_world_ego`` [4, 4] at an instant of the span."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioDrive:
+    """A scenario as it was recorded and edited; the ego drives as recorded."""
+
+    scene: Scene
+    state: ScenarioState
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """See :class:`Drive`."""
+        return self.state.clock
+
+    def at(self, t_us: int) -> Moment:
+        """See :class:`Drive`."""
+        instances = instances_at(self.scene, self.state, t_us)
+        return Moment(t_us, instances, self.placed_at(t_us), self.ego_at(t_us))
+
+    def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
+        """See :class:`Drive`."""
+        return self.state.tracks.at(t_us)
+
+    def ego_at(self, t_us: int) -> Float:
+        """See :class:`Drive`."""
+        return self.scene.ego.transform(t_us)
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeDrive:
+    """A recorded episode as it was lived through; its instants are those of its steps.
+
+    Attributes:
+        scene: that it ran on.
+        worlds: after each step, by time.
+    """
+
+    scene: Scene
+    worlds: tuple[World, ...]
+
+    @classmethod
+    def of(
+        cls, recording: Recording, scene: Scene, *, assets: AssetLookup | None = None
+    ) -> EpisodeDrive:
+        """The episode, replayed.
+
+        Raises:
+            DatasetError: it ran on another scene, or holds no step.
+            EditError, RecordingError: as :meth:`Recording.replayer`.
+        """
+        if recording.scene_hash != scene.content_hash:
+            raise DatasetError(
+                f"the episode ran on a scene with hash {recording.scene_hash[:12]}, not "
+                f"{scene.content_hash[:12] or 'one without'}; give the scene bundle it ran on"
+            )
+        by_time = {world.t_us: world for world in _instants(recording, scene, assets)}
+        if not by_time:
+            raise DatasetError("the episode holds no step to export")
+        return cls(scene, tuple(by_time[t] for t in sorted(by_time)))
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """See :class:`Drive`."""
+        return self.worlds[0].t_us, self.worlds[-1].t_us
+
+    def at(self, t_us: int) -> Moment:
+        """See :class:`Drive`."""
+        world = self._world(t_us)
+        return Moment(t_us, world.instances(), world.agents, np.array(world.T_world_body))
+
+    def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
+        """See :class:`Drive`."""
+        return self._world(t_us).agents
+
+    def ego_at(self, t_us: int) -> Float:
+        """See :class:`Drive`."""
+        return np.array(self._world(t_us).T_world_body)
+
+    def _world(self, t_us: int) -> World:
+        """The one of the last step up to ``t_us``."""
+        times = [world.t_us for world in self.worlds]
+        return self.worlds[max(bisect_right(times, t_us) - 1, 0)]
+
+
+def _instants(recording: Recording, scene: Scene, assets: AssetLookup | None) -> Iterator[World]:
+    replayer = recording.replayer(scene, assets)
+    for entry in recording.entries:
+        world = replayer.apply(entry)
+        if entry.kind in {"reset", "action", "restore"}:
+            yield world

@@ -1,0 +1,269 @@
+"""The whole way from a drive to a folder of labelled data."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from ..render import Backend
+from ..scene import Camera
+from .clips import Clip, write_clip
+from .drive import Drive
+from .errors import DatasetError
+from .labels import HOW
+from .plan import ExportPlan, PlannedClip, planned_cameras, planned_clips
+from .writers import LabelledDrive, writer_of
+
+FORMAT = "real2sim-dataset"
+VERSION = 1
+LICENCE, MANIFEST = "LICENSE.txt", "manifest.json"
+OUTPUT_SHARE = 0.7
+"""Bytes of one written format against those of the labels it is made of, about."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What an export will take, from frames labelled on this machine now.
+
+    Attributes:
+        frames, images: number of them.
+        nbytes: of the folder while it is made, about.
+        minutes: about.
+    """
+
+    frames: int
+    images: int
+    nbytes: int
+    minutes: float
+
+
+def estimate(drive: Drive, plan: ExportPlan, *, backend: str | Backend = "auto") -> Estimate:
+    """Of an export that is not made; three of its frames are labelled and thrown away.
+
+    Raises:
+        DatasetError: as :func:`export_dataset`.
+    """
+    cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    for name in plan.formats:
+        writer_of(name)
+    frames = sum(len(clip.times_us) for clip in clips)
+    middle = clips[len(clips) // 2].times_us[:3]
+    with tempfile.TemporaryDirectory(prefix="real2sim-dataset-") as folder:
+        seconds = [time.perf_counter()]
+        write_clip(
+            drive,
+            plan,
+            cameras,
+            PlannedClip("0000", "train", middle),
+            Path(folder) / "clip",
+            backend=backend,
+            on_frame=lambda: seconds.append(time.perf_counter()),
+        )
+        files = [path for path in Path(folder).rglob("*") if path.is_file()]
+        nbytes = sum(path.stat().st_size for path in files) / len(middle)
+    each = min(b - a for a, b in pairwise(seconds))
+    return Estimate(
+        frames=frames,
+        images=frames * len(cameras),
+        nbytes=round(frames * nbytes * (1 + OUTPUT_SHARE * len(plan.formats))),
+        minutes=frames * each / 60,
+    )
+
+
+def export_dataset(
+    drive: Drive,
+    plan: ExportPlan,
+    out: str | Path,
+    *,
+    made_of: Mapping[str, Any] | None = None,
+    backend: str | Backend = "auto",
+    on_progress: Callable[[str, int, int], None] = lambda _stage, _done, _total: None,
+) -> Path:
+    """Label a drive and write it to the new folder ``out``, which appears only when it is whole.
+
+    What is finished of an export that was stopped is kept beside ``out``: the same call again goes
+    on after the last whole clip, and gives the same bytes.
+
+    Args:
+        drive: what is shown.
+        plan: what is exported of it.
+        out: a folder that does not exist yet.
+        made_of: what else decided on the drive (operations, episode ...), for the manifest; JSON
+            values only.
+        backend: draws.
+        on_progress: called with (stage, done, total): frames that are labelled, formats written.
+
+    Returns:
+        ``out``: a folder for each format, ``manifest.json`` and ``LICENSE.txt``.
+
+    Raises:
+        DatasetError: ``out`` exists, an unknown format or camera, instants outside of the drive,
+            or a stopped export of something else in the way.
+        RenderError, OSError: it cannot be drawn or written.
+    """
+    target = Path(out)
+    if target.exists():
+        raise DatasetError(f"{target} exists already; name a folder that does not")
+    if not plan.formats:
+        raise DatasetError("name at least one format")
+    writers = [writer_of(name) for name in plan.formats]
+    cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    digest = _digest(drive, plan, made_of or {})
+    work = _work_folder(target, digest)
+    opened = _labelled_clips(
+        drive, plan, cameras, clips, work=work, backend=backend, on_progress=on_progress
+    )
+    content = LabelledDrive(
+        name=drive.scene.name,
+        digest=digest,
+        cameras=tuple(cameras),
+        ego_size=drive.scene.ego_size,
+        period_us=plan.period_us,
+        clips=opened,
+        ground=drive.scene.ground,
+        licence=_licence(drive.scene.provenance),
+    )
+    result = work / "result"
+    result.mkdir(exist_ok=True)
+    for done, writer in enumerate(writers):
+        on_progress("formats", done, len(writers))
+        if not (result / writer.name).exists():
+            partial = work / f".{writer.name}.partial"
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+            writer.write(content, partial)
+            partial.rename(result / writer.name)
+    on_progress("formats", len(writers), len(writers))
+    _write_licence(result / LICENCE, drive.scene.provenance)
+    _write_manifest(result, drive, plan, opened, digest=digest, made_of=made_of or {})
+    result.rename(target)
+    shutil.rmtree(work)
+    return target
+
+
+def work_folder(out: str | Path) -> Path:
+    """Where what is finished of a stopped export to ``out`` lies."""
+    target = Path(out)
+    return target.with_name(f".{target.name}.export")
+
+
+def _digest(drive: Drive, plan: ExportPlan, made_of: Mapping[str, Any]) -> str:
+    content = [drive.scene.name, drive.scene.content_hash, plan.digest, made_of]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _work_folder(target: Path, digest: str) -> Path:
+    work = work_folder(target)
+    if work.exists() and (work / "digest").exists() and (work / "digest").read_text() != digest:
+        raise DatasetError(
+            f"{work} holds a stopped export with other options; remove it, or name another folder"
+        )
+    work.mkdir(parents=True, exist_ok=True)
+    (work / "digest").write_text(digest)
+    return work
+
+
+def _labelled_clips(
+    drive: Drive,
+    plan: ExportPlan,
+    cameras: Sequence[Camera],
+    clips: Sequence[PlannedClip],
+    *,
+    work: Path,
+    backend: str | Backend,
+    on_progress: Callable[[str, int, int], None],
+) -> list[Clip]:
+    total, done = sum(len(clip.times_us) for clip in clips), 0
+    (work / "clips").mkdir(exist_ok=True)
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        on_progress("frames", done, total)
+
+    for clip in clips:
+        folder = work / "clips" / clip.name
+        if folder.exists():
+            done += len(clip.times_us)
+            on_progress("frames", done, total)
+        else:
+            write_clip(drive, plan, cameras, clip, folder, backend=backend, on_frame=step)
+    return [Clip.open(work / "clips" / clip.name) for clip in clips]
+
+
+def _licence(provenance: Mapping[str, Any]) -> str:
+    return str(provenance.get("licence") or "not stated by the source")
+
+
+def _write_licence(path: Path, provenance: Mapping[str, Any]) -> None:
+    source = provenance.get("dataset") or provenance.get("source") or "a recording"
+    sequence = f", sequence {provenance['sequence']}" if provenance.get("sequence") else ""
+    path.write_text(
+        "The images and labels of this data set were made of a scene that was reconstructed from "
+        f"{source}{sequence}.\nThe terms of that recording hold for them too:\n\n"
+        f"{_licence(provenance)}\n",
+        encoding="utf-8",
+    )
+
+
+def _write_manifest(
+    result: Path,
+    drive: Drive,
+    plan: ExportPlan,
+    clips: Sequence[Clip],
+    *,
+    digest: str,
+    made_of: Mapping[str, Any],
+) -> None:
+    files = sorted(p for p in result.rglob("*") if p.is_file() and p != result / MANIFEST)
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "digest": digest,
+        "scene": drive.scene.name,
+        "scene_hash": drive.scene.content_hash,
+        "made_of": dict(made_of),
+        "plan": {**asdict(plan), "splits": dict(plan.splits)},
+        "clips": {clip.name: {"split": clip.split, "frames": len(clip.frames)} for clip in clips},
+        "statistics": _statistics(clips),
+        "labels": HOW,
+        "provenance": dict(drive.scene.provenance),
+        "licence": _licence(drive.scene.provenance),
+        "files": {
+            str(path.relative_to(result)): {
+                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+                "bytes": path.stat().st_size,
+            }
+            for path in files
+        },
+    }
+    (result / MANIFEST).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _statistics(clips: Sequence[Clip]) -> dict[str, Any]:
+    """Boxes by category, and those in images by category and visibility."""
+    boxes: Counter[str] = Counter()
+    seen: dict[str, Counter[str]] = {}
+    for clip in clips:
+        for frame in clip.frames:
+            categories = {o["object_id"]: o["category"] for o in frame["objects"]}
+            boxes.update(categories.values())
+            for view in (v for views in frame["views"].values() for v in views):
+                level = min(int(view["visibility"] * 5), 4) * 20
+                counter = seen.setdefault(categories[view["object_id"]], Counter())
+                counter[f"{level} to {level + 20} %"] += 1
+    return {
+        "boxes": dict(sorted(boxes.items())),
+        "boxes_in_images_by_visibility": {
+            name: dict(sorted(counts.items())) for name, counts in sorted(seen.items())
+        },
+    }

@@ -1,0 +1,31 @@
+"""What is known of an instant: boxes, masks, visibility, depth, flow, tracks and futures.
+
+All of it comes from one pass per camera, from passes of objects alone and from the poses that the
+drive has; :data:`HOW` says which label from what.
+"""
+
+from .boxes import ObjectBox, boxes_at, projected_box
+from .flow import flow_between
+from .futures import ego_future, futures_at
+from .how import HOW
+from .images import CameraImages, draw_moment
+from .points import SeenPoints, points_in_boxes, seen_points
+from .views import CameraView, ObjectView, views_of
+
+__all__ = [
+    "HOW",
+    "CameraImages",
+    "CameraView",
+    "ObjectBox",
+    "ObjectView",
+    "SeenPoints",
+    "boxes_at",
+    "draw_moment",
+    "ego_future",
+    "flow_between",
+    "futures_at",
+    "points_in_boxes",
+    "projected_box",
+    "seen_points",
+    "views_of",
+]

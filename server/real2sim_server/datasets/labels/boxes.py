@@ -1,0 +1,102 @@
+"""3D boxes at an instant, and where they are in an image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...edit import ObjectState, PlacedObjects
+from ...geometry.box import box_corners
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform
+from ...scene import Camera
+
+NEAR = 0.1
+"""Boxes are cut at this depth in front of a camera [m]."""
+
+EDGES = (
+    (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7),
+)  # fmt: skip
+"""Edges between corners in the order of ``box_corners``."""
+
+Box2D = tuple[float, float, float, float]
+"""Left, top, right, bottom [px]; pixel (0, 0) reaches from 0 to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectBox:
+    """One object at an instant.
+
+    Attributes:
+        object_id: unique in the drive.
+        category: as in the scene.
+        instance_id: of its pixels in instance images.
+        size: (length, width, height) along its x, y, z [m].
+        T_world_object: [4, 4], origin at the box centre.
+        velocity: [3] in the world [m/s].
+    """
+
+    object_id: str
+    category: str
+    instance_id: int
+    size: tuple[float, float, float]
+    T_world_object: Float
+    velocity: Float
+
+
+def boxes_at(placed: PlacedObjects[ObjectState]) -> list[ObjectBox]:
+    """Boxes of all objects that are there, in their order."""
+    return [
+        ObjectBox(
+            object_id=subject.object_id,
+            category=subject.category,
+            instance_id=subject.instance_id,
+            size=(float(size[0]), float(size[1]), float(size[2])),
+            T_world_object=transform,
+            velocity=velocity,
+        )
+        for subject, size, transform, velocity in zip(
+            placed.objects, placed.sizes, placed.transforms, placed.velocities, strict=True
+        )
+    ]
+
+
+def projected_box(
+    T_world_object: Float, size: Sequence[float], camera: Camera, T_world_camera: Float
+) -> Box2D | None:
+    """Bounding box [px] of a projected 3D box, not cut at the border of the image; None where all
+    of it is behind the near plane."""
+    T_camera_object = invert_transform(T_world_camera) @ T_world_object
+    corners = box_corners(T_camera_object, size)
+    seen = [corner for corner in corners if corner[2] >= NEAR]
+    for i, j in EDGES:
+        a, b = corners[i], corners[j]
+        if (a[2] < NEAR) != (b[2] < NEAR):
+            seen.append(a + (b - a) * (NEAR - a[2]) / (b[2] - a[2]))
+    if not seen:
+        return None
+    points = np.array(seen) @ camera.K.T
+    pixels = points[:, :2] / points[:, 2:]
+    left, top = pixels.min(axis=0).tolist()
+    right, bottom = pixels.max(axis=0).tolist()
+    return (left, top, right, bottom)
+
+
+def cut_at_border(box: Box2D, width: int, height: int) -> Box2D | None:
+    """The part of a box that is in an image; None where there is none."""
+    left, top, right, bottom = box
+    cut = (max(left, 0.0), max(top, 0.0), min(right, float(width)), min(bottom, float(height)))
+    return cut if cut[0] < cut[2] and cut[1] < cut[3] else None
+
+
+def area(box: Box2D) -> float:
+    """[px^2]."""
+    return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def in_frame(box: ObjectBox, T_frame_world: Float) -> tuple[Float, Float]:
+    """``T_frame_object`` [4, 4] and the velocity [3] along the axes of another frame [m/s]."""
+    velocity = apply_transform(T_frame_world, np.stack([box.velocity, np.zeros(3)]))
+    return T_frame_world @ box.T_world_object, velocity[0] - velocity[1]

@@ -1,0 +1,27 @@
+"""How each label is made; every export carries these sentences in its manifest."""
+
+from __future__ import annotations
+
+HOW = {
+    "box_3d": "box: pose and size that the drive has for the object, exact",
+    "velocity": "box: derivative of the object's pose in the world [m/s]",
+    "box_2d_modal": "rendered: bounding box of the object's pixels in the instance image, without "
+    "blobs of fewer than 8 pixels",
+    "box_2d_amodal": "box: bounding box of the projected 3D box, cut at the near plane and at the "
+    "border of the image",
+    "visibility": "rendered: pixels of the object in the scene over those it fills when it is "
+    "drawn alone",
+    "truncation": "box: share of the projected 3D box's bounding box outside of the image",
+    "instance": "rendered: object of the Gaussian that takes half of the light of a pixel",
+    "semantic": "rendered: class of the object by its category; of the background the ground by "
+    "geometry, within 0.15 m of the scene's height field, the sky by opacity",
+    "depth": "rendered: depth along the camera's z axis of the Gaussian that takes half of the "
+    "light of a pixel [m]",
+    "flow": "rendered depth and poses: where the surface of a pixel is in the other image; "
+    "occluded where the other image shows something else there",
+    "points": "rendered: points of the cameras' depth images along the beams of a spinning "
+    "LiDAR, only where a camera looks",
+    "track": "box: poses of the object at the instants before and after",
+    "ego_future": "box: poses of the ego at the instants after, in the ego's frame",
+}
+"""What each label is made from: ``rendered``, ``box`` (poses and sizes of the drive)."""

@@ -1,0 +1,171 @@
+"""Each object in the image of a camera: its pixels, its boxes, how much of it is seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.transform import invert_transform
+from ...render import Backend, Instance, RasterOptions, rasterize
+from ...render.ground_class import back_projected
+from .boxes import Box2D, ObjectBox, area, cut_at_border, projected_box
+from .images import CameraImages
+from .surface import on_surface
+
+SMALLEST_BLOB = 8
+"""Connected pixels of an object that are fewer do not count [px]."""
+
+MARGIN = 0.1
+"""Gaussians of an object reach beyond its box: by this share of its projection, at least 8 px."""
+
+ALONE = RasterOptions(depth=False, instance=True, median_depth=True)
+
+
+@dataclass(frozen=True)
+class ObjectView:
+    """One object in one image.
+
+    Attributes:
+        object_id, instance_id: which.
+        amodal_box: of the projected 3D box, cut at near plane and border [px].
+        modal_box: of the object's pixels; None where none is seen [px].
+        visible_pixels: of the object in the scene.
+        alone_pixels: that it fills in this image when it is drawn alone.
+        truncation: share of the projected box outside of the image, 0 to 1.
+    """
+
+    object_id: str
+    instance_id: int
+    amodal_box: Box2D
+    modal_box: Box2D | None
+    visible_pixels: int
+    alone_pixels: int
+    truncation: float
+
+    @property
+    def visibility(self) -> float:
+        """Share of its pixels in this image that nothing hides, 0 to 1."""
+        return min(self.visible_pixels / self.alone_pixels, 1.0) if self.alone_pixels else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """The objects in one image, by rising id, and the image."""
+
+    images: CameraImages
+    objects: tuple[ObjectView, ...]
+
+
+def views_of(
+    images: CameraImages,
+    boxes: Sequence[ObjectBox],
+    instances: Sequence[Instance],
+    *,
+    backend: str | Backend = "auto",
+) -> CameraView:
+    """Every object whose box is in the image.
+
+    Args:
+        images: of the camera.
+        boxes: of all objects of the instant.
+        instances: what was drawn.
+        backend: draws objects alone.
+    """
+    camera = images.camera
+    found = []
+    for box in sorted(boxes, key=lambda b: b.instance_id):
+        whole = projected_box(box.T_world_object, box.size, camera, images.T_world_camera)
+        seen = None if whole is None else cut_at_border(whole, camera.width, camera.height)
+        if whole is None or seen is None:
+            continue
+        modal, visible = _modal(images.instance, box.instance_id, whole)
+        own = [i for i in instances if i.instance_id == box.instance_id]
+        alone = _alone_pixels(own, box, whole, images, backend)
+        found.append(
+            ObjectView(
+                object_id=box.object_id,
+                instance_id=box.instance_id,
+                amodal_box=seen,
+                modal_box=modal,
+                visible_pixels=visible,
+                alone_pixels=alone,
+                truncation=min(max(1 - area(seen) / area(whole), 0.0), 1.0),
+            )
+        )
+    return CameraView(images, tuple(found))
+
+
+def _window(whole: Box2D, width: int, height: int) -> tuple[int, int, int, int]:
+    """Whole pixels about a projected box in which all of an object shows."""
+    wide = max(8.0, MARGIN * (whole[2] - whole[0]))
+    high = max(8.0, MARGIN * (whole[3] - whole[1]))
+    # Boxes that reach behind the camera have corners at enormous places.
+    left = math.floor(max(whole[0] - wide, 0.0))
+    top = math.floor(max(whole[1] - high, 0.0))
+    right = math.ceil(min(whole[2] + wide, float(width)))
+    bottom = math.ceil(min(whole[3] + high, float(height)))
+    return left, top, right, bottom
+
+
+def _modal(
+    instance: NDArray[np.uint16], instance_id: int, whole: Box2D
+) -> tuple[Box2D | None, int]:
+    height, width = instance.shape
+    left, top, right, bottom = _window(whole, width, height)
+    mask = without_blobs(instance[top:bottom, left:right] == instance_id)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None, 0
+    box = (
+        float(left + columns[0]),
+        float(top + rows[0]),
+        float(left + columns[-1] + 1),
+        float(top + rows[-1] + 1),
+    )
+    return box, int(mask.sum())
+
+
+def without_blobs(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A mask [H, W] without connected parts of fewer than SMALLEST_BLOB pixels."""
+    if not mask.any():
+        return mask
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST_BLOB
+    large[0] = False
+    kept: NDArray[np.bool_] = large[labels]
+    return kept
+
+
+def _alone_pixels(
+    own: Sequence[Instance],
+    box: ObjectBox,
+    whole: Box2D,
+    images: CameraImages,
+    backend: str | Backend,
+) -> int:
+    """Pixels that an object fills in the image when nothing else is drawn."""
+    camera, pose = images.camera, images.T_world_camera
+    left, top, right, bottom = _window(whole, camera.width, camera.height)
+    if not own or left >= right or top >= bottom:
+        return 0
+    K = camera.K.copy()
+    K[:2, 2] -= left, top
+    output = rasterize(
+        own,
+        invert_transform(pose)[None],
+        K[None],
+        right - left,
+        bottom - top,
+        options=ALONE,
+        backend=backend,
+    )
+    assert output.median_depth is not None
+    depth = output.median_depth[0].cpu().numpy()
+    mask = depth > 0
+    mask[mask] = on_surface(back_projected(depth, K, pose)[mask], box.T_world_object, box.size)
+    return int(without_blobs(mask).sum())

@@ -1,0 +1,114 @@
+"""What is exported of a drive: cameras, instants, clips and splits."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from ..scene import Camera
+from .drive import Drive
+from .errors import DatasetError
+
+MAX_FRAMES = 100_000
+
+
+@dataclass(frozen=True)
+class ExportPlan:
+    """Options of an export.
+
+    Attributes:
+        formats: names of writers, see :func:`~.writers.writer_names`.
+        cameras: names; empty for all.
+        width: of images [px]; None for the cameras' own.
+        period_us: between frames [us].
+        start_us, end_us: first and last instant [us]; None for those of the drive.
+        clip_s: length of a clip [s]: a whole that is written, resumed and split as one.
+        splits: share of the clips by name.
+        seed: draws which clip is in which split.
+        flow: whether optical flow is made.
+    """
+
+    formats: tuple[str, ...]
+    cameras: tuple[str, ...] = ()
+    width: int | None = None
+    period_us: int = 100_000
+    start_us: int | None = None
+    end_us: int | None = None
+    clip_s: float = 20.0
+    splits: Mapping[str, float] = field(default_factory=lambda: {"train": 1.0})
+    seed: int = 0
+    flow: bool = True
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all options."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class PlannedClip:
+    """A stretch of the drive.
+
+    Attributes:
+        name: four digits.
+        split: that it belongs to.
+        times_us: of its frames [us].
+    """
+
+    name: str
+    split: str
+    times_us: tuple[int, ...]
+
+
+def planned_cameras(drive: Drive, plan: ExportPlan) -> list[Camera]:
+    """The cameras of a plan. Raises DatasetError for a name that the scene lacks."""
+    rig = drive.scene.rig
+    for name in plan.cameras:
+        if name not in rig.names:
+            raise DatasetError(f"camera {name!r}; the scene has {', '.join(rig.names) or 'none'}")
+    chosen = [rig[name] for name in plan.cameras] or list(rig)
+    if not chosen:
+        raise DatasetError("the scene has no camera to export")
+    return [c if plan.width is None else c.resized(plan.width) for c in chosen]
+
+
+def planned_clips(drive: Drive, plan: ExportPlan) -> list[PlannedClip]:
+    """All clips in their order.
+
+    Raises:
+        DatasetError: for instants outside of the drive, a period or a length that give no frame,
+            too many frames, or shares that are none.
+    """
+    first, last = drive.span
+    start = first if plan.start_us is None else plan.start_us
+    end = last if plan.end_us is None else plan.end_us
+    if not first <= start <= end <= last:
+        raise DatasetError(f"the export would show {start} to {end} us; there is {first} to {last}")
+    if plan.period_us < 1 or not plan.clip_s > 0:
+        raise DatasetError("the period and the length of a clip must be positive")
+    times = list(range(start, end + 1, plan.period_us))
+    if len(times) > MAX_FRAMES:
+        raise DatasetError(f"{len(times)} frames; {MAX_FRAMES} is the most in one export")
+    length = max(1, round(plan.clip_s * 1e6 / plan.period_us))
+    parts = [tuple(times[k : k + length]) for k in range(0, len(times), length)]
+    splits = _splits(len(parts), plan)
+    return [PlannedClip(f"{k:04d}", splits[k], part) for k, part in enumerate(parts)]
+
+
+def _splits(count: int, plan: ExportPlan) -> list[str]:
+    shares = np.array(list(plan.splits.values()), dtype=np.float64)
+    if not len(shares) or not np.isfinite(shares).all() or (shares < 0).any() or not shares.sum():
+        raise DatasetError(f"splits {dict(plan.splits)}; give a share above 0 for each name")
+    for name in plan.splits:
+        if not name.replace("_", "").isalnum():
+            raise DatasetError(f"split {name!r}; a name has letters, digits and _ only")
+    ends = np.rint(np.cumsum(shares) / shares.sum() * count).astype(int)
+    order = np.random.default_rng(plan.seed).permutation(count)
+    names = [""] * count
+    for place, clip in enumerate(order.tolist()):
+        names[clip] = list(plan.splits)[int(np.searchsorted(ends, place, side="right"))]
+    return names

@@ -1,0 +1,56 @@
+"""Writers of public formats, one module each."""
+
+from ..errors import DatasetError
+from .argoverse2 import Argoverse2Writer
+from .coco import CocoWriter
+from .kitti import KittiWriter
+from .labels import LabelsWriter
+from .nuscenes import NuScenesWriter
+from .pictures import PicturesWriter
+from .webdataset import WebDatasetWriter
+from .writer import DatasetWriter, LabelledDrive
+
+WRITERS: list[DatasetWriter] = [
+    LabelsWriter(),
+    KittiWriter(),
+    CocoWriter(),
+    NuScenesWriter(),
+    Argoverse2Writer(),
+    WebDatasetWriter(),
+    PicturesWriter(),
+]
+"""All registered writers."""
+
+
+def writer_names() -> list[str]:
+    """In the order of their registration."""
+    return [writer.name for writer in WRITERS]
+
+
+def writer_of(name: str) -> DatasetWriter:
+    """The writer of that name. Raises DatasetError with those there are."""
+    for writer in WRITERS:
+        if writer.name == name:
+            return writer
+    raise DatasetError(f"format {name!r}; allowed are {', '.join(writer_names())}")
+
+
+def register_writer(writer: DatasetWriter) -> None:
+    """Let exports know one more writer, from outside of this package.
+
+    Raises:
+        ValueError: a writer of that name is registered.
+    """
+    if writer.name in writer_names():
+        raise ValueError(f"a writer named {writer.name!r} is registered already")
+    WRITERS.append(writer)
+
+
+__all__ = [
+    "WRITERS",
+    "DatasetWriter",
+    "LabelledDrive",
+    "register_writer",
+    "writer_names",
+    "writer_of",
+]

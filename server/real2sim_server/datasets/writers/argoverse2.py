@@ -1,0 +1,157 @@
+"""Argoverse 2, sensor data set: a log for each clip.
+
+Source: the user guide and ``av2`` package of the data set (Wilson et al. 2021). The ego frame lies
+on the rear axle, 0.33 m above the ground; pixel centres lie on whole numbers; boxes are in the ego
+frame of their instant.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import feather
+
+from ...geometry.rotation import Float, matrix_to_quaternion
+from ...logs.readers.argoverse2 import AXLE_HEIGHT
+from ...render import encode_image
+from ...scene import Camera
+from ..clips import Clip
+from ..labels.points import MOUNT
+from .nuscenes import FRONT, channels_of
+from .writer import LabelledDrive
+
+CATEGORIES = {
+    "car": "REGULAR_VEHICLE",
+    "van": "REGULAR_VEHICLE",
+    "truck": "BOX_TRUCK",
+    "bus": "BUS",
+    "trailer": "VEHICULAR_TRAILER",
+    "pedestrian": "PEDESTRIAN",
+    "cyclist": "BICYCLIST",
+    "motorcyclist": "MOTORCYCLIST",
+    "bicycle": "BICYCLE",
+    "motorcycle": "MOTORCYCLE",
+    "sign": "SIGN",
+}
+"""Category by ours; others are written in capitals as they are."""
+
+QUATERNION, POSITION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+SIZE = ("length_m", "width_m", "height_m")
+QUALITY = 95
+
+
+class Argoverse2Writer:
+    """Writes ``<split>/<log>`` with poses, calibration, annotations, sweeps and images."""
+
+    name = "argoverse2"
+    holds = "logs with poses, calibration, annotations (points inside counted), lidar, images"
+
+    def write(self, drive: LabelledDrive, folder: Path) -> None:
+        """See :class:`DatasetWriter`. Raises OSError."""
+        names = ring_names(drive.cameras)
+        for clip in drive.clips:
+            log = folder / clip.split / str(uuid.UUID(drive.token("log", clip.name)))
+            _write_calibration(log / "calibration", drive.cameras, names)
+            _write_poses(log / "city_SE3_egovehicle.feather", clip)
+            _write_annotations(log / "annotations.feather", drive, clip)
+            for frame in clip.frames:
+                stamp = f"{frame['t_us'] * 1000}"
+                _write_sweep(log / "sensors" / "lidar" / f"{stamp}.feather", clip, frame["index"])
+                for camera in drive.cameras:
+                    path = log / "sensors" / "cameras" / names[camera.name] / f"{stamp}.jpg"
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    rgb = clip.pixels("rgb", camera.name, frame["index"])
+                    path.write_bytes(encode_image(rgb, "rgb", "jpeg", quality=QUALITY).data)
+
+
+def ring_names(cameras: Sequence[Camera]) -> dict[str, str]:
+    """``ring_front_center`` for the camera that looks ahead most, ``ring_<name>`` for others."""
+    return {
+        name: "ring_front_center" if channel == FRONT else f"ring_{name.removeprefix('ring_')}"
+        for name, channel in channels_of(cameras).items()
+    }
+
+
+def _write_calibration(folder: Path, cameras: Sequence[Camera], names: Mapping[str, str]) -> None:
+    mounts = {names[camera.name]: camera.T_vehicle_camera for camera in cameras}
+    roof = np.eye(4)
+    roof[:3, 3] = MOUNT
+    mounts["up_lidar"] = roof
+    poses = _shift(-AXLE_HEIGHT) @ np.array(list(mounts.values()))
+    columns = {"sensor_name": list(mounts), **_pose_columns(poses)}
+    _write(folder / "egovehicle_SE3_sensor.feather", columns)
+    intrinsics: dict[str, Any] = {
+        "sensor_name": [names[camera.name] for camera in cameras],
+        "fx_px": [float(camera.K[0, 0]) for camera in cameras],
+        "fy_px": [float(camera.K[1, 1]) for camera in cameras],
+        "cx_px": [float(camera.K[0, 2]) - 0.5 for camera in cameras],
+        "cy_px": [float(camera.K[1, 2]) - 0.5 for camera in cameras],
+        **{name: [0.0] * len(cameras) for name in ("k1", "k2", "k3")},
+        "height_px": [camera.height for camera in cameras],
+        "width_px": [camera.width for camera in cameras],
+    }
+    _write(folder / "intrinsics.feather", intrinsics)
+
+
+def _write_poses(path: Path, clip: Clip) -> None:
+    stamps = [frame["t_us"] * 1000 for frame in clip.frames]
+    poses = np.array([frame["T_world_ego"] for frame in clip.frames]) @ _shift(AXLE_HEIGHT)
+    _write(path, {"timestamp_ns": stamps, **_pose_columns(poses)})
+
+
+def _write_annotations(path: Path, drive: LabelledDrive, clip: Clip) -> None:
+    rows = [(frame["t_us"], subject) for frame in clip.frames for subject in frame["objects"]]
+    poses = np.array([subject["T_ego_object"] for _, subject in rows]).reshape(-1, 4, 4)
+    tracks = {
+        subject["object_id"]: str(uuid.UUID(drive.token("track", clip.name, subject["object_id"])))
+        for _, subject in rows
+    }
+    columns = {
+        "timestamp_ns": [t_us * 1000 for t_us, _ in rows],
+        "track_uuid": pa.array([tracks[s["object_id"]] for _, s in rows], pa.string()),
+        "category": pa.array([_category(s["category"]) for _, s in rows], pa.string()),
+        **{name: [float(s["size"][k]) for _, s in rows] for k, name in enumerate(SIZE)},
+        **_pose_columns(_shift(-AXLE_HEIGHT) @ poses),
+        "num_interior_pts": pa.array([s["points"] for _, s in rows], pa.int64()),
+    }
+    _write(path, columns)
+
+
+def _write_sweep(path: Path, clip: Clip, frame: int) -> None:
+    rows = clip.points(frame)
+    points = rows["xyz"].astype(np.float64)
+    points[:, 2] -= AXLE_HEIGHT
+    columns: dict[str, Any] = {
+        name: points[:, k].astype(np.float32) for k, name in enumerate("xyz")
+    }
+    columns["intensity"] = np.rint(rows["intensity"] * 255).astype(np.uint8)
+    columns["laser_number"] = rows["beam"].copy()
+    columns["offset_ns"] = np.zeros(len(rows), np.int32)
+    _write(path, columns)
+
+
+def _category(category: str) -> str:
+    return CATEGORIES.get(category, category.upper())
+
+
+def _pose_columns(poses: Float) -> dict[str, Any]:
+    quaternions = matrix_to_quaternion(poses[:, :3, :3])
+    columns = {name: quaternions[:, k].copy() for k, name in enumerate(QUATERNION)}
+    return columns | {name: poses[:, k, 3].copy() for k, name in enumerate(POSITION)}
+
+
+def _shift(z: float) -> Float:
+    """Of the ego frame along its z axis."""
+    matrix = np.eye(4)
+    matrix[2, 3] = z
+    return matrix
+
+
+def _write(path: Path, columns: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    feather.write_feather(pa.table(dict(columns)), path, compression="zstd")

@@ -1,0 +1,228 @@
+"""KITTI: the layouts of its object and its tracking benchmark.
+
+Source: Geiger et al., "Are we ready for Autonomous Driving? The KITTI Vision Benchmark Suite", CVPR
+2012, and the development kits of both benchmarks. A sequence has one camera, ``image_02``, since
+KITTI's cameras all look the same way: each camera of the rig makes sequences of its own. Boxes turn
+about the camera's vertical axis only, so those of a camera that is pitched, and on slopes, are as
+near as the format has them; pixel centres lie on whole numbers.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform
+from ...logs.readers.sweep_motion import compensate_sweep
+from ...scene import Camera
+from ...scene.camera import T_VEHICLE_OPTICAL
+from ..clips import Clip
+from .writer import LabelledDrive, objects_of, write_json
+
+CLASSES = {
+    "car": "Car",
+    "van": "Van",
+    "truck": "Truck",
+    "bus": "Truck",
+    "pedestrian": "Pedestrian",
+    "cyclist": "Cyclist",
+    "tram": "Tram",
+}
+"""Class by category; all others are ``Misc``."""
+
+OCCLUDED = (0.85, 0.45)
+"""Visibility from which an object is fully (0) and partly (1) visible; below it is 2."""
+
+VELODYNE = (0.9, 0.0, 1.73)
+"""Where the scanner stands in the vehicle's frame [m], as KITTI's stands over the road."""
+
+ROUNDS = 8
+"""In which a place is found that comes out right when the motion is taken out again."""
+
+
+class KittiWriter:
+    """Writes ``tracking/training`` and ``object/training``."""
+
+    name = "kitti"
+    holds = "tracking (image_02, label_02, calib, velodyne, poses, times) and object (label_2)"
+
+    def write(self, drive: LabelledDrive, folder: Path) -> None:
+        """See :class:`DatasetWriter`. Raises OSError."""
+        sequences: dict[str, dict[str, str]] = {}
+        numbers = itertools.count()
+        for clip in drive.clips:
+            for camera in drive.cameras:
+                name = f"{len(sequences):04d}"
+                sequences[name] = {"clip": clip.name, "camera": camera.name, "split": clip.split}
+                _write_sequence(folder / "tracking" / "training", name, clip, camera)
+                for frame in clip.frames:
+                    _write_object_frame(
+                        folder / "object" / "training", next(numbers), clip, camera, frame
+                    )
+        write_json(folder / "sequences.json", sequences)
+
+
+def _write_sequence(root: Path, name: str, clip: Clip, camera: Camera) -> None:
+    for part in ("image_02", "velodyne"):
+        (root / part / name).mkdir(parents=True)
+    tracks = _track_numbers(clip)
+    seen, all_around = [], []
+    for k, frame in enumerate(clip.frames):
+        shutil.copyfile(clip.file("rgb", camera.name, k), root / "image_02" / name / f"{k:06d}.png")
+        _write_scan(root / "velodyne" / name / f"{k:06d}.bin", clip, camera, k)
+        for row in _seen_rows(frame, camera):
+            seen.append(f"{k} {tracks[row['object_id']]} {_columns(row)}")
+        for row in _all_rows(frame, camera):
+            all_around.append(f"{k} {tracks[row['object_id']]} {_columns(row)}")
+    _write_lines(root / "label_02" / f"{name}.txt", seen)
+    _write_lines(root / "boxes_surround" / f"{name}.txt", all_around)
+    _write_lines(root / "calib" / f"{name}.txt", _calibration(camera, "R_rect", "Tr_velo_cam"))
+    first = np.array(clip.frames[0]["T_world_ego"]) @ camera.T_vehicle_camera
+    poses = [
+        invert_transform(first) @ np.array(f["T_world_ego"]) @ camera.T_vehicle_camera
+        for f in clip.frames
+    ]
+    _write_lines(root / "poses" / f"{name}.txt", [_numbers(p[:3].ravel()) for p in poses])
+    start = clip.frames[0]["t_us"]
+    times = [f"{(f['t_us'] - start) * 1e-6:.6f}" for f in clip.frames]
+    _write_lines(root / "times" / f"{name}.txt", times)
+
+
+def _write_object_frame(
+    root: Path, number: int, clip: Clip, camera: Camera, frame: Mapping[str, Any]
+) -> None:
+    name, index = f"{number:06d}", frame["index"]
+    for part in ("image_2", "velodyne"):
+        (root / part).mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(clip.file("rgb", camera.name, index), root / "image_2" / f"{name}.png")
+    _write_scan(root / "velodyne" / f"{name}.bin", clip, camera, index)
+    labels = [_columns(row) for row in _seen_rows(frame, camera)]
+    _write_lines(root / "label_2" / f"{name}.txt", labels)
+    _write_lines(root / "calib" / f"{name}.txt", _calibration(camera, "R0_rect", "Tr_velo_to_cam"))
+
+
+def _track_numbers(clip: Clip) -> dict[str, int]:
+    """A number for each object, in order of its first appearance."""
+    numbers: dict[str, int] = {}
+    for frame in clip.frames:
+        for subject in frame["objects"]:
+            numbers.setdefault(subject["object_id"], len(numbers))
+    return numbers
+
+
+def _seen_rows(frame: Mapping[str, Any], camera: Camera) -> list[dict[str, Any]]:
+    """Objects of which the camera sees a pixel."""
+    objects = objects_of(frame)
+    return [
+        {**objects[view["object_id"]], **view}
+        for view in frame["views"][camera.name]
+        if view["box_2d_modal"] is not None
+    ]
+
+
+def _all_rows(frame: Mapping[str, Any], camera: Camera) -> list[dict[str, Any]]:
+    """All objects, those that the camera does not see too."""
+    seen = {view["object_id"]: view for view in frame["views"][camera.name]}
+    unseen = {"box_2d_modal": None, "visibility": 0.0, "truncation": 1.0}
+    to_camera = invert_transform(camera.T_vehicle_camera)
+    return [
+        {
+            **subject,
+            "T_camera_object": (to_camera @ np.array(subject["T_ego_object"])).tolist(),
+            **seen.get(subject["object_id"], unseen),
+        }
+        for subject in frame["objects"]
+    ]
+
+
+def _columns(row: Mapping[str, Any]) -> str:
+    """Type, truncated, occluded, alpha, 2D box, h w l, x y z, ry."""
+    pose: Float = np.array(row["T_camera_object"])
+    length, width, height = row["size"]
+    x, y, z = pose[:3, 3].tolist()
+    heading = math.atan2(-pose[2, 0], pose[0, 0])
+    alpha = _wrapped(heading - math.atan2(x, z))
+    box = row["box_2d_modal"]
+    pixels = [-1.0] * 4 if box is None else [max(edge - 0.5, 0.0) for edge in box]
+    occluded = sum(row["visibility"] < least for least in OCCLUDED)
+    values = [alpha, *pixels, height, width, length, x, y + height / 2, z, heading]
+    kind = CLASSES.get(row["category"], "Misc")
+    return f"{kind} {row['truncation']:.6f} {occluded} {_numbers(values)}"
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[str]:
+    """The camera stands where KITTI's colour camera does, and is its own reference."""
+    K = camera.K.copy()
+    K[:2, 2] -= 0.5
+    projection = np.concatenate([K, np.zeros((3, 1))], axis=1)
+    T_camera_velo = _T_camera_velo(camera)
+    imu = invert_transform(_shift(VELODYNE))
+    return [
+        *(f"P{k}: {_numbers(projection.ravel())}" for k in range(4)),
+        f"{rectification}: {_numbers(np.eye(3).ravel())}",
+        f"{velo_to_cam}: {_numbers(T_camera_velo[:3].ravel())}",
+        f"Tr_imu_to_velo: {_numbers(imu[:3].ravel())}",
+    ]
+
+
+def _T_camera_velo(camera: Camera) -> Float:
+    """The scanner looks where the camera does, as KITTI's layout has it: a vehicle frame whose x
+    axis is the camera's."""
+    T_vehicle_velo = np.eye(4)
+    T_vehicle_velo[:3, :3] = camera.T_vehicle_camera[:3, :3] @ T_VEHICLE_OPTICAL[:3, :3].T
+    T_vehicle_velo[:3, 3] = T_vehicle_velo[:3, :3] @ np.array([VELODYNE[0], VELODYNE[1], 0.0])
+    T_vehicle_velo[2, 3] = VELODYNE[2]
+    return invert_transform(camera.T_vehicle_camera) @ T_vehicle_velo
+
+
+def _shift(position: Sequence[float]) -> Float:
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def _write_scan(path: Path, clip: Clip, camera: Camera, frame: int) -> None:
+    """x, y, z and reflectance of each point, float32, as a scanner that moves measures them."""
+    rows = clip.points(frame)
+    T_vehicle_velo = _shift(VELODYNE)
+    T_ego_vehicle = (
+        camera.T_vehicle_camera @ _T_camera_velo(camera) @ invert_transform(T_vehicle_velo)
+    )
+    poses = np.array([f["T_world_ego"] for f in clip.frames]) @ T_ego_vehicle
+    points = apply_transform(invert_transform(T_ego_vehicle), rows["xyz"].astype(np.float64))
+    to_velo = invert_transform(T_vehicle_velo)
+    scan = np.empty((len(rows), 4), "<f4")
+    scan[:, :3] = apply_transform(to_velo, _as_measured(points, poses, frame, to_velo))
+    scan[:, 3] = rows["intensity"]
+    path.write_bytes(scan.tobytes())
+
+
+def _as_measured(points: Float, poses: Float, frame: int, to_velo: Float) -> Float:
+    """Points [N, 3] as of one instant in the vehicle's frame at their own instants: the scanner
+    turns clockwise once a frame, and looks ahead at the frame's time."""
+    measured = points
+    for _ in range(ROUNDS):
+        local = apply_transform(to_velo, measured)
+        offset = -np.arctan2(local[:, 1], local[:, 0]) / (2 * np.pi)
+        measured = measured + (points - compensate_sweep(measured, offset, poses, frame))
+    return measured
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{value + 0.0:.9g}" for value in np.asarray(values).tolist())
+
+
+def _write_lines(path: Path, lines: Sequence[str]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

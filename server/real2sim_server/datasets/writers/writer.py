@@ -1,0 +1,74 @@
+"""What a writer of a format is, and what it is given."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from ...scene import Camera, Ground
+from ..clips import Clip
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledDrive:
+    """Everything that writers read.
+
+    Attributes:
+        name: of the data set.
+        digest: SHA-256 of what it was made of; tokens are derived from it.
+        cameras: in their order, of the size that the images have.
+        ego_size: (length, width, height) of the ego [m].
+        period_us: between frames [us].
+        clips: in their order.
+        ground: of the scene.
+        licence: terms under which it may be used.
+    """
+
+    name: str
+    digest: str
+    cameras: tuple[Camera, ...]
+    ego_size: tuple[float, float, float]
+    period_us: int
+    clips: Sequence[Clip]
+    ground: Ground
+    licence: str
+
+    def token(self, *parts: object) -> str:
+        """32 hexadecimal digits, the same for the same parts of the same export."""
+        text = "/".join((self.digest, *map(str, parts)))
+        return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+class DatasetWriter(Protocol):
+    """Writes one format."""
+
+    name: str
+    """As it is asked for."""
+
+    holds: str
+    """What is written, in one line."""
+
+    def write(self, drive: LabelledDrive, folder: Path) -> None:
+        """Fill the empty ``folder``: the same bytes for the same drive, whatever the machine, the
+        day or the folder."""
+        ...
+
+
+def write_json(path: Path, content: Any) -> None:
+    """The same bytes for the same content."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def categories_of(drive: LabelledDrive) -> list[str]:
+    """All categories of objects, sorted."""
+    return sorted({o["category"] for c in drive.clips for f in c.frames for o in f["objects"]})
+
+
+def objects_of(frame: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Objects of a frame by id."""
+    return {o["object_id"]: o for o in frame["objects"]}

@@ -1,0 +1,115 @@
+"""Labels by known answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from real2sim_server.datasets.clips import flow_png, read_flow
+from real2sim_server.datasets.labels import (
+    CameraImages,
+    ObjectBox,
+    boxes_at,
+    draw_moment,
+    ego_future,
+    flow_between,
+    futures_at,
+    projected_box,
+    views_of,
+)
+from real2sim_server.scene import Camera, Trajectory
+
+CAMERA = Camera("c", 96, 64, np.array([[60.0, 0, 48], [0, 60, 32], [0, 0, 1]]), np.eye(4))
+
+
+def pose(x: float, y: float, z: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def plane(depth: float, camera_x: float = 0.0, instance: int = 0) -> CameraImages:
+    """A wall across the whole image."""
+    shape = (CAMERA.height, CAMERA.width)
+    return CameraImages(
+        CAMERA,
+        pose(camera_x, 0, 0),
+        np.zeros((*shape, 3), np.uint8),
+        np.full(shape, depth, np.float32),
+        np.full(shape, instance, np.uint16),
+        np.zeros(shape, np.uint8),
+    )
+
+
+def box(x: float) -> ObjectBox:
+    return ObjectBox("car_0", "car", 1, (4, 2, 2), pose(x, 0, 10), np.zeros(3))
+
+
+def test_box_of_a_cube_is_that_of_its_near_face():
+    left, top, right, bottom = projected_box(pose(0, 0, 10), (2, 2, 2), CAMERA, np.eye(4))
+    assert (left, right) == pytest.approx((48 - 60 / 9, 48 + 60 / 9))
+    assert (top, bottom) == pytest.approx((32 - 60 / 9, 32 + 60 / 9))
+
+
+def test_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
+    left, _, right, _ = projected_box(pose(0, 0, 0), (2, 2, 10), CAMERA, np.eye(4))
+    assert (left, right) == pytest.approx((48 - 600, 48 + 600))
+    assert projected_box(pose(0, 0, -10), (2, 2, 2), CAMERA, np.eye(4)) is None
+
+
+def test_flow_of_a_wall_follows_the_camera():
+    flow, valid, occluded = flow_between(plane(10.0), plane(10.0, camera_x=1.0), [], [])
+    np.testing.assert_allclose(flow[..., 0], -6.0, atol=1e-5)
+    np.testing.assert_allclose(flow[..., 1], 0.0, atol=1e-5)
+    assert valid.all()
+    assert occluded[:, :5].all()
+    assert not occluded[:, 6:].any()
+
+
+def test_flow_of_an_object_follows_its_pose():
+    here, there = plane(10.0, instance=1), plane(10.0, instance=1)
+    flow, valid, _ = flow_between(here, there, [box(0.0)], [box(0.5)])
+    np.testing.assert_allclose(flow[..., 0], 3.0, atol=1e-5)
+    gone = flow_between(here, there, [box(0.0)], [])[1]
+    assert valid.all()
+    assert not gone.any()
+
+
+def test_what_comes_in_front_is_occluded():
+    _, valid, occluded = flow_between(plane(10.0), plane(5.0), [], [])
+    assert valid.all()
+    assert occluded.all()
+
+
+def test_flow_is_stored_to_a_128th_of_a_pixel():
+    flow = np.array([[[1.25, -3.5], [0.0, 0.01]]], np.float32)
+    import cv2
+
+    data = np.frombuffer(flow_png(flow, np.array([[True, False]])), np.uint8)
+    stored, valid = read_flow(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))
+    np.testing.assert_allclose(stored[0, 0], [1.25, -3.5])
+    assert valid.tolist() == [[True, False]]
+
+
+def test_what_stands_behind_another_is_less_visible(tiny_scene, tiny_drive):
+    hidden = tiny_scene.objects["car_red"]
+    front = tiny_scene.objects["car_blue"].trajectory.transform(0)[:3, 3]
+    behind = Trajectory(np.array([0]), front[None] + [[6.0, 1.6, 0]], np.array([[1.0, 0, 0, 0]]))
+    state = tiny_drive.state.with_object(
+        replace(tiny_drive.state.objects["car_red"], trajectory=behind)
+    )
+    moment = replace(tiny_drive, state=state).at(0)
+    (images,) = draw_moment(tiny_scene, moment, [tiny_scene.rig["front"]])
+    view = views_of(images, boxes_at(moment.placed), moment.instances)
+    visibility = {v.object_id: v.visibility for v in view.objects}
+    assert visibility["car_blue"] > 0.95
+    assert 0.0 < visibility[hidden.object_id] < 0.7
+
+
+def test_futures_go_on_as_far_as_the_drive(tiny_drive):
+    rows = futures_at(tiny_drive, 1_000_000, ["car_blue"])["car_blue"]
+    assert [row[0] for row in rows] == [0.5, 1.0]
+    assert rows[1][1] == pytest.approx(28.0)
+    assert [row[1] for row in ego_future(tiny_drive, 1_000_000)] == pytest.approx([2.5, 5.0])

@@ -1,0 +1,40 @@
+"""Labels of the demo's street against rays through it; docs/datasets.md has the figures."""
+
+from __future__ import annotations
+
+import pytest
+
+from real2sim_server.demo.street import SHIPPED
+from real2sim_server.scene import Scene
+from real2sim_server.scene.io import read_packed
+
+from .ray_cast_truth import measure
+
+
+@pytest.fixture(scope="module")
+def street() -> Scene:
+    return read_packed(SHIPPED)
+
+
+def test_labels_of_a_frame_agree_with_rays(street):
+    found = measure(street, [10], ["front"], width=240).summary()
+    assert found["objects"] >= 3
+    assert found["mask_iou"] > 0.85
+    assert found["box_iou"] > 0.8
+    assert found["visibility_error"] < 0.05
+    assert found["depth_median"] < 0.2
+    assert found["flow_median"] < 0.3
+
+
+@pytest.mark.slow
+def test_labels_of_the_whole_drive_agree_with_rays(street):
+    found = measure(street, range(1, 54, 4), street.rig.names).summary()
+    print(found)
+    assert found["mask_iou"] > 0.90
+    assert found["mask_iou_by_pixels"] > 0.93
+    assert found["box_iou"] > 0.88
+    assert found["box_iou_p10"] > 0.78
+    assert found["visibility_error"] < 0.05
+    assert found["depth_median"] < 0.10
+    assert found["flow_median"] < 0.3
+    assert found["flow_outliers"] < 0.07

@@ -1,0 +1,199 @@
+"""What every writer promises, and each format by a reader that shares nothing with its writer."""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from real2sim_server.datasets.writers import WRITERS
+from real2sim_server.logs import open_log
+
+FRAMES, CAMERAS = 5, 2
+
+
+def labels(exported: Path, clip: str = "0000") -> dict:
+    return json.loads((exported / "labels" / clip / "labels.json").read_text())
+
+
+def tables(exported: Path) -> dict[str, list[dict]]:
+    folder = exported / "nuscenes" / "v1.0-real2sim"
+    return {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
+
+
+@pytest.mark.parametrize("writer", WRITERS, ids=lambda w: w.name)
+def test_a_writer_fills_its_folder_and_says_what_with(exported, writer):
+    files = [path for path in (exported / writer.name).rglob("*") if path.is_file()]
+    assert files
+    assert all(path.stat().st_size for path in files if path.suffix != ".txt")
+    assert writer.holds
+    assert not any(str(exported.parent).encode() in p.read_bytes() for p in files)
+
+
+def open_first_clip(exported: Path, folder: str, sequence: str | None):
+    if folder == "argoverse2":
+        sweep = next(exported.glob("argoverse2/*/*/sensors/lidar/0.feather"))
+        return open_log(sweep.parents[2])
+    return open_log(exported / folder, sequence=sequence)
+
+
+def boxes_of_log(log, t_us: int):
+    return {
+        track.object_id: (track.trajectory.transform(t_us), track.size)
+        for track in log.tracks
+        if track.trajectory.covers(t_us)
+    }
+
+
+@pytest.mark.parametrize(
+    ("folder", "sequence"),
+    [("kitti/tracking", "0000"), ("nuscenes", "scene-0000"), ("argoverse2", None)],
+)
+def test_our_own_reader_finds_every_box_where_it_is(exported, folder, sequence):
+    log = open_first_clip(exported, folder, sequence)
+    frame = labels(exported)["frames"][0]
+    first = np.array(frame["T_world_ego"])
+    found = boxes_of_log(log, int(log.frame_times_us[0]))
+    assert len(found) == len(frame["objects"]) == 3
+    for given in frame["objects"]:
+        errors = [
+            np.abs(first @ pose - given["T_world_object"]).max()
+            + np.abs(np.array(size) - given["size"]).max()
+            for pose, size in found.values()
+        ]
+        assert min(errors) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("folder", "sequence"),
+    [("kitti/tracking", "0000"), ("nuscenes", "scene-0000"), ("argoverse2", None)],
+)
+def test_our_own_reader_finds_camera_images_and_points(exported, tiny_scene, folder, sequence):
+    log = open_first_clip(exported, folder, sequence)
+    given = tiny_scene.rig["front"]
+    camera = next(c for c in log.rig if c.name in {"image_02", "cam_front", "ring_front_center"})
+    np.testing.assert_allclose(camera.K, given.K, atol=1e-6)
+    np.testing.assert_allclose(camera.T_vehicle_camera, given.T_vehicle_camera, atol=1e-6)
+    written = cv2.imread(str(exported / "labels/0000/rgb/front/000001.png"))[..., ::-1]
+    difference = np.abs(log.image(camera.name, 1).astype(int) - written)
+    assert difference.mean() < 3
+    points = np.load(exported / "labels/0000/points/000000.npy")
+    np.testing.assert_allclose(log.lidar(0).points, points["xyz"], atol=1e-4)
+
+
+def test_kitti_object_rows_have_fifteen_columns_of_what_is_seen(exported):
+    rows = (exported / "kitti/object/training/label_2/000000.txt").read_text().splitlines()
+    seen = [v for v in labels(exported)["frames"][0]["views"]["front"] if v["box_2d_modal"]]
+    assert len(rows) == len(seen) > 0
+    for row, view in zip(rows, seen, strict=True):
+        words = row.split()
+        assert len(words) == 15
+        box = np.maximum(np.array(view["box_2d_modal"]) - 0.5, 0)
+        np.testing.assert_allclose([float(word) for word in words[4:8]], box)
+
+
+def test_nuscenes_has_no_token_that_leads_nowhere(exported):
+    found = tables(exported)
+    assert len(found) == 13
+    tokens = {name: {row["token"] for row in rows} for name, rows in found.items()}
+    assert all(len(tokens[name]) == len(rows) for name, rows in found.items())
+    everywhere = set().union(*tokens.values())
+    for rows in found.values():
+        for row in rows:
+            for key, value in row.items():
+                given = value if isinstance(value, list) else [value]
+                if key in {"prev", "next"} or key.endswith(("_token", "_tokens")):
+                    assert {v for v in given if v} <= everywhere, (key, row)
+
+
+def test_nuscenes_lists_are_linked_and_files_there(exported):
+    found = tables(exported)
+    rows = {row["token"]: row for row in found["sample_data"]}
+    assert len(rows) == FRAMES * (CAMERAS + 1)
+    for row in rows.values():
+        assert (exported / "nuscenes" / row["filename"]).is_file()
+        assert row["filename"].startswith("samples" if row["is_key_frame"] else "sweeps")
+        if row["next"]:
+            assert rows[row["next"]]["prev"] == row["token"]
+            assert rows[row["next"]]["timestamp"] > row["timestamp"]
+    counts = [row["num_lidar_pts"] for row in found["sample_annotation"]]
+    assert sum(counts) > 0
+
+
+def decoded(counts: str, size: list[int]) -> np.ndarray:
+    """A run-length mask as COCO's own decoder reads it."""
+    lengths, place = [], 0
+    while place < len(counts):
+        value, shift, more = 0, 0, True
+        while more:
+            group = ord(counts[place]) - 48
+            value |= (group & 31) << shift
+            more, shift, place = bool(group & 32), shift + 5, place + 1
+            if not more and group & 16:
+                value |= -1 << shift
+        lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))
+    flat = np.repeat(np.arange(len(lengths)) % 2, lengths).astype(bool)
+    return flat.reshape(size, order="F")
+
+
+def test_coco_masks_are_the_pixels_of_their_objects(exported):
+    content = json.loads((exported / "coco/annotations/instances_train.json").read_text())
+    images = {image["id"]: image for image in content["images"]}
+    assert content["annotations"]
+    for row in content["annotations"]:
+        mask = decoded(row["segmentation"]["counts"], row["segmentation"]["size"])
+        image = images[row["image_id"]]
+        name = f"{image['frame_index']:06d}.png"
+        path = exported / "labels" / image["clip"] / "instance" / image["camera"] / name
+        instance = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert mask.sum() == row["area"]
+        assert (instance[mask] == row["track_id"]).all()
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        x, y, width, height = row["bbox"]
+        assert (x, y) == (columns[0], rows[0])
+        assert (x + width, y + height) == (columns[-1] + 1, rows[-1] + 1)
+
+
+def test_pycocotools_scores_labels_fed_as_detections_with_100(exported):
+    coco = pytest.importorskip("pycocotools.coco", exc_type=ImportError)
+    evaluation = pytest.importorskip("pycocotools.cocoeval", exc_type=ImportError)
+    truth = coco.COCO(str(exported / "coco/annotations/instances_train.json"))
+    rows = truth.dataset["annotations"]
+    fields = ("image_id", "category_id", "bbox", "segmentation")
+    found = truth.loadRes([{**{k: row[k] for k in fields}, "score": 1.0} for row in rows])
+    for kind in ("bbox", "segm"):
+        run = evaluation.COCOeval(truth, found, kind)
+        run.evaluate()
+        run.accumulate()
+        run.summarize()
+        assert run.stats[0] == 1.0
+
+
+def test_coco_panoptic_png_holds_its_segments(exported):
+    content = json.loads((exported / "coco/annotations/panoptic_train.json").read_text())
+    row = content["annotations"][0]
+    path = exported / "coco/annotations/panoptic_train" / row["file_name"]
+    coded = cv2.imread(str(path))[..., ::-1].astype(int)
+    ids = coded[..., 0] + 256 * coded[..., 1] + 65536 * coded[..., 2]
+    areas = {segment["id"]: segment["area"] for segment in row["segments_info"]}
+    assert {int(i): int((ids == i).sum()) for i in np.unique(ids) if i} == areas
+    known = {category["id"] for category in content["categories"]}
+    assert {segment["category_id"] for segment in row["segments_info"]} <= known
+
+
+def test_webdataset_keeps_the_files_of_a_sample_together(exported):
+    shards = sorted((exported / "webdataset").glob("*.tar"))
+    assert [path.name for path in shards] == ["train-000000.tar", "val-000000.tar"]
+    keys = []
+    for path in shards:
+        with tarfile.open(path) as shard:
+            members = shard.getmembers()
+            assert {(m.mtime, m.uid, m.uname) for m in members} == {(0, 0, "")}
+            keys += [member.name.split(".", maxsplit=1)[0] for member in members]
+    changes = sum(one != two for one, two in pairwise(keys))
+    assert changes + 1 == len(set(keys)) == FRAMES * CAMERAS
