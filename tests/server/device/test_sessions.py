@@ -22,11 +22,9 @@ from real2sim_server.service.accounts import PAYER, Account, Payer
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.rendering.renderer import Renderer
-from real2sim_server.service.sessions.pipeline import (
-    EncodedObservation,
-    StepPipeline,
-    Transition,
-)
+from real2sim_server.service.sessions.observation import EncodedObservation
+from real2sim_server.service.sessions.pipeline import StepPipeline
+from real2sim_server.service.sessions.transition import Transition
 from real2sim_server.world import World
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER

@@ -27,7 +27,7 @@ from real2sim_server.service.accounts import (
     RevokedError,
 )
 from real2sim_server.service.engine import Engine
-from real2sim_server.service.sessions.pipeline import Transition
+from real2sim_server.service.sessions.transition import Transition
 from real2sim_server.service.token_file import (
     TokenFileError,
     TokenLimits,
@@ -491,7 +491,7 @@ def test_steps_that_are_made_together_count_for_whoever_asked_for_each(client):
     world = session.running_world()
     accounts = [Account("alice"), None, Account("bob")]
     steps = [Transition(world.fork, {}, account=account) for account in accounts]
-    results = sessions.pipeline._compute_together(steps)
+    results = sessions.pipeline._blind.compute(steps)
     assert not [result for result in results if isinstance(result, Exception)]
     assert accounts[0].world_seconds > 0
     assert accounts[2].world_seconds > 0

@@ -46,8 +46,8 @@ from .handshake import (
     error_message,
     receive_as,
 )
+from .image_limits import MAX_IMAGE_BYTES, raw_image_bytes
 from .messages import BadMessageError, bad_message, read_as
-from .pipeline import MAX_IMAGE_BYTES, raw_image_bytes
 from .registry import Sessions
 from .session import Session, controller_taken
 from .step import DueAction

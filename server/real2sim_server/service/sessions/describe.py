@@ -18,7 +18,7 @@ from ...edit import EditOutcome
 from ...world import Event, LoggedPath, Score, World, agent_fields, ego_fields, metrics_version
 from ...world.ego.route import whole_route
 from ..library.views import camera_infos, edited_objects
-from .pipeline import MAX_IMAGE_BYTES
+from .image_limits import MAX_IMAGE_BYTES
 from .session import Session
 
 

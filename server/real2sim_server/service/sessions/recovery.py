@@ -15,8 +15,9 @@ from ..http.problems import ServiceError
 from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store
 from .log import entries_of
-from .pipeline import StepPipeline, Transition
+from .pipeline import StepPipeline
 from .session import Session
+from .transition import Transition
 
 
 async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> None:

@@ -34,9 +34,11 @@ from ..storage.errors import StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
 from .log_write import LogWrite
-from .pipeline import EncodedObservation, Seen, StepPipeline, Transition, message_of
+from .observation import EncodedObservation, Seen, message_of
+from .pipeline import StepPipeline
 from .segment import FrameSlot
 from .session import Session
+from .transition import Transition
 from .wire import DeferredMessage, EncodedMessage
 
 LogRecord = tuple[str, int, bytes]
@@ -154,7 +156,7 @@ class Stepper:
             payload: canonical bytes of the plan.
             latency_us: wall-clock time from the observation to this action.
             write: may hand the observation to the socket before this returns; see
-                :class:`~.pipeline.Transition`.
+                :class:`~.transition.Transition`.
             slot: that raw images of the observation may be written to.
 
         Raises:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 from real2sim_server.service.sessions.log_write import LogWrite
-from real2sim_server.service.sessions.pipeline import StepPipeline, Transition
+from real2sim_server.service.sessions.transition import Transition, record_together
 from real2sim_server.service.storage.store import SessionEntry, Store
 
 
@@ -36,7 +36,7 @@ def recorded(shelf: Shelf, names: Sequence[str], *, unsure: Sequence[str] = ()) 
         )
         for name in names
     }
-    failed = StepPipeline._record(cast(Any, None), list(transitions.values()))
+    failed = record_together(list(transitions.values()))
     for name, transition in transitions.items():
         assert transition.recorded == (transition not in failed), name
     return {name: failed[t] for name, t in transitions.items() if t in failed}

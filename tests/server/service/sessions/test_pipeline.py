@@ -9,6 +9,7 @@ import pytest
 
 from real2sim_server.service.sessions import pipeline
 from real2sim_server.service.sessions.connection import Connection
+from real2sim_server.service.sessions.phases import StepPhases
 from real2sim_server.service.sessions.pipeline import StepPipeline
 
 pytestmark = pytest.mark.network
@@ -34,8 +35,9 @@ def passed(monkeypatch) -> list[tuple[str, str]]:
 
     for phase in ("receive", "check"):
         note(Connection, f"_{phase}", phase)
-    for phase in ("advance", "render", "evaluate", "encode", "send"):
-        note(StepPipeline, phase, phase)
+    for phase in ("advance", "render", "evaluate", "encode"):
+        note(StepPhases, phase, phase)
+    note(StepPipeline, "send", "send")
     return phases
 
 

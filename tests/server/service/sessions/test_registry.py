@@ -159,7 +159,10 @@ def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeyp
     assert (obs["step"], obs["type"]) == (1, "obs")
 
 
-@pytest.mark.parametrize(("codec", "encoding"), [("raw", "with_pixels"), ("jpeg", "encode_frame")])
+@pytest.mark.parametrize(
+    ("codec", "encoding"),
+    [("raw", "sessions.phases.with_pixels"), ("jpeg", "rendering.renderer.encode_frame")],
+)
 def test_a_step_that_cannot_be_shown_is_taken_off_the_record(
     site, join, monkeypatch, codec, encoding
 ):
@@ -167,11 +170,11 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(
     planner = join(info)
     planner.reset(sensors=[CAMERA | {"codec": codec}])
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise RenderError("no memory for this picture")
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"real2sim_server.service.sessions.pipeline.{encoding}", fail)
+        patch.setattr(f"real2sim_server.service.{encoding}", fail)
         assert planner.act(0)["type"] == "error"
     assert [e.kind for e in entries(site, info)] == ["reset"]
     assert planner.act(0, acceleration=0.2)["step"] == 1

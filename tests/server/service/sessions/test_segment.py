@@ -19,7 +19,7 @@ from real2sim_proto.shared_memory import FOLDER, HEADER_BYTES, MAGIC, SECRET_BYT
 from real2sim_server.service.library.memory import MemoryBudget
 from real2sim_server.service.rendering.frames import EncodedFrame, RenderedImage, encode_frame
 from real2sim_server.service.sessions import segment as module
-from real2sim_server.service.sessions.pipeline import MAX_IMAGE_BYTES
+from real2sim_server.service.sessions.image_limits import MAX_IMAGE_BYTES
 from real2sim_server.service.sessions.segment import SLOTS, Segment, Segments, sweep_segments
 from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 from real2sim_server.settings import Settings
