@@ -261,6 +261,11 @@ class Frame(ServerModel):
     codec: Codec
     dtype: Literal["uint8", "uint16", "float32"]
     shape: list[int] = Field(description="[H, W, 3] or [H, W]")
+    lens: str | None = Field(default=None, description="its model; None: a pinhole")
+    shutter: str | None = Field(default=None, description="its direction; None: global")
+    effects: list[str] | None = Field(
+        default=None, description="of the sensor's, those that are on; None: none"
+    )
     offset: int | None = Field(
         default=None,
         ge=0,

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from .base import Codec, Identifier, Microseconds, Modality, Model
+from .cameras import CameraEffects, Optics
 
 MAX_SENSORS = 16
 MAX_DRIVERS = 64
@@ -33,6 +34,16 @@ class SensorSpec(Model):
         default="auto",
         description="'auto': images of at most 16,384 pixels are drawn from merged Gaussians, "
         "antialiased, in a fraction of the time; 'full': from all of them, as larger ones always",
+    )
+
+    optics: Optics = Field(
+        default="pinhole",
+        description="'pinhole': free of distortion, as scenes are trained; 'recorded': through the "
+        "lens and shutter that the log's camera really had, where its scene knows them; or a lens "
+        "and shutter given here",
+    )
+    effects: CameraEffects | None = Field(
+        default=None, description="what a real camera does to its colour images; default: nothing"
     )
 
     @model_validator(mode="after")

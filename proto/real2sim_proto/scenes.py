@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from .base import Track
+from .cameras import OpticsSpec
 from .operations import SetPhysics, SetVelocity
 
 
@@ -34,6 +35,11 @@ class CameraInfo(Reply):
     height: int
     K: list[list[float]] = Field(description="3x3 intrinsics [px]")
     T_vehicle_camera: list[list[float]] = Field(description="4x4")
+    recorded: OpticsSpec | None = Field(
+        default=None,
+        description="lens and shutter that the log's camera really had, for `optics` of sensors; "
+        "null: not known",
+    )
 
 
 class ObjectInfo(Reply):

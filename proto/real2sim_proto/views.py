@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from .base import Codec, Identifier, Microseconds, Modality, Model, Pose
+from .cameras import CameraEffects, LensSpec, PinholeLens
 from .episode import MAX_SENSORS
 
 MAX_POSED = 4096
@@ -29,7 +30,7 @@ def _intrinsics(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
 
 
 class FreeCamera(Model):
-    """A pinhole camera somewhere in the world."""
+    """A camera somewhere in the world."""
 
     name: Identifier = Field(description="of its frames")
     width: int = Field(ge=16, le=8192, description="[px]")
@@ -37,10 +38,14 @@ class FreeCamera(Model):
     K: Annotated[tuple[Row, Row, Row], AfterValidator(_intrinsics)] = Field(
         description="3x3 intrinsics [px]; pixel centres lie at +0.5"
     )
+    lens: LensSpec = PinholeLens()
     pose: Pose = Field(description="T_world_camera; x right, y down, z forward")
     modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=5)
     codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
     quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
+    effects: CameraEffects | None = Field(
+        default=None, description="what a real camera does to its colour images; default: nothing"
+    )
 
 
 class PosedObject(Model):

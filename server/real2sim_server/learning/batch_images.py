@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..render import (
     Backend,
     RasterOptions,
+    RenderError,
     View,
     WorldViews,
     rasterize_batch,
@@ -48,7 +49,16 @@ def batch_images(
         cameras: C of them.
         worlds: which of the worlds.
         backend: draws.
+
+    Raises:
+        RenderError: for cameras that are no pinholes; batches draw none with lenses.
     """
+    for camera in cameras:
+        if not camera.is_pinhole:
+            raise RenderError(
+                f"camera {camera.name!r} has a lens or a rolling shutter; images of batches are "
+                "those of pinholes"
+            )
     width, height = cameras[0].width, cameras[0].height
     if not len(worlds):
         return np.zeros((0, len(cameras), height, width, 3), np.uint8)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,11 +16,11 @@ from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.native_writer import write_native_log
-from ..scene import CameraRig
+from ..scene import Camera, CameraMotion, CameraRig
 from .bvh import build_geometry
 from .casting import Instances
 from .config import SyntheticConfig
-from .sensors import shoot_image, shoot_lidar
+from .sensors import shoot_image, shoot_lidar, shoot_rays
 from .shading import RaycastWorld
 from .surroundings import build_surroundings
 from .traffic import DrivePlan, PlannedVehicle, plan_drive, poses_at
@@ -51,6 +52,25 @@ class SyntheticLog(DrivingLog):
         source = self.source
         assert isinstance(source, SyntheticSource)
         return source.render(np.asarray(T_world_camera), np.asarray(k), width, height, t_us)
+
+    def render_through(
+        self, camera: Camera, motion: CameraMotion, t_us: int, *, samples: int = 3
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """The truth through any lens and shutter, with vehicles where they are at each row's time.
+
+        Args:
+            camera: lens, shutter, K and size.
+            motion: of the camera over the read-out.
+            t_us: time of the middle of the read-out.
+            samples: rays per pixel along each image axis.
+
+        Returns:
+            RGB uint8 [H, W, 3]; distance from the camera float32 [H, W] [m], mean over a pixel's
+            rays, 0 where any of them meets the sky. Both are 0 where the lens sees nothing.
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        return source.render_through(camera, motion, t_us, samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +113,58 @@ class SyntheticSource:
             height,
             self.config.samples,
         )
+
+    def render_through(
+        self, camera: Camera, motion: CameraMotion, t_us: int, samples: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """See :meth:`SyntheticLog.render_through`."""
+        rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
+        ranges = np.zeros((camera.height, camera.width), np.float32)
+        shutter = camera.shutter
+        times = (
+            shutter.line_times(camera.width, camera.height) if shutter.rolls else np.full(1, 0.5)
+        )
+        for line, time in enumerate(times):
+            part: tuple[Any, ...] = (slice(None), slice(None))
+            if shutter.rolls:
+                part = (line,) if shutter.by_row else (slice(None), line)
+            now_us = t_us + round((time - 0.5) * shutter.readout_us)
+            rgb[part], ranges[part] = self._part(camera, motion, float(time), now_us, part, samples)
+        return rgb, ranges
+
+    def _part(  # noqa: PLR0917 - all of it together says which rays
+        self,
+        camera: Camera,
+        motion: CameraMotion,
+        time: float,
+        t_us: int,
+        part: tuple[Any, ...],
+        samples: int,
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """A part of an image that is taken at one time."""
+        x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        corners = np.stack([x, y], -1)[part].reshape(-1, 2)
+        step = (np.arange(samples) + 0.5) / samples
+        inside = np.stack(np.meshgrid(step, step), -1).reshape(-1, 2)
+        rays, seen = camera.unproject(corners[:, None] + inside)
+        beside = camera.unproject(corners[:, None] + inside + [1e-3, 0.0])[0]
+        turn, place = motion.at(np.array(time))
+        size = np.linalg.norm(beside - rays, axis=-1) / 1e-3 / samples
+        directions = (rays @ turn.T).reshape(-1, 3)
+        seen = np.asarray(seen.all(-1))
+        colours, ranges = shoot_rays(
+            self.world,
+            self.instances(t_us),
+            np.broadcast_to(place, directions.shape).copy(),
+            np.where(np.repeat(seen, samples**2)[:, None], directions, [0.0, 0.0, 1.0]),
+            size.reshape(-1),
+        )
+        colours = colours.reshape(len(corners), -1, 3).mean(1) * seen[:, None]
+        ranges = ranges.reshape(len(corners), -1)
+        solid = seen & (ranges > 0).all(1)
+        shape = np.empty((camera.height, camera.width))[part].shape
+        rgb = (colours * 255 + 0.5).astype(np.uint8).reshape(*shape, 3)
+        return rgb, (ranges.mean(1) * solid).astype(np.float32).reshape(shape)
 
     def instances(self, t_us: int) -> Instances:
         """Where all vehicles are at ``t_us``."""

@@ -117,6 +117,33 @@ def _shoot(world, instances, m, k, positions, size):
     return colours, depth, instance, keys, planes
 
 
+@kernel(parallel=True)
+def shoot_rays(world, instances, origins, directions, sizes):
+    """Display colours [N, 3] float32 and ranges [N] float32 [m], 0 in the sky, along any rays.
+
+    Args:
+        world: static part.
+        instances: vehicles at one instant.
+        origins, directions: [N, 3] of the rays in the world, unit length.
+        sizes: [N], angle that a ray stands for [rad].
+    """
+    n = len(origins)
+    colours, ranges = np.empty((n, 3), np.float32), np.zeros(n, np.float32)
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        stack = new_stack()
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, n)):
+            ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
+            dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+            hit = cast(world, instances, ox, oy, oz, dx, dy, dz, FAR, stack)
+            r, g, b, _, _, _, _, _ = ray_colour(
+                world, instances, hit, ox, oy, oz, dx, dy, dz, sizes[i], stack
+            )
+            colours[i, 0], colours[i, 1], colours[i, 2] = tone(r), tone(g), tone(b)
+            if hit[1] >= 0:
+                ranges[i] = hit[0]
+    return colours, ranges
+
+
 @kernel
 def _find_edges(keys, planes):
     """Which pixels [H, W] show another surface than one of their eight neighbours."""

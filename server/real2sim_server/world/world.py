@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
@@ -364,6 +366,22 @@ class World:
                 )
             drawn += self.deformation.fragments(self.t_us)
         return drawn
+
+    def moving_instances(self) -> list[Instance]:
+        """The same, with the velocities of objects, for cameras whose exposure takes time."""
+        drawn = self.instances()
+        for k, velocity in enumerate(self.agents.velocities, start=1):
+            twist = np.zeros(6)
+            twist[:3] = velocity
+            drawn[k] = replace(drawn[k], twist=twist)
+        return drawn
+
+    @property
+    def twist(self) -> Float:
+        """[6] of the ego in the world: velocity [m/s] of its origin, angular velocity [rad/s]."""
+        vx, vy = self.motion.velocity
+        found: Float = np.array([vx, vy, 0.0, 0.0, 0.0, self.motion.yaw_rate])
+        return found
 
     def due_sensors(self) -> list[SensorSpec]:
         """Sensors of the reset that deliver a frame at this step; all of them at step 0."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform, transform_from
-from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
@@ -211,12 +211,7 @@ def _rig(
     cameras: Mapping[str, object], lenses: Mapping[str, Lens], mounts: Mapping[str, Float]
 ) -> CameraRig:
     try:
-        return CameraRig(
-            tuple(
-                Camera(n, lenses[n].width, lenses[n].height, lenses[n].pinhole_K, mounts[n])
-                for n in cameras
-            )
-        )
+        return CameraRig(tuple(lenses[n].camera(n, mounts[n]) for n in cameras))
     except SceneError as error:
         raise LogError(f"calibration: {error}") from error
 

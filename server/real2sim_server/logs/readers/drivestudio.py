@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
-from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import image_size
 from .box_tracks import FrameBox, build_tracks
@@ -117,12 +117,7 @@ def _read_cameras(path: Path, count: int) -> tuple[CameraRig, ImageFiles, list[s
     images = ImageFiles(files, lenses)
     images.check_sizes()
     try:
-        rig = CameraRig(
-            tuple(
-                Camera(c.name, c.lens.width, c.lens.height, c.lens.pinhole_K, c.T_vehicle_camera)
-                for c in cameras
-            )
-        )
+        rig = CameraRig(tuple(c.lens.camera(c.name, c.T_vehicle_camera) for c in cameras))
     except SceneError as error:
         raise LogError(f"{path}: {error}") from error
     return rig, images, without

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
+from ...scene import BrownConrady, Camera, SceneError, Shutter
+from ...scene.camera import Optics
+from ...scene.shutter import GLOBAL
 
 MAX_ZOOM = 4.0
 
@@ -42,6 +45,24 @@ class Lens:
             middle = (low + high) / 2
             low, high = (low, middle) if self._fits(middle) else (middle, high)
         return self._zoomed(high)
+
+    def camera(self, name: str, T_vehicle_camera: Float, shutter: Shutter = GLOBAL) -> Camera:
+        """The pinhole camera of the undistorted images, which knows the lens and the shutter that
+        they had; not a lens that folds inside the image, through which nothing can be drawn.
+
+        Raises:
+            SceneError: values that make no camera.
+        """
+        pinhole = Camera(name, self.width, self.height, self.pinhole_K, T_vehicle_camera)
+        k1, k2, p1, p2, k3 = self.distortion
+        distorted = any(self.distortion)
+        if not distorted and not shutter.rolls:
+            return pinhole
+        model = BrownConrady((k1, k2, k3, 0.0, 0.0, 0.0), (p1, p2)) if distorted else None
+        try:
+            return replace(pinhole, recorded=Optics(self.K, model, shutter))
+        except SceneError:
+            return pinhole
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The pinhole image of a recorded image, both RGB uint8 [height, width, 3]."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform, transform_from
-from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
@@ -190,7 +190,7 @@ def _rig(
     try:
         return CameraRig(
             tuple(
-                Camera(c.lower(), lens.width, lens.height, lens.pinhole_K, _mount(tables, r))
+                lens.camera(c.lower(), _mount(tables, r))
                 for (c, r), lens in zip(cameras.items(), lenses.values(), strict=True)
             )
         )

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from real2sim_proto.semantics import SKY, UNLABELED
 
+from ...scene import Camera
 from ..lens_view import LensView
 from ..types import (
     SMALL_IMAGE_PIXELS,
@@ -169,17 +170,25 @@ class FrameBackend(Protocol):
         ...
 
 
-def check_optics(backend: Backend, request: RasterRequest) -> None:
-    """Raises RenderError where ``backend`` cannot draw the request's lens or shutter."""
-    if request.optics is None or getattr(backend, "draws_lenses", False):
-        return
-    camera = request.optics.camera
+def draws_lens(backend: Backend) -> bool:
+    """Whether ``backend`` draws lenses and rolling shutters."""
+    return bool(getattr(backend, "draws_lenses", False))
+
+
+def no_lens(backend: Backend, camera: Camera) -> str:
+    """Why ``backend`` does not draw a camera, and what to do."""
     kind = "pinhole" if camera.lens is None else camera.lens.model
-    raise RenderError(
+    return (
         f"the backend {backend.name!r} draws pinhole cameras with a global shutter, not camera "
         f"{camera.name!r} ({kind}, shutter {camera.shutter.direction}); use the backend 'cpu', or "
         "ask for the pinhole image"
     )
+
+
+def check_optics(backend: Backend, request: RasterRequest) -> None:
+    """Raises RenderError where ``backend`` cannot draw the request's lens or shutter."""
+    if request.optics is not None and not draws_lens(backend):
+        raise RenderError(no_lens(backend, request.optics.camera))
 
 
 def device_of(backend: Backend) -> torch.device:

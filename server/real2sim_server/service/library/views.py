@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from real2sim_proto.base import Track
+from real2sim_proto.cameras import OpticsSpec
 from real2sim_proto.scenes import CameraInfo, ObjectInfo, SceneInfo, SceneState
 
 from ...edit import ObjectState
 from ...scene import Camera, Trajectory
 from ...scene.io import SceneSummary
+from ...scene.lens import lens_values
 from .scene_catalog import Listing
 
 
@@ -94,7 +96,18 @@ def camera_info(camera: Camera) -> CameraInfo:
         height=camera.height,
         K=camera.K.tolist(),
         T_vehicle_camera=camera.T_vehicle_camera.tolist(),
+        recorded=recorded_optics(camera),
     )
+
+
+def recorded_optics(camera: Camera) -> OpticsSpec | None:
+    """What a camera really was, as the wire has it; None where that is not known."""
+    known = camera.recorded
+    if known is None:
+        return None
+    shutter = {"direction": known.shutter.direction, "readout_us": known.shutter.readout_us}
+    lens = lens_values(known.lens) or {"model": "pinhole"}
+    return OpticsSpec.model_validate({"K": known.K.tolist(), "lens": lens, "shutter": shutter})
 
 
 def camera_infos(cameras: Sequence[Camera]) -> list[CameraInfo]:

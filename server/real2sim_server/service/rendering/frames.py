@@ -21,6 +21,7 @@ from real2sim_proto.episode import SensorSpec
 from ...render.jpeg import JpegEncoder, turbo_jpeg
 from ...render.modalities import encode_image, modality_of
 from ...scene import Camera
+from .optics import frame_names
 
 Part = bytes | memoryview
 """Bytes of a message, sent as they lie in memory."""
@@ -38,6 +39,7 @@ class RenderedImage:
         K: [3, 3] float64 intrinsics [px].
         pixels: of the dtype and shape of the modality.
         ready: returns when they are there; asked before they are read.
+        camera: that it was drawn by.
     """
 
     sensor: SensorSpec
@@ -47,6 +49,7 @@ class RenderedImage:
     K: NDArray[np.float64]
     pixels: NDArray[Any]
     ready: Callable[[], object] = lambda: None
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +99,7 @@ def encode_frame(image: RenderedImage, *, jpeg: JpegEncoder = turbo_jpeg) -> Enc
     """The frame of an image; raw ones are views of its pixels. On any thread."""
     image.ready()
     fields = _place_fields(image.sensor, image.modality, image.t_us, image.T_world_sensor, image.K)
+    fields |= frame_names(image.sensor, image.camera, image.modality)
     if image.sensor.codec == "raw":
         return with_pixels(_raw_header(fields, image.pixels.shape[:2]), image.pixels)
     encoded = encode_image(
@@ -121,7 +125,8 @@ def raw_headers(
     """
     return [
         _raw_header(
-            _place_fields(sensor, modality, t_us, camera.pose(T_world_vehicle), camera.K),
+            _place_fields(sensor, modality, t_us, camera.pose(T_world_vehicle), camera.K)
+            | frame_names(sensor, camera, modality),
             (camera.height, camera.width),
         )
         for sensor, camera in zip(sensors, cameras, strict=True)

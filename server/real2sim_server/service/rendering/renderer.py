@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Codec
+from real2sim_proto.cameras import MotionBlurSpec
 from real2sim_proto.episode import SensorSpec
 
 from ...render import (
     Backend,
+    Frame,
     Instance,
     RasterOptions,
     RigView,
@@ -39,7 +41,9 @@ from ..http.problems import ServiceError
 from ..lanes import Lane
 from ..library.memory import MemoryBudget
 from .frames import EncodedFrame, RenderedImage, encode_frame
+from .lens_kernels import LensKernels
 from .levels import DetailLevels
+from .optics import EffectImage, blurred, camera_with
 
 log = structlog.get_logger(__name__)
 
@@ -55,6 +59,10 @@ VIEW_PIXELS = 2_000_000
 DEFAULT_OPTIONS = RasterOptions()
 
 
+def _at_once() -> None:
+    """Nothing has to be waited for."""
+
+
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
     """All that is needed to render the sensors of one instant.
@@ -66,6 +74,7 @@ class RenderRequest:
         t_us: instant, noted in the frames [us].
         sensors: cameras, modalities, sizes and codecs.
         rig: whose cameras these are; default: the scene's.
+        twist: [6] of the vehicle, see RigView; for rolling shutters and motion blur.
     """
 
     scene: Scene
@@ -74,6 +83,7 @@ class RenderRequest:
     t_us: int
     sensors: Sequence[SensorSpec]
     rig: CameraRig | None = None
+    twist: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +132,7 @@ class Renderer:
         self._uses_levels = cache(partial(uses_levels, backend))
         self._metrics = metrics
         self._max_pixels = max_pixels
+        self._lenses = LensKernels(engine, backend)
         self._encoders = ThreadPoolExecutor(encoder_threads(), thread_name_prefix="encode")
         self._bulk_encoders = ThreadPoolExecutor(
             1,
@@ -153,7 +164,7 @@ class Renderer:
         """
         rig = request.rig or request.scene.rig
         cameras = check_sensors(rig, request.sensors, max_pixels=self._max_pixels)
-        await self.levels.ready(request.sensors, cameras, lambda: request.instances)
+        await self.ready(request.sensors, cameras, lambda: request.instances)
         submitted = time.perf_counter()
         lane = _lane(cameras, stream)
         images, render_ms = await self._engine.call(
@@ -168,6 +179,22 @@ class Renderer:
         timing = {"queue": queue_ms, "render": render_ms, "encode": encode_ms}
         self._count(frames, timing, stream)
         return RenderedFrames(frames, timing)
+
+    async def ready(
+        self,
+        sensors: Sequence[SensorSpec],
+        cameras: Sequence[Camera],
+        things: Callable[[], Sequence[Instance]],
+    ) -> None:
+        """Wait until cameras can be drawn without holding up others: for levels of detail, see
+        there, and for kernels of lenses.
+
+        Raises:
+            ServiceError: OUT_OF_MEMORY; INVALID_REQUEST where the backend draws no lenses.
+        """
+        if not all(camera.is_pinhole for camera in cameras):
+            await self._lenses.ready(cameras)
+        await self.levels.ready(sensors, cameras, things)
 
     async def encode(
         self, images: Iterable[RenderedImage], *, lane: Lane = Lane.DRIVE
@@ -248,17 +275,46 @@ class Renderer:
             for (r, indices), frames in zip(members.items(), drawn, strict=True):
                 request, cameras = requests[r]
                 for i, frame in zip(indices, frames, strict=True):
-                    sensor, pose, K = request.sensors[i], frame.T_world_camera, cameras[i].K
                     images[r][i] = [
-                        RenderedImage(
-                            sensor, name, request.t_us, pose, K, frame.images[name], frame.ready
-                        )
-                        for name in sensor.modalities
+                        self._image(request, request.sensors[i], cameras[i], frame, name)
+                        for name in request.sensors[i].modalities
                     ]
         return [
             [image for i in range(len(request.sensors)) for image in found[i]]
             for (request, _), found in zip(requests, images, strict=True)
         ]
+
+    def _image(
+        self, request: RenderRequest, sensor: SensorSpec, camera: Camera, frame: Frame, name: str
+    ) -> RenderedImage:
+        """One image of a sensor, with its effects."""
+        image = RenderedImage(
+            sensor,
+            name,
+            request.t_us,
+            frame.T_world_camera,
+            camera.K,
+            frame.images[name],
+            frame.ready,
+            camera,
+        )
+        effects = sensor.effects
+        if effects is None or name != "rgb" or not effects.names:
+            return image
+        drawn, ready = frame.rgb, frame.ready
+        if effects.motion_blur is not None:
+            drawn, ready = self._blurred(request, camera, effects.motion_blur), _at_once
+        made = EffectImage(drawn, ready, effects, (sensor.camera, request.t_us))
+        return replace(image, pixels=made.pixels, ready=made.ready)
+
+    def _blurred(
+        self, request: RenderRequest, camera: Camera, blur: MotionBlurSpec
+    ) -> NDArray[np.uint8]:
+        def draw(view: RigView) -> NDArray[np.uint8]:
+            [[frame]] = render_rigs([view], modalities=("rgb",), backend=self._backend)
+            return frame.rgb
+
+        return blurred(_rig_view(request, [camera], [0]), blur, draw)
 
     def _count(
         self, frames: Sequence[EncodedFrame], timing_ms: dict[str, float], stream: str
@@ -316,6 +372,7 @@ def _rig_view(request: RenderRequest, cameras: Sequence[Camera], indices: Sequen
         cameras=[cameras[i] for i in indices],
         T_world_vehicle=request.T_world_vehicle,
         sky=request.scene.sky,
+        twist=request.twist,
     )
 
 
@@ -334,7 +391,8 @@ def check_sensors(
     """The cameras of ``sensors`` at the sizes they name.
 
     Raises:
-        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
+        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels, and for optics that
+            are none.
     """
     cameras = []
     for sensor in sensors:
@@ -342,7 +400,11 @@ def check_sensors(
             camera = rig[sensor.camera]
         except SceneError as error:
             raise ServiceError(ErrorCode.UNKNOWN_CAMERA, str(error)) from error
-        cameras.append(camera.resized(sensor.width or camera.width))
+        try:
+            camera = camera_with(camera, sensor.optics)
+            cameras.append(camera.resized(sensor.width or camera.width))
+        except SceneError as error:
+            raise ServiceError(ErrorCode.INVALID_REQUEST, str(error)) from error
     pixels = sum(
         c.width * c.height * len(s.modalities) for c, s in zip(cameras, sensors, strict=True)
     )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from real2sim_proto import ErrorCode
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.views import FreeCamera, SceneView
 
 from ...edit import posed_instances
 from ...geometry.transform import transform_from
-from ...scene import Camera, CameraRig, Scene
+from ...scene import Camera, CameraRig, Scene, SceneError
+from ..http.problems import ServiceError
+from ..rendering.optics import lens_of
 from ..rendering.renderer import RenderRequest
 from ..rendering.responses import CODEC_OF, MSGPACK
 
@@ -19,6 +22,7 @@ def free_view_request(scene: Scene, view: SceneView, media_type: str) -> RenderR
 
     Raises:
         EditError: UNKNOWN_OBJECT, for an object that the scene lacks.
+        ServiceError: INVALID_REQUEST, for a lens that does not reach what its image shows.
     """
     t_us = scene.start_us if view.t_us is None else view.t_us
     poses = {posed.object_id: posed.pose for posed in view.objects}
@@ -34,13 +38,17 @@ def free_view_request(scene: Scene, view: SceneView, media_type: str) -> RenderR
 
 
 def _camera(camera: FreeCamera) -> Camera:
-    return Camera(
-        name=camera.name,
-        width=camera.width,
-        height=camera.height,
-        K=np.array(camera.K),
-        T_vehicle_camera=transform_from(camera.pose.position, camera.pose.quaternion),
-    )
+    try:
+        return Camera(
+            name=camera.name,
+            width=camera.width,
+            height=camera.height,
+            K=np.array(camera.K),
+            T_vehicle_camera=transform_from(camera.pose.position, camera.pose.quaternion),
+            lens=lens_of(camera.lens),
+        )
+    except SceneError as error:
+        raise ServiceError(ErrorCode.INVALID_REQUEST, str(error)) from error
 
 
 def _sensor(camera: FreeCamera, media_type: str) -> SensorSpec:
@@ -49,4 +57,5 @@ def _sensor(camera: FreeCamera, media_type: str) -> SensorSpec:
         modalities=camera.modalities,
         codec=camera.codec if media_type == MSGPACK else CODEC_OF[media_type],
         quality=camera.quality,
+        effects=camera.effects,
     )

@@ -135,7 +135,7 @@ class StepPipeline:
             ServiceError: OUT_OF_MEMORY.
         """
         sizes = [cameras[sensor.camera] for sensor in sensors]
-        await self._renderer.levels.ready(sensors, sizes, lambda: things_at_start(scene, state))
+        await self._renderer.ready(sensors, sizes, lambda: things_at_start(scene, state))
 
     async def edit_ready(self, world: World, cameras: Mapping[str, Camera]) -> None:
         """The same for a world that has just been edited, by what it shows now and later."""
@@ -146,7 +146,7 @@ class StepPipeline:
             now = compose(scene, state, world.agents, min(world.t_us, scene.end_us))
             return [*now, *things_at_start(scene, state)]
 
-        await self._renderer.levels.ready(sensors, [cameras[s.camera] for s in sensors], shown)
+        await self._renderer.ready(sensors, [cameras[s.camera] for s in sensors], shown)
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
@@ -259,7 +259,7 @@ class StepPipeline:
         """
         cameras = cameras_of(world.scene, sensors, max_pixels=self._max_pixels)
         things = partial(things_at_start, world.scene, world.state)
-        await self._renderer.levels.ready(sensors, cameras, things)
+        await self._renderer.ready(sensors, cameras, things)
         timer = PhaseTimer()
         view = partial(self._compute_view, world, sensors, cameras, timer)
         try:

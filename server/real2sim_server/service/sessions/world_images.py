@@ -11,6 +11,7 @@ from ...geometry.transform import invert_transform
 from ...scene import Camera
 from ...world import World
 from ..rendering.frames import RenderedImage
+from ..rendering.optics import needs_motion
 from ..rendering.renderer import Renderer, RenderRequest
 from .gathered_calls import attempt
 from .wire import PhaseTimer
@@ -67,12 +68,14 @@ def deform(world: World, timer: PhaseTimer) -> None:
 
 
 def _request(world: World, sensors: Sequence[SensorSpec]) -> RenderRequest:
+    moving = needs_motion(sensors)
     return RenderRequest(
         scene=world.scene,
-        instances=world.instances(),
+        instances=world.moving_instances() if moving else world.instances(),
         T_world_vehicle=world.T_world_body,
         t_us=world.t_us,
         sensors=sensors,
+        twist=world.twist if moving else None,
     )
 
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from ....geometry.rotation import Float
 from ....geometry.transform import invert_transform
-from ....scene import Camera, CameraRig, Trajectory
+from ....scene import Camera, CameraRig, Shutter, Trajectory
 from ....scene.camera import T_VEHICLE_OPTICAL
+from ....scene.shutter import DIRECTIONS, GLOBAL, MAX_READOUT_US
 from ...driving_log import DrivingLog, FrameSource, LogError
 from ..box_tracks import FrameBox, build_tracks, upright_pose
 from ..formats.tables import check_frame_times, check_rigid
@@ -171,7 +172,7 @@ def build_waymo_log(
     tracks, keys = build_tracks(_boxes(frames, to_first))
     return DrivingLog(
         name=name,
-        rig=CameraRig(tuple(_pinhole(c) for c in used)),
+        rig=CameraRig(tuple(_camera(c, frames) for c in used)),
         frame_times_us=times_us,
         ego=_ego(frames, to_first, where),
         tracks=tracks,
@@ -203,9 +204,13 @@ def _check_complete(
                 )
 
 
-def _pinhole(camera: WaymoCamera) -> Camera:
-    lens = camera.lens
-    return Camera(camera.name, lens.width, lens.height, lens.pinhole_K, camera.T_vehicle_camera)
+def _camera(camera: WaymoCamera, frames: Sequence[WaymoFrame]) -> Camera:
+    """The camera of the undistorted images, with what it really is. Raises SceneError."""
+    said = _shutter(camera, frames)
+    readout_us = round(said["readout_us"])
+    rolls = said["direction"] in DIRECTIONS[1:] and 0 < readout_us <= MAX_READOUT_US
+    shutter = Shutter(said["direction"], readout_us) if rolls else GLOBAL
+    return camera.lens.camera(camera.name, camera.T_vehicle_camera, shutter)
 
 
 def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[FrameBox]:
