@@ -14,20 +14,23 @@ TOLERANCE = 0.15
 """What is nearer to the ground's height than this shows it [m]."""
 
 
-def back_projected(depth: NDArray[np.float32], K: Float, T_world_camera: Float) -> Float:
+def back_projected(
+    depth: NDArray[np.float32], K: Float, T_world_camera: Float
+) -> NDArray[np.float32]:
     """Points [H, W, 3] of the world [m] at a depth image [H, W] along the camera's z axis [m]."""
     height, width = depth.shape
     x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
     y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
-    rotation = T_world_camera[:3, :3]
-    rays = x[None, :, None] * rotation[:, 0] + y[:, None, None] * rotation[:, 1] + rotation[:, 2]
-    points: Float = rays * depth[..., None].astype(np.float64) + T_world_camera[:3, 3]
+    points = np.empty((height, width, 3), np.float32)
+    for axis, (right, down, ahead, shift) in enumerate(T_world_camera[:3]):
+        across, along = (x * right + ahead).astype(np.float32), (y * down).astype(np.float32)
+        points[..., axis] = (across + along[:, None]) * depth + np.float32(shift)
     return points
 
 
 def with_ground(
     semantic: NDArray[np.uint8],
-    points: Float,
+    points: NDArray[np.float32],
     depth: NDArray[np.float32],
     ground: Ground,
     *,

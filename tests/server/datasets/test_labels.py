@@ -61,8 +61,8 @@ def test_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
 
 def test_flow_of_a_wall_follows_the_camera():
     flow, valid, occluded = flow_between(plane(10.0), plane(10.0, camera_x=1.0), [], [])
-    np.testing.assert_allclose(flow[..., 0], -6.0, atol=1e-5)
-    np.testing.assert_allclose(flow[..., 1], 0.0, atol=1e-5)
+    np.testing.assert_allclose(flow[..., 0], -6.0, atol=1e-4)
+    np.testing.assert_allclose(flow[..., 1], 0.0, atol=1e-4)
     assert valid.all()
     assert occluded[:, :5].all()
     assert not occluded[:, 6:].any()
@@ -71,7 +71,7 @@ def test_flow_of_a_wall_follows_the_camera():
 def test_flow_of_an_object_follows_its_pose():
     here, there = plane(10.0, instance=1), plane(10.0, instance=1)
     flow, valid, _ = flow_between(here, there, [box(0.0)], [box(0.5)])
-    np.testing.assert_allclose(flow[..., 0], 3.0, atol=1e-5)
+    np.testing.assert_allclose(flow[..., 0], 3.0, atol=1e-4)
     gone = flow_between(here, there, [box(0.0)], [])[1]
     assert valid.all()
     assert not gone.any()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from .boxes import ObjectBox
-from .images import CameraImages
+from .images import CameraImages, ids_in
 
 BEHIND = 1e-3
 """What is less far in front of the other camera is behind it [m]."""
@@ -40,12 +40,13 @@ def flow_between(
         and the other image shows something else at its end, or ends before.
     """
     height, width = here.depth.shape
-    columns, rows = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
+    columns = np.arange(width, dtype=np.float32) + np.float32(0.5)
+    rows = (np.arange(height, dtype=np.float32) + np.float32(0.5))[:, None]
     sky = here.depth == 0
-    depth = np.where(sky, 1.0, here.depth)
+    depth = np.where(sky, np.float32(1), here.depth)
     to_camera = invert_transform(there.T_world_camera)
     still = _Motion.of(to_camera @ here.T_world_camera, here.camera.K, there.camera.K)
-    x, y, z = still.carried(columns, rows, depth, np.where(sky, 0.0, 1.0))
+    x, y, z = still.carried(columns, rows, depth, (~sky).astype(np.float32))
     there_too = np.ones(here.depth.shape, np.bool_)
     for box, later in _pairs(here, boxes_here, boxes_there):
         own = np.nonzero(here.instance == box.instance_id)
@@ -60,9 +61,9 @@ def flow_between(
     z[~valid] = 1.0
     x /= z
     y /= z
-    flow = np.stack([x - columns, y - rows], axis=-1).astype(np.float32)
+    flow = np.stack([x - columns, y - rows], axis=-1)
     flow[~valid] = 0
-    seen = _seen(there, here.instance, x, y, np.where(sky, 0.0, z))
+    seen = _seen(there, here.instance, x, y, np.where(sky, np.float32(0), z))
     return flow, valid, valid & ~seen
 
 
@@ -70,17 +71,18 @@ def flow_between(
 class _Motion:
     """Where a pixel of known depth goes: ``depth * turn @ (u, v, 1) + shift``."""
 
-    turn: Float
-    shift: Float
+    turn: NDArray[np.float32]
+    shift: NDArray[np.float32]
 
     @classmethod
     def of(cls, T_there_here: Float, K_here: Float, K_there: Float) -> _Motion:
         turn = K_there @ T_there_here[:3, :3] @ np.linalg.inv(K_here)
-        return cls(turn, K_there @ T_there_here[:3, 3])
+        shift = K_there @ T_there_here[:3, 3]
+        return cls(turn.astype(np.float32), shift.astype(np.float32))
 
     def carried(
         self, u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], near: NDArray[Any] | float
-    ) -> tuple[Float, ...]:
+    ) -> tuple[NDArray[np.float32], ...]:
         """Image places of the other camera times its depth, and that depth; ``near`` is 0 for what
         is infinitely far away."""
         return tuple(
@@ -94,22 +96,27 @@ def _pairs(
 ) -> list[tuple[ObjectBox, ObjectBox | None]]:
     """Each object of the image, and where it is at the other instant; None where it is not."""
     later = {box.instance_id: box for box in boxes_there}
-    present = set(np.unique(here.instance).tolist())
+    present = ids_in(here.instance)
     return [(b, later.get(b.instance_id)) for b in boxes_here if b.instance_id in present]
 
 
 def _seen(
-    there: CameraImages, instance: NDArray[np.uint16], x: Float, y: Float, depth: Float
+    there: CameraImages,
+    instance: NDArray[np.uint16],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    depth: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
     """Whether the other image shows the same surface: the same object at the same depth."""
     height, width = there.depth.shape
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    column = np.clip(np.where(inside, x, 0), 0, width - 1).astype(np.int64)
-    row = np.clip(np.where(inside, y, 0), 0, height - 1).astype(np.int64)
+    column, row = (np.where(inside, place, np.float32(0)).astype(np.int32) for place in (x, y))
+    pixel = row * width + column
     # Metres lie between two rows of a road far away: its surface is met between neighbours.
-    low, high = (spread(there.depth, BLOCK)[row, column] for spread in (cv2.erode, cv2.dilate))
-    slack = SAME_SURFACE * depth + 0.05
+    low, high = (spread(there.depth, BLOCK).ravel()[pixel] for spread in (cv2.erode, cv2.dilate))
+    slack = np.float32(SAME_SURFACE) * depth + np.float32(0.05)
     met = (low - slack <= depth) & (depth <= high + slack) & (depth > 0)
     both_sky = (low == 0) & (depth == 0)
-    same: NDArray[np.bool_] = inside & (met | both_sky) & (there.instance[row, column] == instance)
+    shown = there.instance.ravel()[pixel]
+    same: NDArray[np.bool_] = inside & (met | both_sky) & (shown == instance)
     return same

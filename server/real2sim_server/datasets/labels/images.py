@@ -21,6 +21,11 @@ from .surface import on_surface
 MODALITIES = ("rgb", "median_depth", "instance", "semantic")
 
 
+def ids_in(instance: NDArray[np.uint16]) -> set[int]:
+    """Ids that an instance image shows, 0 too."""
+    return set(np.flatnonzero(np.bincount(instance.ravel())).tolist())
+
+
 @dataclass(frozen=True, eq=False)
 class CameraImages:
     """What one camera sees.
@@ -69,7 +74,7 @@ def _labelled(
     pose = frame.T_world_camera
     points = back_projected(depth, camera.K, pose)
     semantic = with_ground(frame.images["semantic"], points, depth, scene.ground)
-    present = set(np.unique(instance).tolist())
+    present = ids_in(instance)
     for box in boxes:
         if box.instance_id in present:
             own = np.nonzero(instance == box.instance_id)

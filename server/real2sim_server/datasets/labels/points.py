@@ -92,7 +92,7 @@ def seen_points(
 def _beams_of(image: CameraImages, to_ego: Float) -> tuple[NDArray[np.generic], ...]:
     """Points, brightness, beam, column, instance and class of one pixel for each beam."""
     points = back_projected(image.depth, image.camera.K, to_ego @ image.T_world_camera)
-    x, y, z = (points[..., k].astype(np.float32) - np.float32(MOUNT[k]) for k in range(3))
+    x, y, z = (points[..., k] - np.float32(MOUNT[k]) for k in range(3))
     flat = np.sqrt(x * x + y * y)
     elevation = np.arctan(z / np.maximum(flat, NEAR))
     row = (elevation - ELEVATION[0]) * np.float32((BEAMS - 1) / (ELEVATION[1] - ELEVATION[0]))
@@ -101,17 +101,20 @@ def _beams_of(image: CameraImages, to_ego: Float) -> tuple[NDArray[np.generic], 
     inside = (image.depth > 0) & (beam >= 0) & (beam < BEAMS) & (off < NEAREST)
     inside &= (flat > NEAR) & (flat < FARTHEST)
     chosen = np.flatnonzero(inside)
-    chosen = chosen[np.argsort(off.ravel()[chosen], kind="stable")]
     azimuth = np.arctan2(y.ravel()[chosen], x.ravel()[chosen])
-    turns = np.floor((azimuth / (2 * np.pi) + 0.5) * COLUMNS).astype(np.int64) % COLUMNS
-    beams = beam.ravel()[chosen].astype(np.int64)
-    _, first = np.unique(beams * COLUMNS + turns, return_index=True)
-    chosen = chosen[first]
+    turn = (azimuth * np.float32(COLUMNS / (2 * np.pi)) + COLUMNS // 2).astype(np.int64) % COLUMNS
+    place = beam.ravel()[chosen].astype(np.int64) * COLUMNS + turn
+    # Of several pixels on a beam the last one written counts: the nearest to it.
+    farthest_first = np.argsort((off.ravel()[chosen] * -60_000).astype(np.int16), kind="stable")
+    nearest = np.full(BEAMS * COLUMNS, -1)
+    nearest[place[farthest_first]] = chosen[farthest_first]
+    places = np.flatnonzero(nearest >= 0)
+    chosen = nearest[places]
     return (
         points.reshape(-1, 3)[chosen],
         image.rgb.reshape(-1, 3)[chosen].mean(axis=1) / 255,
-        beams[first],
-        turns[first],
+        places // COLUMNS,
+        places % COLUMNS,
         image.instance.ravel()[chosen],
         image.semantic.ravel()[chosen],
     )

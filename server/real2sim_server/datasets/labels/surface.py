@@ -21,7 +21,9 @@ CLEARANCE = 0.12
 """What is less above the box's lowest face, below it too, is the ground [m]."""
 
 
-def on_surface(points: Float, T_world_object: Float, size: Sequence[float]) -> NDArray[np.bool_]:
+def on_surface(
+    points: NDArray[np.float32], T_world_object: Float, size: Sequence[float]
+) -> NDArray[np.bool_]:
     """Which points [N, 3] of the world at an object's pixels are of itself, [N] bool."""
     local = apply_transform(invert_transform(T_world_object), points)
     half = np.asarray(size) / 2
