@@ -8,6 +8,7 @@ There is no pickle anywhere.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -25,6 +26,9 @@ DEFAULT_MAX_BYTES = MAX_SERVER_MESSAGE_BYTES
 MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
 """A worker accepts messages up to this size from a client; plans and edits are small."""
 
+
+SMALL_ARRAY_BYTES = 4096
+"""Up to this size it takes longer to describe an array than to copy it."""
 
 _LITTLE = {np.dtype(name): name for name in ARRAY_DTYPES}
 _SENT_AS = _LITTLE | {dtype.newbyteorder(">"): name for dtype, name in _LITTLE.items()}
@@ -100,9 +104,20 @@ def _pack_array(value: object) -> msgpack.ExtType:
     dtype = _SENT_AS.get(value.dtype)
     if dtype is None:
         raise TypeError(f"arrays of dtype {value.dtype} have no place on the wire")
+    if value.nbytes <= SMALL_ARRAY_BYTES:
+        # In C order, whatever order it has here.
+        data = value.astype(dtype, copy=False).tobytes()
+        return msgpack.ExtType(ARRAY_EXT, _array_head(dtype, value.shape, len(data)) + data)
     array = np.ascontiguousarray(value, dtype=dtype)
-    payload = msgpack.packb([dtype, list(value.shape), array.data.cast("B") if array.size else b""])
+    payload = msgpack.packb([dtype, list(value.shape), array.data.cast("B")])
     return msgpack.ExtType(ARRAY_EXT, payload)
+
+
+@functools.lru_cache(maxsize=256)
+def _array_head(dtype: str, shape: tuple[int, ...], size: int) -> bytes:
+    """What stands before the ``size`` bytes of an array; most are of few shapes."""
+    payload: bytes = msgpack.packb([dtype, shape, bytes(size)])
+    return payload[: len(payload) - size]
 
 
 def _unpack_array(code: int, payload: bytes) -> np.ndarray:

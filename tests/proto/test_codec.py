@@ -45,6 +45,13 @@ def test_big_endian_and_strided_arrays_arrive_with_the_same_values():
     np.testing.assert_array_equal(decode(encode({"a": array}))["a"], array)
 
 
+@pytest.mark.parametrize("size", [0, 3, codec.SMALL_ARRAY_BYTES // 8, codec.SMALL_ARRAY_BYTES])
+def test_an_array_of_any_size_and_order_is_dtype_shape_and_bytes_in_c_order(size):
+    for array in (np.arange(size, dtype=">f8"), np.arange(2.0 * size).reshape(2, size).T):
+        data = array.astype("<f8").tobytes()
+        assert encode({"a": array}) == packed_array("<f8", list(array.shape), data)
+
+
 def test_received_arrays_are_read_only_views():
     received = decode(encode({"a": np.zeros(3)}))["a"]
     with pytest.raises(ValueError, match="read-only"):

@@ -15,6 +15,7 @@ from ...edit.tracks import sample
 from ...scene import Trajectory
 from ..driving import Command
 from ..errors import WorldError
+from ..evolve import evolved
 from ..seam import Seam
 from .gear import advance_in_gear, can_reverse
 from .motion import Motion, advance_motion, constant_law, teleported
@@ -184,7 +185,7 @@ class EgoController:
             )
         kept = tuple(p for p in self.pending if p.from_us < from_us)
         pending = (*kept, PendingPlan(from_us, _in_world(plan, motion)))
-        return replace(self, pending=pending)
+        return evolved(self, pending=pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
         """Controller and vehicle ``us`` later than ``t_us``."""
