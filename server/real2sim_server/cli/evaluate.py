@@ -21,6 +21,7 @@ from .options import (
 
 if TYPE_CHECKING:
     from ..reconstruct.evaluation import Evaluation
+    from ..reconstruct.evaluation.sweeps import LidarScore
 
 
 @command("evaluate")
@@ -37,6 +38,9 @@ def evaluate(
     ] = "1,2,3",
     around: Annotated[
         bool, typer.Option("--around", help="Also see vehicles from all sides (synthetic logs).")
+    ] = False,
+    lidar: Annotated[
+        bool, typer.Option("--lidar", help="Also cast LiDAR sweeps and compare them.")
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for a page with images.")] = None,
     backend: RenderBackend = "auto",
@@ -56,6 +60,7 @@ def evaluate(
         shifts=_parse_shifts(shifts),
         backend=chosen_backend(backend, device),
         around=around,
+        lidar=lidar,
     )
     loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)
     with staged_progress() as on_progress:
@@ -118,4 +123,26 @@ def _table(result: Evaluation) -> dict[str, object]:
             "vehicles' other sides [dB]": result.around.psnr_unseen,
             "of these covered": result.around.coverage_unseen,
         }
+    if result.lidar is not None:
+        figures |= _lidar_figures(result.lidar)
+    return figures
+
+
+def _lidar_figures(score: LidarScore) -> dict[str, object]:
+    mean = score.mean
+    figures: dict[str, object] = {
+        "lidar against": score.against,
+        "lidar range error, median [m]": mean.median_m,
+        "median squared [m2]": mean.median_squared_m2,
+        "90th percentile [m]": mean.p90_m,
+        "of the expected range, median [m]": mean.expected_m,
+        "chamfer [m2]": mean.chamfer_m2,
+        "chamfer is the": score.chamfer,
+        "F score at 5 cm": mean.f_score,
+        "hit or miss right": mean.hit_miss,
+        "intensity RMSE": mean.intensity_rmse,
+        "drop accuracy": mean.drop_accuracy,
+    }
+    if score.against != "ray-cast truth":
+        figures["residual of the fitted rings [degrees]"] = score.ring_residual_deg
     return figures

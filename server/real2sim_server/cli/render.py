@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,7 +28,10 @@ MODALITIES = ("rgb", "depth", "instance", "median_depth", "semantic")
 def render(
     *,
     scene: SceneBundle,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Image to write: .png or .jpg")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Image (.png, .jpg), or sweep (.ply, .npz, .png)."),
+    ],
     camera: Annotated[str | None, typer.Option(help="Default: the first one.")] = None,
     frame: Annotated[int | None, typer.Option(min=0, help="Recorded frame; default 0.")] = None,
     t_us: Annotated[int | None, typer.Option(help="Or a time stamp [us].")] = None,
@@ -35,19 +39,31 @@ def render(
     modality: Annotated[
         str, typer.Option(help="rgb, depth, instance, median_depth or semantic")
     ] = "rgb",
+    lidar: Annotated[
+        str | None, typer.Option(help="Cast a sweep instead: name or JSON file of a LiDAR.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the sweep's noise and losses.")] = 0,
     delete: Annotated[list[str] | None, typer.Option(help="Objects to leave out.")] = None,
     log: Annotated[Path | None, typer.Option(help="Compare with this log's image: PSNR.")] = None,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
     json: JsonFile = None,
 ) -> None:
-    """Draw one logged camera of a scene; with --log print PSNR against the recorded image."""
+    """Draw one logged camera of a scene; with --log print PSNR against the recorded image.
+
+    With --lidar cast a sweep of a LiDAR on the recording vehicle instead, and draw it beside.
+    """
     from ..edit.compose import instances_at
     from ..render import render_cameras
     from ..scene.io import load_scene
 
     if log is not None and (t_us is not None or delete):
         raise CommandError("--log compares whole recorded frames: use --frame, and no --delete")
+    if lidar is not None:
+        if log is not None:
+            raise CommandError("--lidar is compared by `real2sim evaluate --lidar`, not by --log")
+        _render_sweep(scene, out, lidar, _Moment(frame, t_us), delete or (), seed, json)
+        return
     _check_output(out, modality)
     backend = chosen_backend(backend, device)
     loaded = load_scene(scene)
@@ -72,6 +88,59 @@ def render(
     if log is not None:
         figures |= _compare(loaded, log, frame or 0, picture.camera, backend=backend)
     print_figures(f"{scene.name}, camera {picture.camera}", figures)
+    write_json(json, figures)
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """What the options say of the time."""
+
+    frame: int | None
+    t_us: int | None
+
+
+def _render_sweep(
+    scene: Path,
+    out: Path,
+    lidar: str,
+    moment: _Moment,
+    delete: Sequence[str],
+    seed: int,
+    json: Path | None,
+) -> None:
+    from ..edit.sweep import sweep_of
+    from ..render.cast import detect, sensor_poses
+    from ..render.cast.call import checked_request, select_caster
+    from ..render.cast.files import SUFFIXES, write_sweep
+    from ..scene.io import load_scene
+    from ..scene.lidar_catalogue import find_lidar
+
+    if out.suffix.lower() not in SUFFIXES:
+        raise CommandError(f"--out {out}: the name must end in {', '.join(SUFFIXES)}")
+    sensor, loaded = find_lidar(lidar), load_scene(scene)
+    time_us = _frame_time(loaded, moment.frame or 0) if moment.t_us is None else moment.t_us
+    loaded.ego.pose(time_us)
+    met = sweep_of(loaded, _without(loaded, delete), sensor, time_us)
+    poses = sensor_poses(loaded.ego, sensor, time_us)
+    request = checked_request(
+        met.instances, sensor, poses, object_poses=met.poses, attributes=met.attributes
+    )
+    echo = select_caster().cast(request)
+    sweep = detect(echo, sensor, seed=seed, request=request)
+    picture = out.with_suffix(".png")
+    for path in dict.fromkeys((out, picture)):
+        write_sweep(sweep, sensor, path)
+    figures: dict[str, object] = {
+        "sweep": str(out),
+        "picture": str(picture),
+        "lidar": sensor.name,
+        "t_us": time_us,
+        "rays": sensor.beams.count,
+        "returns": int(sweep.hit.sum()),
+        "surfaces for LiDARs": loaded.lidar is not None,
+    }
+    figures |= {f"{stage}_ms": ms for stage, ms in echo.timing_ms.items()}
+    print_figures(f"{scene.name}, LiDAR {sensor.name}", figures)
     write_json(json, figures)
 
 

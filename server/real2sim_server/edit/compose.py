@@ -139,12 +139,13 @@ def composed_background(
 
     def make() -> GaussianCloud:
         background = inpaint_ground(scene, scene.background, left) if left else scene.background
-        return _hidden(background, erased) if erased else background
+        return without_regions(background, erased) if erased else background
 
     return _kept(scene, (erased, left), make)
 
 
-def _hidden(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
+def without_regions(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
+    """The background with the Gaussians whose centres lie in ``erased`` made invisible."""
     opacities = background.opacities.clone()
     for region in erased:
         T_region_world = invert_transform(

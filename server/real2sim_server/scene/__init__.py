@@ -19,6 +19,7 @@ from .errors import (
 from .ground import Ground
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .lidar import Beams, Detection, Lidar
+from .lidar_surfaces import LidarSurfaces, Reflector
 from .scene import Scene, SceneObject
 from .shutter import Shutter
 from .sky import Sky
@@ -41,7 +42,9 @@ __all__ = [
     "Lens",
     "Lidar",
     "LidarError",
+    "LidarSurfaces",
     "Omnidirectional",
+    "Reflector",
     "Scene",
     "SceneError",
     "SceneObject",

@@ -20,6 +20,7 @@ from .colour import TimeColour
 from .errors import SceneError, UnknownObjectError
 from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
+from .lidar_surfaces import LidarSurfaces
 from .sky import Sky
 from .trajectory import Trajectory
 
@@ -112,6 +113,7 @@ class Scene:
         content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
         stored_ground: as the reconstruction fitted it; None where nobody has so far. Ask
             :attr:`ground`.
+        lidar: what LiDARs see in its place, or None: they see the same Gaussians as cameras.
     """
 
     name: str
@@ -125,6 +127,7 @@ class Scene:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     content_hash: str = ""
     stored_ground: Ground | None = field(default=None, repr=False)
+    lidar: LidarSurfaces | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS:
@@ -179,11 +182,12 @@ class Scene:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all Gaussians, the sky and the stored ground [bytes]."""
+        """Memory of all Gaussians, the sky, the stored ground and what LiDARs see [bytes]."""
         sky = self.sky.nbytes if self.sky else 0
         ground = self.stored_ground.nbytes if self.stored_ground else 0
         objects = sum(o.nbytes for o in self.objects.values())
-        return self.background.nbytes + sky + ground + objects
+        lidar = self.lidar.nbytes if self.lidar else 0
+        return self.background.nbytes + sky + ground + objects + lidar
 
     @property
     def start_us(self) -> int:

@@ -16,7 +16,7 @@ from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.native_writer import write_native_log
-from ..scene import Camera, CameraMotion, CameraRig
+from ..scene import Camera, CameraMotion, CameraRig, Lidar
 from .bvh import build_geometry
 from .casting import Instances
 from .config import SyntheticConfig
@@ -71,6 +71,20 @@ class SyntheticLog(DrivingLog):
         source = self.source
         assert isinstance(source, SyntheticSource)
         return source.render_through(camera, motion, t_us, samples)
+
+    def sweep(self, lidar: Lidar, t_us: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The true sweep of a LiDAR on the vehicle about ``t_us`` [us], without noise or losses.
+
+        Args:
+            lidar: whose rays are [B, C] with one instant for each column.
+            t_us: time stamp of the sweep.
+
+        Returns:
+            Ranges [B, C] [m], 0 where nothing is; reflectivity [B, C] in [0, 1].
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        return source.sweep(lidar, t_us)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +200,20 @@ class SyntheticSource:
             paint=self.body_paints,
             half_size=half,
         )
+
+    def sweep(self, lidar: Lidar, t_us: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See :meth:`SyntheticLog.sweep`."""
+        times_us = t_us + lidar.beams.time_us[0]
+        poses = poses_at(self.drive.ego, times_us) @ lidar.T_vehicle_lidar
+        local = lidar.beams.directions.swapaxes(0, 1)
+        ranges, reflected = shoot_lidar(
+            self.world,
+            self._instances_over(times_us),
+            np.ascontiguousarray(poses[:, :3, 3]),
+            np.ascontiguousarray(np.einsum("cij,cbj->cbi", poses[:, :3, :3], local)),
+            lidar.max_range,
+        )
+        return np.ascontiguousarray(ranges.T), np.ascontiguousarray(reflected.T)
 
     def lidar(self, frame: int) -> LidarSweep:
         """One turn of the LiDAR, clockwise, looking ahead at the frame's time stamp.

@@ -24,6 +24,7 @@ from .object_regions import moving_mask, moving_tracks
 from .rendering import measure_rate, render_view
 from .selection import select_cameras, select_frames
 from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
+from .sweeps import LidarScore, evaluate_sweeps
 from .truth import find_truth
 
 
@@ -40,6 +41,7 @@ class EvaluateOptions:
         repeats: timed renders.
         backend: of the renderer.
         around: whether vehicles are rendered from all around, where truth exists.
+        lidar: whether LiDAR sweeps are cast and compared, where the log has any.
 
     Raises:
         ReconstructError: a value out of range.
@@ -52,6 +54,7 @@ class EvaluateOptions:
     repeats: int = 10
     backend: str = "auto"
     around: bool = False
+    lidar: bool = False
 
     def __post_init__(self) -> None:
         if self.width is not None and not 16 <= self.width <= 8192:
@@ -131,6 +134,7 @@ class Evaluation:
         no_shifted: why it is empty; empty where it is not.
         lane_band: the road from beside the path against what other images show of it.
         around: vehicles from all sides; None unless asked for, or where no truth exists.
+        lidar: sweeps against what was there; None unless asked for, or without sweeps.
     """
 
     scene: str
@@ -154,6 +158,7 @@ class Evaluation:
     no_shifted: str = ""
     lane_band: tuple[LaneBandScore, ...] = ()
     around: AroundScore | None = None
+    lidar: LidarScore | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
@@ -163,6 +168,8 @@ class Evaluation:
         """
         values = _plain(asdict(self))
         values.pop("no_shifted" if self.shifted else "shifted")
+        if self.lidar is None:
+            values.pop("lidar")
         return dict(values)
 
 
@@ -208,6 +215,8 @@ def evaluate_scene(
         lane_band = _lane_band(scene, log, cameras[0], chosen.frames, options)
     with stages("around"):
         around = _around(scene, log) if options.around else None
+    with stages("lidar"):
+        lidar = evaluate_sweeps(scene, log, chosen.frames) if options.lidar else None
     return Evaluation(
         scene=scene.name,
         log=log.name,
@@ -224,6 +233,7 @@ def evaluate_scene(
         no_shifted=missing,
         lane_band=lane_band,
         around=around,
+        lidar=lidar,
         timing_s=timing_s,
         **asdict(_summary(views, errors)),
     )

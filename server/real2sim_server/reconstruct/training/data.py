@@ -50,7 +50,11 @@ class _FrameSubset:
 def training_log(log: DrivingLog, hold_out: int) -> DrivingLog:
     """``log`` without the held-out frames; paths and boxes stay whole."""
     held_out = set(held_out_frames(log.frame_count, hold_out))
-    frames = [f for f in range(log.frame_count) if f not in held_out]
+    return log_of_frames(log, [f for f in range(log.frame_count) if f not in held_out])
+
+
+def log_of_frames(log: DrivingLog, frames: list[int]) -> DrivingLog:
+    """``log`` with these frames alone; paths and boxes stay whole."""
     return replace(
         log,
         frame_times_us=log.frame_times_us[frames],

@@ -5,6 +5,8 @@ of it (a :class:`Sweep`). Nothing here is compiled before the first call.
 """
 
 from .call import cast, select_caster
+from .detect import Sweep, detect
+from .recorded import SweepScene, recorded_scene, recorded_sweep, sensor_poses
 from .types import CastBackend, CastRequest, Echo, Return
 
 __all__ = [
@@ -12,6 +14,12 @@ __all__ = [
     "CastRequest",
     "Echo",
     "Return",
+    "Sweep",
+    "SweepScene",
     "cast",
+    "detect",
+    "recorded_scene",
+    "recorded_sweep",
     "select_caster",
+    "sensor_poses",
 ]

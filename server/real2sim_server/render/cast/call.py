@@ -43,14 +43,28 @@ def cast(
     Raises:
         RenderError: poses or attributes of other shapes or values, or an unknown backend.
     """
-    request = CastRequest(
+    request = checked_request(
+        instances, lidar, T_world_lidar, object_poses=object_poses, attributes=attributes
+    )
+    return select_caster(backend).cast(request)
+
+
+def checked_request(
+    instances: Sequence[Instance],
+    lidar: Lidar,
+    T_world_lidar: ArrayLike,
+    *,
+    object_poses: Sequence[ArrayLike | None] | None = None,
+    attributes: Sequence[NDArray[np.float32] | None] | None = None,
+) -> CastRequest:
+    """The request of :func:`cast`. Raises like it."""
+    return CastRequest(
         instances=tuple(instances),
         lidar=lidar,
         T_world_lidar=_poses(T_world_lidar, lidar, "T_world_lidar"),
         object_poses=_object_poses(object_poses, instances, lidar),
         attributes=_attributes(attributes, instances),
     )
-    return select_caster(backend).cast(request)
 
 
 @cache

@@ -2,69 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float, slerp
 from ...geometry.transform import transform_from
-from ...scene import Lidar, Scene, Trajectory
+from ...scene import GaussianCloud, Lidar, Scene, Trajectory
 from ..types import Instance
 from .call import cast
 from .types import Echo
 
+Attributes = NDArray[np.float32]
 
-def recorded_sweep(
-    scene: Scene,
-    lidar: Lidar,
-    t_us: int,
-    *,
-    attributes: Sequence[NDArray[np.float32] | None] | None = None,
-    backend: str = "auto",
-) -> Echo:
+
+@dataclass(frozen=True, eq=False)
+class SweepScene:
+    """What cast() takes, one entry for each instance."""
+
+    instances: tuple[Instance, ...]
+    poses: tuple[Float | None, ...]
+    attributes: tuple[Attributes | None, ...]
+
+
+def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "auto") -> Echo:
     """What ``lidar`` on the recording vehicle meets in the sweep about ``t_us`` [us].
 
-    Args:
-        scene: gives Gaussians, trajectories and the vehicle's path.
-        attributes: of the background and of each object in the order of ``scene.objects``; by
-            default those of the scene's clouds.
-        backend: see :func:`.cast`.
+    A scene's own set for LiDARs (``scene.lidar``) is met where there is one.
     """
-    instances, poses, places = recorded_instances(scene, lidar, t_us)
-    if attributes is not None:
-        attributes = [attributes[place] for place in places]
+    met = recorded_scene(scene, lidar, t_us)
     return cast(
-        instances,
+        met.instances,
         lidar,
-        sensor_poses(scene, lidar, t_us),
-        object_poses=poses,
-        attributes=attributes,
+        sensor_poses(scene.ego, lidar, t_us),
+        object_poses=met.poses,
+        attributes=met.attributes,
         backend=backend,
     )
 
 
-def recorded_instances(
-    scene: Scene, lidar: Lidar, t_us: int
-) -> tuple[list[Instance], list[Float | None], list[int]]:
-    """Background and the objects that exist at ``t_us``, their poses over the sweep, and where
-    each stands in the list of the background and all objects."""
+def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
+    """Background and the objects that exist at ``t_us``, and how they move over the sweep."""
     times = t_us + lidar.beams.slots[0]
-    instances, poses, places = [Instance(scene.background)], [None], [0]
-    moved: list[Float | None] = list(poses)
-    for index, item in enumerate(scene.objects.values()):
-        if item.trajectory.covers(t_us):
-            pose = item.trajectory.transform(t_us)
-            instances.append(Instance(item.cloud, pose, instance_id=index + 1))
-            moved.append(transforms_at(item.trajectory, times))
-            places.append(index + 1)
-    return instances, moved, places
+    cloud, attributes = met_by_lidar(scene, None)
+    instances, known = [Instance(cloud)], [attributes]
+    moved: list[Float | None] = [None]
+    for index, (object_id, item) in enumerate(scene.objects.items()):
+        if not item.trajectory.covers(t_us):
+            continue
+        cloud, attributes = met_by_lidar(scene, object_id)
+        pose = item.trajectory.transform(t_us)
+        instances.append(Instance(cloud, pose, instance_id=index + 1))
+        moved.append(transforms_at(item.trajectory, times))
+        known.append(attributes)
+    return SweepScene(tuple(instances), tuple(moved), tuple(known))
 
 
-def sensor_poses(scene: Scene, lidar: Lidar, t_us: int) -> Float:
-    """``T_world_lidar`` [S, 4, 4] on the recording vehicle over the sweep about ``t_us``."""
-    times = t_us + lidar.beams.slots[0]
-    return transforms_at(scene.ego, times) @ lidar.T_vehicle_lidar
+def met_by_lidar(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, Attributes | None]:
+    """Gaussians that a LiDAR meets of an object, or of the background, and their attributes."""
+    if scene.lidar is not None:
+        held = scene.lidar.background if object_id is None else scene.lidar.objects.get(object_id)
+        if held is not None:
+            return held.cloud, held.attributes.numpy()
+    return (scene.background if object_id is None else scene.object(object_id).cloud), None
+
+
+def sensor_poses(ego: Trajectory, lidar: Lidar, t_us: int) -> Float:
+    """``T_world_lidar`` [S, 4, 4] on a vehicle that drives along ``ego`` [T_world_vehicle]."""
+    return transforms_at(ego, t_us + lidar.beams.slots[0]) @ lidar.T_vehicle_lidar
 
 
 def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
@@ -81,6 +87,7 @@ def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
     part = (times_us - known[after - 1]) / (known[after] - known[after - 1])
     first, last = trajectory.positions[after - 1], trajectory.positions[after]
     positions = first + part[:, None] * (last - first)
-    turned = np.clip(part, 0.0, 1.0)
-    quaternions = slerp(trajectory.quaternions[after - 1], trajectory.quaternions[after], turned)
+    quaternions = slerp(
+        trajectory.quaternions[after - 1], trajectory.quaternions[after], np.clip(part, 0.0, 1.0)
+    )
     return transform_from(positions, quaternions)

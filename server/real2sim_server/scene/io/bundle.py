@@ -20,6 +20,7 @@ from ..colour import TimeColour
 from ..errors import BundleError, SceneError
 from ..ground import Ground, of_bundle
 from ..ground_fit import BoxTrack, fit_scene_ground
+from ..lidar_surfaces import LidarSurfaces, Reflector
 from ..scene import Scene, SceneObject
 from ..sky import Sky
 from .container import read_container, write_container
@@ -32,18 +33,28 @@ from .document import (
     ColourPart,
     EgoPart,
     GroundPart,
+    LidarPart,
     ObjectPart,
+    ReflectorPart,
     SceneContent,
     SceneDocument,
     SkyPart,
     TrajectoryPart,
 )
-from .tensors import TensorFile, cloud_shapes, cloud_tensors, tensor_hashes
+from .tensors import (
+    TensorFile,
+    cloud_shapes,
+    cloud_tensors,
+    reflector_shapes,
+    reflector_tensors,
+    tensor_hashes,
+)
 
 BACKGROUND_FILE = "background.safetensors"
 OBJECTS_FILE = "objects.safetensors"
 SKY_FILE = "sky.safetensors"
 GROUND_FILE = "ground.safetensors"
+LIDAR_FILE = "lidar.safetensors"
 ASSET_FILE = "asset.safetensors"
 
 _UNWRITTEN = {"format": "", "version": 0, "content_hash": "0" * 64, "files": {}}
@@ -82,6 +93,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         ],
         sky=SkyPart(resolution=sky["faces"].shape[1], tensors=tensor_hashes(sky)) if sky else None,
         ground=_ground_part(scene.ground, ground),
+        lidar=_lidar_part(scene.lidar),
     )
     document = SceneDocument(
         kind="scene",
@@ -96,6 +108,8 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
     files = {BACKGROUND_FILE: background, OBJECTS_FILE: keyed, GROUND_FILE: ground}
     if sky:
         files[SKY_FILE] = sky
+    if scene.lidar is not None:
+        files[LIDAR_FILE] = _lidar_tensors(scene.lidar)
     written = write_container(document, Path(path), tensors=files, overwrite=overwrite)
     return replace(scene, content_hash=written.content_hash, stored_ground=scene.ground)
 
@@ -132,6 +146,7 @@ def load_scene(
             provenance=document.provenance,
             content_hash=document.content_hash,
             stored_ground=_ground(folder, document, verify) if content.ground else None,
+            lidar=_lidar(folder, document, verify) if content.lidar else None,
         )
     return scene.to(device)
 
@@ -232,6 +247,30 @@ def _ground_part(ground: Ground, tensors: Mapping[str, Tensor]) -> GroundPart:
     )
 
 
+def _reflectors(lidar: LidarSurfaces) -> list[tuple[str, Reflector]]:
+    """Prefix of the tensors' keys, and what they are of."""
+    objects = enumerate(lidar.objects.values())
+    return [("background.", lidar.background), *((f"{i}.", part) for i, part in objects)]
+
+
+def _lidar_tensors(lidar: LidarSurfaces) -> dict[str, Tensor]:
+    keyed: dict[str, Tensor] = {}
+    for prefix, reflector in _reflectors(lidar):
+        reflector.check_values(f"lidar {prefix[:-1]}")
+        keyed |= {prefix + name: t for name, t in reflector_tensors(reflector).items()}
+    return keyed
+
+
+def _lidar_part(lidar: LidarSurfaces | None) -> LidarPart | None:
+    if lidar is None:
+        return None
+    parts = [
+        ReflectorPart(gaussians=len(part.cloud), tensors=tensor_hashes(reflector_tensors(part)))
+        for _, part in _reflectors(lidar)
+    ]
+    return LidarPart(background=parts[0], objects=dict(zip(lidar.objects, parts[1:], strict=True)))
+
+
 def _cloud_part(tensors: Mapping[str, Tensor]) -> CloudPart:
     n, coefficients, _ = tensors["sh"].shape
     degree = round(coefficients**0.5) - 1
@@ -328,6 +367,27 @@ def _sky(folder: Path, document: SceneDocument, verify: bool) -> Sky | None:
     if verify and not bool(torch.isfinite(sky.faces).all()):
         raise SceneError("sky: faces hold values that are not finite")
     return sky
+
+
+def _lidar(folder: Path, document: SceneDocument, verify: bool) -> LidarSurfaces:
+    part = document.content.lidar
+    assert part is not None
+    file = _open(folder, LIDAR_FILE, document.files, verify)
+    objects = {
+        object_id: _reflector(file, f"{index}.", stored, f"lidar of object {object_id!r}")
+        for index, (object_id, stored) in enumerate(part.objects.items())
+    }
+    background = _reflector(file, "background.", part.background, "lidar of the background")
+    return LidarSurfaces(background, objects)
+
+
+def _reflector(file: TensorFile, prefix: str, part: ReflectorPart, what: str) -> Reflector:
+    taken = file.take(prefix, shapes=reflector_shapes(part.gaussians), hashes=part.tensors)
+    attributes = taken.pop("attributes")
+    reflector = Reflector(GaussianCloud(**taken, sh=torch.zeros(part.gaussians, 1, 3)), attributes)
+    if file.verify:
+        reflector.check_values(what)
+    return reflector
 
 
 def _ground(folder: Path, document: SceneDocument, verify: bool) -> Ground:

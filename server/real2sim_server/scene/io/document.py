@@ -203,11 +203,26 @@ class ObjectPart(_Part):
         return values
 
 
+class ReflectorPart(_Part):
+    """Gaussians that only LiDARs see, without colours, with two attributes each."""
+
+    gaussians: Count
+    tensors: dict[str, Sha256]
+
+
+class LidarPart(_Part):
+    """The second set of a scene; its objects' tensors are keyed by their position here."""
+
+    background: ReflectorPart
+    objects: dict[str, ReflectorPart]
+
+
 class SceneContent(_Part):
     """Everything that makes a scene what it is; the content hash is taken over this.
 
     Attributes:
         ground: left out of the JSON where there is none, as versions 1 and 2 of the format ask.
+        lidar: left out of the JSON where there is none, as versions 1 to 4 of the format ask.
     """
 
     cameras: list[CameraPart]
@@ -217,17 +232,21 @@ class SceneContent(_Part):
     objects: list[ObjectPart]
     sky: SkyPart | None
     ground: GroundPart | None = None
+    lidar: LidarPart | None = None
 
     @model_serializer(mode="wrap")
-    def _without_absent_ground(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        if values.get("ground") is None:
-            values.pop("ground", None)
+        for name in ("ground", "lidar"):
+            if values.get(name) is None:
+                values.pop(name, None)
         return values
 
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
+        if self.lidar is not None:
+            return 5
         if any(camera.has_optics for camera in self.cameras):
             return 4
         if self.ground is not None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..cloud import GaussianCloud
 from ..errors import BundleError
+from ..lidar_surfaces import Reflector
 
 CLOUD_FIELDS = tuple(f.name for f in fields(GaussianCloud))
 
@@ -34,6 +35,20 @@ def cloud_shapes(gaussians: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
         "opacities": (n,),
         "sh": (n, (sh_degree + 1) ** 2, 3),
     }
+
+
+def reflector_tensors(reflector: Reflector) -> dict[str, Tensor]:
+    """Tensors of what LiDARs see by name, on the CPU and contiguous; colours are not kept."""
+    tensors = cloud_tensors(reflector.cloud)
+    del tensors["sh"]
+    return tensors | {"attributes": reflector.attributes.detach().cpu().contiguous()}
+
+
+def reflector_shapes(gaussians: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of :func:`reflector_tensors`."""
+    shapes = cloud_shapes(gaussians, 0)
+    del shapes["sh"]
+    return shapes | {"attributes": (gaussians, 2)}
 
 
 def tensor_hash(tensor: Tensor) -> str:

@@ -16,7 +16,7 @@ from ...backends.cpu.sort import sort_records
 from ...backends.cpu.tile import tile_starts
 from ..motion import Motion, motions_of
 from ..types import CastRequest, Echo, Return
-from .blend import follow_rays
+from .blend import follow_rays, gather_light
 from .layout import BeamLayout, layout_of
 from .prepare import prepare_body
 from .records import RECORD, Body, Lights, Sensor
@@ -52,6 +52,41 @@ class CpuCaster:
             with timed(timing, "follow"):
                 lights = _follow(request, motions, records, lists, starts, layout)
         return _echo(request, lights, timing)
+
+    def gather(self, request: CastRequest, known: NDArray[np.float32]) -> NDArray[np.float64]:
+        """What the light of each Gaussian brought back, for back-projection.
+
+        Args:
+            request: of a recorded sweep.
+            known: [R, 2], see :func:`.blend.gather_light`.
+
+        Returns:
+            [N, 4] over the Gaussians of all instances: light, light times reflectivity, light
+            whose loss is known, lost light.
+        """
+        with self._lock:
+            records, regions, motions = self._prepare(request)
+            layout = layout_of(request.lidar.beams)
+            total = int(records.counts[:regions].sum())
+            pairs = self._space.array("pairs", (total,), np.uint64)
+            scratch = self._space.array("pairs_scratch", (total,), np.uint64)
+            order = sort_records(records, regions, pairs, scratch)
+            lists, starts = self._tile(records, order, layout)
+            counts = np.array([len(instance.cloud) for instance in request.instances] or [0])
+            sums = np.zeros((int(counts.sum()), 4))
+            gather_light(
+                records.values,
+                lists,
+                starts,
+                layout,
+                np.array(motions.of_body or [0], np.int64),
+                _rows(invert_transform(motions.to_sensor)),
+                _limits(request),
+                (np.cumsum(counts) - counts).astype(np.int64),
+                np.ascontiguousarray(known, dtype=np.float32),
+                sums,
+            )
+        return sums
 
     def _prepare(self, request: CastRequest) -> tuple[Records, int, Motion]:
         chunks = [-(-len(instance.cloud) // CHUNK) for instance in request.instances]
@@ -123,6 +158,11 @@ def _body(request: CastRequest, motions: Motion, index: int) -> Body:
     )
 
 
+def _limits(request: CastRequest) -> NDArray[np.float32]:
+    lidar = request.lidar
+    return np.array([lidar.min_range, lidar.max_range, lidar.pulse], np.float32)
+
+
 def _rows(transforms: Float) -> NDArray[np.float32]:
     """[..., 4, 4] as [..., 12] float32."""
     rows = transforms[..., :3, :].reshape(*transforms.shape[:-2], 12)
@@ -145,7 +185,7 @@ def _follow(  # noqa: PLR0917
         np.empty((count if lidar.returns > 1 else 0, 9), np.float32),
     )
     origins = _rows(invert_transform(motions.to_sensor))
-    limits = np.array([lidar.min_range, lidar.max_range, lidar.pulse], np.float32)
+    limits = _limits(request)
     of_body = np.array(motions.of_body or [0], np.int64)
     follow_rays(
         records.values, lists, starts, layout, of_body, origins, limits, lidar.returns, lights

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ....geometry.rotation import Float
 from ....scene import Beams
+from ....scene.lidar import wrapped
 from ...backends.cpu.lanes import LANES
 
 GROUPS = 8
@@ -234,9 +235,10 @@ def _turning(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
     times, slots = beams.slots
     centres = -np.pi + (np.arange(AZIMUTH_BINS) + 0.5) * AZIMUTH_BIN
     duration = float(times[-1] - times[0])
+    if len(beams.shape) == 1 and duration > 0:
+        return _turning_table(beams)
     if len(beams.shape) == 1 or beams.shape[1] < LANES or duration <= 0:
-        middle = np.full(AZIMUTH_BINS, len(times) // 2, dtype=np.int32)
-        return middle, 4.0, duration / 2, 0.0
+        return _staring(beams)
     azimuth, elevation_slots = beams.azimuth[0], slots[0]
     offsets = _difference(beams.azimuth[:, 0], azimuth[0])
     middle = (azimuth + float(offsets.mean()) + np.pi) % (2 * np.pi) - np.pi
@@ -255,6 +257,46 @@ def _turning(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
     seam = middle[0] - towards * step / 2 if turned > np.pi else 4.0
     seam = float((seam + np.pi) % (2 * np.pi) - np.pi) if turned > np.pi else 4.0
     return slot_of, seam, spread, rate
+
+
+def _staring(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
+    """Of a sensor that looks everywhere at any time."""
+    times = beams.slots[0]
+    middle = np.full(AZIMUTH_BINS, len(times) // 2, dtype=np.int32)
+    return middle, 4.0, float(times[-1] - times[0]) / 2, 0.0
+
+
+def _turning_table(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
+    """Of a table; it may be that of a turning sensor, as recorded sweeps are."""
+    times, slots = beams.slots
+    duration = float(times[-1] - times[0])
+    bins, when = _azimuth_bins(wrapped(beams.azimuth)), times[slots]
+    low, high = np.full(AZIMUTH_BINS, np.inf), np.full(AZIMUTH_BINS, -np.inf)
+    np.minimum.at(low, bins, when)
+    np.maximum.at(high, bins, when)
+    seen = np.flatnonzero(high >= low)
+    apart = high[seen] - low[seen]
+    at_seam = apart > duration / 2
+    if len(seen) < AZIMUTH_BINS // 8 or at_seam.mean() > 0.02 or np.median(apart) > duration / 16:
+        return _staring(beams)
+    middle = np.where(at_seam, high[seen], (low[seen] + high[seen]) / 2)
+    centres = np.arange(AZIMUTH_BINS)
+    after = np.searchsorted(seen, centres)
+    before = np.clip(after - 1, 0, len(seen) - 1)
+    after = np.clip(after, 0, len(seen) - 1)
+    nearer = np.where(centres - seen[before] < seen[after] - centres, before, after)
+    time_of = middle[nearer]
+    slot_of = np.clip(np.searchsorted(times, time_of), 0, len(times) - 1).astype(np.int32)
+    jumps = np.flatnonzero(np.abs(np.diff(time_of, append=time_of[0])) > duration / 2)
+    seam = -np.pi + (int(jumps[0]) + 1) * AZIMUTH_BIN if len(jumps) else 4.0
+    off = np.abs(when - time_of[bins])
+    spread = float(off[off < duration / 2].max()) + 2 * AZIMUTH_BIN / (2 * np.pi) * duration
+    return (
+        slot_of,
+        float(wrapped(np.array(seam))) if seam < 4 else 4.0,
+        spread,
+        float(2 * np.pi / (duration * 1e-6)),
+    )
 
 
 def _difference(a: Float, b: Float) -> Float:

@@ -1,0 +1,6 @@
+"""What LiDARs see of a scene: a set of Gaussians made of the recorded sweeps."""
+
+from .rays import RecordedRays, recorded_rays
+from .surfaces import SurfacesReport, fit_lidar_surfaces
+
+__all__ = ["RecordedRays", "SurfacesReport", "fit_lidar_surfaces", "recorded_rays"]

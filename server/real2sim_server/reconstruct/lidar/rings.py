@@ -1,0 +1,122 @@
+"""The beam table of a turning sensor, found from its raw scans.
+
+Scans of some data sets list one ring after the other, each from the same azimuth on. Where the
+azimuth falls back a new ring begins. The sensor may be tilted on its vehicle: rays of a ring lie on
+a cone about its axis, which is the direction in which they scatter least about their mean. The
+elevation of a ring is the median of its points'.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float
+from ...scene import Beams
+from ...scene.lidar import MAX_RAYS, wrapped
+from .rays import RecordedRays
+
+FALLS_BACK = np.pi
+"""A step back by more than this is the begin of a ring [rad]."""
+MIN_RING = 50
+"""Fewer points make no ring."""
+NOT_ONE = np.radians(0.35)
+"""Elevations of a ring scatter less than this [rad], or the scan is not by rings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """A fitted beam table.
+
+    Attributes:
+        elevation: [B] of each ring, as the scan lists them [rad].
+        residual: root mean square of the points' elevations about their rings' [rad].
+        ring: [R] int32, of each ray; -1 for those of no ring.
+        columns: azimuth steps of a turn.
+        clockwise: as seen from above.
+        T_vehicle_lidar: [4, 4], turned so that z is the axis.
+        azimuth, height: [R] of each ray about that axis [rad].
+    """
+
+    elevation: Float
+    residual: float
+    ring: NDArray[np.int32]
+    columns: int
+    clockwise: bool
+    T_vehicle_lidar: Float
+    azimuth: Float
+    height: Float
+
+    def beams(self, rays: RecordedRays) -> Beams:
+        """The grid of rings by columns, each column at the instant at which ``rays`` were there."""
+        slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
+        azimuth = wrapped(-np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns)
+        order = np.argsort(wrapped(azimuth - start) * np.sign(slope), kind="stable")
+        azimuth = azimuth[order]
+        time_us = wrapped(azimuth - start) / slope
+        shape = (len(self.elevation), self.columns)
+        return Beams(
+            np.broadcast_to(azimuth, shape),
+            np.broadcast_to(self.elevation[:, None], shape),
+            np.broadcast_to(time_us, shape),
+        )
+
+
+def fit_rings(rays: RecordedRays) -> Rings | None:
+    """The rings of a sweep whose rays are in the order of the scan; None where it has none."""
+    # Rings run from ahead to ahead: seen from behind there is one fall back for each.
+    turned = rays.lidar.beams.azimuth % (2 * np.pi)
+    step = np.diff(turned)
+    rises = np.median(step) > 0
+    begins = np.flatnonzero((-step if rises else step) > FALLS_BACK) + 1
+    ring = np.zeros(len(turned), np.int32)
+    ring[begins] = 1
+    ring = np.cumsum(ring).astype(np.int32)
+    counts = np.bincount(ring)
+    kept = np.flatnonzero(counts >= MIN_RING)
+    if len(kept) < 2:
+        return None
+    number = np.full(len(counts), -1, np.int32)
+    number[kept] = np.arange(len(kept))
+    ring = number[ring]
+    turn = _upright(rays.lidar.beams.directions, ring)
+    local = rays.lidar.beams.directions @ turn
+    azimuth = np.arctan2(local[:, 1], local[:, 0])
+    elevation = np.arcsin(np.clip(local[:, 2], -1, 1))
+    middle = np.array([np.median(elevation[ring == index]) for index in range(len(kept))])
+    off = (elevation - middle[ring])[ring >= 0]
+    residual = float(np.sqrt(np.mean(np.square(off))))
+    if residual > NOT_ONE:
+        return None
+    width = float(np.median(np.abs(step[np.abs(step) < 0.1])))
+    columns = int(np.clip(round(2 * np.pi / max(width, 1e-4)), 1, MAX_RAYS // len(kept)))
+    slope, _ = _turn(azimuth, rays.lidar.beams.time_us)
+    pose = rays.lidar.T_vehicle_lidar.copy()
+    pose[:3, :3] = pose[:3, :3] @ turn
+    return Rings(middle, residual, ring, columns, slope < 0, pose, azimuth, elevation)
+
+
+def _upright(directions: Float, ring: NDArray[np.int32]) -> Float:
+    """Turn [3, 3] whose columns are the sensor's axes, the last one that of the cones."""
+    scatter = np.zeros((3, 3))
+    for index in range(int(ring.max()) + 1):
+        own = directions[ring == index]
+        away = own - own.mean(0)
+        scatter += away.T @ away
+    axis = np.linalg.eigh(scatter)[1][:, 0]
+    axis = axis if axis[2] > 0 else -axis
+    ahead = np.array([1.0, 0, 0]) - axis[0] * axis
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([ahead, np.cross(axis, ahead), axis], axis=1)
+
+
+def _turn(azimuth: Float, time_us: Float) -> tuple[float, float]:
+    """Speed [rad/us] at which a sweep turns, and where it looks at its time stamp [rad]."""
+    near = np.abs(time_us) < np.abs(time_us).max() / 4
+    start = float(np.angle(np.exp(1j * azimuth[np.abs(time_us) < 2000]).mean()))
+    away = wrapped(azimuth[near] - start)
+    moments = time_us[near]
+    slope = float((away * moments).sum() / max(np.square(moments).sum(), 1e-9))
+    return slope if abs(slope) > 1e-9 else -2 * np.pi / 1e5, start

@@ -1,0 +1,106 @@
+"""Recorded sweeps as rays, beam tables from them, and the surfaces that they make."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from real2sim_server.reconstruct.evaluation.sweeps import evaluate_sweeps, synthetic_lidar
+from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
+from real2sim_server.reconstruct.lidar import RecordedRays, fit_lidar_surfaces, recorded_rays
+from real2sim_server.reconstruct.lidar.rings import fit_rings
+from real2sim_server.reconstruct.options import InitialiseOptions
+from real2sim_server.scene import Beams, Lidar
+from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
+from real2sim_server.synthetic.config import CameraSpec
+
+CONFIG = SyntheticConfig(
+    seed=3,
+    frames=5,
+    width=96,
+    height=64,
+    samples=1,
+    cameras=(CameraSpec("front"),),
+    moving_cars=1,
+    parked_cars=2,
+    lidar_beams=32,
+    lidar_columns=512,
+    lidar_noise=0.01,
+)
+
+
+@pytest.fixture(scope="module")
+def log() -> SyntheticLog:
+    return generate_log(CONFIG)
+
+
+def test_rays_start_where_the_sensor_was(log: SyntheticLog) -> None:
+    rays = recorded_rays(log, 2)
+    assert rays is not None
+    lidar = synthetic_lidar(CONFIG)
+    truth, reflectivity = log.sweep(lidar, int(log.frame_times_us[2]))
+    beams = rays.lidar.beams
+    # Rays lie on the grid on which they were cast: compare with the truth there.
+    row = np.abs(beams.elevation[:, None] - lidar.beams.elevation[:, 0]).argmin(1)
+    turned = np.abs(np.exp(1j * beams.azimuth[:, None]) - np.exp(1j * lidar.beams.azimuth[0]))
+    column = turned.argmin(1)
+    assert np.abs(beams.elevation - lidar.beams.elevation[row, 0]).max() < 1e-4
+    assert turned.min(1).max() < 1e-4
+    error = rays.range - truth[row, column]
+    assert np.abs(error).max() < 6 * CONFIG.lidar_noise
+    assert np.std(error) == pytest.approx(CONFIG.lidar_noise, rel=0.2)
+    assert np.abs(rays.intensity - reflectivity[row, column]).mean() < 0.02
+
+
+def ring_scan(elevations: np.ndarray, jitter: float) -> RecordedRays:  # type: ignore[type-arg]
+    """A scan that lists ring after ring from ahead on, anticlockwise, with gaps."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation, time = [], [], []
+    for height in elevations:
+        turned = np.sort(rng.choice(np.arange(1000), 900, replace=False)) * 2 * np.pi / 1000
+        azimuth.append((turned + np.pi) % (2 * np.pi) - np.pi)
+        elevation.append(height + rng.normal(0, jitter, 900))
+        time.append(-azimuth[-1] / (2 * np.pi) * 1e5)
+    beams = Beams(*(np.concatenate(parts) for parts in (azimuth, elevation, time)))
+    count = beams.count
+    ones = np.ones(count)
+    return RecordedRays(Lidar("scan", beams), ones, ones.astype("f4"), np.zeros((count, 3)))
+
+
+def test_rings_are_found_from_a_raw_scan() -> None:
+    elevations = np.radians(np.linspace(2, -24, 32))
+    rays = ring_scan(elevations, np.radians(0.02))
+    rings = fit_rings(rays)
+    assert rings is not None
+    assert np.allclose(rings.elevation, elevations, atol=np.radians(0.005))
+    assert np.degrees(rings.residual) == pytest.approx(0.02, rel=0.1)
+    assert rings.columns == pytest.approx(1000, abs=5)
+    assert rings.clockwise
+    grid = rings.beams(rays)
+    assert grid.shape == (32, rings.columns)
+    # Columns are at the instants at which the scan was there.
+    expected = -grid.azimuth[0] / (2 * np.pi) * 1e5
+    assert np.abs(grid.time_us[0] - expected)[np.abs(grid.azimuth[0]) < 3].max() < 200
+
+
+def test_a_scan_that_is_not_by_rings_gives_none() -> None:
+    rays = ring_scan(np.radians(np.linspace(2, -24, 32)), np.radians(2.0))
+    assert fit_rings(rays) is None
+
+
+@pytest.mark.slow
+def test_surfaces_of_sweeps_measure_what_was_there(log: SyntheticLog) -> None:
+    options = InitialiseOptions(max_background=20_000, voxel=0.2, ground_spacing=0.2)
+    scene = initialise_scene(log, options=options)
+    made, report = fit_lidar_surfaces(scene, log, surfaces=scene)
+    assert made.lidar is not None
+    assert report.sweeps == 5
+    assert set(made.lidar.objects) == set(scene.objects)
+    before, after = (evaluate_sweeps(s, log, [2]) for s in (scene, made))
+    assert before is not None
+    assert after is not None
+    assert after.against == "ray-cast truth"
+    assert after.mean.median_m < 0.03
+    assert after.mean.median_m < before.mean.median_m
+    assert after.mean.hit_miss > 0.95
+    assert after.mean.intensity_rmse < 0.7 * before.mean.intensity_rmse

@@ -1,0 +1,66 @@
+"""What LiDARs see, in bundles."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from real2sim_server.scene import BundleError, LidarSurfaces, Reflector, SceneError
+from real2sim_server.scene.io import load_scene, save_scene
+
+
+@pytest.fixture
+def surfaces(make_cloud):
+    def reflector(count: int) -> Reflector:
+        cloud = make_cloud(count, degree=0)
+        return Reflector(cloud, torch.linspace(0, 1, 2 * count).reshape(count, 2))
+
+    return LidarSurfaces(reflector(7), {"car_3": reflector(3)})
+
+
+def test_surfaces_come_back_as_they_were(scene, surfaces, tmp_path):
+    save_scene(replace(scene, lidar=surfaces), tmp_path / "a.r2s")
+    assert json.loads((tmp_path / "a.r2s" / "scene.json").read_text())["version"] == 5
+    read = load_scene(tmp_path / "a.r2s").lidar
+    assert read is not None
+    pairs = [
+        (surfaces.background, read.background),
+        (surfaces.objects["car_3"], read.objects["car_3"]),
+    ]
+    for written, back in pairs:
+        assert torch.equal(written.attributes, back.attributes)
+        for name in ("means", "quats", "scales", "opacities"):
+            assert torch.equal(getattr(written.cloud, name), getattr(back.cloud, name))
+
+
+def test_a_scene_without_them_is_written_as_before(scene, tmp_path):
+    save_scene(scene, tmp_path / "a.r2s")
+    document = json.loads((tmp_path / "a.r2s" / "scene.json").read_text())
+    assert document["version"] < 5
+    assert "lidar" not in document["content"]
+    assert not (tmp_path / "a.r2s" / "lidar.safetensors").exists()
+    assert load_scene(tmp_path / "a.r2s").lidar is None
+
+
+def test_changed_attributes_are_noticed(scene, surfaces, tmp_path):
+    save_scene(replace(scene, lidar=surfaces), tmp_path / "a.r2s")
+    file = tmp_path / "a.r2s" / "lidar.safetensors"
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(bytes(data))
+    with pytest.raises(BundleError, match=r"lidar\.safetensors"):
+        load_scene(tmp_path / "a.r2s")
+
+
+def test_attributes_of_another_number_are_refused(make_cloud):
+    with pytest.raises(SceneError, match=r"must be \(4, 2\) float32"):
+        Reflector(make_cloud(4), torch.zeros(3, 2))
+
+
+def test_attributes_out_of_range_are_refused(make_cloud, scene, tmp_path):
+    bad = LidarSurfaces(Reflector(make_cloud(4), torch.full((4, 2), 2.0)))
+    with pytest.raises(SceneError, match=r"8 attributes are outside \[0, 1\]"):
+        save_scene(replace(scene, lidar=bad), tmp_path / "a.r2s")
