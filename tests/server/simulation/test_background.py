@@ -128,7 +128,9 @@ def crash(scene, state, name, velocity, **options):
 def test_what_slides_into_a_house_stops_there(scene, background):
     state = ScenarioState.of(scene)
     velocity = (*(-8.0 * NORMAL), 0.0)
-    result = crash(scene, state, "crate", velocity, duration=0.6, background=background)
+    result = crash(
+        scene, state, "crate", velocity, duration=0.6, background=background, max_particles=800
+    )
     own = result.objects["crate"]
     beyond = (own.positions[-1, :2] - FOOT) @ -NORMAL
     hit = {c.other for c in result.contacts if c.other.startswith("background.")}

@@ -101,8 +101,9 @@ def calibrated(scene, state, observation, *parameters):
     ).fit
 
 
-def within(found, name) -> bool:
-    return abs(found.factors[name] / TRUE[name] - 1) < 2 * found.uncertainty[name]
+def within(found, name, deviations=1.0) -> bool:
+    """Whether a factor is right within so many of the standard deviations that are claimed."""
+    return abs(found.factors[name] / TRUE[name] - 1) < deviations * found.uncertainty[name]
 
 
 def test_marked_points_tell_stiffness_friction_and_speed(scene, state, truth):
@@ -128,8 +129,12 @@ def test_small_images_tell_speed(scene, state, truth, worker_kernels):
     assert within(found, "speed")
 
 
+@pytest.mark.slow
 def test_what_was_observed_on_half_the_cells_is_found_within_the_uncertainty(scene, state):
-    """The part that is due to cells is most of it, and observations alone would claim too much."""
+    """The part that is due to cells is most of it, and observations alone would claim too much.
+
+    Two standard deviations, as 19 of 20 measurements are: here the cells really differ.
+    """
     finer = simulate(scene, state, thrown(**TRUE, grid=16))
     observed = points_of(finer)
     coarse = thrown()
@@ -143,7 +148,7 @@ def test_what_was_observed_on_half_the_cells_is_found_within_the_uncertainty(sce
         parameters=["stiffness", "speed"],
     ).fit
     for name in ("stiffness", "speed"):
-        assert within(found, name), name
+        assert within(found, name, 2.0), name
     assert found.discretisation["stiffness"] > found.observation["stiffness"]
 
 

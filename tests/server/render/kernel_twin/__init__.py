@@ -16,7 +16,7 @@ import subprocess
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -32,47 +32,76 @@ WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-Wno-unused-
 FAULTS = {1: "no such kernel", 2: "threads of a block part ways at a barrier"}
 
 
-@functools.cache
-def twin() -> ctypes.CDLL:
-    """The compiled kernels; compiled once for each state of the sources."""
-    sources = sorted([*FOLDER.iterdir(), *HERE.glob("*.h"), *HERE.glob("*.cpp")])
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources) + repr(FLAGS).encode())
+def compiled_twin(
+    name: str,
+    main: Path,
+    *,
+    sources: Iterable[Path],
+    flags: Sequence[str] = (),
+    made: Mapping[str, str] | None = None,
+) -> ctypes.CDLL:
+    """Kernels compiled for the CPU; compiled once for each state of what they are made of.
+
+    Args:
+        name: of what is kept on the disk.
+        main: that includes all else, from the folders of ``sources``.
+        sources: the kernels, and the headers in their folders.
+        flags: of the compiler, beside those of all.
+        made: headers that are in no folder, by name.
+    """
+    made = made or {}
+    files = sorted({main, *sources, *HERE.glob("*.h")})
+    flags = (*FLAGS, *WARNINGS, *flags)
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
+    digest.update(repr((sorted(made.items()), flags)).encode())
     folder = Path(tempfile.gettempdir()) / "real2sim-kernel-twin"
-    library = folder / f"{digest.hexdigest()[:16]}.so"
+    library = folder / f"{name}-{digest.hexdigest()[:16]}.so"
     if not library.is_file():
         folder.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as made:
-            target = Path(made) / library.name
-            command = [str(COMPILER), *FLAGS, *WARNINGS, "-I", str(FOLDER), "-o", str(target)]
-            subprocess.run([*command, str(HERE / "twin.cpp")], check=True)
+        with tempfile.TemporaryDirectory(dir=folder) as making:
+            for header, text in made.items():
+                (Path(making) / header).write_text(text, encoding="ascii")
+            target = Path(making) / library.name
+            folders = [making, *sorted({str(path.parent) for path in files})]
+            includes = [part for path in folders for part in ("-I", path)]
+            command = [str(COMPILER), *flags, *includes, "-o", str(target), str(main)]
+            subprocess.run(command, check=True)
             target.replace(library)
     loaded = ctypes.CDLL(str(library))
     arguments = [ctypes.c_char_p, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_int]
     loaded.run.argtypes = arguments
+    return loaded
+
+
+@functools.cache
+def twin() -> ctypes.CDLL:
+    """The compiled serving kernels."""
+    loaded = compiled_twin("serving", HERE / "twin.cpp", sources=FOLDER.iterdir())
     for name in ("exponential", "logarithm"):
         function = getattr(loaded, name)
         function.argtypes, function.restype = [ctypes.c_float], ctypes.c_float
     return loaded
 
 
-class TwinLauncher:
-    """A Launcher that runs the kernels on the CPU.
+class KernelTwin:
+    """What launchers have in common that run kernels on the CPU.
 
     Args:
+        kernels: gives what was compiled.
         backwards: run blocks, and the threads of each, in the opposite order.
 
     Attributes:
         launches: number of launches of each kernel.
     """
 
-    def __init__(self, *, backwards: bool = False) -> None:
+    def __init__(self, kernels: Callable[[], ctypes.CDLL], *, backwards: bool) -> None:
         self.device = torch.device("cpu")
         self.launches: Counter[str] = Counter()
-        self._backwards = backwards
+        self._kernels, self._backwards = kernels, backwards
 
-    def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
+    def launch(self, kernel: str, blocks: int, space: int, argument: int = 0) -> None:
         self.launches[kernel] += 1
-        fault = twin().run(kernel.encode(), blocks, frame, argument, self._backwards)
+        fault = self._kernels().run(kernel.encode(), blocks, space, argument, self._backwards)
         assert fault == 0, f"{kernel}: {FAULTS[fault]}"
 
     def pointer(self, tensor: Tensor) -> int:
@@ -85,6 +114,13 @@ class TwinLauncher:
 
     def wait(self) -> None:
         """Everything is done when it is launched."""
+
+
+class TwinLauncher(KernelTwin):
+    """A Launcher of the renderer that runs the serving kernels on the CPU."""
+
+    def __init__(self, *, backwards: bool = False) -> None:
+        super().__init__(twin, backwards=backwards)
 
     def copy_out(self, source: Tensor, target: Tensor) -> Callable[[], object]:
         lock, copied = threading.Lock(), []
