@@ -14,6 +14,7 @@ from real2sim_server.physics.particles import box_particles
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.simulation.breakages import find_breakages
 from real2sim_server.simulation.damage import BreakageLog, DamagedVehicle, fragment_cloud
+from real2sim_server.simulation.damage.appearance import CLEARANCE, HANGS_STILL
 from real2sim_server.simulation.damage.parts import parts_of
 from real2sim_server.simulation.embedding import Embedding, deform_cloud
 from real2sim_server.simulation.playback import Playback
@@ -131,6 +132,24 @@ def test_the_same_bits_come_of_the_same_crash(vehicle):
     one, two = (drawn(vehicle, crushed_front(), {"front bumper": 0.2})[1] for _ in range(2))
     for name in ("means", "quats", "scales", "sh"):
         assert torch.equal(getattr(one, name), getattr(two, name))
+
+
+def test_a_loose_bumper_sinks_and_comes_to_rest_above_the_road():
+    y = np.linspace(-0.88, 0.88, 30)
+    row = np.stack([np.full(30, 2.25), y, np.full(30, -0.55)], axis=1).astype(np.float32)
+    cloud = replace(skin(15), means=torch.from_numpy(row))
+    made = DamagedVehicle(
+        cloud, PARTICLES, spacing=SPACING, category="car", size=SIZE, object_id="car_1"
+    )
+    still = np.zeros_like(PARTICLES)
+
+    def height(age):
+        means = made.cloud(still, made.shortening(still), {"front bumper": age}).means
+        return means[:, 2] + SIZE[2] / 2
+
+    assert float((height(0.1) - height(0.3)).max()) > 0.02
+    assert torch.equal(height(HANGS_STILL), height(2 * HANGS_STILL))
+    assert float(height(HANGS_STILL).min()) == pytest.approx(CLEARANCE, abs=1e-5)
 
 
 def test_a_front_that_is_pushed_in_breaks_what_is_there():
