@@ -3,7 +3,7 @@
 Scans of some data sets list one ring after the other, each from the same azimuth on. Where the
 azimuth falls back a new ring begins. The sensor may be tilted on its vehicle: rays of a ring lie on
 a cone about its axis, which is the direction in which they scatter least about their mean. The
-elevation of a ring is the median of its points'.
+lasers of a sensor leave it at different heights, so a ring is the line z = offset + slope rho.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ FALLS_BACK = np.pi
 """A step back by more than this is the begin of a ring [rad]."""
 MIN_RING = 50
 """Fewer points make no ring."""
+ROUNDS = 5
+"""Times that the farthest points of a ring are left aside and the rest is fitted again."""
 NOT_ONE = np.radians(0.35)
 """Elevations of a ring scatter less than this [rad], or the scan is not by rings."""
 
@@ -32,15 +34,18 @@ class Rings:
 
     Attributes:
         elevation: [B] of each ring, as the scan lists them [rad].
-        residual: root mean square of the points' elevations about their rings' [rad].
+        offset: [B] of each ring's origin above the sensor's [m].
+        residual: root mean square of the points' elevations about their rings' as seen from there
+            [rad], the farthest twentieth left aside.
         ring: [R] int32, of each ray; -1 for those of no ring.
         columns: azimuth steps of a turn.
         clockwise: as seen from above.
         T_vehicle_lidar: [4, 4], turned so that z is the axis.
-        azimuth, height: [R] of each ray about that axis [rad].
+        azimuth, height: [R] of each ray about that axis, and of its ring [rad].
     """
 
     elevation: Float
+    offset: Float
     residual: float
     ring: NDArray[np.int32]
     columns: int
@@ -84,9 +89,9 @@ def fit_rings(rays: RecordedRays) -> Rings | None:
     turn = _upright(rays.lidar.beams.directions, ring)
     local = rays.lidar.beams.directions @ turn
     azimuth = np.arctan2(local[:, 1], local[:, 0])
-    elevation = np.arcsin(np.clip(local[:, 2], -1, 1))
-    middle = np.array([np.median(elevation[ring == index]) for index in range(len(kept))])
-    off = (elevation - middle[ring])[ring >= 0]
+    slope_of, offset, off = _cones(local * rays.range[:, None], ring)
+    middle = np.arctan(slope_of)
+    elevation = np.where(ring >= 0, middle[ring], np.arcsin(np.clip(local[:, 2], -1, 1)))
     residual = float(np.sqrt(np.mean(np.square(off))))
     if residual > NOT_ONE:
         return None
@@ -95,7 +100,27 @@ def fit_rings(rays: RecordedRays) -> Rings | None:
     slope, _ = _turn(azimuth, rays.lidar.beams.time_us)
     pose = rays.lidar.T_vehicle_lidar.copy()
     pose[:3, :3] = pose[:3, :3] @ turn
-    return Rings(middle, residual, ring, columns, slope < 0, pose, azimuth, elevation)
+    return Rings(middle, offset, residual, ring, columns, slope < 0, pose, azimuth, elevation)
+
+
+def _cones(points: Float, ring: NDArray[np.int32]) -> tuple[Float, Float, Float]:
+    """Slope and offset [B] of each ring, and how far [rad] its points are off, without the
+    farthest twentieth."""
+    rho = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-3)
+    count = int(ring.max()) + 1
+    slopes, offsets, off = np.zeros(count), np.zeros(count), []
+    for index in range(count):
+        own = np.flatnonzero(ring == index)
+        far, rise = 1 / rho[own], points[own, 2] / rho[own]
+        kept = np.ones(len(own), np.bool_)
+        for _ in range(ROUNDS):
+            table = np.stack([np.ones(int(kept.sum())), far[kept]], axis=1)
+            (slope, offset), *_ = np.linalg.lstsq(table, rise[kept], rcond=None)
+            error = np.abs(rise - slope - offset * far)
+            kept = error <= np.quantile(error, 0.95)
+        slopes[index], offsets[index] = slope, offset
+        off.append((rise - slope - offset * far)[kept] / (1 + slope**2))
+    return slopes, offsets, np.concatenate(off)
 
 
 def _upright(directions: Float, ring: NDArray[np.int32]) -> Float:

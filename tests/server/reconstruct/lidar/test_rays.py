@@ -63,8 +63,10 @@ def ring_scan(elevations: np.ndarray, jitter: float) -> RecordedRays:  # type: i
         time.append(-azimuth[-1] / (2 * np.pi) * 1e5)
     beams = Beams(*(np.concatenate(parts) for parts in (azimuth, elevation, time)))
     count = beams.count
-    ones = np.ones(count)
-    return RecordedRays(Lidar("scan", beams), ones, ones.astype("f4"), np.zeros((count, 3)))
+    distance = rng.uniform(3, 40, count)
+    return RecordedRays(
+        Lidar("scan", beams), distance, np.ones(count, np.float32), np.zeros((count, 3))
+    )
 
 
 def test_rings_are_found_from_a_raw_scan() -> None:
@@ -73,7 +75,8 @@ def test_rings_are_found_from_a_raw_scan() -> None:
     rings = fit_rings(rays)
     assert rings is not None
     assert np.allclose(rings.elevation, elevations, atol=np.radians(0.005))
-    assert np.degrees(rings.residual) == pytest.approx(0.02, rel=0.1)
+    assert np.degrees(rings.residual) == pytest.approx(0.02, rel=0.2)
+    assert np.abs(rings.offset).max() < 0.02
     assert rings.columns == pytest.approx(1000, abs=5)
     assert rings.clockwise
     grid = rings.beams(rays)
