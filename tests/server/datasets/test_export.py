@@ -38,7 +38,9 @@ class Killed(BaseException):
     """Nobody catches it, as nobody catches the end of a process."""
 
 
-@pytest.mark.parametrize("stage", [("frames", 4), ("formats", 3)])
+@pytest.mark.parametrize(
+    "stage", [("frames", 4), pytest.param(("formats", 3), marks=pytest.mark.slow)]
+)
 def test_a_stopped_export_goes_on_to_the_same_bytes(exported, tiny_drive, plan, tmp_path, stage):
     labelled = []
 

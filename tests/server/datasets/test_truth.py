@@ -17,7 +17,7 @@ def street() -> Scene:
 
 
 def test_labels_of_a_frame_agree_with_rays(street):
-    found = measure(street, [10], ["front"], width=240).summary()
+    found = measure(street, [10], ["front"], width=200).summary()
     assert found["objects"] >= 3
     assert found["mask_iou"] > 0.85
     assert found["box_iou"] > 0.8
