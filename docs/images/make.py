@@ -5,8 +5,8 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
     .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
 
-NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground; without one, all are made.
-It takes about a quarter of an hour on two cores.
+NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses; without one, all are
+made. It takes about a quarter of an hour on two cores.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -27,6 +28,10 @@ import real2sim
 from real2sim_server.demo.run import SCENE
 from real2sim_server.demo.street import DURATION_S, TRAINING_HZ, record_street, unpack_street
 from real2sim_server.demo.worker import worker_process
+from real2sim_server.edit import posed_instances
+from real2sim_server.render import render_cameras
+from real2sim_server.scene import Fisheye, Shutter
+from real2sim_server.scene.io import load_scene
 
 HERE = Path(__file__).parent
 EDITS = [
@@ -52,6 +57,7 @@ EDITS = [
 ]
 """Of docs/rest.md."""
 SHOWN_US = 5_250_000
+LENSES_US = 5_300_000
 IN_THE_LANE = {"op": "translate", "object_id": "car_6", "y": 3.0, "frame": "object", "snap": True}
 """Puts a parked car before the van that drives ahead, for the studio's run of physics."""
 
@@ -160,8 +166,28 @@ def ground(work: Path, scenes: Path) -> None:
     save("ground.jpg", read(picture), width=1100)
 
 
+def lenses(_: Path, scenes: Path) -> None:
+    """``lenses.jpg``: a fisheye of 190 degrees, and a rolling shutter at 30 m/s."""
+    scene = load_scene(scenes / SCENE)
+    front, left = scene.rig["front"].resized(640), scene.rig["front_left"].resized(640)
+    focal = 320 / np.radians(95)
+    K = np.array([[focal, 0, 320], [0, focal, front.height / 2], [0, 0, 1]])
+    eye = replace(front, K=K, lens=Fisheye((0.02, -0.01, 0.001, 0.0), np.radians(95)))
+    rolling = replace(left, shutter=Shutter("top_to_bottom", 60_000))
+    vehicle = scene.ego.transform(LENSES_US)
+    fast = np.concatenate([vehicle[:3, 0] * 30, np.zeros(3)])
+    instances = posed_instances(scene, LENSES_US, {})
+    frames = render_cameras(
+        instances, [eye, rolling], vehicle, sky=scene.sky, backend="cpu", twist=fast
+    )
+    gap = np.full((front.height, 6, 3), 255, np.uint8)
+    pictures = [frame.rgb[..., ::-1] for frame in frames]
+    save("lenses.jpg", np.concatenate([pictures[0], gap, pictures[1]], axis=1), width=1286)
+
+
 PICTURES = {
-    make.__name__: make for make in (demo, scenario, studio, wall, pair, drop, crashes, ground)
+    make.__name__: make
+    for make in (demo, scenario, studio, wall, pair, drop, crashes, ground, lenses)
 }
 
 
