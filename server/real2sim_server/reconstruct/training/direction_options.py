@@ -12,10 +12,11 @@ class DirectionOptions:
     Attributes:
         lobe_prior: variance of the directions at which objects keep half of a colour that depends
             on the direction; 0 leaves colours as they were learnt.
-        sides: whether sides of vehicles that no image shows are taken from initialisation.
+        sides: whether sides of vehicles that images show only edge on are taken from
+            initialisation: right for edits, but recorded views lose by it.
         views: that are asked.
     """
 
     lobe_prior: float = 0.03
-    sides: bool = True
+    sides: bool = False
     views: int = 32
