@@ -5,8 +5,8 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
     .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
 
-NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses; without one, all are
-made. It takes about a quarter of an hour on two cores.
+NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses; without one, all
+are made. It takes about a quarter of an hour on two cores.
 """
 
 from __future__ import annotations
