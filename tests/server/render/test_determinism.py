@@ -89,12 +89,12 @@ def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
 def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     instances = scene()
     whole = digest(draw(instances))
-    monkeypatch.setattr("real2sim_server.render.backends.cpu.backend.LIST_BUDGET", 2000)
+    monkeypatch.setattr("real2sim_server.render.backends.cpu.drawing.LIST_BUDGET", 2000)
     assert digest(draw(instances)) == whole
 
 
 def test_a_picture_drawn_in_pieces_is_the_same_whatever_is_drawn_between(monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr("real2sim_server.render.backends.cpu.backend.PIECE_PIXELS", 4000)
+    monkeypatch.setattr("real2sim_server.render.backends.cpu.drawing.PIECE_PIXELS", 4000)
     instances = scene()
     whole, other = digest(draw(instances)), digest(draw(instances[1:]))
     between = []

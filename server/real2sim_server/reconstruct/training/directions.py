@@ -138,12 +138,13 @@ def plain_lobes(model: SceneModel, seen: ViewingDirections, *, prior: float = LO
     covariance = seen.seconds[objects] - means[:, :, None] * means[:, None]
     eye = torch.eye(3, device=sh.device)
     kept = torch.linalg.solve(covariance + prior * eye, covariance)
-    order, signs = [3, 1, 2], sh.new_tensor([-1.0, -1.0, 1.0])[:, None]
-    slopes = sh[:, order] * signs * SH_C1
+    # Lobes lie in the order y, z, x.
+    signs = sh.new_tensor([-1.0, -1.0, 1.0])[:, None]
+    slopes = sh[:, 1:4].roll(1, dims=1) * signs * SH_C1
     less = kept @ slopes
     colour = ((slopes - less) * means[:, :, None]).sum(1)
     sh[:, 0] += colour / SH_C0
-    sh[:, order] = less * signs / SH_C1
+    sh[:, 1:4] = (less * signs / SH_C1).roll(-1, dims=1)
     # Lobes of higher degree shrink as much as the mean of the three.
     factor = kept.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
     sh[:, 4:] *= factor
