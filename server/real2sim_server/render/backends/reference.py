@@ -18,7 +18,6 @@ from .base import (
     ALPHA_MAX,
     ALPHA_MIN,
     CLAMP_MARGIN,
-    TRANSMITTANCE_MIN,
     Placement,
     RasterRequest,
     needs_gradients,
@@ -26,6 +25,7 @@ from .base import (
     place_instances,
     with_colours,
 )
+from .front_to_back import blend
 from .reference_rays import blend_rays
 from .screen import ScreenTracker, ScreenWatch
 
@@ -272,26 +272,12 @@ def _blend_pixels(
     splats: _Splats, dx: Tensor, dy: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, ...]:
     """Front-to-back blending of sorted splats in one tile of ``size`` (height, width)."""
-    dtype = splats.means2d.dtype
     a, b, c = splats.conics[:, 0:1], splats.conics[:, 1:2], splats.conics[:, 2:3]
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
     alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0.0)
 
-    after = torch.cumprod(1 - alpha, dim=0)
-    alpha = torch.where(after > TRANSMITTANCE_MIN, alpha, 0.0)
-    after = torch.cumprod(1 - alpha, dim=0)
-    before = torch.cat([torch.ones(1, after.shape[1], dtype=dtype), after[:-1]])[: len(after)]
-    weights = alpha * before
-    total = 1 - torch.prod(1 - alpha, dim=0)
-    rgb = weights.mT @ splats.colors
-    depth = (weights.mT @ splats.depths) / torch.where(total > 0, total, 1.0)
-
-    crossing = (before > 0.5) & (after <= 0.5)
-    instance = (crossing * splats.instance_ids[:, None]).sum(0)
-    median = (crossing * splats.depths.detach()[:, None]).sum(0)
-    rest = (image.reshape(size) for image in (total, depth, instance, median))
-    return rgb.reshape(*size, 3), *rest
+    return blend(splats, alpha, size)
 
 
 def _behind(request: RasterRequest, camera: int, dtype: torch.dtype) -> Tensor:

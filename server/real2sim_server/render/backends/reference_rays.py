@@ -20,7 +20,8 @@ from ...scene.camera_motion import turned
 from ...scene.spherical_harmonics import evaluate_sh
 from ..lens_view import LensView, continued, tables_of
 from ..types import Instance, RenderError
-from .base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Placement, RasterRequest
+from .base import ALPHA_MAX, ALPHA_MIN, Placement, RasterRequest
+from .front_to_back import blend
 
 STEP = 1e-5
 """Of finite differences, relative to the distance."""
@@ -189,7 +190,7 @@ def _blur(axes: Tensor, centres: Tensor, eps2d: float) -> Tensor:
 
 def _blend(splats: RaySplats, rays: Tensor, times: Tensor) -> tuple[Tensor, ...]:
     """Front-to-back blending of sorted Gaussians along rays [h, W, 3] at times [h, W]."""
-    shape, dtype = times.shape, times.dtype
+    shape = times.shape
     directions, times = rays.reshape(-1, 3), times.reshape(-1)
     towards = torch.einsum("vij,pj->vpi", splats.roots, directions)
     away = torch.einsum("vij,vj->vi", splats.roots, splats.centres)[:, None]
@@ -199,17 +200,4 @@ def _blend(splats: RaySplats, rays: Tensor, times: Tensor) -> tuple[Tensor, ...]
     alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
     ahead = (away * towards).sum(-1) > 0
     alpha = torch.where(ahead & (alpha >= ALPHA_MIN), alpha, 0.0)
-
-    after = torch.cumprod(1 - alpha, dim=0)
-    alpha = torch.where(after > TRANSMITTANCE_MIN, alpha, 0.0)
-    after = torch.cumprod(1 - alpha, dim=0)
-    before = torch.cat([torch.ones(1, after.shape[1], dtype=dtype), after[:-1]])[: len(after)]
-    weights = alpha * before
-    total = 1 - torch.prod(1 - alpha, dim=0)
-    rgb = weights.mT @ splats.colors
-    depth = (weights.mT @ splats.depths) / torch.where(total > 0, total, 1.0)
-    crossing = (before > 0.5) & (after <= 0.5)
-    instance = (crossing * splats.instance_ids[:, None]).sum(0)
-    median = (crossing * splats.depths.detach()[:, None]).sum(0)
-    rest = (image.reshape(shape) for image in (total, depth, instance, median))
-    return rgb.reshape(*shape, 3), *rest
+    return blend(splats, alpha, shape)

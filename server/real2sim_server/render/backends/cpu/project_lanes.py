@@ -75,13 +75,19 @@ class Named:
         return self._kind.types[index], self._builder.extract_value(self._value, index)
 
 
-def _step(build: Callable[[Planes, Named, Named], Any]) -> Any:
-    """The intrinsic ``step(planes, lanes, view, cluster)`` that emits what ``build`` says."""
+def eight_step(build: Callable[[Planes, Named, Named], Any], *, count: int) -> Any:
+    """The intrinsic ``step(planes, lanes, view, cluster)`` that emits what ``build`` says.
+
+    Args:
+        build: gets ``count`` planes of eight numbers, and the named tuples of the viewer and of
+            the cluster that is looked at; gives the mask of the lanes that remain.
+        count: of the planes.
+    """
 
     def step(typingctx, planes, lanes, view, cluster):  # type: ignore[no-untyped-def]
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
             array = context.make_array(planes)(context, builder, arguments[0])
-            eight = Planes(builder, array.data, I64(0), planes=PROJECTION)
+            eight = Planes(builder, array.data, I64(0), planes=count)
             known = (
                 Named(context, builder, kind, value)
                 for kind, value in zip((view, cluster), arguments[2:], strict=True)
@@ -248,7 +254,7 @@ def _dot(a: Sequence[Lanes], b: Sequence[Lanes], addend: Lanes | None = None) ->
     return a[0].fused(b[0], a[1].fused(b[1], last))
 
 
-place_eight = _step(partial(_place, deformed=False))
-place_eight_deformed = _step(partial(_place, deformed=True))
-shape_eight = _step(partial(_shape, deformed=False))
-shape_eight_deformed = _step(partial(_shape, deformed=True))
+place_eight = eight_step(partial(_place, deformed=False), count=PROJECTION)
+place_eight_deformed = eight_step(partial(_place, deformed=True), count=PROJECTION)
+shape_eight = eight_step(partial(_shape, deformed=False), count=PROJECTION)
+shape_eight_deformed = eight_step(partial(_shape, deformed=True), count=PROJECTION)

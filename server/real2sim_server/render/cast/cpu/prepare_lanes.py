@@ -11,12 +11,9 @@ from collections.abc import Sequence
 from functools import partial, reduce
 from typing import Any
 
-from numba import types
-from numba.extending import intrinsic
-
 from ...backends.base import ALPHA_MIN
-from ...backends.cpu.lanes import I64, Lanes, Planes, logarithm, mask_bits, mask_of
-from ...backends.cpu.project_lanes import LOG_255, Named
+from ...backends.cpu.lanes import Lanes, Planes, logarithm
+from ...backends.cpu.project_lanes import LOG_255, Named, eight_step
 from ...backends.cpu.records import EXPONENT_UNIT
 from .records import (
     FRAME,
@@ -252,24 +249,5 @@ def _dot_all(a: Sequence[Lanes], b: Sequence[Lanes]) -> Lanes:
     return total
 
 
-def _step(build: Any) -> Any:
-    """The intrinsic ``step(planes, lanes, sensor, body)`` that emits what ``build`` says."""
-
-    def step(typingctx, planes, lanes, sensor, body):  # type: ignore[no-untyped-def]
-        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-            array = context.make_array(planes)(context, builder, arguments[0])
-            eight = Planes(builder, array.data, I64(0), planes=PREPARATION)
-            known = (
-                Named(context, builder, kind, value)
-                for kind, value in zip((sensor, body), arguments[2:], strict=True)
-            )
-            remaining = build(eight, *known)
-            return mask_bits(builder, builder.and_(mask_of(builder, arguments[1]), remaining))
-
-        return types.int64(planes, types.int64, sensor, body), generate
-
-    return intrinsic(step)
-
-
-prepare_eight = _step(partial(_prepare, deformed=False))
-prepare_eight_deformed = _step(partial(_prepare, deformed=True))
+prepare_eight = eight_step(partial(_prepare, deformed=False), count=PREPARATION)
+prepare_eight_deformed = eight_step(partial(_prepare, deformed=True), count=PREPARATION)
