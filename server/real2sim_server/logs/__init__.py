@@ -8,7 +8,7 @@ from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTr
 from .inspect import CameraReport, LogReport, inspect_log
 from .native_writer import write_native_log
 from .open import open_log
-from .selection import LogSelection, same_part, select_from_log
+from .selection import LogSelection, log_of_frames, same_part, select_from_log
 
 __all__ = [
     "CameraReport",
@@ -21,6 +21,7 @@ __all__ = [
     "ObjectTrack",
     "check_log",
     "inspect_log",
+    "log_of_frames",
     "open_log",
     "same_part",
     "select_from_log",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import CameraRig
-from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTrack
+from .driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 
 SELECTION = "selection"
 """Of a log's provenance: what it is a part of, see :func:`select_from_log`."""
@@ -50,24 +50,19 @@ def select_from_log(log: DrivingLog, selection: LogSelection) -> DrivingLog:
     """
     frames = _frames(log, selection)
     rig = _cameras(log, selection.cameras)
-    index = np.arange(frames.start, frames.stop, frames.step)
-    times_us = log.frame_times_us[index]
-    image_times_us = {
-        name: taken[index] for name, taken in log.image_times_us.items() if name in rig.names
-    }
-    instants = np.concatenate([times_us, *image_times_us.values()])
+    part = log_of_frames(log, frames)
+    image_times_us = {k: taken for k, taken in part.image_times_us.items() if k in rig.names}
+    instants = np.concatenate([part.frame_times_us, *image_times_us.values()])
     start_us, end_us = int(instants.min()), int(instants.max())
     return replace(
-        log,
+        part,
         rig=rig,
-        frame_times_us=times_us,
         ego=log.ego.between(start_us, end_us),
         tracks=tuple(
             replace(track, trajectory=track.trajectory.between(start_us, end_us))
             for track in log.tracks
             if _is_there(track, start_us, end_us)
         ),
-        source=_SelectedFrames(log.source, frames),
         image_times_us=image_times_us,
         provenance={
             **log.provenance,
@@ -92,17 +87,28 @@ def same_part(log: DrivingLog, provenance: Mapping[str, Any]) -> DrivingLog:
     )
 
 
-class _SelectedFrames:
-    """A source under the numbers of the selected frames."""
+def log_of_frames(log: DrivingLog, frames: Sequence[int]) -> DrivingLog:
+    """``log`` with these frames alone; paths and boxes stay whole."""
+    index = np.asarray(frames, np.int64)
+    return replace(
+        log,
+        frame_times_us=log.frame_times_us[index],
+        source=_SelectedFrames(log, frames),
+        image_times_us={name: taken[index] for name, taken in log.image_times_us.items()},
+    )
 
-    def __init__(self, source: FrameSource, frames: range) -> None:
-        self._source, self._frames = source, frames
+
+class _SelectedFrames:
+    """A source under the numbers of the selected frames; errors name those of the whole log."""
+
+    def __init__(self, log: DrivingLog, frames: Sequence[int]) -> None:
+        self._log, self._frames = log, frames
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        return self._source.image(camera, self._frames[frame])
+        return self._log.image(camera, self._frames[frame])
 
     def lidar(self, frame: int) -> LidarSweep:
-        return self._source.lidar(self._frames[frame])
+        return self._log.lidar(self._frames[frame])
 
 
 def _frames(log: DrivingLog, selection: LogSelection) -> range:

@@ -29,8 +29,8 @@ from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
 
 
-def _at_once() -> None:
-    """Nothing has to be waited for."""
+def at_once() -> None:
+    """For images that are whole: nothing has to be waited for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Frame:
     images: Mapping[str, NDArray[Any]]
     T_world_camera: NDArray[np.float64]
     timing_ms: dict[str, float] = field(default_factory=dict)
-    ready: Callable[[], object] = _at_once
+    ready: Callable[[], object] = at_once
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
@@ -248,7 +248,7 @@ class _Drawn:
 
     images: Mapping[str, NDArray[Any]]
     timing_ms: Mapping[str, float]
-    ready: Callable[[], object] = _at_once
+    ready: Callable[[], object] = at_once
 
 
 def _drawn(

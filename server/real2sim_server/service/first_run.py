@@ -7,9 +7,12 @@ lets it begin first, where nothing of an earlier run lies on disk.
 
 from __future__ import annotations
 
+import asyncio
 import os
 import subprocess
 import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 KEPT = "entries.advance_vehicle-*.nbi"
@@ -17,6 +20,7 @@ KEPT = "entries.advance_vehicle-*.nbi"
 
 SERVER = Path(__file__).parents[1]
 LOWEST_PRIORITY = 19
+POLL_S = 0.05
 
 _begun: list[subprocess.Popen[bytes]] = []
 
@@ -33,15 +37,30 @@ def take_begun() -> subprocess.Popen[bytes] | None:
     return _begun.pop() if _begun else None
 
 
-def compile_beside(function: str, *, niceness: int = 0) -> subprocess.Popen[bytes]:
-    """A process that runs a function of the world's warm-up. Its failure is left to those who load
-    its work."""
+def compile_beside(
+    function: str, *arguments: str, package: str = "world", niceness: int = 0
+) -> subprocess.Popen[bytes]:
+    """A process that runs a warm-up of ``package``. Its failure is left to those who load its
+    work."""
     return subprocess.Popen(
-        [sys.executable, "-c", _PROGRAM, function, str(niceness)],
+        [sys.executable, "-c", _PROGRAM, str(niceness), package, function, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
+
+
+@asynccontextmanager
+async def awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
+    """A process beside the block, which is waited for at its end and does not outlive it."""
+    try:
+        yield
+        while process.poll() is None:
+            await asyncio.sleep(POLL_S)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
 
 
 def _any_on_disk() -> bool:
@@ -52,9 +71,9 @@ def _any_on_disk() -> bool:
 
 
 _PROGRAM = """
-import gc, os, sys
+import gc, importlib, os, sys
 gc.disable()
-os.nice(int(sys.argv[2]))
-import real2sim_server.world
-getattr(real2sim_server.world, sys.argv[1])()
+niceness, package, function, *arguments = sys.argv[1:]
+os.nice(int(niceness))
+getattr(importlib.import_module("real2sim_server." + package), function)(*arguments)
 """

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
-import subprocess
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 
 import structlog
 
@@ -23,11 +22,9 @@ from ..world import (
     warm_up_planning,
 )
 from ..world import warm_up as warm_up_world
-from .first_run import LOWEST_PRIORITY, compile_beside, take_begun
+from .first_run import LOWEST_PRIORITY, awaited, compile_beside, take_begun
 
 log = structlog.get_logger(__name__)
-
-POLL_S = 0.05
 
 
 class KernelWarmUp:
@@ -57,7 +54,7 @@ class KernelWarmUp:
         try:
             if not planning_on_disk():
                 beside = compile_beside("warm_up_planning", niceness=LOWEST_PRIORITY)
-                async with _awaited(beside):
+                async with awaited(beside):
                     pass
             await asyncio.to_thread(warm_up_planning)
         finally:
@@ -75,7 +72,7 @@ class KernelWarmUp:
         if begun is not None or (not kernels_on_disk() and (os.cpu_count() or 1) > 1):
             log.info("compiling kernels, on the first run only")
             with _no_collections():
-                async with _awaited(begun or compile_beside("warm_up")):
+                async with awaited(begun or compile_beside("warm_up")):
                     await warm_up_renderer()
         else:
             await warm_up_renderer()
@@ -117,26 +114,13 @@ class DeformationKernels:
             if not await asyncio.to_thread(deformation_on_disk):
                 log.info("compiling kernels of deformation, on the first run only")
                 beside = compile_beside("warm_up_deformation", niceness=LOWEST_PRIORITY)
-                async with _awaited(beside):
+                async with awaited(beside):
                     pass
             await asyncio.to_thread(warm_up_deformation)
         except Exception:
             log.exception("warm-up of deformation failed")
         finally:
             self.ready = True
-
-
-@asynccontextmanager
-async def _awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
-    """A process beside the block, which is waited for at its end and does not outlive it."""
-    try:
-        yield
-        while process.poll() is None:
-            await asyncio.sleep(POLL_S)
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...logs import DrivingLog
+from ...logs import DrivingLog, log_of_frames
 from ...render.cast.call import checked_request
 from ...render.cast.cpu.backend import CpuCaster
 from ...render.cast.recorded import recorded_scene, sensor_poses
@@ -22,7 +22,6 @@ from ...scene import GaussianCloud, LidarSurfaces, Reflector, Scene
 from ..initialise.stage0 import initialise_scene
 from ..options import InitialiseOptions, ReconstructError
 from ..stages import OnProgress, Stages
-from ..training.data import log_of_frames
 from .rays import RecordedRays, recorded_rays
 
 THINNED = 0.3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.transform import apply_transform
-from ...logs import DrivingLog, LidarSweep
+from ...logs import DrivingLog, log_of_frames
 from ...scene import Camera
 from ..options import ReconstructError
 from .schedule import TrainOptions
@@ -34,33 +34,10 @@ def held_out_frames(frame_count: int, every: int) -> list[int]:
     return list(range(min(2, every - 1), frame_count - 1, every))
 
 
-class _FrameSubset:
-    """A source without the frames that are held out."""
-
-    def __init__(self, log: DrivingLog, frames: list[int]) -> None:
-        self._log, self._frames = log, frames
-
-    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        return self._log.image(camera, self._frames[frame])
-
-    def lidar(self, frame: int) -> LidarSweep:
-        return self._log.lidar(self._frames[frame])
-
-
 def training_log(log: DrivingLog, hold_out: int) -> DrivingLog:
     """``log`` without the held-out frames; paths and boxes stay whole."""
     held_out = set(held_out_frames(log.frame_count, hold_out))
     return log_of_frames(log, [f for f in range(log.frame_count) if f not in held_out])
-
-
-def log_of_frames(log: DrivingLog, frames: list[int]) -> DrivingLog:
-    """``log`` with these frames alone; paths and boxes stay whole."""
-    return replace(
-        log,
-        frame_times_us=log.frame_times_us[frames],
-        source=_FrameSubset(log, frames),
-        image_times_us={k: v[frames] for k, v in log.image_times_us.items()},
-    )
 
 
 @dataclass(frozen=True, eq=False)

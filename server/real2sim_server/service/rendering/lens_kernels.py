@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 from collections.abc import Sequence
 
 import structlog
@@ -15,17 +13,13 @@ from ...render import Backend, RenderError
 from ...render.lenses import kernels_of_lenses_on_disk, refuse_lenses, warm_up_lenses
 from ...scene import Camera
 from ..engine import Engine
+from ..first_run import awaited, compile_beside
 from ..http.problems import ServiceError
 
 log = structlog.get_logger(__name__)
 
-POLL_S = 0.1
-_PROGRAM = """
-import os
-os.nice(10)
-from real2sim_server.render.lenses import warm_up_lenses
-warm_up_lenses("cpu")
-"""
+NICENESS = 10
+"""Of the process that compiles: the worker draws for others meanwhile."""
 
 
 class LensKernels:
@@ -57,23 +51,9 @@ class LensKernels:
     async def _make(self) -> None:
         if self._backend.name == "cpu" and not kernels_of_lenses_on_disk():
             log.info("compiling kernels of lenses, on the first run only")
-            await _finished(
-                subprocess.Popen(
-                    [sys.executable, "-c", _PROGRAM],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                )
+            beside = compile_beside(
+                "warm_up_lenses", "cpu", package="render.lenses", niceness=NICENESS
             )
+            async with awaited(beside):
+                pass
         await self._engine.call(warm_up_lenses, self._backend, label="warm-up")
-
-
-async def _finished(process: subprocess.Popen[bytes]) -> None:
-    """Wait for a process, which does not outlive who waits."""
-    try:
-        while process.poll() is None:
-            await asyncio.sleep(POLL_S)
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()

@@ -32,6 +32,7 @@ from ...render import (
     warm_up,
 )
 from ...render.backends import device_of
+from ...render.frame import at_once
 from ...render.jpeg import JpegEncoder, jpeg_encoder_for, turbo_jpeg
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
@@ -57,10 +58,6 @@ BULK_NICENESS = 10
 VIEW_PIXELS = 2_000_000
 """Requests of more pixels wait behind those that somebody looks at."""
 DEFAULT_OPTIONS = RasterOptions()
-
-
-def _at_once() -> None:
-    """Nothing has to be waited for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +300,7 @@ class Renderer:
             return image
         drawn, ready = frame.rgb, frame.ready
         if effects.motion_blur is not None:
-            drawn, ready = self._blurred(request, camera, effects.motion_blur), _at_once
+            drawn, ready = self._blurred(request, camera, effects.motion_blur), at_once
         made = EffectImage(drawn, ready, effects, (sensor.camera, request.t_us))
         return replace(image, pixels=made.pixels, ready=made.ready)
 
