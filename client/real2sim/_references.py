@@ -39,6 +39,14 @@ def job_id_of(job: Any) -> str:
     return _checked_id(job, "simulation", "an id or a job's handle")
 
 
+def session_and_token(session: Any) -> tuple[str | None, str | None]:
+    """Id of a session and its token, as far as it is known. Raises TypeError for what is none."""
+    if session is None or isinstance(session, str):
+        return session, None
+    name, token = getattr(session, "session_id", None), getattr(session, "token", None)
+    return _checked_id(name, "session", "an id, a SessionInfo or an open drive session"), token
+
+
 def optional_scene_name(scene: SceneRef | None) -> str | None:
     """As :func:`scene_name`; None stays None."""
     return None if scene is None else scene_name(scene)

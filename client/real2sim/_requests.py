@@ -7,12 +7,20 @@ in who waits.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.episode import SensorSpec
-from real2sim_proto.jobs import CalibrateRequest, ExportRequest, JobInfo, JobList, SimulateRequest
+from real2sim_proto.jobs import (
+    CalibrateRequest,
+    DatasetRequest,
+    ExportRequest,
+    JobInfo,
+    JobList,
+    SimulateRequest,
+)
 from real2sim_proto.operations import Operation
 from real2sim_proto.scenarios import (
     History,
@@ -192,6 +200,11 @@ def calibrate(scenario_id: str, body: CalibrateRequest) -> Call[JobInfo]:
 
 def create_export(body: ExportRequest) -> Call[JobInfo]:
     return Call(post("/v1/exports", body, long_timeout=True), model_of(JobInfo))
+
+
+def create_dataset(body: DatasetRequest, token: str | None) -> Call[JobInfo]:
+    request = post("/v1/exports", body, long_timeout=True)
+    return Call(replace(request, headers=request.headers | bearer(token)), model_of(JobInfo))
 
 
 def list_jobs(subject: str | None) -> Call[JobList]:

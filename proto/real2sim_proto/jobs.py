@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, TypeAdapter, model_validator
 
 from .base import Identifier, Microseconds, Model, Quaternion, Vector3, one_of
 from .errors import Problem
@@ -223,3 +223,87 @@ class ExportRequest(Model):
         if sum(name is not None for name in given) != 1:
             raise ValueError("name exactly one of scenario, scene and simulation")
         return self
+
+
+DatasetFormat = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+SplitName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]{1,32}$")]
+Share = Annotated[float, Field(ge=0, le=1e6)]
+
+MAX_RECORDING_TEXT = 3_500_000
+"""Characters of a recording in a request: what leaves room for the rest of its body."""
+
+
+class DatasetRequest(Model):
+    """Body of `POST /v1/exports`: a labelled data set."""
+
+    kind: Literal["dataset"]
+    scenario: Identifier | None = Field(
+        default=None, description="as it is now, driven as it was recorded"
+    )
+    scene: Identifier | None = Field(
+        default=None, description="as it was recorded; with `recording` what that ran on"
+    )
+    session: Identifier | None = Field(
+        default=None,
+        description="its episode so far; wants the session's token, or one of the worker",
+    )
+    recording: str | None = Field(
+        default=None,
+        max_length=MAX_RECORDING_TEXT,
+        description="an episode on `scene`: a file of `GET /v1/sessions/{id}/recording`, base64",
+    )
+    formats: list[DatasetFormat] = Field(
+        min_length=1,
+        max_length=16,
+        description="labels, kitti, coco, nuscenes, argoverse2, webdataset, pictures ...; "
+        "docs/datasets.md has all",
+    )
+    cameras: list[Identifier] = Field(
+        default_factory=list, max_length=64, description="default: all of the scene"
+    )
+    width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
+    period_us: int = Field(
+        default=100_000, ge=1_000, le=60_000_000, description="from one frame to the next"
+    )
+    start_us: Microseconds | None = Field(default=None, description="default: of the source")
+    end_us: Microseconds | None = Field(default=None, description="default: of the source")
+    clip_s: float = Field(
+        default=20.0, gt=0, le=3600, description="length of a clip, which is in one split [s]"
+    )
+    splits: dict[SplitName, Share] = Field(
+        default_factory=lambda: {"train": 1.0},
+        min_length=1,
+        max_length=16,
+        description="share of the clips by name",
+    )
+    seed: int = Field(default=0, ge=0, le=2**53, description="draws which clip is in which split")
+    flow: bool = Field(default=True, description="whether optical flow is made")
+    dry_run: bool = Field(
+        default=False, description="only tell frames, images, bytes and minutes in the result"
+    )
+
+    @model_validator(mode="after")
+    def _names_one_source(self) -> DatasetRequest:
+        if sum(name is not None for name in (self.scenario, self.scene, self.session)) != 1:
+            raise ValueError("name exactly one of scenario, scene and session")
+        if self.recording is not None and self.scene is None:
+            raise ValueError("a recording wants the scene that it ran on")
+        return self
+
+
+def _export_kind(body: Any) -> str:
+    kind = body.get("kind", "video") if isinstance(body, dict) else getattr(body, "kind", "video")
+    return kind if isinstance(kind, str) else ""
+
+
+ExportBody = Annotated[
+    Annotated[ExportRequest, Tag("video")] | Annotated[DatasetRequest, Tag("dataset")],
+    Discriminator(
+        _export_kind,
+        custom_error_type="export_kind",
+        custom_error_message="kind is video (default) or dataset",
+    ),
+]
+"""What `POST /v1/exports` takes, by its `kind`; video where that is left out."""
+
+EXPORT_BODY: TypeAdapter[ExportRequest | DatasetRequest] = TypeAdapter(ExportBody)

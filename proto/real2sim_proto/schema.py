@@ -73,6 +73,7 @@ MODELS: dict[str, type[BaseModel]] = {
         jobs.SimulateRequest,
         jobs.CalibrateRequest,
         jobs.ExportRequest,
+        jobs.DatasetRequest,
         scenarios.ScenarioCreate,
         scenarios.ScenarioFork,
         scenarios.ScenarioDocument,

@@ -3,17 +3,26 @@
 
 from __future__ import annotations
 
+import base64
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from real2sim_proto.jobs import ExportRequest, JobInfo
+from real2sim_proto.jobs import DatasetRequest, ExportRequest, JobInfo
+from real2sim_proto.sessions import SessionInfo
 
 from .. import _requests
 from .._call import checked
 from .._job_state import JobBase, OnProgress, poll_delays, require_success
-from .._references import ScenarioRef, SceneRef, job_id_of, optional_scenario_id
+from .._references import (
+    ScenarioRef,
+    SceneRef,
+    job_id_of,
+    optional_scenario_id,
+    session_and_token,
+)
 from .._references import optional_scene_name as name_of
+from .._session_state import SessionBase
 from ..images import write_atomically
 from .concurrency import run_blocking, sleep
 from .transport import Transport
@@ -95,6 +104,81 @@ class Jobs:
             "fps": fps,
         }
         call = _requests.create_export(checked(ExportRequest, **fields))
+        return Job(self._transport, self._transport.send(call))
+
+    def export_dataset(
+        self,
+        *,
+        formats: Sequence[str],
+        scenario: ScenarioRef | None = None,
+        scene: SceneRef | None = None,
+        session: str | SessionInfo | SessionBase | None = None,
+        recording: bytes | None = None,
+        cameras: Sequence[str] = (),
+        width: int | None = None,
+        period_us: int = 100_000,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        clip_s: float = 20.0,
+        splits: Mapping[str, float] | None = None,
+        seed: int = 0,
+        flow: bool = True,
+        dry_run: bool = False,
+    ) -> Job:
+        """Start making a labelled data set: images with boxes, masks, depth, flow, points, tracks.
+
+        Args:
+            formats: ``labels``, ``kitti``, ``coco``, ``nuscenes``, ``argoverse2``,
+                ``webdataset``, ``pictures``.
+            scenario, scene, session: exactly one of them, or its id; of a session its episode so
+                far.
+            recording: an episode on ``scene`` instead of the recorded drive, see
+                ``DriveSession.recording``.
+            cameras: names; default: all.
+            width: pixels; default: as recorded.
+            period_us: from one frame to the next.
+            start_us, end_us: default: as long as there is something.
+            clip_s: length of a clip in seconds; a clip is in one split.
+            splits: share of the clips by name; default: all in ``train``.
+            seed: draws which clip is in which split.
+            flow: whether optical flow is made.
+            dry_run: only tell frames, images, bytes and minutes in ``info.result``.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> job = client.jobs.export_dataset(
+            ...     scene="street", formats=["coco"], cameras=["front"], width=64, end_us=100_000
+            ... )
+            >>> job = job.wait(timeout=60.0)
+            >>> job.info.result["statistics"]["boxes"]
+            {'car': 4, 'pole': 2}
+            >>> path = job.download("dataset.tar", folder / "street.tar")
+            >>> path.stat().st_size > 0
+            True
+        """
+        session_id, token = session_and_token(session)
+        fields = {
+            "kind": "dataset",
+            "scenario": optional_scenario_id(scenario),
+            "scene": name_of(scene),
+            "session": session_id,
+            "recording": None if recording is None else base64.b64encode(recording).decode(),
+            "formats": list(formats),
+            "cameras": list(cameras),
+            "width": width,
+            "period_us": period_us,
+            "start_us": start_us,
+            "end_us": end_us,
+            "clip_s": clip_s,
+            "splits": {"train": 1.0} if splits is None else dict(splits),
+            "seed": seed,
+            "flow": flow,
+            "dry_run": dry_run,
+        }
+        body = checked(DatasetRequest, **fields)
+        call = _requests.create_dataset(body, self._transport.target.token or token)
         return Job(self._transport, self._transport.send(call))
 
 

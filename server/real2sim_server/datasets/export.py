@@ -7,7 +7,6 @@ import json
 import shutil
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -21,11 +20,13 @@ from .drive import Drive
 from .errors import DatasetError
 from .labels import HOW
 from .plan import ExportPlan, PlannedClip, planned_cameras, planned_clips
+from .previews import write_previews
+from .statistics import statistics_of
 from .writers import LabelledDrive, writer_of
 
 FORMAT = "real2sim-dataset"
 VERSION = 1
-LICENCE, MANIFEST = "LICENSE.txt", "manifest.json"
+LICENCE, MANIFEST, PREVIEW = "LICENSE.txt", "manifest.json", "preview"
 OUTPUT_SHARE = 0.7
 """Bytes of one written format against those of the labels it is made of, about."""
 
@@ -103,7 +104,8 @@ def export_dataset(
         on_progress: called with (stage, done, total): frames that are labelled, formats written.
 
     Returns:
-        ``out``: a folder for each format, ``manifest.json`` and ``LICENSE.txt``.
+        ``out``: a folder for each format, ``preview`` with a few sheets of labels over pictures,
+        ``manifest.json`` and ``LICENSE.txt``.
 
     Raises:
         DatasetError: ``out`` exists, an unknown format or camera, instants outside of the drive,
@@ -143,6 +145,7 @@ def export_dataset(
             writer.write(content, partial)
             partial.rename(result / writer.name)
     on_progress("formats", len(writers), len(writers))
+    write_previews(opened, cameras, result / PREVIEW)
     _write_licence(result / LICENCE, drive.scene.provenance)
     _write_manifest(result, drive, plan, opened, digest=digest, made_of=made_of or {})
     result.rename(target)
@@ -234,7 +237,7 @@ def _write_manifest(
         "made_of": dict(made_of),
         "plan": {**asdict(plan), "splits": dict(plan.splits)},
         "clips": {clip.name: {"split": clip.split, "frames": len(clip.frames)} for clip in clips},
-        "statistics": _statistics(clips),
+        "statistics": statistics_of(clips),
         "labels": HOW,
         "provenance": dict(drive.scene.provenance),
         "licence": _licence(drive.scene.provenance),
@@ -247,23 +250,3 @@ def _write_manifest(
         },
     }
     (result / MANIFEST).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _statistics(clips: Sequence[Clip]) -> dict[str, Any]:
-    """Boxes by category, and those in images by category and visibility."""
-    boxes: Counter[str] = Counter()
-    seen: dict[str, Counter[str]] = {}
-    for clip in clips:
-        for frame in clip.frames:
-            categories = {o["object_id"]: o["category"] for o in frame["objects"]}
-            boxes.update(categories.values())
-            for view in (v for views in frame["views"].values() for v in views):
-                level = min(int(view["visibility"] * 5), 4) * 20
-                counter = seen.setdefault(categories[view["object_id"]], Counter())
-                counter[f"{level} to {level + 20} %"] += 1
-    return {
-        "boxes": dict(sorted(boxes.items())),
-        "boxes_in_images_by_visibility": {
-            name: dict(sorted(counts.items())) for name, counts in sorted(seen.items())
-        },
-    }

@@ -65,6 +65,13 @@ BODIES: dict[str, Any] = {
         "simulate": {"start_us": 0, "end_us": 2_000_000},
     },
     "ExportRequest": {"scenario": "sc_0123456789abcdef", "camera": "front", "fps": 10},
+    "DatasetRequest": {
+        "kind": "dataset",
+        "scenario": "sc_0123456789abcdef",
+        "formats": ["nuscenes", "coco"],
+        "period_us": 500_000,
+        "splits": {"train": 0.8, "val": 0.2},
+    },
     "SessionCreate": {"reset": {"seed": 0, "dt_us": 100_000}},
     "ResetSpec": {"seed": 0, "dt_us": 100_000},
     "SessionEdit": {
@@ -174,7 +181,7 @@ def _add_worker_token(operation: dict[str, Any]) -> None:
 
 
 def _schema_name(schema: dict[str, Any]) -> str:
-    references = [schema, *schema.get("anyOf", ())]
+    references = [schema, *schema.get("anyOf", ()), *schema.get("oneOf", ())]
     return next((r["$ref"].rsplit("/", 1)[1] for r in references if "$ref" in r), "")
 
 

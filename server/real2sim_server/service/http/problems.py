@@ -22,11 +22,13 @@ from starlette.routing import Match
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem
 from real2sim_proto.errors import ProblemDetail, title_of
 
+from ...datasets.errors import DatasetError
 from ...edit import EditError
 from ...physics.errors import PhysicsError
 from ...render import RenderError
 from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from ...world import WorldError
+from ...world.recording.recording import RecordingError
 from ..accounts import Limit, OverLimitError, RevokedError, seconds_to_wait
 from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
 from ..storage.errors import (
@@ -98,6 +100,8 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (RenderError, ErrorCode.INVALID_REQUEST, None),
     (SceneError, ErrorCode.INVALID_OPERATION, None),
     (PhysicsError, ErrorCode.INVALID_REQUEST, None),
+    (DatasetError, ErrorCode.INVALID_REQUEST, None),
+    (RecordingError, ErrorCode.INVALID_REQUEST, None),
 )
 """Errors of other packages whose messages are sent as they are; the first that fits counts."""
 

@@ -140,6 +140,11 @@ class Jobs:
         self._turn = asyncio.Lock()
         self._closing = False
 
+    @property
+    def quota(self) -> Quota:
+        """Of jobs and their files."""
+        return self._quota
+
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Jobs]:
         """Marks what an earlier run left unfinished; cancels what is unfinished at the end."""

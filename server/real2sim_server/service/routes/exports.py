@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from real2sim_proto.jobs import ExportRequest, JobInfo
+from real2sim_proto.jobs import DatasetRequest, ExportBody, ExportRequest, JobInfo
 
+from ...datasets.drive import EpisodeDrive, ScenarioDrive
 from ...edit import ScenarioState, instances_at
-from ..http.auth import TokenRoute
+from ...world.recording.recording import Recording, RecordingError, recording_of_bytes
+from ..http.auth import TokenRoute, bearer_token, unauthorized
 from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey
 from ..http.responses import info_response
+from ..jobs.datasets import DatasetSource, EngineBackend, check_dataset, make_dataset, plan_of
 from ..jobs.exports import VideoSource, check_camera, export_video, frame_times
-from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
+from ..jobs.jobs import JobContext, JobResult, NewJob, Work, accepted_headers
+from ..sessions.recording import episode_of
+from ..sessions.registry import check_not_closed
+from ..sessions.session import opens_session
 from ..worker import Worker, WorkerOf
 
 router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=TokenRoute)
@@ -23,29 +31,48 @@ router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=TokenRout
 @router.post("", status_code=202, response_model=JobInfo)
 async def create(
     worker: WorkerOf,
-    body: ExportRequest,
+    body: ExportBody,
     request: Request,
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Make a video of a scene, a scenario as it is now, or a simulation, from a camera's way.
+    """Make a file that leaves the worker; the answer is a job.
 
-    The answer is a job; once it has succeeded, `GET /v1/jobs/{id}/files/video.webm`.
+    A **video** of a scene, a scenario as it is now, or a simulation, from a camera's way; once the
+    job has succeeded, `GET /v1/jobs/{id}/files/video.webm`. Or a labelled **data set** of a scene,
+    a scenario as it is now, a recorded episode or the running episode of a session, in public
+    formats: `GET /v1/jobs/{id}/files/dataset.tar`, `manifest.json` and `preview_0.jpg`.
     """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
-        video_source = await _video_source(worker, body)
-        check_camera(video_source, body, max_pixels=worker.settings.max_pixels_per_step)
-        frame_times(video_source, body)
-
-        async def work(context: JobContext) -> JobResult:
-            return await export_video(video_source, body, renderer=worker.renderer, context=context)
-
-        subject = body.scenario or body.scene or body.simulation or ""
-        new = NewJob("export", subject, body.model_dump(mode="json", exclude_none=True), who)
+        if isinstance(body, DatasetRequest):
+            work = await _dataset_work(worker, body, request)
+        else:
+            work = await _video_work(worker, body)
+        fields = body.model_dump(mode="json", exclude_none=True, exclude={"recording"})
+        new = NewJob("export", _subject(body), fields, who)
         info = await worker.jobs.start(new, work, idempotent=idempotent)
         return info_response(info, status=202, headers=accepted_headers(info))
+
+
+def _subject(body: ExportRequest | DatasetRequest) -> str:
+    other = body.session if isinstance(body, DatasetRequest) else body.simulation
+    return body.scenario or body.scene or other or ""
+
+
+# --- videos -----------------------------------------------------------------------------------
+
+
+async def _video_work(worker: Worker, body: ExportRequest) -> Work:
+    video_source = await _video_source(worker, body)
+    check_camera(video_source, body, max_pixels=worker.settings.max_pixels_per_step)
+    frame_times(video_source, body)
+
+    async def work(context: JobContext) -> JobResult:
+        return await export_video(video_source, body, renderer=worker.renderer, context=context)
+
+    return work
 
 
 async def _video_source(worker: Worker, request: ExportRequest) -> VideoSource:
@@ -60,3 +87,75 @@ async def _video_source(worker: Worker, request: ExportRequest) -> VideoSource:
     scene = await worker.scene_cache.get(request.scene or "")
     state = await asyncio.to_thread(ScenarioState.of, scene)
     return VideoSource(scene, lambda t_us: instances_at(scene, state, t_us), state.clock)
+
+
+# --- data sets --------------------------------------------------------------------------------
+
+
+async def _dataset_work(worker: Worker, body: DatasetRequest, request: Request) -> Work:
+    plan = plan_of(body)
+    source = await _dataset_source(worker, body, request)
+    max_pixels = worker.settings.max_pixels_per_step
+    await asyncio.to_thread(check_dataset, source.drive, plan, max_pixels=max_pixels)
+    loop = asyncio.get_running_loop()
+
+    async def work(context: JobContext) -> JobResult:
+        backend = EngineBackend(worker.engine, worker.backend, context, loop)
+        return await make_dataset(
+            source, plan, dry_run=body.dry_run, backend=backend, quota=worker.jobs.quota
+        )
+
+    return work
+
+
+async def _dataset_source(worker: Worker, body: DatasetRequest, request: Request) -> DatasetSource:
+    if body.session is not None:
+        return await _session_source(worker, body.session, request)
+    if body.recording is not None:
+        recording = await asyncio.to_thread(_read_recording, body.recording)
+        return await _episode_source(worker, recording, body.scene or "")
+    if body.scenario is not None:
+        view = await worker.scenarios.view(body.scenario)
+        document = await worker.scenarios.export(body.scenario)
+        scene = await worker.scene_cache.get(view.row.scene)
+        entries = [entry.model_dump(mode="json", exclude_none=True) for entry in document.entries]
+        return DatasetSource(ScenarioDrive(scene, view.state), _made_of(entries))
+    scene = await worker.scene_cache.get(body.scene or "")
+    state = await asyncio.to_thread(ScenarioState.of, scene)
+    return DatasetSource(ScenarioDrive(scene, state), {"operations": []})
+
+
+def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """A scenario's history without its instants: the same edits give the same bytes."""
+    if all(entry["kind"] == "edit" for entry in entries):
+        return {"operations": [edit for entry in entries for edit in entry["operations"]]}
+    kept = ("kind", "operations", "target")
+    return {"history": [{k: entry[k] for k in kept if k in entry} for entry in entries]}
+
+
+async def _session_source(worker: Worker, session_id: str, request: Request) -> DatasetSource:
+    row = check_not_closed(await worker.sessions.row(session_id))
+    # Where the worker wants a token, the route has seen one: it opens every session.
+    if not worker.accounts.wants_token and not opens_session(bearer_token(request), row):
+        error = unauthorized("the data set of a session wants the session's token")
+        error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
+        raise error
+    session = await worker.sessions.find(session_id)
+    async with session.lock:
+        recording = await episode_of(worker.sessions, session)
+    return await _episode_source(worker, recording, row.scene)
+
+
+def _read_recording(text: str) -> Recording:
+    try:
+        data = base64.b64decode(text, validate=True)
+    except ValueError as error:
+        raise RecordingError(f"recording: it is no base64 ({error})") from error
+    return recording_of_bytes(data, "recording")
+
+
+async def _episode_source(worker: Worker, recording: Recording, name: str) -> DatasetSource:
+    scene = await worker.scene_cache.get(name)
+    find = worker.assets.find
+    drive = await asyncio.to_thread(lambda: EpisodeDrive.of(recording, scene, assets=find))
+    return DatasetSource(drive, {"episode": recording.digests[-1]})

@@ -22,6 +22,15 @@ from ..rendering.responses import FRAME_RESPONSES, frame_response
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
+FILE_TYPES = (
+    "video/webm",
+    "application/json",
+    "application/octet-stream",
+    "application/x-tar",
+    "image/jpeg",
+)
+"""Of what jobs leave."""
+
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=TokenRoute)
 
 
@@ -117,7 +126,7 @@ async def preview(
             "description": "the file",
             "content": {
                 media_type: {"schema": {"type": "string", "format": "binary"}}
-                for media_type in ("video/webm", "application/json", "application/octet-stream")
+                for media_type in FILE_TYPES
             },
         }
     },

@@ -32,6 +32,23 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
     Raises:
         ServiceError: NOT_RESET, or PAYLOAD_TOO_LARGE for more than 512 MiB of images.
     """
+    recording, entries = await _replayed(sessions, session)
+    if frames:
+        drawn = await _frames(sessions.pipeline, session.start, entries)
+        recording = replace(recording, frames=drawn)
+    return await sessions.pipeline.on_world_thread(to_bytes, recording)
+
+
+async def episode_of(sessions: Sessions, session: Session) -> Recording:
+    """The running episode so far, without images.
+
+    Raises:
+        ServiceError: NOT_RESET.
+    """
+    return (await _replayed(sessions, session))[0]
+
+
+async def _replayed(sessions: Sessions, session: Session) -> tuple[Recording, list[Entry]]:
     session.running_world()
     entries = last_episode(await sessions.entries(session))
     start, row = session.start, session.row
@@ -55,10 +72,7 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
             no_action_impact=impact,
         )
 
-    recording = await sessions.pipeline.on_world_thread(made)
-    if frames:
-        recording = replace(recording, frames=await _frames(sessions.pipeline, start, entries))
-    return await sessions.pipeline.on_world_thread(to_bytes, recording)
+    return await sessions.pipeline.on_world_thread(made), entries
 
 
 async def _frames(

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from real2sim_proto.assets import AssetCut
-from real2sim_proto.jobs import ExportRequest, SimulateRequest
+from real2sim_proto.jobs import DatasetRequest, ExportRequest, SimulateRequest
 from real2sim_proto.scenarios import (
     OperationBatch,
     ScenarioCreate,
@@ -92,6 +92,7 @@ def test_every_post_that_changes_something_takes_an_idempotency_key(made):
         ScenarioFork,
         SimulateRequest,
         ExportRequest,
+        DatasetRequest,
     ],
 )
 def test_examples_are_valid(model):

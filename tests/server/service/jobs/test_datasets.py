@@ -1,0 +1,184 @@
+"""Data sets by way of the service: one worker for all tests."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import tarfile
+import time
+
+import cv2
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.jobs import JobInfo
+from real2sim_server.scene.io import save_scene
+from real2sim_server.service.app import create_app
+from real2sim_server.settings import Settings
+
+ASKED = {
+    "kind": "dataset",
+    "scene": "tiny",
+    "formats": ["coco"],
+    "cameras": ["front"],
+    "width": 48,
+    "period_us": 100_000,
+    "end_us": 200_000,
+    "flow": False,
+}
+
+
+@pytest.fixture(scope="module")
+def client(tiny_scene, tmp_path_factory):
+    scenes = tmp_path_factory.mktemp("scenes")
+    save_scene(tiny_scene, scenes / "tiny.r2s")
+    settings = Settings(
+        data_dir=tmp_path_factory.mktemp("data"),
+        scenes_dir=scenes,
+        port=0,
+        backend="cpu",
+        log_level="error",
+        drain_seconds=0,
+        jobs_quota_bytes=50_000_000,
+    )
+    with TestClient(create_app(settings), base_url="http://127.0.0.1") as client:
+        yield client
+
+
+def finished(client, response) -> dict:
+    assert response.status_code == 202, response.text
+    url = response.headers["Location"]
+    deadline = time.monotonic() + 60
+    while not JobInfo.model_validate(job := client.get(url).json()).over:
+        assert time.monotonic() < deadline, job
+        time.sleep(0.02)
+    return job
+
+
+def succeeded(client, **change) -> dict:
+    job = finished(client, client.post("/v1/exports", json=ASKED | change))
+    assert job["state"] == "succeeded", job
+    return job
+
+
+def file_of(client, job: dict, name: str) -> bytes:
+    answer = client.get(f"/v1/jobs/{job['job_id']}/files/{name}")
+    assert answer.status_code == 200, answer.text
+    return answer.content
+
+
+def members(archive: bytes) -> dict[str, bytes]:
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        return {m.name: tar.extractfile(m).read() for m in tar.getmembers()}
+
+
+@pytest.fixture(scope="module")
+def job(client) -> dict:
+    return succeeded(client)
+
+
+def test_a_data_set_is_one_archive_with_manifest_and_licence(client, job):
+    assert job["result"]["frames"] == 3
+    held = members(file_of(client, job, "dataset.tar"))
+    assert {"manifest.json", "LICENSE.txt", "coco/annotations/instances_train.json"} <= set(held)
+    assert file_of(client, job, "manifest.json") == held["manifest.json"]
+    names = {name for name in held if name != "manifest.json"}
+    assert set(json.loads(held["manifest.json"])["files"]) == names
+
+
+def test_a_data_set_leaves_sheets_to_look_at(client, job):
+    sheet = file_of(client, job, "preview_0.jpg")
+    picture = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == 2 * 48
+    assert job["result"]["statistics"]["boxes"]["car"] == 6
+
+
+def test_the_same_request_gives_the_same_bytes(client, job):
+    again = succeeded(client)
+    assert file_of(client, again, "dataset.tar") == file_of(client, job, "dataset.tar")
+
+
+def test_a_dry_run_leaves_figures_and_no_file(client):
+    job = succeeded(client, dry_run=True)
+    assert (job["result"]["frames"], job["result"]["images"]) == (3, 3)
+    assert job["result"]["bytes"] > 0
+    assert job["files"] == []
+
+
+def test_a_scenario_is_exported_as_edited(client):
+    scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
+    edits = [{"op": "delete", "object_id": "car_blue"}]
+    client.post(f"/v1/scenarios/{scenario}/operations", json={"operations": edits})
+    asked = {k: v for k, v in ASKED.items() if k != "scene"} | {"scenario": scenario}
+    job = finished(client, client.post("/v1/exports", json=asked))
+    assert job["result"]["statistics"]["boxes"]["car"] == 3
+    made_of = json.loads(file_of(client, job, "manifest.json"))["made_of"]
+    assert made_of == {"operations": edits}
+
+
+@pytest.fixture(scope="module")
+def session(client) -> dict:
+    made = client.post("/v1/sessions?scene=tiny", json={"reset": {}}).json()
+    bearer = {"Authorization": f"Bearer {made['token']}"}
+    client.post(f"/v1/sessions/{made['session_id']}/step", json={"n": 2}, headers=bearer)
+    return {"id": made["session_id"], "bearer": bearer}
+
+
+def test_the_episode_of_a_session_and_its_recording_give_the_same_bytes(client, session):
+    asked = {k: v for k, v in ASKED.items() if k not in {"scene", "end_us"}}
+    live = asked | {"session": session["id"]}
+    running = finished(client, client.post("/v1/exports", json=live, headers=session["bearer"]))
+    url = f"/v1/sessions/{session['id']}/recording"
+    recording = base64.b64encode(client.get(url, headers=session["bearer"]).content).decode()
+    recorded = asked | {"scene": "tiny", "recording": recording}
+    stored = finished(client, client.post("/v1/exports", json=recorded))
+    assert running["result"]["frames"] == 3, running
+    assert "recording" not in stored["request"]
+    assert file_of(client, running, "dataset.tar") == file_of(client, stored, "dataset.tar")
+
+
+def test_a_session_is_not_exported_without_its_token(client, session):
+    asked = {k: v for k, v in ASKED.items() if k != "scene"} | {"session": session["id"]}
+    answer = client.post("/v1/exports", json=asked)
+    assert (answer.status_code, answer.json()["code"]) == (401, ErrorCode.UNAUTHORIZED)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"formats": ["kitty"]}, "allowed are labels, kitti"),
+        ({"cameras": ["rear"]}, "the scene has front, left"),
+        ({"end_us": 99_000_000}, "there is 0 to 2000000"),
+        ({"splits": {"train": 0}}, "a share above 0"),
+        ({"width": 8000, "cameras": []}, "this worker draws at most"),
+        ({"recording": base64.b64encode(b"nothing").decode()}, "recording"),
+        ({"session": "w0.0123456789abcdef"}, "exactly one of scenario, scene and session"),
+        ({"kind": "film"}, "kind is video (default) or dataset"),
+    ],
+)
+def test_a_wrong_data_set_is_refused_at_once(client, change, message):
+    answer = client.post("/v1/exports", json=ASKED | change)
+    assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
+    assert message in answer.text
+
+
+def test_fields_that_are_wrong_are_pointed_at_by_their_own_names(client):
+    answer = client.post("/v1/exports", json=ASKED | {"period_us": 0}).json()
+    assert [error["pointer"] for error in answer["errors"]] == ["/period_us"]
+
+
+def test_a_running_data_set_can_be_cancelled(client):
+    long = {"period_us": 5_000, "end_us": 2_000_000, "width": 400}
+    job = client.post("/v1/exports", json=ASKED | long).json()
+    cancelled = client.delete(f"/v1/jobs/{job['job_id']}").json()
+    assert cancelled["state"] == "cancelled"
+
+
+def test_more_than_the_disk_may_hold_is_refused_before_it_is_drawn(client):
+    large = {"period_us": 1_000, "end_us": 2_000_000, "width": 480, "formats": ["labels", "kitti"]}
+    job = finished(client, client.post("/v1/exports", json=ASKED | large))
+    assert job["error"]["code"] == ErrorCode.QUOTA_EXCEEDED
+    assert job["progress"] == 0
