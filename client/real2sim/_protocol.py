@@ -175,9 +175,11 @@ class ProtocolState:
             message, Edited, "confirmation of the edit", only_at_revision=self._revision
         )
 
-    def render(self, sensors: Sequence[SensorSpec]) -> PendingRequest[View]:
-        """Asks for images of the current instant."""
-        message = checked(Render, id=self._next_id(), sensors=list(sensors))
+    def render(
+        self, sensors: Sequence[SensorSpec], ranging: Mapping[str, Any]
+    ) -> PendingRequest[View]:
+        """Asks for images of the current instant, and clouds of LiDARs and radars."""
+        message = checked(Render, id=self._next_id(), sensors=list(sensors), **ranging)
         return self._request_for(message, View, "images", has_images=True)
 
     def agent(

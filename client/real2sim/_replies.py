@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from real2sim_proto import CodecError, decode
 from real2sim_proto.drive import Frame as WireFrame
+from real2sim_proto.drive import PointCloud as WireCloud
 from real2sim_proto.scenarios import HistoryEntry
 
 from ._models import read_json
@@ -133,6 +134,7 @@ def parse_view(reply: Reply) -> View:
         t_us=int(message.get("t_us", wires[0].t_us if wires else 0)),
         revision=int(message.get("revision", 0)),
         timing=message.get("timing", {}),
+        clouds=[_wire_cloud(cloud) for cloud in message.get("clouds", ())],
     )
 
 
@@ -149,6 +151,13 @@ def _wire_frame(value: Any) -> WireFrame:
         return WireFrame.model_validate(known)
     except ValidationError as error:
         raise MalformedReplyError(f"the worker sent a broken frame: {describe(error)}") from error
+
+
+def _wire_cloud(value: Any) -> WireCloud:
+    try:
+        return WireCloud.model_validate(value)
+    except ValidationError as error:
+        raise MalformedReplyError(f"the worker sent a broken cloud: {describe(error)}") from error
 
 
 def describe(error: ValidationError) -> str:

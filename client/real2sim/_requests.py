@@ -314,9 +314,11 @@ def record_session(session_id: str, token: str | None, frames: bool) -> Call[byt
     return Call(request, lambda reply: reply.content)
 
 
-def render_session(session_id: str, token: str | None, sensors: Sequence[SensorSpec]) -> Call[View]:
+def render_session(
+    session_id: str, token: str | None, sensors: Sequence[SensorSpec], ranging: Mapping[str, Any]
+) -> Call[View]:
     """Never moves time, so it may be sent again."""
-    body = checked(SessionRender, sensors=list(sensors))
+    body = checked(SessionRender, sensors=list(sensors), **ranging)
     request = Request(
         "POST",
         f"{_session(session_id)}/render",

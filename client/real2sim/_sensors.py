@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeAlias, TypedDict
+from typing import Any, Literal, TypeAlias, TypedDict, TypeVar, cast
 
 from real2sim_proto.episode import (
     AgentsSpec,
@@ -15,16 +15,30 @@ from real2sim_proto.episode import (
     ScoringSpec,
     SensorSpec,
 )
+from real2sim_proto.ranging import LidarSpec, RadarSpec
 
 from ._call import checked
 
 Sensor: TypeAlias = str | SensorSpec | Mapping[str, Any]
 """A camera: its name, or a spec, or a spec's fields: ``{"camera": "front", "width": 640}``."""
 
+S = TypeVar("S")
+R = TypeVar("R", LidarSpec, RadarSpec)
+
+LidarSensor: TypeAlias = str | LidarSpec | Mapping[str, Any]
+"""A LiDAR: a name of the worker's catalogue, or a spec, or a spec's fields:
+``{"lidar": "top", "model": "os1-128", "rate_hz": 20}``."""
+
+RadarSensor: TypeAlias = str | RadarSpec | Mapping[str, Any]
+"""A radar: a name of the worker's catalogue, or a spec, or a spec's fields:
+``{"radar": "front", "model": "long-range"}``."""
+
 
 class ResetOptions(TypedDict, total=False):
     """Options of reset, besides its sensors; meaning and defaults as in ``ResetSpec``."""
 
+    lidars: Sequence[LidarSensor]
+    radars: Sequence[RadarSensor]
     seed: int
     randomization: Randomization | Mapping[str, Any]
     start_us: int | None
@@ -62,7 +76,38 @@ def reset_spec(sensors: Sequence[Sensor], codec: str, options: ResetOptions) -> 
     Raises:
         ValueError: a field that is not allowed.
     """
-    return checked(ResetSpec, sensors=sensor_specs(sensors, codec), **options)
+    given: dict[str, Any] = dict(options)
+    given |= ranging_specs(options.get("lidars", ()), options.get("radars", ()))
+    return checked(ResetSpec, sensors=sensor_specs(sensors, codec), **given)
+
+
+def ranging_specs(
+    lidars: Sequence[LidarSensor], radars: Sequence[RadarSensor]
+) -> dict[str, list[LidarSpec] | list[RadarSpec]]:
+    """Specs of LiDARs and radars as members of a message, which has those alone that are given.
+
+    Raises:
+        ValueError: a field that is not allowed.
+    """
+    found: dict[str, list[LidarSpec] | list[RadarSpec]] = {}
+    if lidars:
+        found["lidars"] = [_ranging_spec(LidarSpec, "lidar", s) for s in _several(lidars)]
+    if radars:
+        found["radars"] = [_ranging_spec(RadarSpec, "radar", s) for s in _several(radars)]
+    return found
+
+
+def _several(sensors: Sequence[S]) -> Sequence[S]:
+    if isinstance(sensors, str):
+        raise ValueError(f"{sensors!r} is a string; give a list, as [{sensors!r}]")
+    return sensors
+
+
+def _ranging_spec(kind: type[R], name: str, sensor: object) -> R:
+    if isinstance(sensor, kind):
+        return sensor
+    fields = {name: sensor} if isinstance(sensor, str) else dict(cast(Mapping[str, Any], sensor))
+    return checked(kind, **fields)
 
 
 def _sensor_spec(sensor: Sensor, codec: str) -> SensorSpec:

@@ -178,8 +178,8 @@ def frame_from_wire(wire: WireFrame, pixels: memoryview | None = None) -> Frame:
         shape=tuple(wire.shape),
         sensor=wire.sensor,
         t_us=wire.t_us,
-        T_world_sensor=_matrix(wire.T_world_sensor, (4, 4), "T_world_sensor"),
-        K=_matrix(wire.K, (3, 3), "K"),
+        T_world_sensor=matrix_from_wire(wire.T_world_sensor, (4, 4), "T_world_sensor"),
+        K=matrix_from_wire(wire.K, (3, 3), "K"),
     )
     if pixels is not None:
         if wire.codec != "raw":
@@ -214,7 +214,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise
 
 
-def _matrix(value: Any, shape: tuple[int, int], name: str) -> NDArray[np.float64]:
+def matrix_from_wire(value: Any, shape: tuple[int, int], name: str) -> NDArray[np.float64]:
+    """A matrix of a frame. Raises MalformedReplyError: it has another shape."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

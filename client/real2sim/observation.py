@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .clouds import LidarCloud, PointCloud, RadarCloud, clouds_by_sensor
 from .errors import MalformedReplyError
 from .images import Frame, frames_by_camera
 
 if TYPE_CHECKING:
     from real2sim_proto.drive import AgentState, EgoState, Event, Obs
     from real2sim_proto.drive import Frame as WireFrame
+    from real2sim_proto.drive import PointCloud as WireCloud
+
+C = TypeVar("C", bound=PointCloud)
 
 Frames = Mapping[str, Mapping[str, Frame]]
 """Frames by camera, then by modality."""
@@ -28,6 +32,7 @@ class View:
         t_us: that instant.
         revision: of the session's edits.
         frames: camera -> modality -> frame.
+        clouds: LiDAR or radar -> point cloud.
         timing: milliseconds by stage, measured by the worker.
 
     Examples:
@@ -42,6 +47,7 @@ class View:
     t_us: int
     revision: int
     frames: Frames = field(repr=False)
+    clouds: Mapping[str, PointCloud] = field(default_factory=dict, repr=False)
     timing: Mapping[str, float] = field(default_factory=dict, repr=False)
 
     def image(self, camera: str, modality: str = "rgb") -> NDArray[Any]:
@@ -61,6 +67,34 @@ class View:
             raise KeyError(
                 f"no frame {camera}/{modality} at {self.t_us} us; there: {there}"
             ) from None
+
+    def lidar(self, name: str) -> LidarCloud:
+        """The sweep of a LiDAR.
+
+        Raises:
+            KeyError: this instant has none of that name; the sentence names those it has.
+
+        Examples:
+            >>> obs.lidar("vlp-16").return_number.min()
+            1
+        """
+        return self._cloud(name, LidarCloud)
+
+    def radar(self, name: str) -> RadarCloud:
+        """The scan of a radar. Raises KeyError as :meth:`lidar`.
+
+        Examples:
+            >>> bool((obs.radar("corner").range > 0).all())
+            True
+        """
+        return self._cloud(name, RadarCloud)
+
+    def _cloud(self, name: str, kind: type[C]) -> C:
+        found = self.clouds.get(name)
+        if not isinstance(found, kind):
+            there = ", ".join(f"{n} ({c.modality})" for n, c in self.clouds.items()) or "none"
+            raise KeyError(f"no such cloud {name!r} at {self.t_us} us; there: {there}")
+        return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,6 +175,7 @@ def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) ->
         route=route,
         command=obs.command,
         frames=frames_by_camera(obs.frames, pixels),
+        clouds=clouds_by_sensor(obs.clouds),
         agents=tuple(obs.agents),
         events=tuple(obs.events),
         metrics=obs.metrics,
@@ -162,7 +197,13 @@ def view_from_frames(
     revision: int,
     timing: Mapping[str, float],
     pixels: Sequence[memoryview | None] = (),
+    clouds: Sequence[WireCloud] = (),
 ) -> View:
     """The view in a message; ``pixels`` as of :func:`observation_from_wire`."""
-    found = frames_by_camera(frames, pixels)
-    return View(t_us=t_us, revision=revision, frames=found, timing=timing)
+    return View(
+        t_us=t_us,
+        revision=revision,
+        frames=frames_by_camera(frames, pixels),
+        clouds=clouds_by_sensor(clouds),
+        timing=timing,
+    )

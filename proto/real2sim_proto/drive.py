@@ -6,6 +6,7 @@ messages with ``id``; the answer carries the same ``id``. The clock moves only o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -20,6 +21,16 @@ from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, 
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .operations import Operation
 from .plans import Gear, Plan, PlanPoses, PlanTimes, check_times
+from .ranging import (
+    MAX_LIDARS,
+    MAX_RADARS,
+    CloudCodec,
+    CloudField,
+    CloudFrame,
+    CloudModality,
+    LidarSpec,
+    RadarSpec,
+)
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import CameraInfo, ObjectInfo
 from .shared_memory import MAX_SLOTS, NAME, SECRET_BYTES
@@ -41,6 +52,12 @@ Slot = Annotated[
         "None, or without shared memory: they come with the answer",
     ),
 ]
+
+
+def check_asked(*asked: Sequence[object]) -> None:
+    """Raises ValueError: nothing is to be shown."""
+    if not any(asked):
+        raise ValueError("nothing is asked for; name sensors, lidars or radars")
 
 
 class Envelope(Model):
@@ -196,8 +213,15 @@ class Render(Envelope):
     """An out-of-loop view of the current instant; never moves time."""
 
     type: Literal["render"] = "render"
-    sensors: list[SensorSpec] = Field(min_length=1, max_length=MAX_SENSORS)
+    sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
+    lidars: list[LidarSpec] = Field(default_factory=list, max_length=MAX_LIDARS)
+    radars: list[RadarSpec] = Field(default_factory=list, max_length=MAX_RADARS)
     slot: Slot = None
+
+    @model_validator(mode="after")
+    def _shows_something(self) -> Render:
+        check_asked(self.sensors, self.lidars, self.radars)
+        return self
 
 
 class Agent(Envelope):
@@ -274,6 +298,28 @@ class Frame(ServerModel):
     data: bytes = Field(description="empty where the image lies in the shared memory")
 
 
+class PointCloud(ServerModel):
+    """What a LiDAR or a radar has measured: columns, one after the other in `data`."""
+
+    sensor: str
+    modality: str = one_of(CloudModality)
+    t_us: Microseconds = Field(description="its instant; a sweep's last ray is fired then")
+    duration_us: int = Field(description="from the first ray to the last; 0 of radars")
+    frame: str = one_of(CloudFrame)
+    compensated: bool = Field(
+        description="points are as seen from the pose at `t_us`; false: at each ray's own instant"
+    )
+    T_world_sensor: Array = Field(description="[4, 4] float64, at `t_us`")
+    T_vehicle_sensor: Array = Field(description="[4, 4] float64")
+    count: int = Field(ge=0, description="number of points, N")
+    fields: list[CloudField] = Field(description="columns in their order; each [N, width]")
+    codec: str = one_of(CloudCodec)
+    data: bytes = Field(
+        description="'raw': the columns, little-endian; 'deflate': zlib of them, the first bytes "
+        "of all numbers of a column before the second ones, and so on"
+    )
+
+
 class SharedMemory(ServerModel):
     """Memory that a controller on the worker's machine may read raw images from."""
 
@@ -327,6 +373,9 @@ class Obs(ServerEnvelope):
     command: Literal["straight", "left", "right"] = Field(description="from the route ahead")
     route: Array = Field(description="[R, 2] float64 x, y of the route ahead, vehicle frame [m]")
     frames: list[Frame]
+    clouds: list[PointCloud] = Field(
+        default_factory=list, description="of LiDARs and radars that are due"
+    )
     agents: list[AgentState] = Field(default_factory=list)
     events: list[Event] = Field(default_factory=list)
     metrics: dict[str, float] = Field(default_factory=dict)
@@ -362,6 +411,7 @@ class View(ServerEnvelope):
     t_us: Microseconds
     revision: int
     frames: list[Frame]
+    clouds: list[PointCloud] = Field(default_factory=list)
     timing: dict[str, float] = Field(default_factory=dict)
 
 

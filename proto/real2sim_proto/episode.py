@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from .base import Codec, Identifier, Microseconds, Modality, Model
 from .cameras import CameraEffects, Optics
+from .ranging import MAX_LIDARS, MAX_RADARS, LidarSpec, RadarSpec
 
 MAX_SENSORS = 16
 MAX_DRIVERS = 64
@@ -517,7 +518,11 @@ class ResetSpec(Model):
     warmup_us: int = Field(
         default=0, ge=0, description="the ego moves as recorded for so long; plans wait"
     )
-    sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
+    sensors: list[SensorSpec] = Field(
+        default_factory=list, max_length=MAX_SENSORS, description="cameras"
+    )
+    lidars: list[LidarSpec] = Field(default_factory=list, max_length=MAX_LIDARS)
+    radars: list[RadarSpec] = Field(default_factory=list, max_length=MAX_RADARS)
     ego: EgoSpec = EgoSpec()
     action: Literal["trajectory", "control", "pose"] = "trajectory"
     agents: AgentsSpec = AgentsSpec()

@@ -103,6 +103,7 @@ class Limits(Reply):
     max_operations_per_request: int
     max_cameras_per_step: int
     max_pixels_per_step: int
+    max_rays_per_step: int = Field(default=0, description="0: of a worker without LiDARs")
     max_steps_per_request: int
     scene_memory_bytes: int
     queue_length: int
@@ -128,6 +129,12 @@ class ServerInfo(Reply):
     limits: Limits
     codecs: list[str]
     modalities: list[str]
+    lidar_models: list[str] = Field(
+        default_factory=list, description="that `lidars` of a session may name"
+    )
+    radar_models: list[str] = Field(
+        default_factory=list, description="that `radars` of a session may name"
+    )
     conventions: dict[str, str]
 
 

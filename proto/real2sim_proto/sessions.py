@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .base import Microseconds, Model
-from .drive import AgentState, EgoState, Event
+from .drive import AgentState, EgoState, Event, check_asked
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .operations import Operation
 from .plans import Plan
+from .ranging import MAX_LIDARS, MAX_RADARS, LidarSpec, RadarSpec
 from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
 from .scenes import Reply
 
@@ -97,4 +98,11 @@ class SessionState(Reply):
 class SessionRender(Model):
     """Body of `POST /v1/sessions/{id}/render`."""
 
-    sensors: list[SensorSpec] = Field(min_length=1, max_length=MAX_SENSORS)
+    sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
+    lidars: list[LidarSpec] = Field(default_factory=list, max_length=MAX_LIDARS)
+    radars: list[RadarSpec] = Field(default_factory=list, max_length=MAX_RADARS)
+
+    @model_validator(mode="after")
+    def _shows_something(self) -> SessionRender:
+        check_asked(self.sensors, self.lidars, self.radars)
+        return self

@@ -63,6 +63,7 @@ class Settings(BaseSettings):
         jobs_quota, jobs_quota_bytes: jobs on record, and the disk of their files; no job begins
             beyond.
         max_pixels_per_step: pixels over all cameras of one observation or render.
+        max_rays_per_step: rays over all LiDARs and radars of one observation or render.
         stall_seconds: `/livez` fails when one job takes longer than this.
         drain_seconds: how long a worker that is to stop goes on serving, not ready, so that proxies
             send new work elsewhere; SIGINT, or a second signal, ends it at once.
@@ -118,6 +119,7 @@ class Settings(BaseSettings):
     jobs_quota: int = Field(default=10_000, ge=0)
     jobs_quota_bytes: int = Field(default=100 * GIB, ge=0)
     max_pixels_per_step: int = Field(default=64_000_000, ge=1)
+    max_rays_per_step: int = Field(default=1 << 19, ge=1)
     stall_seconds: float = Field(default=120.0, gt=0)
     drain_seconds: float = Field(default=5.0, ge=0)
     graceful_seconds: float = Field(default=10.0, ge=0)

@@ -11,7 +11,15 @@ from real2sim_proto.sessions import SessionCreate, SessionInfo, SessionState, St
 from .. import _requests
 from .._call import checked
 from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
-from .._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
+from .._sensors import (
+    LidarSensor,
+    RadarSensor,
+    ResetOptions,
+    Sensor,
+    ranging_specs,
+    reset_spec,
+    sensor_specs,
+)
 from .._session_state import SessionTokens
 from ..observation import View
 from .transport import AsyncTransport
@@ -114,7 +122,13 @@ class AsyncSessions:
         return await self._transport.send(call)
 
     async def render(
-        self, session_id: str, sensors: Sequence[Sensor], *, codec: str = "auto"
+        self,
+        session_id: str,
+        sensors: Sequence[Sensor] = (),
+        *,
+        lidars: Sequence[LidarSensor] = (),
+        radars: Sequence[RadarSensor] = (),
+        codec: str = "auto",
     ) -> View:
         """Images of the current instant; never moves time.
 
@@ -124,5 +138,6 @@ class AsyncSessions:
             (64, 96, 3)
         """
         specs = sensor_specs(sensors, self._transport.target.codec(codec))
-        call = _requests.render_session(session_id, self._tokens.of(session_id), specs)
+        ranging = ranging_specs(lidars, radars)
+        call = _requests.render_session(session_id, self._tokens.of(session_id), specs, ranging)
         return await self._transport.send(call)

@@ -23,7 +23,15 @@ from real2sim_proto.plans import Plan
 from .. import _requests
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest
-from .._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
+from .._sensors import (
+    LidarSensor,
+    RadarSensor,
+    ResetOptions,
+    Sensor,
+    ranging_specs,
+    reset_spec,
+    sensor_specs,
+)
 from .._session_state import SessionBase, SessionPlan, not_open
 from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
@@ -89,7 +97,8 @@ class DriveSession(SessionBase):
             sensors: camera names or specs; what every observation shows.
             options: seed, start_us, dt_us, horizon, ego, action, agents, privileged, deadline_ms,
                 on_timeout, latency, on_collision and more; see
-                ``real2sim_proto.episode.ResetSpec``.
+                ``real2sim_proto.episode.ResetSpec``. ``lidars`` and ``radars`` are names of the
+                worker's catalogues, or specs.
 
         Raises:
             ValueError: an option that is not allowed.
@@ -105,6 +114,10 @@ class DriveSession(SessionBase):
             (32, 48)
             >>> sorted(agent.object_id for agent in obs.agents)
             ['car_blue', 'car_red', 'post']
+            >>> obs = session.reset(lidars=["vlp-16"], radars=["corner"])
+            >>> sweep, scan = obs.lidar("vlp-16"), obs.radar("corner")
+            >>> sweep.points.shape[1], sweep.t_us, scan.velocity.dtype
+            (3, 0, dtype('float32'))
         """
         spec = reset_spec(sensors, self._codec, options)
         return self._observe(self._protocol.reset(spec))
@@ -173,21 +186,32 @@ class DriveSession(SessionBase):
         """
         return self._request(self._protocol.edit(operations))
 
-    def render(self, sensors: Sequence[Sensor]) -> View:
-        """Images of the current instant; never moves time.
+    def render(
+        self,
+        sensors: Sequence[Sensor] = (),
+        *,
+        lidars: Sequence[LidarSensor] = (),
+        radars: Sequence[RadarSensor] = (),
+    ) -> View:
+        """Images of the current instant, and clouds of LiDARs and radars; never moves time.
 
         Examples:
             >>> view = session.render(["left"])
             >>> view.image("left").shape
             (64, 96, 3)
+            >>> view = session.render(lidars=[{"lidar": "top", "model": "vlp-16"}])
+            >>> view.lidar("top").frame
+            'sensor'
         """
-        view = self._request(self._protocol.render(sensor_specs(sensors, self._codec)))
+        asked = sensor_specs(sensors, self._codec), ranging_specs(lidars, radars)
+        view = self._request(self._protocol.render(*asked))
         return view_from_frames(
             view.frames,
             t_us=view.t_us,
             revision=view.revision,
             timing=view.timing,
             pixels=self._pixels_of(view.frames),
+            clouds=view.clouds,
         )
 
     def steer(

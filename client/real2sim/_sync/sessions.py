@@ -12,7 +12,15 @@ from real2sim_proto.sessions import SessionCreate, SessionInfo, SessionState, St
 from .. import _requests
 from .._call import checked
 from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
-from .._sensors import ResetOptions, Sensor, reset_spec, sensor_specs
+from .._sensors import (
+    LidarSensor,
+    RadarSensor,
+    ResetOptions,
+    Sensor,
+    ranging_specs,
+    reset_spec,
+    sensor_specs,
+)
 from .._session_state import SessionTokens
 from ..observation import View
 from .transport import Transport
@@ -114,7 +122,15 @@ class Sessions:
         call = _requests.session_state(session_id, self._tokens.of(session_id))
         return self._transport.send(call)
 
-    def render(self, session_id: str, sensors: Sequence[Sensor], *, codec: str = "auto") -> View:
+    def render(
+        self,
+        session_id: str,
+        sensors: Sequence[Sensor] = (),
+        *,
+        lidars: Sequence[LidarSensor] = (),
+        radars: Sequence[RadarSensor] = (),
+        codec: str = "auto",
+    ) -> View:
         """Images of the current instant; never moves time.
 
         Examples:
@@ -123,5 +139,6 @@ class Sessions:
             (64, 96, 3)
         """
         specs = sensor_specs(sensors, self._transport.target.codec(codec))
-        call = _requests.render_session(session_id, self._tokens.of(session_id), specs)
+        ranging = ranging_specs(lidars, radars)
+        call = _requests.render_session(session_id, self._tokens.of(session_id), specs, ranging)
         return self._transport.send(call)

@@ -141,7 +141,7 @@ def composed_background(
         background = inpaint_ground(scene, scene.background, left) if left else scene.background
         return without_regions(background, erased) if erased else background
 
-    return _kept(scene, (erased, left), make)
+    return kept(scene, (erased, left), make)
 
 
 def without_regions(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
@@ -171,13 +171,13 @@ _derived: WeakKeyDictionary[Scene, OrderedDict[Hashable, object]] = WeakKeyDicti
 _deriving = threading.Lock()
 
 
-def _kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
+def kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
     """What ``make`` made of ``scene`` before, or makes now."""
     with _deriving:
-        kept = _derived.setdefault(scene, OrderedDict())
-        if key not in kept:
-            kept[key] = make()
-        kept.move_to_end(key)
-        while len(kept) > KEPT_BACKGROUNDS:
-            kept.popitem(last=False)
-        return kept[key]  # type: ignore[return-value]
+        made = _derived.setdefault(scene, OrderedDict())
+        if key not in made:
+            made[key] = make()
+        made.move_to_end(key)
+        while len(made) > KEPT_BACKGROUNDS:
+            made.popitem(last=False)
+        return made[key]  # type: ignore[return-value]

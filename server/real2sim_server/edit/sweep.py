@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from real2sim_proto.semantics import semantic_class
+
 from ..geometry.rotation import Float
 from ..render.cast.recorded import Attributes, SweepScene, met_by_lidar, transforms_at
 from ..render.types import Instance
 from ..scene import GaussianCloud, Lidar, Scene
-from .compose import without_regions
+from .compose import kept, without_regions
 from .state import ObjectState, ScenarioState
 
 
@@ -19,19 +21,33 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
     Raises:
         UnknownObjectError: ``state`` is of another scene.
     """
-    cloud, attributes = met_by_lidar(scene, None)
-    if state.erased:
-        cloud = without_regions(cloud, state.erased)
-    instances, known = [Instance(cloud)], [attributes]
-    moved: list[Float | None] = [None]
     placed = state.tracks.at(t_us)
     times = t_us + lidar.beams.slots[0]
+    found = [met_background(scene, state)]
+    moved: list[Float | None] = [None]
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        cloud, attributes = _met(scene, subject)
-        instances.append(Instance(cloud, transform, subject.instance_id, subject.scale))
+        found.append(met_object(scene, subject, transform))
         moved.append(transforms_at(subject.trajectory, times))
-        known.append(attributes)
-    return SweepScene(tuple(instances), tuple(moved), tuple(known))
+    instances, known = zip(*found, strict=True)
+    return SweepScene(instances, tuple(moved), known)
+
+
+def met_background(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
+    """What rays meet of the background, without erased regions, and its attributes."""
+    cloud, attributes = met_by_lidar(scene, None)
+    if state.erased:
+        cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
+    return Instance(cloud), attributes
+
+
+def met_object(
+    scene: Scene, subject: ObjectState, transform: Float
+) -> tuple[Instance, Attributes | None]:
+    """What rays meet of an object at ``transform``, and its attributes."""
+    cloud, attributes = _met(scene, subject)
+    semantic = semantic_class(subject.category)
+    instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)
+    return instance, attributes
 
 
 def _met(scene: Scene, subject: ObjectState) -> tuple[GaussianCloud, Attributes | None]:

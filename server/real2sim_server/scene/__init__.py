@@ -12,6 +12,7 @@ from .errors import (
     BundleError,
     BundleTooLargeError,
     LidarError,
+    RadarError,
     SceneError,
     TimeOutOfRangeError,
     UnknownObjectError,
@@ -20,6 +21,7 @@ from .ground import Ground
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .lidar import Beams, Detection, Lidar
 from .lidar_surfaces import LidarSurfaces, Reflector
+from .radar import Radar
 from .scene import Scene, SceneObject
 from .shutter import Shutter
 from .sky import Sky
@@ -44,6 +46,8 @@ __all__ = [
     "LidarError",
     "LidarSurfaces",
     "Omnidirectional",
+    "Radar",
+    "RadarError",
     "Reflector",
     "Scene",
     "SceneError",

@@ -4,6 +4,7 @@ SceneError
 ├── TimeOutOfRangeError   a pose was asked for outside a trajectory
 ├── UnknownObjectError    an object id the scene does not have
 ├── LidarError            a LiDAR that cannot be, or a name that the catalogue does not have
+├── RadarError            a name that the catalogue of radars does not have
 └── BundleError           a file that is not a readable scene or splat file
     └── BundleTooLargeError   one that would take more memory than it may
 """
@@ -28,6 +29,10 @@ class UnknownObjectError(SceneError, KeyError):
 
 class LidarError(SceneError, ValueError):
     """A LiDAR out of range or unknown; the message says what was given and what is allowed."""
+
+
+class RadarError(SceneError, ValueError):
+    """A radar that the catalogue does not have; the message names those it has."""
 
 
 class BundleError(SceneError, ValueError):

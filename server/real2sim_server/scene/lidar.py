@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from real2sim_proto.ranging import MAX_RAYS
+
 from ..geometry.rotation import Float
 from ..geometry.transform import is_rigid
 from .errors import LidarError
 
-MAX_RAYS = 1 << 19
-"""Rays of one sweep; the densest sensors sold today fire less than half as many."""
 MAX_SLOTS = 2048
 """Instants of a sweep at which poses are taken: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
 MAX_RANGE_M = 2000.0

@@ -9,159 +9,28 @@ import json
 from functools import cache
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, assert_never
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
+
+from real2sim_proto.ranging import (
+    MAX_RAYS,
+    GridBeams,
+    LidarModel,
+    RosetteBeams,
+    SpinningBeams,
+    TableBeams,
+)
 
 from ..geometry.rotation import Float
 from .errors import LidarError
-from .lidar import MAX_RAYS, Beams, Detection, Lidar
+from .lidar import Beams, Detection, Lidar
 
 FOLDER = Path(__file__).parent / "lidar_models"
 MAX_FILE_BYTES = 64 << 20
-Numbers = Annotated[list[float], Field(min_length=1, max_length=MAX_RAYS)]
-Span = tuple[float, float]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class SpinningPart(_Part):
-    """Rows that turn, see :meth:`~.lidar.Beams.spinning`; angles in degrees."""
-
-    kind: Literal["spinning"]
-    elevation_deg: Numbers
-    azimuth_offset_deg: Numbers | None = None
-    columns: int
-    rate_hz: float = 10.0
-    clockwise: bool = True
-    start_deg: float = 180.0
-    field_of_view_deg: float = 360.0
-
-    def build(self) -> Beams:
-        """The rays."""
-        offsets = self.azimuth_offset_deg or [0.0] * len(self.elevation_deg)
-        if len(offsets) != len(self.elevation_deg):
-            raise LidarError(
-                f"{len(offsets)} azimuth_offset_deg for {len(self.elevation_deg)} elevation_deg"
-            )
-        return Beams.spinning(
-            np.radians(self.elevation_deg),
-            columns=self.columns,
-            rate_hz=self.rate_hz,
-            azimuth_offset=np.radians(offsets),
-            clockwise=self.clockwise,
-            start=float(np.radians(self.start_deg)),
-            field_of_view=float(np.radians(self.field_of_view_deg)),
-        )
-
-
-class TablePart(_Part):
-    """Every ray by itself."""
-
-    kind: Literal["table"]
-    azimuth_deg: Numbers
-    elevation_deg: Numbers
-    time_us: Numbers
-
-    def build(self) -> Beams:
-        """The rays."""
-        azimuth, elevation = np.radians(self.azimuth_deg), np.radians(self.elevation_deg)
-        return Beams(azimuth, elevation, np.array(self.time_us))
-
-
-class GridPart(_Part):
-    """A solid-state sensor that scans rows of even steps, top row first, left to right."""
-
-    kind: Literal["grid"]
-    azimuth_deg: Span
-    elevation_deg: Span
-    columns: Annotated[int, Field(ge=1, le=MAX_RAYS)]
-    rows: Annotated[int, Field(ge=1, le=MAX_RAYS)]
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
-
-    def build(self) -> Beams:
-        """The rays, row by row."""
-        if self.rows * self.columns > MAX_RAYS:
-            raise LidarError(
-                f"{self.rows:,} rows of {self.columns:,} columns; allowed are {MAX_RAYS:,} rays"
-            )
-        high, low = max(self.elevation_deg), min(self.elevation_deg)
-        left, right = max(self.azimuth_deg), min(self.azimuth_deg)
-        elevation = np.radians(_centres(high, low, self.rows))
-        azimuth = np.radians(_centres(left, right, self.columns))
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        time_us = (np.arange(len(row)) + 0.5) / len(row) - 0.5
-        return Beams(azimuth[column], elevation[row], time_us * 1e6 / self.rate_hz)
-
-
-class RosettePart(_Part):
-    """Two prisms that turn at different speeds: petals about the sensor's x axis.
-
-    The deflections of the prisms add up: (azimuth, elevation) = r/2 (e^(i a t) + e^(i b t)).
-    """
-
-    kind: Literal["rosette"]
-    radius_deg: Annotated[float, Field(gt=0, lt=90)]
-    turns_per_minute: Span
-    rays: Annotated[int, Field(ge=1, le=MAX_RAYS)]
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
-
-    def build(self) -> Beams:
-        """The rays in the order of time."""
-        seconds = ((np.arange(self.rays) + 0.5) / self.rays - 0.5) / self.rate_hz
-        first, second = (2 * np.pi * turns / 60 * seconds for turns in self.turns_per_minute)
-        half = np.radians(self.radius_deg) / 2
-        azimuth = half * (np.cos(first) + np.cos(second))
-        elevation = half * (np.sin(first) + np.sin(second))
-        return Beams(azimuth, elevation, seconds * 1e6)
-
-
-class DetectionPart(_Part):
-    """See :class:`~.lidar.Detection`."""
-
-    range_m: float = 120.0
-    reflectivity: float = 0.1
-    loss: float = 0.0
-    softness: float = 0.25
-
-
-class LidarDocument(_Part):
-    """A LiDAR as JSON."""
-
-    name: Annotated[str, Field(min_length=1, max_length=64)]
-    source: str = ""
-    beams: Annotated[SpinningPart | TablePart | GridPart | RosettePart, Field(discriminator="kind")]
-    T_vehicle_lidar: list[list[float]] | None = None
-    range_m: Span = (0.5, 120.0)
-    divergence_mrad: Span = (0.0, 0.0)
-    returns: int = 1
-    pulse_m: float = 0.4
-    range_noise_m: float = 0.0
-    detection: DetectionPart = DetectionPart()
-
-    def build(self) -> Lidar:
-        """The sensor; by default 1.73 m above the vehicle's rear axle and 0.9 m before it."""
-        pose = np.eye(4)
-        pose[:3, 3] = (0.9, 0.0, 1.73)
-        if self.T_vehicle_lidar is not None:
-            pose = _matrix(self.T_vehicle_lidar)
-        horizontal, vertical = self.divergence_mrad
-        return Lidar(
-            name=self.name,
-            beams=self.beams.build(),
-            T_vehicle_lidar=pose,
-            min_range=self.range_m[0],
-            max_range=self.range_m[1],
-            divergence=(horizontal * 1e-3, vertical * 1e-3),
-            returns=self.returns,
-            pulse=self.pulse_m,
-            range_noise=self.range_noise_m,
-            detection=Detection(**self.detection.model_dump()),
-            source=self.source,
-        )
+MOUNT = (0.9, 0.0, 1.73)
+"""Of LiDARs whose model names no pose, from the vehicle's rear axle [m]."""
 
 
 @cache
@@ -218,13 +87,97 @@ def lidar_from_values(values: Any) -> Lidar:
         LidarError: with the first fields that are wrong, and why.
     """
     try:
-        document = TypeAdapter(LidarDocument).validate_python(values)
+        model = TypeAdapter(LidarModel).validate_python(values)
     except ValidationError as error:
         reasons = [
             f"{'.'.join(map(str, issue['loc']))}: {issue['msg']}" for issue in error.errors()[:4]
         ]
         raise LidarError("; ".join(reasons)) from error
-    return document.build()
+    return lidar_of(model)
+
+
+def lidar_of(model: LidarModel) -> Lidar:
+    """The sensor; at MOUNT where the model names no pose.
+
+    Raises:
+        LidarError: a value out of range, named with what is allowed.
+    """
+    pose = np.eye(4)
+    pose[:3, 3] = MOUNT
+    if model.T_vehicle_lidar is not None:
+        pose = _matrix(model.T_vehicle_lidar)
+    horizontal, vertical = model.divergence_mrad
+    return Lidar(
+        name=model.name,
+        beams=_beams_of(model.beams),
+        T_vehicle_lidar=pose,
+        min_range=model.range_m[0],
+        max_range=model.range_m[1],
+        divergence=(horizontal * 1e-3, vertical * 1e-3),
+        returns=model.returns,
+        pulse=model.pulse_m,
+        range_noise=model.range_noise_m,
+        detection=Detection(**model.detection.model_dump()),
+        source=model.source,
+    )
+
+
+def _beams_of(beams: SpinningBeams | TableBeams | GridBeams | RosetteBeams) -> Beams:
+    match beams:
+        case SpinningBeams():
+            return _spinning(beams)
+        case TableBeams():
+            azimuth, elevation = np.radians(beams.azimuth_deg), np.radians(beams.elevation_deg)
+            return Beams(azimuth, elevation, np.array(beams.time_us))
+        case GridBeams():
+            return _grid(beams)
+        case RosetteBeams():
+            return _rosette(beams)
+        case _:
+            assert_never(beams)
+
+
+def _spinning(beams: SpinningBeams) -> Beams:
+    offsets = beams.azimuth_offset_deg or [0.0] * len(beams.elevation_deg)
+    if len(offsets) != len(beams.elevation_deg):
+        raise LidarError(
+            f"{len(offsets)} azimuth_offset_deg for {len(beams.elevation_deg)} elevation_deg"
+        )
+    return Beams.spinning(
+        np.radians(beams.elevation_deg),
+        columns=beams.columns,
+        rate_hz=beams.rate_hz,
+        azimuth_offset=np.radians(offsets),
+        clockwise=beams.clockwise,
+        start=float(np.radians(beams.start_deg)),
+        field_of_view=float(np.radians(beams.field_of_view_deg)),
+    )
+
+
+def _grid(beams: GridBeams) -> Beams:
+    """Row by row."""
+    if beams.rows * beams.columns > MAX_RAYS:
+        raise LidarError(
+            f"{beams.rows:,} rows of {beams.columns:,} columns; allowed are {MAX_RAYS:,} rays"
+        )
+    high, low = max(beams.elevation_deg), min(beams.elevation_deg)
+    left, right = max(beams.azimuth_deg), min(beams.azimuth_deg)
+    elevation = np.radians(_centres(high, low, beams.rows))
+    azimuth = np.radians(_centres(left, right, beams.columns))
+    row, column = np.divmod(np.arange(beams.rows * beams.columns), beams.columns)
+    time_us = (np.arange(len(row)) + 0.5) / len(row) - 0.5
+    return Beams(azimuth[column], elevation[row], time_us * 1e6 / beams.rate_hz)
+
+
+def _rosette(beams: RosetteBeams) -> Beams:
+    """In the order of time. The deflections of the prisms add up:
+    (azimuth, elevation) = r/2 (e^(i a t) + e^(i b t))."""
+    seconds = ((np.arange(beams.rays) + 0.5) / beams.rays - 0.5) / beams.rate_hz
+    first, second = (2 * np.pi * turns / 60 * seconds for turns in beams.turns_per_minute)
+    half = np.radians(beams.radius_deg) / 2
+    azimuth = half * (np.cos(first) + np.cos(second))
+    elevation = half * (np.sin(first) + np.sin(second))
+    return Beams(azimuth, elevation, seconds * 1e6)
 
 
 def _centres(first: float, last: float, count: int) -> Float:

@@ -159,6 +159,7 @@ class Worker:
                     metrics,
                     deformation=kernels.deformation,
                     max_pixels=settings.max_pixels_per_step,
+                    max_rays=settings.max_rays_per_step,
                 ),
                 kernels=kernels,
                 store=store,

@@ -55,6 +55,7 @@ from .randomization import (
     latency_jitter_us,
     randomized_start,
 )
+from .ranging import Mounted, StepWay, Wake, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
 from .seam import Seam
 from .traffic import ObservedEgo, Surroundings, Traffic
@@ -90,6 +91,8 @@ class World:
             ``deadline``, ``wall_clock``.
         lap: times that the ego has been put back to the start of the route.
         drawn: what the seed has drawn for the start and for objects so far, by name.
+        ranging: LiDARs and radars of the episode.
+        wake: the way that all has come, as far back as a sweep looks.
     """
 
     def __init__(
@@ -117,6 +120,8 @@ class World:
         self.reason: str | None = None
         self.lap = 0
         self._clock = episode_clock(scene, spec)
+        self.ranging = mounted_sensors(spec.lidars, spec.radars, spec.dt_us)
+        self.wake = Wake.of(self.ranging.longest_us)
         self.t_us = self._clock.at(self.steps)
         # Until then the ego moves as recorded.
         self._warm_up_end_us = self._clock.start_us + spec.warmup_us
@@ -236,8 +241,11 @@ class World:
         controller, late_events = self._with_fallback(controller, missed=missed)
         reaction_events = self._let_agents_react()
         start = self._step_start(controller)
+        since_us, body = self.t_us, self.T_world_body
         moved = self._advance(controller)
         self._commit_motion(moved)
+        ways = (body, self.T_world_body), (start.agents, self.agents)
+        self.wake = self.wake.after(StepWay(since_us, self.t_us, *ways))
         self._step_drawn = _newly_drawn(self.traffic.drawn, drawn_before, jitter_us)
         contacts = self._apply_impacts(moved.impacts, start.agents)
         events = (*self._edit_events, *loop_events, *late_events, *reaction_events)
@@ -387,6 +395,10 @@ class World:
         """Sensors of the reset that deliver a frame at this step; all of them at step 0."""
         elapsed = self.steps * self._clock.dt_us
         return [s for s in self.spec.sensors if elapsed % (s.period_us or self._clock.dt_us) == 0]
+
+    def due_ranging(self) -> tuple[Mounted, ...]:
+        """LiDARs and radars whose cloud is complete at this step; all of them at step 0."""
+        return self.ranging.due(self.steps * self._clock.dt_us)
 
     def fork(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""

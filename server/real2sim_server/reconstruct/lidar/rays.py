@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from real2sim_proto.ranging import MAX_RAYS
+
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast.recorded import transforms_at
 from ...scene import Beams, Lidar
-from ...scene.lidar import MAX_RAYS
 
 FAR = 250.0
 """Recorded points beyond this are left out [m]."""

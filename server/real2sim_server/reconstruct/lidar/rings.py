@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from real2sim_proto.ranging import MAX_RAYS
+
 from ...geometry.rotation import Float
 from ...scene import Beams
-from ...scene.lidar import MAX_RAYS, wrapped
+from ...scene.lidar import wrapped
 from .rays import RecordedRays
 
 FALLS_BACK = np.pi

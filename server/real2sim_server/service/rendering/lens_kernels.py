@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
-
-import structlog
+from functools import partial
 
 from real2sim_proto import ErrorCode
 
@@ -13,25 +11,29 @@ from ...render import Backend, RenderError
 from ...render.lenses import kernels_of_lenses_on_disk, refuse_lenses, warm_up_lenses
 from ...scene import Camera
 from ..engine import Engine
-from ..first_run import awaited, compile_beside
+from ..first_run import compile_beside
 from ..http.problems import ServiceError
-
-log = structlog.get_logger(__name__)
-
-NICENESS = 10
-"""Of the process that compiles: the worker draws for others meanwhile."""
+from .kernels_beside import NICENESS, KernelsBeside
 
 
 class LensKernels:
-    """Gets them ready beside the engine, which draws for all sessions meanwhile.
-
-    A process of its own compiles them on the first run; the engine then loads what that left on
-    disk. Belongs to the event loop.
-    """
+    """Gets them ready beside the engine, see :class:`.KernelsBeside`."""
 
     def __init__(self, engine: Engine, backend: Backend) -> None:
-        self._engine, self._backend = engine, backend
-        self._made: asyncio.Task[None] | None = None
+        self._backend = backend
+        self._kernels = KernelsBeside(
+            engine,
+            "lenses",
+            on_disk=lambda: backend.name != "cpu" or kernels_of_lenses_on_disk(),
+            compile=partial(
+                compile_beside,
+                "warm_up_lenses",
+                "cpu",
+                package="render.lenses",
+                niceness=NICENESS,
+            ),
+            load=partial(warm_up_lenses, backend),
+        )
 
     async def ready(self, cameras: Sequence[Camera]) -> None:
         """Return once cameras can be drawn, some of which have lenses or rolling shutters.
@@ -43,17 +45,4 @@ class LensKernels:
             refuse_lenses(self._backend, cameras)
         except RenderError as error:
             raise ServiceError(ErrorCode.INVALID_REQUEST, str(error)) from error
-        if self._made is None or (self._made.done() and self._made.exception() is not None):
-            self._made = asyncio.create_task(self._make())
-        # Whoever gives up waiting does not end it for others.
-        await asyncio.shield(self._made)
-
-    async def _make(self) -> None:
-        if self._backend.name == "cpu" and not kernels_of_lenses_on_disk():
-            log.info("compiling kernels of lenses, on the first run only")
-            beside = compile_beside(
-                "warm_up_lenses", "cpu", package="render.lenses", niceness=NICENESS
-            )
-            async with awaited(beside):
-                pass
-        await self._engine.call(warm_up_lenses, self._backend, label="warm-up")
+        await self._kernels.ready()

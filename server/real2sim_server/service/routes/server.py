@@ -16,6 +16,8 @@ from real2sim_proto.scenes import Limits, ServerInfo
 from real2sim_proto.sessions import MAX_STEPS_PER_REQUEST
 from real2sim_proto.version import SUPPORTED_SUBPROTOCOLS
 
+from ...scene.lidar_catalogue import lidar_names
+from ...scene.radar import RADARS
 from ...settings import Settings
 from ..http.auth import TokenRoute
 from ..worker import WorkerOf
@@ -35,6 +37,8 @@ async def describe(worker: WorkerOf) -> ServerInfo:
         limits=limits_of(worker.settings),
         codecs=list(get_args(Codec)),
         modalities=list(get_args(Modality)),
+        lidar_models=list(lidar_names()),
+        radar_models=list(RADARS),
         conventions=CONVENTIONS,
     )
 
@@ -48,6 +52,7 @@ def limits_of(settings: Settings) -> Limits:
         max_operations_per_request=MAX_OPERATIONS_PER_REQUEST,
         max_cameras_per_step=MAX_SENSORS,
         max_pixels_per_step=settings.max_pixels_per_step,
+        max_rays_per_step=settings.max_rays_per_step,
         max_steps_per_request=MAX_STEPS_PER_REQUEST,
         scene_memory_bytes=settings.scene_memory_bytes,
         queue_length=settings.queue_length,

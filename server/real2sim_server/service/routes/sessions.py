@@ -277,7 +277,7 @@ async def recording(
     response_class=Response,
     responses={
         200: {
-            "description": "application/msgpack with all frames; or one frame as image file",
+            "description": "application/msgpack with all frames and clouds; or one frame as a file",
             "content": {
                 media_type: {"schema": {"type": "string", "format": "binary"}}
                 for media_type in ("application/msgpack", "image/jpeg", "image/png")
@@ -291,9 +291,9 @@ async def render(
     body: SessionRender,
     accept: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """Images of the current instant; never moves time."""
+    """Images, sweeps and scans of the current instant; never moves time."""
     pipeline, world = worker.sessions.pipeline, session.running_world()
-    return await view_response(pipeline, world, body.sensors, accept)
+    return await view_response(pipeline, world, body, accept)
 
 
 def _state_reply(session: Session, idempotent: IdempotentRequest) -> MakeReply:

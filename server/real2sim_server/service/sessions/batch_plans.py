@@ -103,6 +103,8 @@ def check_for_batch(spec: ResetSpec) -> None:
     outside = (
         ("deadline_ms", spec.deadline_ms is not None),
         ("wall_clock_s", spec.wall_clock_s is not None),
+        ("lidars", bool(spec.lidars)),
+        ("radars", bool(spec.radars)),
         ("latency.model 'measured'", spec.latency.model == "measured"),
     )
     named = [name for name, given in outside if given]

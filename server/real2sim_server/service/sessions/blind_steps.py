@@ -66,7 +66,7 @@ class BlindSteps:
     def _encode(self, transition: Transition, world: World) -> EncodedObservation:
         members = pack_members(world.observe().obs_fields())
         transition.timer.stage("settle")
-        rendered = RenderedObservation(world, (), "obs", members, transition.timer)
+        rendered = RenderedObservation(world, (), (), "obs", members, transition.timer)
         return self._phases.encode(rendered, ())
 
 

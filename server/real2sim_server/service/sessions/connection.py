@@ -50,6 +50,7 @@ from .observers import ObserverQueue
 from .registry import Sessions
 from .segment import FrameSlot, Segment
 from .session import Session, controller_taken
+from .views import looking
 from .wire import EncodedMessage, pack_message
 
 CLOSE_TIMEOUT_S = 2.0
@@ -237,7 +238,9 @@ class Connection:
             case Render():
                 session.check_open()
                 world, slot = session.running_world(), self._slot(message.slot)
-                view = await self._sessions.pipeline.view(world, message.sensors, slot=slot)
+                view = await self._sessions.pipeline.view(
+                    world, message.sensors, ranging=looking(world, message), slot=slot
+                )
                 return view.answer
             case Attach() | Agent() | Snapshot() | Restore() | Fork():
                 async with session.lock:

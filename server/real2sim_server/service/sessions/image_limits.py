@@ -24,14 +24,19 @@ def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) 
         ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels or bytes.
     """
     cameras = check_sensors(scene.rig, sensors, max_pixels=max_pixels)
-    size = raw_image_bytes(sensors, cameras)
+    check_message_bytes(raw_image_bytes(sensors, cameras))
+    return cameras
+
+
+def check_message_bytes(size: int) -> None:
+    """Raises ServiceError: INVALID_REQUEST for raw images and clouds that no one message holds."""
     if size > MAX_IMAGE_BYTES:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
-            f"{size} bytes of raw images in one message; readers allow {MAX_IMAGE_BYTES}",
+            f"{size} bytes of raw images and clouds in one message; readers allow "
+            f"{MAX_IMAGE_BYTES}",
             hint="ask for smaller or fewer images, or for codec 'jpeg' or 'png'",
         )
-    return cameras
 
 
 def raw_image_bytes(sensors: Sequence[SensorSpec], cameras: Iterable[Camera]) -> int:

@@ -10,6 +10,8 @@ from real2sim_proto.episode import SensorSpec
 
 from ...scene import Camera
 from ...world import Observation, World
+from ...world.ranging import Cloud
+from ..rendering.clouds import cloud_parts
 from ..rendering.frames import EncodedFrame, FrameHeader, RenderedImage, raw_headers
 from .segment import FrameSlot
 from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
@@ -32,6 +34,7 @@ class RenderedObservation:
     Attributes:
         world: at that instant.
         images: in the order of sensors and modalities.
+        clouds: of LiDARs, then of radars.
         kind, members: of the message, without frames and timing.
         timer: runs on.
         slot: that raw images of the answer may be written to.
@@ -39,6 +42,7 @@ class RenderedObservation:
 
     world: World
     images: Sequence[RenderedImage]
+    clouds: Sequence[Cloud]
     kind: str
     members: EncodedMembers
     timer: PhaseTimer
@@ -95,6 +99,9 @@ def with_frames(
     kind, members, timer = rendered.kind, rendered.members, rendered.timer
     lying = rendered.slot.place(frames) if rendered.slot is not None else None
     timer.stage("encode")
-    message = pack_with_frames(kind, members, frames, timer)
-    placed = pack_with_frames(kind, members, lying, timer) if lying is not None else None
+    clouds = [cloud_parts(cloud) for cloud in rendered.clouds]
+    message = pack_with_frames(kind, members, frames, timer, clouds=clouds)
+    placed = None
+    if lying is not None:
+        placed = pack_with_frames(kind, members, lying, timer, clouds=clouds)
     return EncodedObservation(rendered.world, frames, message, timer.timing_ms, placed)

@@ -10,6 +10,7 @@ from real2sim_proto.episode import SensorSpec
 
 from ...scene import Camera
 from ...world import World
+from ...world.ranging import Cloud, Mounted
 from ..rendering.frames import FrameHeader, with_pixels
 from ..warm_up import DeformationKernels
 from .observation import (
@@ -21,16 +22,18 @@ from .observation import (
 )
 from .transition import Transition, record
 from .wire import PhaseTimer
+from .world_clouds import WorldClouds
 from .world_images import Images, WorldImages, deform
 
 
 class Moved(NamedTuple):
-    """A new world as far as images show it, and the sensors that are due."""
+    """A new world as far as images show it, and the cameras, LiDARs and radars that are due."""
 
     transition: Transition
     world: World
     sensors: Sequence[SensorSpec]
     cameras: Sequence[Camera]
+    due: Sequence[Mounted]
 
 
 class KernelsMissingError(Exception):
@@ -42,6 +45,7 @@ class StepPhases:
 
     Args:
         images: of worlds.
+        clouds: of worlds.
         deformation: see there.
 
     Attributes:
@@ -49,9 +53,12 @@ class StepPhases:
         evaluators: the thread beside the rendering.
     """
 
-    def __init__(self, images: WorldImages, deformation: DeformationKernels) -> None:
+    def __init__(
+        self, images: WorldImages, clouds: WorldClouds, deformation: DeformationKernels
+    ) -> None:
         self.evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
         self._images = images
+        self._clouds = clouds
         self.deformation = deformation
 
     def close(self) -> None:
@@ -62,28 +69,32 @@ class StepPhases:
         """The phases of one job, which ends encoded where all images are raw."""
         timer = transition.timer
         timer.stage("queue")
-        _, world, sensors, cameras = self.begin(transition)
+        _, world, sensors, cameras, due = self.begin(transition)
         timer.stage("world")
         images: Images = ()
-        if sensors:
+        clouds: Sequence[Cloud] = ()
+        if sensors or due:
             evaluation = self.evaluators.submit(self.evaluate, transition, world, sensors, cameras)
             try:
                 images = self.render(world, sensors, cameras, timer)
+                clouds = self.measure(world, due, timer)
             finally:
                 evaluation.exception()  # waits
             described = evaluation.result()
         else:
             timer.stage("render")
             described = self.evaluate(transition, world, sensors, cameras)
-        return self.observation(transition, world, images, described)
+        return self.observation(transition, world, images, described, clouds=clouds)
 
     def begin(self, transition: Transition) -> Moved:
         """The new world with the sensors that are due. Raises KernelsMissingError."""
         world = self.advance(transition)
         sensors = world.due_sensors()
-        if sensors:
+        due = world.due_ranging() if transition.clouds else ()
+        if sensors or due:
             self.require_kernels(world)
-        return Moved(transition, world, sensors, [transition.cameras[s.camera] for s in sensors])
+        cameras = [transition.cameras[s.camera] for s in sensors]
+        return Moved(transition, world, sensors, cameras, due)
 
     def advance(self, transition: Transition) -> World:
         """The new world, as far as images show it."""
@@ -104,6 +115,13 @@ class StepPhases:
         timer.stage("render")
         return images
 
+    def measure(self, world: World, due: Sequence[Mounted], timer: PhaseTimer) -> list[Cloud]:
+        """Clouds of a world whose objects are deformed already."""
+        clouds = self._clouds.of(world, due)
+        if due:
+            timer.stage("cast")
+        return clouds
+
     def evaluate(
         self,
         transition: Transition,
@@ -122,15 +140,19 @@ class StepPhases:
         world: World,
         images: Images,
         described: Described,
+        *,
+        clouds: Sequence[Cloud] = (),
     ) -> RenderedObservation | EncodedObservation:
-        """Of a rendered and evaluated world, encoded where all images are raw."""
+        """Of a rendered and evaluated world, encoded where all images and clouds are raw."""
         members, headers = described
         # Of the evaluation only what did not happen beside the rendering.
         transition.timer.stage("settle")
         rendered = RenderedObservation(
-            world, images, "obs", members, transition.timer, transition.slot
+            world, images, clouds, "obs", members, transition.timer, transition.slot
         )
-        return rendered if headers is None else self.encode(rendered, headers)
+        if headers is None or any(cloud.codec != "raw" for cloud in clouds):
+            return rendered
+        return self.encode(rendered, headers)
 
     def encode(
         self, rendered: RenderedObservation, headers: Sequence[FrameHeader]

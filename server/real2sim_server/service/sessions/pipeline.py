@@ -46,6 +46,7 @@ from ...edit import ScenarioState, compose, instances_at, things_at_start
 from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
+from ...world.ranging import NO_SENSORS, RangingSensors
 from ..accounts import computing_account, count_sent, counted_world_time
 from ..engine import Engine
 from ..http.metrics import Metrics
@@ -54,14 +55,15 @@ from ..rendering.renderer import Renderer, RenderRequest
 from ..warm_up import DeformationKernels
 from .blind_steps import BlindSteps
 from .gathered_calls import GatheredCalls
-from .image_limits import cameras_of
+from .image_limits import cameras_of, raw_image_bytes
 from .joint_drawing import JointDrawing, pieces_of, share_of
 from .observation import EncodedObservation, RenderedObservation, Seen, with_frames
 from .phases import KernelsMissingError, StepPhases
 from .segment import FrameSlot
 from .transition import Transition
 from .wire import PhaseTimer, pack_members
-from .world_images import WorldImages
+from .world_clouds import WorldClouds
+from .world_images import Images, WorldImages
 
 T = TypeVar("T")
 
@@ -77,6 +79,7 @@ class StepPipeline:
         metrics: gets durations by stage.
         deformation: kernels that images after impacts need.
         max_pixels: over all images of one instant.
+        max_rays: over all LiDARs and radars of one instant.
     """
 
     def __init__(
@@ -87,13 +90,15 @@ class StepPipeline:
         *,
         deformation: DeformationKernels,
         max_pixels: int,
+        max_rays: int,
     ) -> None:
         self._engine = engine
         self._renderer = renderer
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._images = WorldImages(renderer)
-        self._phases = StepPhases(self._images, deformation)
+        self._clouds = WorldClouds(engine, max_rays=max_rays)
+        self._phases = StepPhases(self._images, self._clouds, deformation)
         self._joint = JointDrawing(self._phases, self._images)
         self._blind = BlindSteps(self._phases)
         self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
@@ -117,10 +122,25 @@ class StepPipeline:
         No session waits for the deformations of another.
         """
         sensors = world.spec.sensors
-        if not sensors or (world.deformation is not None and world.deformation.has_impacts):
+        if (
+            not sensors
+            or world.ranging
+            or (world.deformation is not None and world.deformation.has_impacts)
+        ):
             return None
         sizes = [cameras[sensor.camera] for sensor in sensors]
         return world.scene if self._renderer.draws_together(sensors, sizes) else None
+
+    async def ranging_ready(
+        self, ranging: RangingSensors, sensors: Sequence[SensorSpec], cameras: Mapping[str, Camera]
+    ) -> None:
+        """Wait until clouds of an episode can be made.
+
+        Raises:
+            ServiceError: INVALID_REQUEST for too many rays, or bytes beside those of raw images.
+        """
+        size = raw_image_bytes(sensors, [cameras[sensor.camera] for sensor in sensors])
+        await self._clouds.ready(ranging, image_bytes=size)
 
     async def levels_ready(
         self,
@@ -165,7 +185,7 @@ class StepPipeline:
             QueueFullError: too much waits for the engine.
         """
         observation: RenderedObservation | EncodedObservation
-        if transition.cameras:
+        if transition.cameras or transition.clouds:
             try:
                 observation = await self._on_engine(transition)
             except KernelsMissingError:
@@ -244,13 +264,19 @@ class StepPipeline:
     # --- a view of a world that stays as it is --------------------------------------------------
 
     async def view(
-        self, world: World, sensors: Sequence[SensorSpec], *, slot: FrameSlot | None = None
+        self,
+        world: World,
+        sensors: Sequence[SensorSpec],
+        *,
+        ranging: RangingSensors = NO_SENSORS,
+        slot: FrameSlot | None = None,
     ) -> EncodedObservation:
-        """Images of a committed instant, from cameras of the vehicle; time does not move.
+        """Images and clouds of a committed instant, from the vehicle; time does not move.
 
         Args:
             world: at that instant.
             sensors: what it is seen by.
+            ranging: LiDARs and radars that look, too; all of them are due.
             slot: that raw images of the answer may be written to.
 
         Raises:
@@ -260,8 +286,9 @@ class StepPipeline:
         cameras = cameras_of(world.scene, sensors, max_pixels=self._max_pixels)
         things = partial(things_at_start, world.scene, world.state)
         await self._renderer.ready(sensors, cameras, things)
+        await self._clouds.ready(ranging, image_bytes=raw_image_bytes(sensors, cameras))
         timer = PhaseTimer()
-        view = partial(self._compute_view, world, sensors, cameras, timer)
+        view = partial(self._compute_view, world, sensors, cameras, timer, ranging)
         try:
             rendered = await self._engine.call(view, label="view")
         except KernelsMissingError:
@@ -275,13 +302,17 @@ class StepPipeline:
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
         timer: PhaseTimer,
+        ranging: RangingSensors,
     ) -> RenderedObservation:
         timer.stage("queue")
         self._phases.require_kernels(world)
-        images = self._images.of(world, sensors, cameras, between=self._engine.give_way)
+        images: Images = ()
+        if sensors:
+            images = self._images.of(world, sensors, cameras, between=self._engine.give_way)
         timer.stage("render")
+        clouds = self._phases.measure(world, ranging.all, timer)
         members = pack_members({"t_us": world.t_us, "revision": world.revision})
-        return RenderedObservation(world, images, "view", members, timer)
+        return RenderedObservation(world, images, clouds, "view", members, timer)
 
     async def first_render(self, scene: Scene, state: ScenarioState) -> None:
         """Render a scene from its first camera, to have everything compiled and in memory.

@@ -9,6 +9,7 @@ from real2sim_proto import ErrorCode, decode
 from real2sim_proto.plans import PLAN
 
 from ...edit import LogEntry, Scenario, ScenarioState
+from ...scene import Camera
 from ...world import World
 from ...world.recording.replay import Entry, Replayer, plan_payload
 from ..http.problems import ServiceError
@@ -42,10 +43,12 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
     await pipeline.on_world_thread(_apply_all, replayer, before)
     session.snapshots = replayer.snapshots
     if last.kind == "action":
-        sensors = _world(replayer).spec.sensors
-        cameras = pipeline.cameras(start.scene, sensors)
-        await pipeline.levels_ready(start.scene, start.state, sensors, cameras)
-        observation = await pipeline.run(Transition(lambda: replayer.apply(last), cameras))
+        before_last = _world(replayer)
+        cameras = await _cameras_ready(pipeline, session, before_last)
+        clouds = bool(before_last.ranging)
+        observation = await pipeline.run(
+            Transition(lambda: replayer.apply(last), cameras, clouds=clouds)
+        )
         session.begin(observation.world, cameras)
         session.lockstep.reset(observation.world.steps, over=observation.world.over)
         if not decode(last.payload).get("missed"):
@@ -53,10 +56,19 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
         session.newest = observation.message
         return
     world = await pipeline.on_world_thread(replayer.apply, last)
-    cameras = pipeline.cameras(start.scene, world.spec.sensors)
-    await pipeline.levels_ready(start.scene, start.state, world.spec.sensors, cameras)
-    session.begin(world, cameras)
+    session.begin(world, await _cameras_ready(pipeline, session, world))
     session.lockstep.reset(world.steps, over=world.over)
+
+
+async def _cameras_ready(
+    pipeline: StepPipeline, session: Session, world: World
+) -> dict[str, Camera]:
+    """Cameras of an episode, once all that its observations would wait for is there."""
+    start, sensors = session.start, world.spec.sensors
+    cameras = pipeline.cameras(start.scene, sensors)
+    await pipeline.ranging_ready(world.ranging, sensors, cameras)
+    await pipeline.levels_ready(start.scene, start.state, sensors, cameras)
+    return cameras
 
 
 async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> ScenarioState:

@@ -20,6 +20,7 @@ from real2sim_proto.operations import Operation
 from ...edit import EditOutcome
 from ...scene import Camera, Scene
 from ...world import Event, Plan, World
+from ...world.ranging import mounted_sensors
 from ...world.recording.replay import (
     KEPT_PLAN,
     action_payload,
@@ -101,7 +102,12 @@ class Stepper:
         cameras = await self._announced(session, spec)
         record = ("reset", 0, reset_payload(spec))
         observation, _ = await self._observe(
-            session, _beginning(session, spec), cameras, record, slot=slot
+            session,
+            _beginning(session, spec),
+            cameras,
+            record,
+            clouds=bool(spec.lidars or spec.radars),
+            slot=slot,
         )
         session.begin(observation.world, cameras)
         session.publish(observation.message)
@@ -128,6 +134,8 @@ class Stepper:
         """Cameras of an episode, once all that it would wait for on the way is there."""
         start = session.start
         cameras = self._pipeline.cameras(start.scene, spec.sensors)
+        ranging = mounted_sensors(spec.lidars, spec.radars, spec.dt_us)
+        await self._pipeline.ranging_ready(ranging, spec.sensors, cameras)
         await self._kernels.ready(spec)
         await self._pipeline.levels_ready(start.scene, start.state, spec.sensors, cameras)
         return cameras
@@ -240,7 +248,11 @@ class Stepper:
         now = session.running_world()
         record = ("stop", now.steps, stop_payload(reason))
         observation, _ = await self._observe(
-            session, partial(_stopped, now, reason), session.cameras, record
+            session,
+            partial(_stopped, now, reason),
+            session.cameras,
+            record,
+            clouds=bool(now.ranging),
         )
         session.world = observation.world
         session.lockstep.end()
@@ -262,6 +274,7 @@ class Stepper:
             change,
             session.cameras,
             record,
+            clouds=bool(session.running_world().ranging),
             write=write,
             slot=slot,
             scene=self._pipeline.drawn_with(session.running_world(), session.cameras),
@@ -362,7 +375,9 @@ class Stepper:
             )
         cameras = self._pipeline.cameras(snapshot.scene, snapshot.spec.sensors)
         record = ("restore", snapshot.steps, name_payload(name))
-        observation, _ = await self._observe(session, lambda: snapshot, cameras, record)
+        observation, _ = await self._observe(
+            session, lambda: snapshot, cameras, record, clouds=bool(snapshot.ranging)
+        )
         session.begin(snapshot, cameras)
         session.lockstep.reset(snapshot.steps, over=snapshot.over)
         session.publish(observation.message)
@@ -375,6 +390,7 @@ class Stepper:
         cameras: Mapping[str, Camera],
         record: LogRecord,
         *,
+        clouds: bool,
         write: Callable[[EncodedMessage], bool] | None = None,
         slot: FrameSlot | None = None,
         scene: Scene | None = None,
@@ -382,7 +398,9 @@ class Stepper:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])
         store = LogWrite(self._store, session.session_id, entries, session.log_unsure)
-        transition = Transition(change, cameras, record=store, write=write, slot=slot, scene=scene)
+        transition = Transition(
+            change, cameras, clouds=clouds, record=store, write=write, slot=slot, scene=scene
+        )
         try:
             observation = await self._pipeline.run(transition)
         except StoreUnavailableError:

@@ -22,6 +22,7 @@ class Transition:
         change: makes the new world, complete as far as images show it, and leaves the present one
             alone; runs off the event loop.
         cameras: of the world's sensors, by name, at the sizes they name.
+        clouds: whether those of its LiDARs and radars are made.
         record: writes the log entry of the change; runs off the event loop, once the new world is
             evaluated. None where it is in the log already.
         write: hands a message to the socket if nothing has to be waited for; whether it did. None
@@ -37,6 +38,7 @@ class Transition:
 
     change: Callable[[], World]
     cameras: Mapping[str, Camera]
+    clouds: bool = False
     record: Callable[[], object] | None = None
     write: Callable[[EncodedMessage], bool] | None = None
     slot: FrameSlot | None = None

@@ -15,6 +15,7 @@ from real2sim_proto import PROTOCOL_VERSION
 from ..rendering.frames import EncodedFrame, Part, array_header, map_header, pack_pairs
 
 FRAMES: bytes = msgpack.packb("frames")
+CLOUDS: bytes = msgpack.packb("clouds")
 IMAGES: bytes = msgpack.packb("images")
 
 
@@ -99,18 +100,28 @@ def pack_message(kind: str, fields: Mapping[str, Any]) -> EncodedMessage:
 
 
 def pack_with_frames(
-    kind: str, members: EncodedMembers, frames: Sequence[EncodedFrame], watch: PhaseTimer
+    kind: str,
+    members: EncodedMembers,
+    frames: Sequence[EncodedFrame],
+    watch: PhaseTimer,
+    *,
+    clouds: Sequence[Sequence[Part]] = (),
 ) -> EncodedMessage:
-    """A message with the members ``frames`` and ``timing`` besides ``members``.
+    """A message with the members ``frames``, ``timing`` and, where there are any, ``clouds`` (maps,
+    each in parts) besides ``members``.
 
     What it takes to send the parts is not in ``timing``, for that comes later.
     """
     parts: list[Part] = [members.encoded + FRAMES + array_header(len(frames))]
     for frame in frames:
         parts += [frame.header.encoded, frame.data]
+    if clouds:
+        parts.append(CLOUDS + array_header(len(clouds)))
+        for cloud in clouds:
+            parts += cloud
     watch.stage("pack")
     parts.append(pack_pairs({"timing": watch.timing_ms}))
-    return EncodedMessage(_head(kind, members.count + 2), tuple(parts))
+    return EncodedMessage(_head(kind, members.count + 2 + bool(clouds)), tuple(parts))
 
 
 def pack_with_images(

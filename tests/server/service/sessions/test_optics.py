@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from real2sim_server.render.lenses import warm_up_lenses
+
 pytestmark = pytest.mark.network
 
 RESET = {"action": "control", "dt_us": 100_000}
@@ -14,6 +16,12 @@ ROLLING = {
     "shutter": {"direction": "top_to_bottom", "readout_us": 30_000},
 }
 NOISE = {"noise": {"photon": 0.001, "read": 0.01}}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def lens_kernels():
+    """On disk, so that no reset waits for them."""
+    warm_up_lenses("cpu")
 
 
 def image(frame):

@@ -1,0 +1,267 @@
+"""LiDARs and radars of a session, and the point clouds that they give."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from .base import Identifier, Model, Pose
+
+MAX_LIDARS = 8
+MAX_RADARS = 8
+MAX_RAYS = 1 << 19
+"""Rays of one sweep; the densest sensors sold today fire less than half as many."""
+
+CloudCodec = Literal["raw", "deflate"]
+CloudModality = Literal["lidar", "radar"]
+CloudFrame = Literal["sensor", "vehicle"]
+LidarField = Literal["intensity", "ring", "time_us", "return_number", "instance"]
+LIDAR_FIELDS: tuple[LidarField, ...] = (
+    "intensity",
+    "ring",
+    "time_us",
+    "return_number",
+    "instance",
+)
+
+Numbers = Annotated[list[float], Field(min_length=1, max_length=MAX_RAYS)]
+Span = tuple[float, float]
+Hertz = Annotated[float, Field(ge=0.1, le=1000)]
+
+
+# --- models of LiDARs -------------------------------------------------------------------------
+
+
+class SpinningBeams(Model):
+    """Rows that turn about the sensor's z axis; angles in degrees."""
+
+    kind: Literal["spinning"]
+    elevation_deg: Numbers = Field(description="of each row")
+    azimuth_offset_deg: Numbers | None = Field(
+        default=None, description="of each row against its column; default: 0"
+    )
+    columns: int = Field(description="azimuth steps of a turn")
+    rate_hz: float = Field(default=10.0, description="turns a second")
+    clockwise: bool = Field(default=True, description="seen from above")
+    start_deg: float = Field(default=180.0, description="azimuth at which a turn begins")
+    field_of_view_deg: float = Field(default=360.0, description="covered about the turn's middle")
+
+
+class TableBeams(Model):
+    """Every ray by itself."""
+
+    kind: Literal["table"]
+    azimuth_deg: Numbers
+    elevation_deg: Numbers
+    time_us: Numbers
+
+
+class GridBeams(Model):
+    """A solid-state sensor that scans rows of even steps, top row first, left to right."""
+
+    kind: Literal["grid"]
+    azimuth_deg: Span = Field(description="from edge to edge")
+    elevation_deg: Span = Field(description="from edge to edge")
+    columns: Annotated[int, Field(ge=1, le=MAX_RAYS)]
+    rows: Annotated[int, Field(ge=1, le=MAX_RAYS)]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+
+
+class RosetteBeams(Model):
+    """Two prisms that turn at different speeds: petals about the sensor's x axis."""
+
+    kind: Literal["rosette"]
+    radius_deg: Annotated[float, Field(gt=0, lt=90)]
+    turns_per_minute: Span = Field(description="of the two prisms")
+    rays: Annotated[int, Field(ge=1, le=MAX_RAYS)]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+
+
+class DetectionSpec(Model):
+    """What a LiDAR's detector sees."""
+
+    range_m: float = Field(default=120.0, description="where `reflectivity` is just seen")
+    reflectivity: float = Field(default=0.1, description="0 to 1")
+    loss: float = Field(default=0.0, description="share of rays lost whatever they meet")
+    softness: float = Field(
+        default=0.25, description="width of the passage from seen to lost, of the limiting power"
+    )
+
+
+class LidarModel(Model):
+    """A LiDAR of one's own."""
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    source: str = Field(default="", description="where the numbers come from")
+    beams: Annotated[
+        SpinningBeams | TableBeams | GridBeams | RosetteBeams, Field(discriminator="kind")
+    ]
+    T_vehicle_lidar: list[list[float]] | None = Field(
+        default=None, description="4x4; default: 0.9 m before and 1.73 m above the rear axle"
+    )
+    range_m: Span = Field(default=(0.5, 120.0), description="nearest and farthest return")
+    divergence_mrad: Span = Field(
+        default=(0.0, 0.0), description="full angle at 1/e^2 of the power, horizontal, vertical"
+    )
+    returns: int = Field(default=1, description="1, 2 (first, last) or 3 (and the strongest)")
+    pulse_m: float = Field(default=0.4, description="echoes nearer to each other are one")
+    range_noise_m: float = Field(default=0.0, description="standard deviation")
+    detection: DetectionSpec = DetectionSpec()
+
+
+# --- models of radars -------------------------------------------------------------------------
+
+Degrees = Annotated[float, Field(gt=0, le=360)]
+Metres = Annotated[float, Field(gt=0, le=2000)]
+
+
+class RadarModel(Model):
+    """A radar that resolves range, azimuth, elevation and radial velocity. The defaults are those
+    of a front radar of 77 GHz and middle range."""
+
+    range_m: tuple[float, float] = Field(default=(0.5, 160.0), description="nearest, farthest")
+    field_of_view_deg: tuple[Degrees, Degrees] = Field(
+        default=(120.0, 20.0), description="horizontal, vertical"
+    )
+    range_resolution_m: Annotated[float, Field(ge=0.02, le=50)] = Field(
+        default=0.4, description="of a cell"
+    )
+    azimuth_resolution_deg: Annotated[float, Field(ge=0.1, le=90)] = 1.5
+    elevation_resolution_deg: Annotated[float, Field(ge=0.1, le=180)] = Field(
+        default=20.0, description="as large as the field of view: elevation is not resolved"
+    )
+    velocity_resolution_mps: Annotated[float, Field(ge=0.01, le=50)] = 0.1
+    max_velocity_mps: Annotated[float, Field(gt=0, le=500)] | None = Field(
+        default=None, description="velocities beyond fold back into -this to this; null: none do"
+    )
+    detection_range_m: Metres = Field(
+        default=140.0, description="where a target of 10 m^2 is just detected"
+    )
+    ray_spacing_deg: Annotated[float, Field(ge=0.05, le=10)] = Field(
+        default=0.4, description="of the rays that look for targets"
+    )
+    range_noise_m: Annotated[float, Field(ge=0, le=10)] = Field(
+        default=0.05, description="standard deviation"
+    )
+    azimuth_noise_deg: Annotated[float, Field(ge=0, le=10)] = 0.15
+    velocity_noise_mps: Annotated[float, Field(ge=0, le=10)] = 0.03
+    clutter_rate: Annotated[float, Field(ge=0, le=10_000)] = Field(
+        default=2.0, description="mean number of detections of nothing in a scan"
+    )
+    ghost_rate: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.0, description="share of objects' detections seen again at twice their range"
+    )
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        near, far = self.range_m
+        if not 0 <= near < far <= 2000:
+            raise ValueError(f"range_m {self.range_m!r} must rise within 0 to 2000 m")
+        rays = self.ray_count
+        if rays > MAX_RAYS:
+            raise ValueError(
+                f"{rays:,} rays of {self.ray_spacing_deg} degrees; allowed are {MAX_RAYS:,}"
+            )
+        if self.field_of_view_deg[1] > 179:
+            raise ValueError("field_of_view_deg: 179 degrees of elevation at most")
+        return self
+
+    @property
+    def ray_count(self) -> int:
+        """Rays of one scan."""
+        wide, high = (max(round(a / self.ray_spacing_deg), 1) for a in self.field_of_view_deg)
+        return int(wide * high)
+
+
+# --- sensors of a session ---------------------------------------------------------------------
+
+PERIOD = "time between clouds; a multiple of dt_us; default: the least such that a sweep fits into"
+
+
+class LidarSpec(Model):
+    """One LiDAR of an observation."""
+
+    lidar: Identifier = Field(description="its name; of its clouds, too")
+    model: Identifier | LidarModel | None = Field(
+        default=None, description="name in the catalogue, or a model; default: called as `lidar`"
+    )
+    pose: Pose | None = Field(
+        default=None, description="T_vehicle_lidar, x forward; default: the model's"
+    )
+    rate_hz: Hertz | None = Field(
+        default=None, description="sweeps a second, the rays' times scaled; default: the model's"
+    )
+    period_us: int | None = Field(default=None, gt=0, le=2**40, description=PERIOD)
+    frame: CloudFrame = Field(default="sensor", description="of the points")
+    compensated: bool = Field(
+        default=True,
+        description="points are where they would be seen from the pose at the cloud's instant; "
+        "false: from where the sensor was when each ray was fired",
+    )
+    fields: list[LidarField] = Field(
+        default=list(LIDAR_FIELDS), max_length=len(LIDAR_FIELDS), description="beside `points`"
+    )
+    codec: CloudCodec = "raw"
+
+    @field_validator("fields")
+    @classmethod
+    def _fields_differ(cls, fields: list[LidarField]) -> list[LidarField]:
+        if len(set(fields)) != len(fields):
+            raise ValueError(f"fields {fields!r} repeat one")
+        return fields
+
+
+class RadarSpec(Model):
+    """One radar of an observation."""
+
+    radar: Identifier = Field(description="its name; of its clouds, too")
+    model: Identifier | RadarModel | None = Field(
+        default=None, description="name in the catalogue, or a model; default: called as `radar`"
+    )
+    pose: Pose | None = Field(
+        default=None,
+        description="T_vehicle_radar, x along its axis; default: 3.6 m before the rear axle, 0.5 "
+        "m high, forward",
+    )
+    period_us: int | None = Field(
+        default=None,
+        gt=0,
+        le=2**40,
+        description="time between scans; a multiple of dt_us, and dt_us by default",
+    )
+    frame: CloudFrame = Field(default="sensor", description="of the points")
+    codec: CloudCodec = "raw"
+
+
+# --- clouds -----------------------------------------------------------------------------------
+
+
+class CloudField(Model):
+    """A column of a cloud: one number of each point, or several."""
+
+    name: str
+    dtype: Literal["float32", "uint8", "uint16", "int32"]
+    width: int = Field(default=1, ge=1, le=16, description="numbers of each point")
+
+
+__all__ = [
+    "LIDAR_FIELDS",
+    "MAX_LIDARS",
+    "MAX_RADARS",
+    "MAX_RAYS",
+    "CloudCodec",
+    "CloudField",
+    "CloudFrame",
+    "CloudModality",
+    "DetectionSpec",
+    "GridBeams",
+    "LidarField",
+    "LidarModel",
+    "LidarSpec",
+    "RadarModel",
+    "RadarSpec",
+    "RosetteBeams",
+    "SpinningBeams",
+    "TableBeams",
+]

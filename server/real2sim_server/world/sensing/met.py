@@ -1,0 +1,84 @@
+"""What the rays of a sensor meet in a world: surfaces, and how they have moved past it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...edit.compose import compose
+from ...edit.sweep import met_background, met_object
+from ...geometry.rotation import Float
+from ...render.cast.call import checked_request
+from ...render.cast.recorded import Attributes
+from ...render.cast.types import CastRequest
+from ...render.types import Instance
+from ...scene import Lidar
+from ..world import World
+
+
+@dataclass(frozen=True, eq=False)
+class MetThings:
+    """Background, objects and fragments at an instant.
+
+    Attributes:
+        instances: background first, then the objects in their order, then fragments.
+        attributes: what is known of their reflectivity.
+        object_ids: of the objects.
+    """
+
+    instances: Sequence[Instance]
+    attributes: Sequence[Attributes | None]
+    object_ids: Sequence[str]
+
+
+def met_things(world: World) -> MetThings:
+    """What there is for rays to meet: with surfaces for LiDARs where the scene has them, objects
+    deformed by impacts as images show them, and no shadows."""
+    scene, agents = world.scene, world.agents
+    found = [met_background(scene, world.state)]
+    for subject, transform in zip(agents.objects, agents.transforms, strict=True):
+        found.append(met_object(scene, subject, transform))
+    ids = [subject.object_id for subject in agents.objects]
+    if world.deformation is not None:
+        _deform(world, found, ids)
+        fragments = world.deformation.fragments(world.t_us)
+        found += [(fragment, None) for fragment in fragments]
+    instances, attributes = zip(*found, strict=True)
+    return MetThings(instances, attributes, ids)
+
+
+def _deform(
+    world: World, found: list[tuple[Instance, Attributes | None]], ids: Sequence[str]
+) -> None:
+    """Put deformed objects in the place of whole ones."""
+    shapes = world.deformation
+    assert shapes is not None
+    if not shapes.has_impacts:
+        return
+    drawn = compose(world.scene, world.state, world.agents, min(world.t_us, world.scene.end_us))
+    for k, object_id in enumerate(ids, start=1):
+        deformed = shapes.deformed_instance(object_id, drawn[k], world.t_us)
+        if deformed is not drawn[k]:
+            found[k] = (deformed, None)
+
+
+def sweep_request(world: World, lidar: Lidar, things: MetThings) -> CastRequest:
+    """The sweep that ends at the instant of ``world``."""
+    offsets = lidar.beams.slots[0]
+    times = world.t_us + offsets
+    wake, agents = world.wake, world.agents
+    ego = wake.ego_poses(times, t_us=world.t_us, now=world.T_world_body, twist=world.twist)
+    still = not np.any(offsets)
+    moved: list[Float | None] = [None] * len(things.instances)
+    for k, object_id in enumerate(things.object_ids, start=1):
+        if not still:
+            moved[k] = wake.object_poses(object_id, times, t_us=world.t_us, now=agents)
+    return checked_request(
+        things.instances,
+        lidar,
+        ego @ lidar.T_vehicle_lidar,
+        object_poses=moved,
+        attributes=things.attributes,
+    )
