@@ -278,6 +278,11 @@ class DatasetRequest(Model):
     )
     seed: int = Field(default=0, ge=0, le=2**53, description="draws which clip is in which split")
     flow: bool = Field(default=True, description="whether optical flow is made")
+    lidar: Identifier | None = Field(
+        default=None,
+        description="name in the catalogue (docs/lidar.md): its returns are the labelled points; "
+        "default: points of what the cameras see",
+    )
     dry_run: bool = Field(
         default=False, description="only tell frames, images, bytes and minutes in the result"
     )

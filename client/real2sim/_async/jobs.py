@@ -122,6 +122,7 @@ class AsyncJobs:
         splits: Mapping[str, float] | None = None,
         seed: int = 0,
         flow: bool = True,
+        lidar: str | None = None,
         dry_run: bool = False,
     ) -> AsyncJob:
         """Start making a labelled data set: images with boxes, masks, depth, flow, points, tracks.
@@ -141,6 +142,8 @@ class AsyncJobs:
             splits: share of the clips by name; default: all in ``train``.
             seed: draws which clip is in which split.
             flow: whether optical flow is made.
+            lidar: such as ``hdl-64e``: its returns are the labelled points; default: points of
+                what the cameras see.
             dry_run: only tell frames, images, bytes and minutes in ``info.result``.
 
         Raises:
@@ -174,6 +177,7 @@ class AsyncJobs:
             "splits": {"train": 1.0} if splits is None else dict(splits),
             "seed": seed,
             "flow": flow,
+            "lidar": lidar,
             "dry_run": dry_run,
         }
         body = checked(DatasetRequest, **fields)

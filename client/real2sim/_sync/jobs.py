@@ -123,6 +123,7 @@ class Jobs:
         splits: Mapping[str, float] | None = None,
         seed: int = 0,
         flow: bool = True,
+        lidar: str | None = None,
         dry_run: bool = False,
     ) -> Job:
         """Start making a labelled data set: images with boxes, masks, depth, flow, points, tracks.
@@ -142,6 +143,8 @@ class Jobs:
             splits: share of the clips by name; default: all in ``train``.
             seed: draws which clip is in which split.
             flow: whether optical flow is made.
+            lidar: such as ``hdl-64e``: its returns are the labelled points; default: points of
+                what the cameras see.
             dry_run: only tell frames, images, bytes and minutes in ``info.result``.
 
         Raises:
@@ -175,6 +178,7 @@ class Jobs:
             "splits": {"train": 1.0} if splits is None else dict(splits),
             "seed": seed,
             "flow": flow,
+            "lidar": lidar,
             "dry_run": dry_run,
         }
         body = checked(DatasetRequest, **fields)

@@ -48,6 +48,13 @@ def export_dataset(
     splits: Annotated[str, typer.Option(help="Shares of the clips.")] = "train=1",
     seed: Annotated[int, typer.Option(min=0, help="Draws the clips of each split.")] = 0,
     flow: Annotated[bool, typer.Option(help="Whether optical flow is made.")] = True,
+    lidar: Annotated[
+        str | None,
+        typer.Option(
+            help="hdl-64e, os1-128 ... or a JSON file (docs/lidar.md): its returns are the "
+            "labelled points. Default: points of what the cameras see."
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say how many frames, bytes and minutes.")
     ] = False,
@@ -76,6 +83,7 @@ def export_dataset(
         splits=_shares(splits),
         seed=seed,
         flow=flow,
+        lidar=_lidar(lidar),
     )
     loaded = load_scene(scene)
     drive, made_of = _drive(loaded, operations, episode, assets)
@@ -149,6 +157,17 @@ def _content(operations: Path | None) -> Any:
         return json_module.loads(operations.read_bytes())
     except ValueError as error:
         raise CommandError(f"{operations}: is no JSON file ({error})") from error
+
+
+def _lidar(name: str | None) -> str | dict[str, Any] | None:
+    """A name of the catalogue as it is, or the values in a file."""
+    if name is None or not name.endswith(".json"):
+        return name
+    try:
+        values: dict[str, Any] = json_module.loads(Path(name).read_bytes())
+    except (OSError, ValueError) as error:
+        raise CommandError(f"--lidar {name}: is no JSON file ({error})") from error
+    return values
 
 
 def _shares(text: str) -> dict[str, float]:

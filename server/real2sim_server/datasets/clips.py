@@ -16,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial as partial_of
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform
 from ..render import Backend, encode_image
+from ..render.cast import CastBackend, select_caster
 from ..scene import Camera
 from .drive import Drive, Moment
 from .labels import (
@@ -37,12 +38,13 @@ from .labels import (
     ego_future,
     flow_between,
     futures_at,
+    lidar_points,
     points_in_boxes,
     seen_points,
     views_of,
 )
 from .labels.boxes import in_frame
-from .plan import ExportPlan, PlannedClip
+from .plan import ExportPlan, PlannedClip, planned_lidar
 
 POINT = np.dtype(
     [
@@ -52,14 +54,26 @@ POINT = np.dtype(
         ("instance", "<u2"),
         ("semantic", "u1"),
         ("velocity", "<f4", 3),
+        ("time_us", "<i4"),
+        ("return_number", "u1"),
     ]
 )
 """A row of ``points``: ego frame [m], [m/s]."""
+
+SEED_STEP = 1_000_003
+"""Between the seeds of exports, whose frames add their instant."""
 
 ENCODERS = 2
 """Threads that encode."""
 
 FLOW_SCALE, FLOW_ZERO = 64.0, 1 << 15
+
+
+@runtime_checkable
+class CastsToo(Protocol):
+    """A backend that follows beams itself, where whoever draws must."""
+
+    caster: CastBackend
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +146,7 @@ def write_clip(
             images = draw_moment(drive.scene, moment, cameras, backend=backend)
             here = LabelledMoment(moment, boxes_at(moment.placed), images)
             views = [views_of(i, here.boxes, moment.instances, backend=backend) for i in images]
-            points = seen_points(images, here.boxes, moment.T_world_ego)
+            points = _points_of(drive, plan, here, backend)
             frames.append(_frame_labels(drive, here, views, points, index))
             files.finish()
             _write_images(files, images, index)
@@ -145,6 +159,17 @@ def write_clip(
     content = {"name": clip.name, "split": clip.split, "frames": frames}
     (partial / "labels.json").write_text(json.dumps(content), encoding="utf-8")
     partial.rename(folder)
+
+
+def _points_of(
+    drive: Drive, plan: ExportPlan, here: LabelledMoment, backend: str | Backend
+) -> SeenPoints:
+    lidar = planned_lidar(plan)
+    if lidar is None:
+        return seen_points(here.images, here.boxes, here.moment.T_world_ego)
+    caster = backend.caster if isinstance(backend, CastsToo) else select_caster()
+    seed = plan.seed * SEED_STEP + here.moment.t_us
+    return lidar_points(drive, here.moment, here.boxes, lidar, seed=seed, caster=caster)
 
 
 def _frame_labels(
@@ -257,7 +282,8 @@ def _points_file(points: SeenPoints) -> Callable[[], bytes]:
     rows = np.zeros(len(points.points), POINT)
     rows["xyz"], rows["intensity"], rows["beam"] = points.points, points.intensity, points.beam
     rows["instance"], rows["semantic"] = points.instance, points.semantic
-    rows["velocity"] = points.velocity
+    rows["velocity"], rows["time_us"] = points.velocity, points.time_us
+    rows["return_number"] = points.return_number
     file = io.BytesIO()
     np.save(file, rows)
     return file.getvalue

@@ -10,9 +10,11 @@ from typing import Protocol
 import numpy as np
 
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
-from ..geometry.rotation import Float
+from ..edit.sweep import met_background, met_object, sweep_of
+from ..geometry.rotation import Float, matrix_to_quaternion
+from ..render.cast.recorded import SweepScene, sensor_poses, transforms_at
 from ..render.types import Instance
-from ..scene import Scene
+from ..scene import Lidar, Scene, Trajectory
 from ..world import World
 from ..world.recording.recording import Recording
 from .errors import DatasetError
@@ -35,6 +37,19 @@ class Moment:
     T_world_ego: Float
 
 
+@dataclass(frozen=True, eq=False)
+class MetSweep:
+    """What a LiDAR meets in the sweep about an instant.
+
+    Attributes:
+        things: background first, then the objects, see :class:`~..render.cast.SweepScene`.
+        T_world_lidar: [S, 4, 4] at the instants of the sweep.
+    """
+
+    things: SweepScene
+    T_world_lidar: Float
+
+
 class Drive(Protocol):
     """A drive, from its first to its last instant."""
 
@@ -54,6 +69,10 @@ class Drive(Protocol):
 
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
         """Where the objects are at an instant of the span."""
+        ...
+
+    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+        """What a LiDAR of the ego meets, everything on its way, in the sweep about an instant."""
         ...
 
     def ego_at(self, t_us: int) -> Float:
@@ -81,6 +100,11 @@ class ScenarioDrive:
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
         """See :class:`Drive`."""
         return self.state.tracks.at(t_us)
+
+    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+        """See :class:`Drive`."""
+        poses = sensor_poses(self.scene.ego, lidar, t_us)
+        return MetSweep(sweep_of(self.scene, self.state, lidar, t_us), poses)
 
     def ego_at(self, t_us: int) -> Float:
         """See :class:`Drive`."""
@@ -139,8 +163,41 @@ class EpisodeDrive:
 
     def _world(self, t_us: int) -> World:
         """The one of the last step up to ``t_us``."""
+        return self.worlds[self._place(t_us)]
+
+    def _place(self, t_us: int) -> int:
         times = [world.t_us for world in self.worlds]
-        return self.worlds[max(bisect_right(times, t_us) - 1, 0)]
+        return max(bisect_right(times, t_us) - 1, 0)
+
+    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+        """See :class:`Drive`; between steps everything moves evenly."""
+        place = self._place(t_us)
+        near = self.worlds[max(place - 1, 0) : place + 2]
+        world, times = self.worlds[place], t_us + lidar.beams.slots[0]
+        found, moved = [met_background(self.scene, world.state)], list[Float | None]([None])
+        for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):
+            found.append(met_object(self.scene, subject, transform))
+            moved.append(transforms_at(_way(near, subject.object_id), times))
+        instances, known = zip(*found, strict=True)
+        ego = _trajectory([(w.t_us, np.array(w.T_world_body)) for w in near])
+        poses = transforms_at(ego, times) @ lidar.T_vehicle_lidar
+        return MetSweep(SweepScene(instances, tuple(moved), known), poses)
+
+
+def _way(worlds: Sequence[World], object_id: str) -> Trajectory:
+    """Of an object over a few steps, as far as it is there."""
+    rows = []
+    for world in worlds:
+        for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):
+            if subject.object_id == object_id:
+                rows.append((world.t_us, transform))
+    return _trajectory(rows)
+
+
+def _trajectory(rows: Sequence[tuple[int, Float]]) -> Trajectory:
+    poses = np.stack([pose for _, pose in rows])
+    times = np.array([t_us for t_us, _ in rows])
+    return Trajectory(times, poses[:, :3, 3], matrix_to_quaternion(poses[:, :3, :3]))
 
 
 def _instants(recording: Recording, scene: Scene, assets: AssetLookup | None) -> Iterator[World]:

@@ -19,7 +19,7 @@ from .clips import Clip, write_clip
 from .drive import Drive
 from .errors import DatasetError
 from .labels import HOW
-from .plan import ExportPlan, PlannedClip, planned_cameras, planned_clips
+from .plan import ROOF, ExportPlan, PlannedClip, planned_cameras, planned_clips, planned_lidar
 from .previews import write_previews
 from .statistics import statistics_of
 from .writers import LabelledDrive, writer_of
@@ -54,6 +54,7 @@ def estimate(drive: Drive, plan: ExportPlan, *, backend: str | Backend = "auto")
         DatasetError: as :func:`export_dataset`.
     """
     cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    planned_lidar(plan)
     for name in plan.formats:
         writer_of(name)
     frames = sum(len(clip.times_us) for clip in clips)
@@ -119,6 +120,7 @@ def export_dataset(
         raise DatasetError("name at least one format")
     writers = [writer_of(name) for name in plan.formats]
     cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    lidar = planned_lidar(plan)
     digest = _digest(drive, plan, made_of or {})
     work = _work_folder(target, digest)
     opened = _labelled_clips(
@@ -133,6 +135,7 @@ def export_dataset(
         clips=opened,
         ground=drive.scene.ground,
         licence=_licence(drive.scene.provenance),
+        lidar_position=ROOF if lidar is None else tuple(lidar.T_vehicle_lidar[:3, 3].tolist()),
     )
     result = work / "result"
     result.mkdir(exist_ok=True)
@@ -227,6 +230,7 @@ def _write_manifest(
     digest: str,
     made_of: Mapping[str, Any],
 ) -> None:
+    unmade = "lidar" if plan.lidar is None else "points"
     files = sorted(p for p in result.rglob("*") if p.is_file() and p != result / MANIFEST)
     content = {
         "format": FORMAT,
@@ -238,7 +242,7 @@ def _write_manifest(
         "plan": {**asdict(plan), "splits": dict(plan.splits)},
         "clips": {clip.name: {"split": clip.split, "frames": len(clip.frames)} for clip in clips},
         "statistics": statistics_of(clips),
-        "labels": HOW,
+        "labels": {k: v for k, v in HOW.items() if k != unmade},
         "provenance": dict(drive.scene.provenance),
         "licence": _licence(drive.scene.provenance),
         "files": {

@@ -6,14 +6,19 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
-from ..scene import Camera
+from ..geometry.transform import transform_from
+from ..scene import Camera, Lidar, LidarError
+from ..scene.lidar_catalogue import catalogue_lidar, lidar_from_values
 from .drive import Drive
 from .errors import DatasetError
 
 MAX_FRAMES = 100_000
+ROOF = (0.9, 0.0, 1.73)
+"""Where a LiDAR stands that is not placed itself, in the ego frame [m]."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,8 @@ class ExportPlan:
         splits: share of the clips by name.
         seed: draws which clip is in which split.
         flow: whether optical flow is made.
+        lidar: name in the catalogue, or the values of a file of a sensor; None: points are those
+            that the cameras' depth gives.
     """
 
     formats: tuple[str, ...]
@@ -42,6 +49,7 @@ class ExportPlan:
     splits: Mapping[str, float] = field(default_factory=lambda: {"train": 1.0})
     seed: int = 0
     flow: bool = True
+    lidar: str | Mapping[str, Any] | None = None
 
     @property
     def digest(self) -> str:
@@ -74,6 +82,25 @@ def planned_cameras(drive: Drive, plan: ExportPlan) -> list[Camera]:
     if not chosen:
         raise DatasetError("the scene has no camera to export")
     return [c if plan.width is None else c.resized(plan.width) for c in chosen]
+
+
+def planned_lidar(plan: ExportPlan) -> Lidar | None:
+    """The LiDAR of a plan, on the roof where it is not placed itself.
+
+    Raises:
+        DatasetError: an unknown name, or values that are no sensor's.
+    """
+    if plan.lidar is None:
+        return None
+    try:
+        if isinstance(plan.lidar, str):
+            lidar = catalogue_lidar(plan.lidar)
+        else:
+            lidar = lidar_from_values(plan.lidar)
+    except LidarError as error:
+        raise DatasetError(str(error)) from error
+    placed = not np.array_equal(lidar.T_vehicle_lidar, np.eye(4))
+    return lidar if placed else lidar.placed(transform_from(ROOF, (1.0, 0.0, 0.0, 0.0)))
 
 
 def planned_clips(drive: Drive, plan: ExportPlan) -> list[PlannedClip]:

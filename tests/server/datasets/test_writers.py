@@ -99,7 +99,7 @@ def test_kitti_object_rows_have_fifteen_columns_of_what_is_seen(exported):
 
 def test_nuscenes_has_no_token_that_leads_nowhere(exported):
     found = tables(exported)
-    assert len(found) == 13
+    assert len(found) == 15
     tokens = {name: {row["token"] for row in rows} for name, rows in found.items()}
     assert all(len(tokens[name]) == len(rows) for name, rows in found.items())
     everywhere = set().union(*tokens.values())

@@ -9,6 +9,7 @@ from .flow import flow_between
 from .futures import ego_future, futures_at
 from .how import HOW
 from .images import CameraImages, draw_moment
+from .lidar import lidar_points
 from .points import SeenPoints, points_in_boxes, seen_points
 from .views import CameraView, ObjectView, views_of
 
@@ -24,6 +25,7 @@ __all__ = [
     "ego_future",
     "flow_between",
     "futures_at",
+    "lidar_points",
     "points_in_boxes",
     "projected_box",
     "seen_points",

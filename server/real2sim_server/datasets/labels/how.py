@@ -21,6 +21,9 @@ HOW = {
     "occluded where the other image shows something else there",
     "points": "rendered: points of the cameras' depth images along the beams of a spinning "
     "LiDAR, only where a camera looks",
+    "lidar": "rendered: returns of the LiDAR through the scene's Gaussians, everything where it "
+    "is at each ray's instant; the ego's motion is taken out; instance of the Gaussian that takes "
+    "half of the ray's light, class by category, the ground by geometry",
     "track": "box: poses of the object at the instants before and after",
     "ego_future": "box: poses of the ego at the instants after, in the ego's frame",
 }

@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...render.ground_class import back_projected
+from ..plan import ROOF
 from .boxes import ObjectBox
 from .images import CameraImages
 
 BEAMS, COLUMNS = 64, 1024
 ELEVATION = (np.radians(-25.0), np.radians(3.0))
-MOUNT = (0.9, 0.0, 1.73)
-"""Where the beams start, in the ego frame [m]."""
 NEAR, FARTHEST = 1.0, 80.0
 """Between these distances seen from above there are points [m]."""
 NEAREST = 0.25
@@ -44,15 +43,17 @@ def points_in_boxes(points: ArrayLike, transforms: ArrayLike, sizes: ArrayLike) 
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Points on the surfaces that cameras see, one for each beam that meets one.
+    """Points of surfaces, as cameras or a LiDAR see them.
 
     Attributes:
         points: [N, 3] float32, ego frame [m].
-        intensity: [N] float32, brightness of the pixel, 0 to 1.
-        beam: [N] uint8, 0 is the lowest.
+        intensity: [N] float32, brightness of the pixel or reflectivity, 0 to 1.
+        beam: [N] uint8, row of the sensor, 0 is the lowest; 0 of sensors without rows.
         instance: [N] uint16, 0 is background.
         semantic: [N] uint8, see SEMANTIC_CLASSES.
         velocity: [N, 3] float32, of the surface along the ego's axes [m/s].
+        time_us: [N] int32, when each was measured, relative to the frame.
+        return_number: [N] uint8, of several returns of a ray the nearest is 1.
     """
 
     points: NDArray[np.float32]
@@ -61,6 +62,8 @@ class SeenPoints:
     instance: NDArray[np.uint16]
     semantic: NDArray[np.uint8]
     velocity: NDArray[np.float32]
+    time_us: NDArray[np.int32]
+    return_number: NDArray[np.uint8]
 
 
 def seen_points(
@@ -86,13 +89,15 @@ def seen_points(
         instance=kept,
         semantic=semantic[first],
         velocity=_velocities(points[first], kept, boxes, to_ego),
+        time_us=np.zeros(len(first), np.int32),
+        return_number=np.ones(len(first), np.uint8),
     )
 
 
 def _beams_of(image: CameraImages, to_ego: Float) -> tuple[NDArray[np.generic], ...]:
     """Points, brightness, beam, column, instance and class of one pixel for each beam."""
     points = back_projected(image.depth, image.camera.K, to_ego @ image.T_world_camera)
-    x, y, z = (points[..., k] - np.float32(MOUNT[k]) for k in range(3))
+    x, y, z = (points[..., k] - np.float32(ROOF[k]) for k in range(3))
     flat = np.sqrt(x * x + y * y)
     elevation = np.arctan(z / np.maximum(flat, NEAR))
     row = (elevation - ELEVATION[0]) * np.float32((BEAMS - 1) / (ELEVATION[1] - ELEVATION[0]))

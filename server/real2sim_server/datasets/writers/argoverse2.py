@@ -21,7 +21,6 @@ from ...logs.readers.argoverse2 import AXLE_HEIGHT
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip
-from ..labels.points import MOUNT
 from .nuscenes import FRONT, channels_of
 from .writer import LabelledDrive
 
@@ -56,7 +55,7 @@ class Argoverse2Writer:
         names = ring_names(drive.cameras)
         for clip in drive.clips:
             log = folder / clip.split / str(uuid.UUID(drive.token("log", clip.name)))
-            _write_calibration(log / "calibration", drive.cameras, names)
+            _write_calibration(log / "calibration", drive, names)
             _write_poses(log / "city_SE3_egovehicle.feather", clip)
             _write_annotations(log / "annotations.feather", drive, clip)
             for frame in clip.frames:
@@ -77,10 +76,11 @@ def ring_names(cameras: Sequence[Camera]) -> dict[str, str]:
     }
 
 
-def _write_calibration(folder: Path, cameras: Sequence[Camera], names: Mapping[str, str]) -> None:
+def _write_calibration(folder: Path, drive: LabelledDrive, names: Mapping[str, str]) -> None:
+    cameras = drive.cameras
     mounts = {names[camera.name]: camera.T_vehicle_camera for camera in cameras}
     roof = np.eye(4)
-    roof[:3, 3] = MOUNT
+    roof[:3, 3] = drive.lidar_position
     mounts["up_lidar"] = roof
     poses = _shift(-AXLE_HEIGHT) @ np.array(list(mounts.values()))
     columns = {"sensor_name": list(mounts), **_pose_columns(poses)}
@@ -131,7 +131,7 @@ def _write_sweep(path: Path, clip: Clip, frame: int) -> None:
     }
     columns["intensity"] = np.rint(rows["intensity"] * 255).astype(np.uint8)
     columns["laser_number"] = rows["beam"].copy()
-    columns["offset_ns"] = np.zeros(len(rows), np.int32)
+    columns["offset_ns"] = rows["time_us"] * np.int32(1000)
     _write(path, columns)
 
 

@@ -1,4 +1,4 @@
-"""nuScenes v1.0: thirteen tables, key frames at 2 Hz, all other frames as sweeps.
+"""nuScenes v1.0 with lidarseg and panoptic: key frames at 2 Hz, all other frames as sweeps.
 
 Source: Caesar et al., "nuScenes: A multimodal dataset for autonomous driving", CVPR 2020, and
 ``docs/schema_nuscenes.md`` of its development kit. A clip is a scene, the world of the drive the
@@ -7,18 +7,21 @@ map's frame; ``LIDAR_TOP`` are the labelled points. Pixel centres lie on whole n
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.semantics import GROUND
 
 from ...geometry.rotation import Float, matrix_to_quaternion
 from ...geometry.transform import apply_transform, invert_transform
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip
-from ..labels.points import MOUNT
 from .writer import LabelledDrive, categories_of, objects_of, write_json
 
 VERSION = "v1.0-real2sim"
@@ -41,6 +44,9 @@ CATEGORIES = {
 
 LEVELS = ("v0-40", "v40-60", "v60-80", "v80-100")
 BOUNDS = (0.4, 0.6, 0.8)
+NOISE, DRIVEABLE, MANMADE = "noise", "flat.driveable_surface", "static.manmade"
+PANOPTIC = 1000
+"""A panoptic label is this times the index of the category, plus the object's number."""
 SPEED_MOVING = 0.2
 MAP_CELL = 0.1
 """Of the mask of the ground, as the development kit has it [m]."""
@@ -93,8 +99,9 @@ class _Tables:
         self.rows: dict[str, list[dict[str, Any]]] = {
             name: []
             for name in (
-                "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map",
-                "sample", "sample_annotation", "sample_data", "scene", "sensor", "visibility",
+                "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "lidarseg",
+                "log", "map", "panoptic", "sample", "sample_annotation", "sample_data", "scene",
+                "sensor", "visibility",
             )
         }  # fmt: skip
 
@@ -104,7 +111,7 @@ class _Tables:
         return token
 
     def add_sensors(self) -> None:
-        self._sensor(LIDAR, "lidar", _shift(MOUNT), [])
+        self._sensor(LIDAR, "lidar", _shift(self.drive.lidar_position), [])
         for camera in self.drive.cameras:
             K = camera.K.copy()
             K[:2, 2] -= 0.5
@@ -118,8 +125,9 @@ class _Tables:
         )
 
     def add_categories(self) -> None:
-        for name in sorted({_category(c) for c in categories_of(self.drive)}):
-            self.add("category", (name,), name=name, description="")
+        names = sorted({_category(c) for c in categories_of(self.drive)})
+        for index, name in enumerate((NOISE, *names, DRIVEABLE, MANMADE)):
+            self.add("category", (name,), name=name, description="", index=index)
         for level, name in enumerate(LEVELS, start=1):
             share = name.removeprefix("v")
             self.rows["visibility"].append(
@@ -206,7 +214,7 @@ class _Tables:
                 name = _file_name(clip, channel, frame, is_key=is_key)
                 path = folder / name
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(_scan(clip, k) if camera is None else _image(clip, camera, k))
+                path.write_bytes(self._scan(clip, k) if camera is None else _image(clip, camera, k))
                 self.rows["sample_data"].append(
                     {
                         "token": tokens[k],
@@ -223,6 +231,39 @@ class _Tables:
                         "prev": tokens[k - 1] if k else "",
                     }
                 )
+                if is_key and camera is None:
+                    self._point_labels(clip, k, tokens[k], folder)
+
+    def _scan(self, clip: Clip, frame: int) -> bytes:
+        """x, y, z, intensity (0 to 255) and row of each point in the scanner's frame, float32."""
+        rows = clip.points(frame)
+        scan = np.empty((len(rows), 5), "<f4")
+        to_lidar = invert_transform(_shift(self.drive.lidar_position))
+        scan[:, :3] = apply_transform(to_lidar, rows["xyz"].astype(np.float64))
+        scan[:, 3], scan[:, 4] = rows["intensity"] * 255, rows["beam"]
+        return scan.tobytes()
+
+    def _point_labels(self, clip: Clip, frame: int, sample_data: str, folder: Path) -> None:
+        """Classes and objects of the points of a key frame: lidarseg and panoptic."""
+        rows = clip.points(frame)
+        index = {row["name"]: row["index"] for row in self.rows["category"]}
+        classes = np.where(rows["semantic"] == GROUND, index[DRIVEABLE], index[MANMADE])
+        for subject in clip.frames[frame]["objects"]:
+            own = rows["instance"] == subject["instance_id"]
+            classes[own] = index[_category(subject["category"])]
+        things = rows["instance"].astype(np.int64) % PANOPTIC
+        files = {
+            "lidarseg": ("_lidarseg.bin", classes.astype(np.uint8).tobytes()),
+            "panoptic": ("_panoptic.npz", _npz((classes * PANOPTIC + things).astype(np.uint16))),
+        }
+        for table, (suffix, data) in files.items():
+            name = f"{table}/{VERSION}/{sample_data}{suffix}"
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            self.rows[table].append(
+                {"token": sample_data, "sample_data_token": sample_data, "filename": name}
+            )
 
     def _annotations(self, clip: Clip, keys: Sequence[int], samples: Sequence[str]) -> None:
         seen: dict[str, list[tuple[int, str]]] = {}
@@ -272,6 +313,12 @@ class _Tables:
         }
 
 
+def _npz(labels: NDArray[np.uint16]) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, data=labels)
+    return file.getvalue()
+
+
 def _category(category: str) -> str:
     return CATEGORIES.get(category, f"movable_object.{category}")
 
@@ -294,16 +341,6 @@ def _file_name(clip: Clip, channel: str, frame: Mapping[str, Any], *, is_key: bo
 def _image(clip: Clip, camera: Camera, frame: int) -> bytes:
     rgb = clip.pixels("rgb", camera.name, frame)
     return encode_image(rgb, "rgb", "jpeg", quality=QUALITY).data
-
-
-def _scan(clip: Clip, frame: int) -> bytes:
-    """x, y, z, intensity (0 to 255) and ring of each point in the scanner's frame, float32."""
-    rows = clip.points(frame)
-    scan = np.empty((len(rows), 5), "<f4")
-    to_lidar = invert_transform(_shift(MOUNT))
-    scan[:, :3] = apply_transform(to_lidar, rows["xyz"].astype(np.float64))
-    scan[:, 3], scan[:, 4] = rows["intensity"] * 255, rows["beam"]
-    return scan.tobytes()
 
 
 def _pose(transform: Float) -> dict[str, list[float]]:

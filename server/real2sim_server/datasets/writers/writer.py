@@ -26,6 +26,7 @@ class LabelledDrive:
         clips: in their order.
         ground: of the scene.
         licence: terms under which it may be used.
+        lidar_position: where the LiDAR stands, in the ego frame [m].
     """
 
     name: str
@@ -36,6 +37,7 @@ class LabelledDrive:
     clips: Sequence[Clip]
     ground: Ground
     licence: str
+    lidar_position: tuple[float, float, float]
 
     def token(self, *parts: object) -> str:
         """32 hexadecimal digits, the same for the same parts of the same export."""

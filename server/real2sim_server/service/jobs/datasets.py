@@ -7,24 +7,29 @@ import json
 import shutil
 import tarfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import DatasetRequest
 
 from ...datasets.drive import Drive
 from ...datasets.export import MANIFEST, PREVIEW, Estimate, estimate, export_dataset, work_folder
-from ...datasets.plan import ExportPlan, planned_cameras, planned_clips
+from ...datasets.plan import ExportPlan, planned_cameras, planned_clips, planned_lidar
 from ...datasets.writers import writer_of
 from ...render import Backend, RenderOutput
 from ...render.backends.base import RasterRequest
+from ...render.cast import CastRequest, Echo, select_caster
 from ..engine import Engine, QueueFullError
 from ..http.problems import ServiceError
 from ..lanes import Lane
 from ..library.quotas import Quota
 from .jobs import JobContext, JobResult
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 ARCHIVE = "dataset.tar"
 FOLDER = "dataset"
@@ -62,6 +67,7 @@ class EngineBackend:
         context: of the job, whose account is charged.
         loop: that the engine's callers await on.
         name: of the backend that draws.
+        caster: follows the beams of LiDARs there, too.
     """
 
     engine: Engine
@@ -69,9 +75,11 @@ class EngineBackend:
     context: JobContext
     loop: asyncio.AbstractEventLoop
     name: str = field(init=False)
+    caster: EngineCaster = field(init=False)
 
     def __post_init__(self) -> None:
         self.name = self.backend.name
+        self.caster = EngineCaster(self)
 
     @property
     def draws_lenses(self) -> bool:
@@ -81,18 +89,32 @@ class EngineBackend:
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw when interactive requests leave room in the queue. Raises JobCancelled."""
         yielding = replace(request, between=self.engine.give_way)
+        return self.on_engine(self.backend.rasterize, yielding)
+
+    def warm_up(self) -> None:
+        """The engine's is warm."""
+
+    def on_engine(self, work: Callable[[T], R], argument: T) -> R:
+        """The result of ``work`` on the engine's thread. Raises JobCancelled."""
         while True:
             self.context.check()
-            awaited = self.engine.call(
-                self.backend.rasterize, yielding, label="dataset", lane=Lane.BULK
-            )
+            awaited = self.engine.call(work, argument, label="dataset", lane=Lane.BULK)
             try:
                 return asyncio.run_coroutine_threadsafe(awaited, self.loop).result()
             except QueueFullError:
                 time.sleep(0.2)
 
-    def warm_up(self) -> None:
-        """The engine's is warm."""
+
+@dataclass(frozen=True)
+class EngineCaster:
+    """Follows beams on the engine."""
+
+    backend: EngineBackend
+    name: str = "engine"
+
+    def cast(self, request: CastRequest) -> Echo:
+        """See :class:`CastBackend`. Raises JobCancelled."""
+        return self.backend.on_engine(select_caster().cast, request)
 
 
 def plan_of(request: DatasetRequest) -> ExportPlan:
@@ -108,6 +130,7 @@ def plan_of(request: DatasetRequest) -> ExportPlan:
         splits=request.splits,
         seed=request.seed,
         flow=request.flow,
+        lidar=request.lidar,
     )
 
 
@@ -121,6 +144,7 @@ def check_dataset(drive: Drive, plan: ExportPlan, *, max_pixels: int) -> None:
     for name in plan.formats:
         writer_of(name)
     cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    planned_lidar(plan)
     frames = sum(len(clip.times_us) for clip in clips)
     if frames > MAX_FRAMES:
         raise ServiceError(
