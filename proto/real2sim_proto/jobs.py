@@ -225,6 +225,70 @@ class ExportRequest(Model):
         return self
 
 
+SweptValue = float | int | str | bool
+Pair = tuple[float, float]
+
+
+class SweptValues(Model):
+    """What a parameter of a sweep is: exactly one of these."""
+
+    values: list[SweptValue] | None = Field(default=None, min_length=1, max_length=1000)
+    range: tuple[float, float, Annotated[int, Field(ge=1, le=1000)]] | None = Field(
+        default=None, description="first, last, and how many, evenly spread"
+    )
+    uniform: Pair | None = Field(default=None, description="drawn between these")
+    normal: tuple[float, Annotated[float, Field(ge=0)]] | None = Field(
+        default=None, description="drawn with this mean and standard deviation"
+    )
+
+    @model_validator(mode="after")
+    def _is_one(self) -> SweptValues:
+        given = (self.values, self.range, self.uniform, self.normal)
+        if sum(value is not None for value in given) != 1:
+            raise ValueError("give exactly one of values, range, uniform and normal")
+        if self.uniform is not None and self.uniform[0] > self.uniform[1]:
+            raise ValueError("uniform wants its lower bound first")
+        return self
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether it has a distribution."""
+        return self.uniform is not None or self.normal is not None
+
+
+class DatasetSweep(Model):
+    """The same drive many times over, each with other values in its edits."""
+
+    parameters: dict[Identifier, SweptValues] = Field(min_length=1, max_length=16)
+    draws: int = Field(
+        default=1, ge=1, le=1000, description="of distributions, for each of the combinations"
+    )
+    operations: list[dict[str, Any]] = Field(
+        min_length=1,
+        max_length=64,
+        description='edits after those of the scenario; "$name" stands for a parameter\'s value',
+    )
+
+
+class DatasetPerturbation(Model):
+    """Clips whose ego starts beside its path and finds back to it, which is its future."""
+
+    lateral_sigma: float = Field(default=0.5, ge=0, le=5, description="beside the path [m]")
+    heading_sigma: float = Field(default=0.07, ge=0, le=0.6, description="against it [rad]")
+    recover_s: float = Field(default=3.0, ge=0.5, le=30, description="until it is on its path [s]")
+    copies: int = Field(default=1, ge=1, le=100, description="of each clip")
+
+
+class DatasetNoise(Model):
+    """Boxes as a detector would give them, beside the true ones."""
+
+    position: float = Field(default=0.0, ge=0, le=10, description="standard deviation [m]")
+    size: float = Field(default=0.0, ge=0, le=1, description="of each edge, as a share of it")
+    heading: float = Field(default=0.0, ge=0, le=3.2, description="[rad]")
+    missed: float = Field(default=0.0, ge=0, le=1, description="share that is not found")
+    false: float = Field(default=0.0, ge=0, le=100, description="found where nothing is, a frame")
+
+
 DatasetFormat = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 SplitName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]{1,32}$")]
 Share = Annotated[float, Field(ge=0, le=1e6)]
@@ -283,6 +347,12 @@ class DatasetRequest(Model):
         description="name in the catalogue (docs/lidar.md): its returns are the labelled points; "
         "default: points of what the cameras see",
     )
+    rig: dict[str, Any] | None = Field(
+        default=None, description="cameras and LiDAR of one's own, instead: docs/datasets.md"
+    )
+    sweep: DatasetSweep | None = None
+    perturb: DatasetPerturbation | None = None
+    noise: DatasetNoise | None = None
     dry_run: bool = Field(
         default=False, description="only tell frames, images, bytes and minutes in the result"
     )
@@ -293,6 +363,10 @@ class DatasetRequest(Model):
             raise ValueError("name exactly one of scenario, scene and session")
         if self.recording is not None and self.scene is None:
             raise ValueError("a recording wants the scene that it ran on")
+        if self.sweep is not None and (self.recording is not None or self.session is not None):
+            raise ValueError("a sweep edits a scene or a scenario; an episode stays as it went")
+        if self.rig is not None and (self.cameras or self.width or self.lidar):
+            raise ValueError("a rig says all of cameras, width and lidar: leave those out")
         return self
 
 

@@ -6,8 +6,16 @@ import base64
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from real2sim_proto.jobs import DatasetRequest, ExportRequest, JobInfo
+from real2sim_proto.jobs import (
+    DatasetNoise,
+    DatasetPerturbation,
+    DatasetRequest,
+    DatasetSweep,
+    ExportRequest,
+    JobInfo,
+)
 from real2sim_proto.sessions import SessionInfo
 
 from .. import _requests
@@ -123,6 +131,10 @@ class AsyncJobs:
         seed: int = 0,
         flow: bool = True,
         lidar: str | None = None,
+        rig: Mapping[str, Any] | None = None,
+        sweep: DatasetSweep | Mapping[str, Any] | None = None,
+        perturb: DatasetPerturbation | Mapping[str, Any] | None = None,
+        noise: DatasetNoise | Mapping[str, Any] | None = None,
         dry_run: bool = False,
     ) -> AsyncJob:
         """Start making a labelled data set: images with boxes, masks, depth, flow, points, tracks.
@@ -144,6 +156,10 @@ class AsyncJobs:
             flow: whether optical flow is made.
             lidar: such as ``hdl-64e``: its returns are the labelled points; default: points of
                 what the cameras see.
+            rig: cameras and LiDAR of one's own, instead of ``cameras``, ``width`` and ``lidar``.
+            sweep: parameters, and edits in which ``"$name"`` stands for one's value.
+            perturb: the ego starts beside its path and finds back: recovery data.
+            noise: errors of a detector, whose boxes are written beside the true ones.
             dry_run: only tell frames, images, bytes and minutes in ``info.result``.
 
         Raises:
@@ -178,6 +194,10 @@ class AsyncJobs:
             "seed": seed,
             "flow": flow,
             "lidar": lidar,
+            "rig": None if rig is None else dict(rig),
+            "sweep": sweep,
+            "perturb": perturb,
+            "noise": noise,
             "dry_run": dry_run,
         }
         body = checked(DatasetRequest, **fields)

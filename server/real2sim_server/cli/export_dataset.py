@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +15,11 @@ from .device import chosen_backend
 from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle
 
 if TYPE_CHECKING:
+    from real2sim_proto.jobs import DatasetSweep
+
     from ..datasets.drive import Drive
+    from ..datasets.labels.noise import BoxNoise
+    from ..datasets.perturbed import Perturbation
     from ..edit import AssetLookup, ScenarioState
     from ..scene import Scene
 
@@ -55,6 +60,24 @@ def export_dataset(
             "labelled points. Default: points of what the cameras see."
         ),
     ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="JSON file of cameras and LiDAR, instead of --cameras and --lidar."),
+    ] = None,
+    sweep: Annotated[
+        Path | None, typer.Option(help="JSON file of parameters and the edits they are in.")
+    ] = None,
+    perturb: Annotated[
+        str | None,
+        typer.Option(help="The ego starts beside its path: lateral=0.5,heading=4,copies=2."),
+    ] = None,
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            help="Boxes as a detector would give them: position=0.2,size=0.05,heading=2,"
+            "missed=0.1,false=0.5."
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say how many frames, bytes and minutes.")
     ] = False,
@@ -66,9 +89,12 @@ def export_dataset(
 
     Stopped and called again it goes on after the last whole clip, and gives the same bytes.
     """
+    from ..datasets.drive import ScenarioDrive
     from ..datasets.export import estimate
     from ..datasets.export import export_dataset as export
     from ..datasets.plan import ExportPlan
+    from ..datasets.rig import read_rig
+    from ..datasets.variants import Variant, swept
     from ..scene.io import load_scene
 
     backend = chosen_backend(backend, device)
@@ -84,11 +110,24 @@ def export_dataset(
         seed=seed,
         flow=flow,
         lidar=_lidar(lidar),
+        rig=None if rig is None else read_rig(rig),
+        perturb=None if perturb is None else _perturbation(perturb),
+        noise=None if noise is None else _noise(noise),
     )
+    if rig is not None and (cameras or width or lidar):
+        raise CommandError("--rig says all of cameras, width and lidar: leave those out")
     loaded = load_scene(scene)
     drive, made_of = _drive(loaded, operations, episode, assets)
+    variants = [Variant(drive)]
+    if sweep is not None:
+        if episode is not None:
+            raise CommandError("--episode is exported as it went: leave --sweep out")
+        assert isinstance(drive, ScenarioDrive)
+        asked = _sweep(sweep)
+        variants = swept(loaded, drive.state, asked, seed)
+        made_of["sweep"] = asked.model_dump(mode="json", exclude_none=True)
     if dry_run:
-        guess = estimate(drive, plan, backend=backend)
+        guess = estimate(variants, plan, backend=backend)
         figures: dict[str, Any] = {
             "frames": guess.frames,
             "images": guess.images,
@@ -97,7 +136,7 @@ def export_dataset(
         }
     else:
         with staged_progress() as report:
-            export(drive, plan, out, made_of=made_of, backend=backend, on_progress=report)
+            export(variants, plan, out, made_of=made_of, backend=backend, on_progress=report)
         manifest = json_module.loads((out / "manifest.json").read_bytes())
         files = manifest["files"].values()
         figures = {
@@ -157,6 +196,55 @@ def _content(operations: Path | None) -> Any:
         return json_module.loads(operations.read_bytes())
     except ValueError as error:
         raise CommandError(f"{operations}: is no JSON file ({error})") from error
+
+
+def _sweep(path: Path) -> DatasetSweep:
+    from pydantic import ValidationError
+
+    from real2sim_proto.jobs import DatasetSweep
+
+    try:
+        return DatasetSweep.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise CommandError(f"{path}: is no sweep ({error})") from error
+
+
+def _perturbation(text: str) -> Perturbation:
+    from ..datasets.perturbed import Perturbation
+
+    given = _numbers("--perturb", text, ("lateral", "heading", "recover", "copies"))
+    default = Perturbation()
+    return Perturbation(
+        lateral_sigma=given.get("lateral", default.lateral_sigma),
+        heading_sigma=math.radians(given.get("heading", math.degrees(default.heading_sigma))),
+        recover_s=given.get("recover", default.recover_s),
+        copies=max(1, round(given.get("copies", default.copies))),
+    )
+
+
+def _noise(text: str) -> BoxNoise:
+    from ..datasets.labels.noise import BoxNoise
+
+    given = _numbers("--noise", text, ("position", "size", "heading", "missed", "false"))
+    if "heading" in given:
+        given["heading"] = math.radians(given["heading"])
+    return BoxNoise(**given)
+
+
+def _numbers(option: str, text: str, allowed: tuple[str, ...]) -> dict[str, float]:
+    """Of ``name=number,name=number``, none below 0."""
+    found = {}
+    for part in text.split(","):
+        name, _, number = part.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            found[name.strip()] = -1.0
+    if set(found) - set(allowed) or min(found.values()) < 0:
+        raise CommandError(
+            f"{option} {text!r}; allowed are {', '.join(f'{n}=0.5' for n in allowed)}"
+        )
+    return found
 
 
 def _lidar(name: str | None) -> str | dict[str, Any] | None:

@@ -11,11 +11,12 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial as partial_of
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, Self, runtime_checkable
 
 import cv2
@@ -44,7 +45,10 @@ from .labels import (
     views_of,
 )
 from .labels.boxes import in_frame
+from .labels.noise import noisy_boxes
+from .perturbed import PerturbedDrive, perturbed
 from .plan import ExportPlan, PlannedClip, planned_lidar
+from .variants import Variant
 
 POINT = np.dtype(
     [
@@ -63,6 +67,7 @@ POINT = np.dtype(
 SEED_STEP = 1_000_003
 """Between the seeds of exports, whose frames add their instant."""
 
+NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 ENCODERS = 2
 """Threads that encode."""
 
@@ -94,18 +99,21 @@ class Clip:
         name: four digits.
         split: that it belongs to.
         frames: labels of each frame, see ``docs/datasets.md``.
+        values: of the parameters of a sweep.
     """
 
     folder: Path
     name: str
     split: str
     frames: Sequence[dict[str, Any]]
+    values: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def open(cls, folder: Path) -> Clip:
         """The clip in a folder that :func:`write_clip` has made."""
         content = json.loads((folder / "labels.json").read_bytes())
-        return cls(folder, content["name"], content["split"], content["frames"])
+        values = content.get("values", {})
+        return cls(folder, content["name"], content["split"], content["frames"], values)
 
     def file(self, kind: str, camera: str, frame: int) -> Path:
         """The png of an image of that kind; the first and last frame lack a flow each."""
@@ -124,6 +132,34 @@ class Clip:
         return rows
 
 
+def write_shard(
+    variant: Variant,
+    plan: ExportPlan,
+    cameras: Sequence[Camera],
+    clip: PlannedClip,
+    folder: Path,
+    *,
+    backend: str | Backend = "auto",
+    on_frame: Callable[[], None] = lambda: None,
+) -> None:
+    """Draw and label a clip of a sweep, beside its path where the plan says so; as
+    :func:`write_clip`."""
+    drive = variant.drive
+    if plan.perturb is not None and clip.copy is not None:
+        seed = (plan.seed, int(clip.name), clip.copy)
+        drive = perturbed(drive, plan.perturb, clip.times_us, seed)
+    write_clip(
+        drive,
+        plan,
+        cameras,
+        clip,
+        folder,
+        values=variant.values,
+        backend=backend,
+        on_frame=on_frame,
+    )
+
+
 def write_clip(
     drive: Drive,
     plan: ExportPlan,
@@ -131,6 +167,7 @@ def write_clip(
     clip: PlannedClip,
     folder: Path,
     *,
+    values: Mapping[str, Any] = NO_VALUES,
     backend: str | Backend = "auto",
     on_frame: Callable[[], None] = lambda: None,
 ) -> None:
@@ -147,7 +184,10 @@ def write_clip(
             here = LabelledMoment(moment, boxes_at(moment.placed), images)
             views = [views_of(i, here.boxes, moment.instances, backend=backend) for i in images]
             points = _points_of(drive, plan, here, backend)
-            frames.append(_frame_labels(drive, here, views, points, index))
+            labels = _frame_labels(drive, here, views, points, index)
+            if plan.noise is not None:
+                labels["detections"] = _detections(here, labels, plan, (int(clip.name), index))
+            frames.append(labels)
             files.finish()
             _write_images(files, images, index)
             files.add("points", "", index, _points_file(points))
@@ -156,7 +196,9 @@ def write_clip(
                 _write_flow(files, here, before, "backward", index)
             before = here
             on_frame()
-    content = {"name": clip.name, "split": clip.split, "frames": frames}
+    content: dict[str, Any] = {"name": clip.name, "split": clip.split, "frames": frames}
+    if values:
+        content["values"] = dict(values)
     (partial / "labels.json").write_text(json.dumps(content), encoding="utf-8")
     partial.rename(folder)
 
@@ -180,6 +222,7 @@ def _frame_labels(
     index: int,
 ) -> dict[str, Any]:
     moment, boxes = here.moment, here.boxes
+    beside = _beside(drive, moment.t_us)
     to_ego = invert_transform(moment.T_world_ego)
     in_ego = [in_frame(box, to_ego) for box in boxes]
     counts = points_in_boxes(points.points, [pose for pose, _ in in_ego], [b.size for b in boxes])
@@ -189,6 +232,7 @@ def _frame_labels(
         "t_us": moment.t_us,
         "T_world_ego": moment.T_world_ego.tolist(),
         "ego_future": ego_future(drive, moment.t_us),
+        **beside,
         "objects": [
             {
                 "object_id": box.object_id,
@@ -206,6 +250,22 @@ def _frame_labels(
         ],
         "views": {view.images.camera.name: _view_labels(view, boxes) for view in views},
     }
+
+
+def _beside(drive: Drive, t_us: int) -> dict[str, Any]:
+    """How far the ego is beside its path, where it is."""
+    if not isinstance(drive, PerturbedDrive):
+        return {}
+    lateral, heading = drive.offset_at(t_us)
+    return {"beside_path": {"lateral": lateral, "heading": heading}}
+
+
+def _detections(
+    here: LabelledMoment, labels: Mapping[str, Any], plan: ExportPlan, place: tuple[int, int]
+) -> list[dict[str, Any]]:
+    assert plan.noise is not None
+    poses = [np.array(subject["T_ego_object"]) for subject in labels["objects"]]
+    return noisy_boxes(here.boxes, poses, plan.noise, (plan.seed, *place))
 
 
 def _view_labels(view: CameraView, boxes: Sequence[ObjectBox]) -> list[dict[str, Any]]:

@@ -8,20 +8,21 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from ..render import Backend
-from ..scene import Camera
-from .clips import Clip, write_clip
+from ..scene import Camera, Scene
+from .clips import Clip, write_shard
 from .drive import Drive
 from .errors import DatasetError
 from .labels import HOW
-from .plan import ROOF, ExportPlan, PlannedClip, planned_cameras, planned_clips, planned_lidar
+from .plan import ROOF, ExportPlan, PlannedClip, planned_cameras, planned_lidar, planned_shards
 from .previews import write_previews
 from .statistics import statistics_of
+from .variants import Variant
 from .writers import LabelledDrive, writer_of
 
 FORMAT = "real2sim-dataset"
@@ -47,31 +48,35 @@ class Estimate:
     minutes: float
 
 
-def estimate(drive: Drive, plan: ExportPlan, *, backend: str | Backend = "auto") -> Estimate:
+def estimate(
+    drive: Drive | Sequence[Variant], plan: ExportPlan, *, backend: str | Backend = "auto"
+) -> Estimate:
     """Of an export that is not made; three of its frames are labelled and thrown away.
 
     Raises:
         DatasetError: as :func:`export_dataset`.
     """
-    cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    variants = _variants(drive)
+    cameras, clips = planned_cameras(variants[0].drive, plan), planned_shards(variants, plan)
     planned_lidar(plan)
     for name in plan.formats:
         writer_of(name)
     frames = sum(len(clip.times_us) for clip in clips)
-    middle = clips[len(clips) // 2].times_us[:3]
+    middle = clips[len(clips) // 2]
+    few = replace(middle, times_us=middle.times_us[:3])
     with tempfile.TemporaryDirectory(prefix="real2sim-dataset-") as folder:
         seconds = [time.perf_counter()]
-        write_clip(
-            drive,
+        write_shard(
+            variants[few.variant],
             plan,
             cameras,
-            PlannedClip("0000", "train", middle),
+            few,
             Path(folder) / "clip",
             backend=backend,
             on_frame=lambda: seconds.append(time.perf_counter()),
         )
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
-        nbytes = sum(path.stat().st_size for path in files) / len(middle)
+        nbytes = sum(path.stat().st_size for path in files) / len(few.times_us)
     each = min(b - a for a, b in pairwise(seconds))
     return Estimate(
         frames=frames,
@@ -82,7 +87,7 @@ def estimate(drive: Drive, plan: ExportPlan, *, backend: str | Backend = "auto")
 
 
 def export_dataset(
-    drive: Drive,
+    drive: Drive | Sequence[Variant],
     plan: ExportPlan,
     out: str | Path,
     *,
@@ -96,7 +101,7 @@ def export_dataset(
     on after the last whole clip, and gives the same bytes.
 
     Args:
-        drive: what is shown.
+        drive: what is shown; or the variants of a sweep, all of one scene.
         plan: what is exported of it.
         out: a folder that does not exist yet.
         made_of: what else decided on the drive (operations, episode ...), for the manifest; JSON
@@ -119,22 +124,24 @@ def export_dataset(
     if not plan.formats:
         raise DatasetError("name at least one format")
     writers = [writer_of(name) for name in plan.formats]
-    cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    variants = _variants(drive)
+    scene = variants[0].drive.scene
+    cameras, clips = planned_cameras(variants[0].drive, plan), planned_shards(variants, plan)
     lidar = planned_lidar(plan)
-    digest = _digest(drive, plan, made_of or {})
+    digest = _digest(variants, plan, made_of or {})
     work = _work_folder(target, digest)
     opened = _labelled_clips(
-        drive, plan, cameras, clips, work=work, backend=backend, on_progress=on_progress
+        variants, plan, cameras, clips, work=work, backend=backend, on_progress=on_progress
     )
     content = LabelledDrive(
-        name=drive.scene.name,
+        name=scene.name,
         digest=digest,
         cameras=tuple(cameras),
-        ego_size=drive.scene.ego_size,
+        ego_size=scene.ego_size,
         period_us=plan.period_us,
         clips=opened,
-        ground=drive.scene.ground,
-        licence=_licence(drive.scene.provenance),
+        ground=scene.ground,
+        licence=_licence(scene.provenance),
         lidar_position=ROOF if lidar is None else tuple(lidar.T_vehicle_lidar[:3, 3].tolist()),
     )
     result = work / "result"
@@ -149,8 +156,8 @@ def export_dataset(
             partial.rename(result / writer.name)
     on_progress("formats", len(writers), len(writers))
     write_previews(opened, cameras, result / PREVIEW)
-    _write_licence(result / LICENCE, drive.scene.provenance)
-    _write_manifest(result, drive, plan, opened, digest=digest, made_of=made_of or {})
+    _write_licence(result / LICENCE, scene.provenance)
+    _write_manifest(result, scene, plan, opened, digest=digest, made_of=made_of or {})
     result.rename(target)
     shutil.rmtree(work)
     return target
@@ -162,8 +169,13 @@ def work_folder(out: str | Path) -> Path:
     return target.with_name(f".{target.name}.export")
 
 
-def _digest(drive: Drive, plan: ExportPlan, made_of: Mapping[str, Any]) -> str:
-    content = [drive.scene.name, drive.scene.content_hash, plan.digest, made_of]
+def _variants(drive: Drive | Sequence[Variant]) -> list[Variant]:
+    return list(drive) if isinstance(drive, Sequence) else [Variant(drive)]
+
+
+def _digest(variants: Sequence[Variant], plan: ExportPlan, made_of: Mapping[str, Any]) -> str:
+    scene, values = variants[0].drive.scene, [dict(variant.values) for variant in variants]
+    content = [scene.name, scene.content_hash, plan.digest, made_of, values]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -179,7 +191,7 @@ def _work_folder(target: Path, digest: str) -> Path:
 
 
 def _labelled_clips(
-    drive: Drive,
+    variants: Sequence[Variant],
     plan: ExportPlan,
     cameras: Sequence[Camera],
     clips: Sequence[PlannedClip],
@@ -202,7 +214,8 @@ def _labelled_clips(
             done += len(clip.times_us)
             on_progress("frames", done, total)
         else:
-            write_clip(drive, plan, cameras, clip, folder, backend=backend, on_frame=step)
+            variant = variants[clip.variant]
+            write_shard(variant, plan, cameras, clip, folder, backend=backend, on_frame=step)
     return [Clip.open(work / "clips" / clip.name) for clip in clips]
 
 
@@ -223,28 +236,28 @@ def _write_licence(path: Path, provenance: Mapping[str, Any]) -> None:
 
 def _write_manifest(
     result: Path,
-    drive: Drive,
+    scene: Scene,
     plan: ExportPlan,
     clips: Sequence[Clip],
     *,
     digest: str,
     made_of: Mapping[str, Any],
 ) -> None:
-    unmade = "lidar" if plan.lidar is None else "points"
+    unmade = "lidar" if planned_lidar(plan) is None else "points"
     files = sorted(p for p in result.rglob("*") if p.is_file() and p != result / MANIFEST)
     content = {
         "format": FORMAT,
         "version": VERSION,
         "digest": digest,
-        "scene": drive.scene.name,
-        "scene_hash": drive.scene.content_hash,
+        "scene": scene.name,
+        "scene_hash": scene.content_hash,
         "made_of": dict(made_of),
         "plan": {**asdict(plan), "splits": dict(plan.splits)},
-        "clips": {clip.name: {"split": clip.split, "frames": len(clip.frames)} for clip in clips},
+        "clips": {clip.name: _clip_row(clip) for clip in clips},
         "statistics": statistics_of(clips),
         "labels": {k: v for k, v in HOW.items() if k != unmade},
-        "provenance": dict(drive.scene.provenance),
-        "licence": _licence(drive.scene.provenance),
+        "provenance": dict(scene.provenance),
+        "licence": _licence(scene.provenance),
         "files": {
             str(path.relative_to(result)): {
                 "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -254,3 +267,8 @@ def _write_manifest(
         },
     }
     (result / MANIFEST).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _clip_row(clip: Clip) -> dict[str, Any]:
+    row: dict[str, Any] = {"split": clip.split, "frames": len(clip.frames)}
+    return row | {"values": dict(clip.values)} if clip.values else row

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,10 @@ from ..scene import Camera, Lidar, LidarError
 from ..scene.lidar_catalogue import catalogue_lidar, lidar_from_values
 from .drive import Drive
 from .errors import DatasetError
+from .labels.noise import BoxNoise
+from .perturbed import Perturbation
+from .rig import cameras_of
+from .variants import Variant
 
 MAX_FRAMES = 100_000
 ROOF = (0.9, 0.0, 1.73)
@@ -37,6 +41,9 @@ class ExportPlan:
         flow: whether optical flow is made.
         lidar: name in the catalogue, or the values of a file of a sensor; None: points are those
             that the cameras' depth gives.
+        rig: values of a rig file, instead of ``cameras``, ``width`` and ``lidar``.
+        perturb: where the ego of each clip starts; None: on its path.
+        noise: of a detector, whose boxes are written beside the true ones; None: none are.
     """
 
     formats: tuple[str, ...]
@@ -50,6 +57,9 @@ class ExportPlan:
     seed: int = 0
     flow: bool = True
     lidar: str | Mapping[str, Any] | None = None
+    rig: Mapping[str, Any] | None = None
+    perturb: Perturbation | None = None
+    noise: BoxNoise | None = None
 
     @property
     def digest(self) -> str:
@@ -65,16 +75,22 @@ class PlannedClip:
         name: four digits.
         split: that it belongs to.
         times_us: of its frames [us].
+        variant: number of its drive in the sweep.
+        copy: number of its start beside the path; None where it starts on it.
     """
 
     name: str
     split: str
     times_us: tuple[int, ...]
+    variant: int = 0
+    copy: int | None = None
 
 
 def planned_cameras(drive: Drive, plan: ExportPlan) -> list[Camera]:
     """The cameras of a plan. Raises DatasetError for a name that the scene lacks."""
     rig = drive.scene.rig
+    if plan.rig is not None:
+        return cameras_of(plan.rig, rig)
     for name in plan.cameras:
         if name not in rig.names:
             raise DatasetError(f"camera {name!r}; the scene has {', '.join(rig.names) or 'none'}")
@@ -90,17 +106,35 @@ def planned_lidar(plan: ExportPlan) -> Lidar | None:
     Raises:
         DatasetError: an unknown name, or values that are no sensor's.
     """
-    if plan.lidar is None:
+    named = plan.lidar if plan.rig is None else plan.rig.get("lidar")
+    if named is None:
         return None
     try:
-        if isinstance(plan.lidar, str):
-            lidar = catalogue_lidar(plan.lidar)
-        else:
-            lidar = lidar_from_values(plan.lidar)
+        lidar = catalogue_lidar(named) if isinstance(named, str) else lidar_from_values(named)
     except LidarError as error:
         raise DatasetError(str(error)) from error
     placed = not np.array_equal(lidar.T_vehicle_lidar, np.eye(4))
     return lidar if placed else lidar.placed(transform_from(ROOF, (1.0, 0.0, 0.0, 0.0)))
+
+
+def planned_shards(variants: Sequence[Variant], plan: ExportPlan) -> list[PlannedClip]:
+    """The clips of all drives, each as often as it is perturbed, numbered through. All of a stretch
+    of time are in one split, so that nothing is trained on that is tested on.
+
+    Raises:
+        DatasetError: as :func:`planned_clips`, or too many frames in all.
+    """
+    copies = (None,) if plan.perturb is None else tuple(range(plan.perturb.copies))
+    found = [
+        replace(clip, variant=number, copy=copy)
+        for number, variant in enumerate(variants)
+        for clip in planned_clips(variant.drive, plan)
+        for copy in copies
+    ]
+    frames = sum(len(clip.times_us) for clip in found)
+    if frames > MAX_FRAMES:
+        raise DatasetError(f"{frames} frames; {MAX_FRAMES} is the most in one export")
+    return [replace(clip, name=f"{k:04d}") for k, clip in enumerate(found)]
 
 
 def planned_clips(drive: Drive, plan: ExportPlan) -> list[PlannedClip]:

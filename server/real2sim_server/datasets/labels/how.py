@@ -25,6 +25,7 @@ HOW = {
     "is at each ray's instant; the ego's motion is taken out; instance of the Gaussian that takes "
     "half of the ray's light, class by category, the ground by geometry",
     "track": "box: poses of the object at the instants before and after",
+    "detections": "box: boxes of the drive, moved, missed and made up as a detector might",
     "ego_future": "box: poses of the ego at the instants after, in the ego's frame",
 }
 """What each label is made from: ``rendered``, ``box`` (poses and sizes of the drive)."""

@@ -51,7 +51,7 @@ def _sample(clip: Clip, camera: Camera, frame: dict[str, Any]) -> Iterator[tuple
         if path.exists():
             yield f"{kind}.png", path.read_bytes()
     objects = objects_of(frame)
-    content = {
+    content: dict[str, Any] = {
         "clip": clip.name,
         "split": clip.split,
         "camera": camera.name,
@@ -62,6 +62,7 @@ def _sample(clip: Clip, camera: Camera, frame: dict[str, Any]) -> Iterator[tuple
         "ego_future": frame["ego_future"],
         "objects": [{**objects[view["object_id"]], **view} for view in frame["views"][camera.name]],
     }
+    content |= {key: frame[key] for key in ("beside_path", "detections") if key in frame}
     yield "json", json.dumps(content).encode()
 
 

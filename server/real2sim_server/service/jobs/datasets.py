@@ -7,7 +7,7 @@ import json
 import shutil
 import tarfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,9 +15,11 @@ from typing import Any, TypeVar
 from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import DatasetRequest
 
-from ...datasets.drive import Drive
 from ...datasets.export import MANIFEST, PREVIEW, Estimate, estimate, export_dataset, work_folder
-from ...datasets.plan import ExportPlan, planned_cameras, planned_clips, planned_lidar
+from ...datasets.labels.noise import BoxNoise
+from ...datasets.perturbed import Perturbation
+from ...datasets.plan import ExportPlan, planned_cameras, planned_lidar, planned_shards
+from ...datasets.variants import Variant
 from ...datasets.writers import writer_of
 from ...render import Backend, RenderOutput
 from ...render.backends.base import RasterRequest
@@ -49,11 +51,11 @@ class DatasetSource:
     """What a data set shows.
 
     Attributes:
-        drive: what is labelled.
+        variants: what is labelled.
         made_of: what else decided on it, for the manifest.
     """
 
-    drive: Drive
+    variants: Sequence[Variant]
     made_of: dict[str, Any]
 
 
@@ -131,10 +133,13 @@ def plan_of(request: DatasetRequest) -> ExportPlan:
         seed=request.seed,
         flow=request.flow,
         lidar=request.lidar,
+        rig=request.rig,
+        perturb=None if request.perturb is None else Perturbation(**dict(request.perturb)),
+        noise=None if request.noise is None else BoxNoise(**dict(request.noise)),
     )
 
 
-def check_dataset(drive: Drive, plan: ExportPlan, *, max_pixels: int) -> None:
+def check_dataset(variants: Sequence[Variant], plan: ExportPlan, *, max_pixels: int) -> None:
     """Refuse what cannot be exported before the job begins.
 
     Raises:
@@ -143,7 +148,7 @@ def check_dataset(drive: Drive, plan: ExportPlan, *, max_pixels: int) -> None:
     """
     for name in plan.formats:
         writer_of(name)
-    cameras, clips = planned_cameras(drive, plan), planned_clips(drive, plan)
+    cameras, clips = planned_cameras(variants[0].drive, plan), planned_shards(variants, plan)
     planned_lidar(plan)
     frames = sum(len(clip.times_us) for clip in clips)
     if frames > MAX_FRAMES:
@@ -178,15 +183,15 @@ async def make_dataset(
         ServiceError: QUOTA_EXCEEDED, before or while it is made.
     """
     if dry_run:
-        guess = await asyncio.to_thread(_estimate, source.drive, plan, backend)
+        guess = await asyncio.to_thread(_estimate, source.variants, plan, backend)
         values = {"frames": guess.frames, "images": guess.images}
         return JobResult(values | {"bytes": guess.nbytes, "minutes": guess.minutes})
     return await asyncio.to_thread(_export, source, plan, backend, quota)
 
 
-def _estimate(drive: Drive, plan: ExportPlan, backend: EngineBackend) -> Estimate:
+def _estimate(variants: Sequence[Variant], plan: ExportPlan, backend: EngineBackend) -> Estimate:
     backend.context.progress(0.0, "estimating")
-    return estimate(drive, plan, backend=backend)
+    return estimate(variants, plan, backend=backend)
 
 
 def _export(
@@ -195,12 +200,12 @@ def _export(
     context = backend.context
     context.folder.mkdir(parents=True, exist_ok=True)
     folder = context.folder / FOLDER
-    frames = sum(len(clip.times_us) for clip in planned_clips(source.drive, plan))
+    frames = sum(len(clip.times_us) for clip in planned_shards(source.variants, plan))
     if frames > FEW_FRAMES:
-        quota.check(added_bytes=_estimate(source.drive, plan, backend).nbytes, entries=0)
+        quota.check(added_bytes=_estimate(source.variants, plan, backend).nbytes, entries=0)
     try:
         export_dataset(
-            source.drive,
+            source.variants,
             plan,
             folder,
             made_of=source.made_of,

@@ -11,7 +11,9 @@ from fastapi import APIRouter, Request, Response
 from real2sim_proto.jobs import DatasetRequest, ExportBody, ExportRequest, JobInfo
 
 from ...datasets.drive import EpisodeDrive, ScenarioDrive
+from ...datasets.variants import Variant, swept
 from ...edit import ScenarioState, instances_at
+from ...scene import Scene
 from ...world.recording.recording import Recording, RecordingError, recording_of_bytes
 from ..http.auth import TokenRoute, bearer_token, unauthorized
 from ..http.clients import ClientName
@@ -96,7 +98,7 @@ async def _dataset_work(worker: Worker, body: DatasetRequest, request: Request) 
     plan = plan_of(body)
     source = await _dataset_source(worker, body, request)
     max_pixels = worker.settings.max_pixels_per_step
-    await asyncio.to_thread(check_dataset, source.drive, plan, max_pixels=max_pixels)
+    await asyncio.to_thread(check_dataset, source.variants, plan, max_pixels=max_pixels)
     loop = asyncio.get_running_loop()
 
     async def work(context: JobContext) -> JobResult:
@@ -119,10 +121,20 @@ async def _dataset_source(worker: Worker, body: DatasetRequest, request: Request
         document = await worker.scenarios.export(body.scenario)
         scene = await worker.scene_cache.get(view.row.scene)
         entries = [entry.model_dump(mode="json", exclude_none=True) for entry in document.entries]
-        return DatasetSource(ScenarioDrive(scene, view.state), _made_of(entries))
+        return await _edited_source(scene, view.state, body, _made_of(entries))
     scene = await worker.scene_cache.get(body.scene or "")
     state = await asyncio.to_thread(ScenarioState.of, scene)
-    return DatasetSource(ScenarioDrive(scene, state), {"operations": []})
+    return await _edited_source(scene, state, body, {"operations": []})
+
+
+async def _edited_source(
+    scene: Scene, state: ScenarioState, body: DatasetRequest, made_of: dict[str, Any]
+) -> DatasetSource:
+    if body.sweep is None:
+        return DatasetSource([Variant(ScenarioDrive(scene, state))], made_of)
+    variants = await asyncio.to_thread(swept, scene, state, body.sweep, body.seed)
+    made_of["sweep"] = body.sweep.model_dump(mode="json", exclude_none=True)
+    return DatasetSource(variants, made_of)
 
 
 def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
@@ -158,4 +170,4 @@ async def _episode_source(worker: Worker, recording: Recording, name: str) -> Da
     scene = await worker.scene_cache.get(name)
     find = worker.assets.find
     drive = await asyncio.to_thread(lambda: EpisodeDrive.of(recording, scene, assets=find))
-    return DatasetSource(drive, {"episode": recording.digests[-1]})
+    return DatasetSource([Variant(drive)], {"episode": recording.digests[-1]})

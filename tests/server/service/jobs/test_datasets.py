@@ -140,6 +140,16 @@ def test_the_episode_of_a_session_and_its_recording_give_the_same_bytes(client, 
     assert file_of(client, running, "dataset.tar") == file_of(client, stored, "dataset.tar")
 
 
+def test_a_sweep_is_exported_value_by_value(client):
+    sweep = {
+        "parameters": {"gap": {"values": [1.0, 3.0]}},
+        "operations": [{"op": "translate", "object_id": "car_blue", "x": "$gap"}],
+    }
+    job = succeeded(client, sweep=sweep, end_us=0)
+    clips = json.loads(file_of(client, job, "manifest.json"))["clips"]
+    assert [clip["values"] for clip in clips.values()] == [{"gap": 1.0}, {"gap": 3.0}]
+
+
 def test_a_session_is_not_exported_without_its_token(client, session):
     asked = {k: v for k, v in ASKED.items() if k != "scene"} | {"session": session["id"]}
     answer = client.post("/v1/exports", json=asked)

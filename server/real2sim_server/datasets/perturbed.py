@@ -1,0 +1,191 @@
+"""Drives beside the recorded path that find back to it: recovery data for planners.
+
+The ego of a clip starts to the side of its path and turned, and a plan brings it back: the offset
+to the path is a polynomial of fifth order in the way driven, with the slope of the turned heading
+at the start and none at the end. Cameras and LiDAR see what they would have seen there, and the
+ego's future is that plan. After SimScale (arXiv 2511.23369), whose pseudo-expert plans back too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..edit import ObjectState, PlacedObjects
+from ..geometry.box import box_penetration
+from ..geometry.rotation import Float
+from ..geometry.transform import invert_transform
+from ..scene import Lidar, Scene
+from .drive import Drive, MetSweep, Moment
+
+STEP_US = 50_000
+"""Between poses of which the way driven is measured [us]."""
+LEAST_WAY = 8.0
+"""The way back is at least so long [m]."""
+TRIES = 20
+"""Draws in search of one that is clear of every object; each after the first is smaller."""
+SMALLER = 0.85
+LIMIT = 2.5
+"""Draws are cut at so many standard deviations."""
+CHECK_US = 500_000
+CLEAR_M = 0.3
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Where the ego of each clip starts.
+
+    Attributes:
+        lateral_sigma: standard deviation beside its path [m].
+        heading_sigma: of its heading against the path [rad].
+        recover_s: time in which it finds back, at the speed that it has at the start [s].
+        copies: of each clip, each with a start of its own.
+    """
+
+    lateral_sigma: float = 0.5
+    heading_sigma: float = 0.07
+    recover_s: float = 3.0
+    copies: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class PerturbedDrive:
+    """A drive of which the ego begins beside its path.
+
+    Attributes:
+        base: as it was driven.
+        lateral: offset at the start, to the left [m].
+        heading: at the start, to the left [rad].
+        times_us, way: way driven [m] at instants from the start of the clip on.
+        length: way on which it finds back [m].
+    """
+
+    base: Drive
+    lateral: float
+    heading: float
+    times_us: Float
+    way: Float
+    length: float
+
+    @classmethod
+    def beside(
+        cls, base: Drive, start_us: int, lateral: float, heading: float, recover_s: float
+    ) -> PerturbedDrive:
+        """A drive that is beside ``base`` at ``start_us`` and on it from then on again."""
+        times = np.arange(start_us, base.span[1] + 1, STEP_US)
+        places = np.array([base.ego_at(int(t))[:2, 3] for t in times])
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        way = np.concatenate([[0.0], np.cumsum(steps)])
+        # Speed over the first half second, whatever the steps of an episode are.
+        first = min(10, len(way) - 1)
+        speed = way[first] / max(first * STEP_US * 1e-6, 1e-6)
+        length = max(LEAST_WAY, speed * recover_s)
+        return cls(base, lateral, heading, times.astype(np.float64), way, float(length))
+
+    @property
+    def scene(self) -> Scene:
+        """See :class:`Drive`."""
+        return self.base.scene
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """See :class:`Drive`."""
+        return self.base.span
+
+    def at(self, t_us: int) -> Moment:
+        """See :class:`Drive`."""
+        return replace(self.base.at(t_us), T_world_ego=self.ego_at(t_us))
+
+    def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
+        """See :class:`Drive`."""
+        return self.base.placed_at(t_us)
+
+    def ego_at(self, t_us: int) -> Float:
+        """See :class:`Drive`."""
+        lateral, heading = self.offset_at(t_us)
+        moved: Float = self._moved(self.base.ego_at(t_us)[None], lateral, heading)[0]
+        return moved
+
+    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+        """See :class:`Drive`."""
+        met = self.base.sweep_at(lidar, t_us)
+        times = t_us + lidar.beams.slots[0]
+        ends = [self.offset_at(round(t)) for t in (times[0], times[-1])]
+        span = [times[0], max(times[-1], times[0] + 1)]
+        lateral, heading = (np.interp(times, span, pair) for pair in zip(*ends, strict=True))
+        mount = lidar.T_vehicle_lidar
+        ego = self._moved(met.T_world_lidar @ invert_transform(mount), lateral, heading)
+        return MetSweep(met.things, ego @ mount)
+
+    def offset_at(self, t_us: int) -> tuple[float, float]:
+        """How far it is beside its path, to the left [m], and how it is turned against it [rad]."""
+        share = min(float(np.interp(t_us, self.times_us, self.way)) / self.length, 1.0)
+        slope = math.tan(self.heading) * self.length
+        offset, rise = _quintic(share, self.lateral, slope)
+        return offset, math.atan(rise / self.length)
+
+    def _moved(self, ego: Float, lateral: Float | float, heading: Float | float) -> Float:
+        """Poses [N, 4, 4] shifted to their left and turned, as high above the ground as before."""
+        moved = ego.copy()
+        moved[:, :3, 3] += ego[:, :3, 1] * np.broadcast_to(lateral, len(ego))[:, None]
+        ground = self.scene.ground
+        rise = ground.height_at(moved[:, :2, 3]) - ground.height_at(ego[:, :2, 3])
+        moved[:, 2, 3] = ego[:, 2, 3] + np.where(np.isfinite(rise), rise, 0.0)
+        turn = np.zeros((len(ego), 3, 3))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(heading)
+        turn[:, 1, 0] = np.sin(heading)
+        turn[:, 0, 1] = -turn[:, 1, 0]
+        turn[:, 2, 2] = 1
+        moved[:, :3, :3] = ego[:, :3, :3] @ turn
+        return moved
+
+
+def perturbed(
+    drive: Drive, perturbation: Perturbation, times_us: Sequence[int], seed: Sequence[int]
+) -> PerturbedDrive:
+    """The drive of a clip from a start that ``seed`` draws, and that is clear of every object.
+
+    After TRIES draws that are not, it starts on its path.
+    """
+    rng = np.random.default_rng(list(seed))
+    for k in range(TRIES):
+        lateral, heading = np.clip(rng.standard_normal(2), -LIMIT, LIMIT) * SMALLER**k
+        found = PerturbedDrive.beside(
+            drive,
+            times_us[0],
+            float(lateral * perturbation.lateral_sigma),
+            float(heading * perturbation.heading_sigma),
+            perturbation.recover_s,
+        )
+        if _is_clear(found, times_us):
+            return found
+    return PerturbedDrive.beside(drive, times_us[0], 0.0, 0.0, perturbation.recover_s)
+
+
+def _is_clear(drive: PerturbedDrive, times_us: Sequence[int]) -> bool:
+    length, width, height = drive.scene.ego_size
+    centre = np.eye(4)
+    # From the rear axle, on the ground, to the middle of the vehicle.
+    centre[:3, 3] = length / 4, 0.0, height / 2 + CLEAR_M
+    size = (length + CLEAR_M, width + CLEAR_M, height)
+    for t_us in range(times_us[0], times_us[-1] + 1, CHECK_US):
+        placed = drive.placed_at(t_us)
+        if not len(placed.objects):
+            continue
+        ego = drive.ego_at(t_us) @ centre
+        if (box_penetration(ego, size, placed.transforms, placed.sizes) > 0).any():
+            return False
+    return True
+
+
+def _quintic(share: float, start: float, slope: float) -> tuple[float, float]:
+    """Value and derivative at ``share`` of the way from ``start`` and ``slope`` to 0, level and
+    without curvature at the end, without curvature at the start."""
+    a, b = -10 * start - 6 * slope, 15 * start + 8 * slope
+    c = -6 * start - 3 * slope
+    u = share
+    value = start + slope * u + a * u**3 + b * u**4 + c * u**5
+    return value, slope + 3 * a * u**2 + 4 * b * u**3 + 5 * c * u**4
