@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from real2sim_proto.episode import SensorSpec
     from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
+    from real2sim_proto.ranging import LidarSpec, RadarSpec
 
     from ._async.client import AsyncClient, connect_async
     from ._async.drive_batch import AsyncDriveBatch
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from ._sync.drive_batch import DriveBatch
     from ._sync.drive_session import DriveSession
     from .batch_observation import BatchImages, BatchObservation
+    from .clouds import LidarCloud, PointCloud, RadarCloud
     from .env import DriveEnv
     from .errors import (
         BadStepError,
@@ -87,13 +89,18 @@ __all__ = [
     "InvalidActionError",
     "InvalidOperationError",
     "InvalidRequestError",
+    "LidarCloud",
+    "LidarSpec",
     "MalformedReplyError",
     "NotFoundError",
     "NotOpenError",
     "NotResetError",
     "Observation",
+    "PointCloud",
     "PoseCommand",
     "ProtocolMismatchError",
+    "RadarCloud",
+    "RadarSpec",
     "Real2SimError",
     "ReplyTimeoutError",
     "SensorSpec",
@@ -125,8 +132,13 @@ _ELSEWHERE = {
     "DriveSession": "real2sim._sync.drive_session",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",
+    "LidarCloud": "real2sim.clouds",
+    "LidarSpec": "real2sim_proto.ranging",
     "Observation": "real2sim.observation",
+    "PointCloud": "real2sim.clouds",
     "PoseCommand": "real2sim_proto.plans",
+    "RadarCloud": "real2sim.clouds",
+    "RadarSpec": "real2sim_proto.ranging",
     "SensorSpec": "real2sim_proto.episode",
     "TrajectoryPlan": "real2sim_proto.plans",
     "View": "real2sim.observation",

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from real2sim_proto.plans import Control
 
 from ._references import ScenarioRef, SceneRef
-from ._sensors import Sensor
+from ._sensors import LidarSensor, RadarSensor, Sensor
 from ._sync.client import connect
+from .clouds import PointCloud
 from .observation import Observation
 
 Obs = dict[str, NDArray[Any]]
@@ -42,6 +43,13 @@ FAR = 1e4
 AGENTS = 16
 """Road users that a vehicle without cameras is told of."""
 AGENT_FIELDS = 9
+
+POINTS = 8192
+"""Rows of a LiDAR in observations, if nobody says how many."""
+DETECTIONS = 256
+"""Rows of a radar."""
+CLOUD_FIELDS = {"lidar": ("intensity",), "radar": ("velocity", "rcs")}
+"""Columns behind x, y, z."""
 
 FORMS: dict[str, tuple[float, type[np.generic]]] = {
     "rgb": (255, np.uint8),
@@ -64,7 +72,10 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     [H, W, 3], and what else a sensor shows: ``front/depth`` [H, W] float32 [m], ``front/instance``
     [H, W] uint16. ``agents`` [N, 9] float32 are the N road users nearest to the vehicle, in its
     frame: 1, x, y [m], cosine and sine of the heading, velocity along x and y [m/s], length, width
-    [m]; rows of zeros where there are fewer.
+    [m]; rows of zeros where there are fewer. A LiDAR under its name is [P, 4] float32, x, y, z [m]
+    and intensity; of more returns than P every so manieth is shown. A radar is [256, 5] float32, x,
+    y, z, radial velocity [m/s] and RCS [dBsm], the nearest first. Rows of zeros where there are
+    fewer; a slower sensor keeps its last image or cloud until the next one is due.
 
     Reward: metres of way along the route, less 10 for a contact that the ego is to blame for, less
     0.1 for a step off the road. ``info`` has ``metrics``, ``events`` and what the seed has
@@ -77,7 +88,10 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         url, token: of the worker; defaults as of :func:`real2sim.connect`.
         scene, scenario: exactly one of them, or its name or id.
         sensors: camera names or specs; a spec says which modalities.
-        agents: how many road users are shown; default: 16 without sensors, else none.
+        lidars, radars: names of the worker's catalogues or specs, as of ``DriveSession.reset``.
+        points: P, rows of each LiDAR.
+        agents: how many road users are shown; default: 16 without any sensors, else
+            none.
         options: of ``DriveSession.reset``; ``seed`` and ``action`` are the environment's, and
             ``privileged`` where it shows agents.
 
@@ -95,6 +109,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         scene: SceneRef | None = None,
         scenario: ScenarioRef | None = None,
         sensors: Sequence[Sensor] = (),
+        lidars: Sequence[LidarSensor] = (),
+        radars: Sequence[RadarSensor] = (),
+        points: int = POINTS,
         agents: int | None = None,
         render_mode: str | None = None,
         options: Mapping[str, Any] | None = None,
@@ -105,12 +122,20 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             raise ValueError("render_mode 'rgb_array' shows the first camera; name one in sensors")
         self.render_mode = render_mode
         self._sensors = list(sensors)
-        self._agents = agents if agents is not None else 0 if sensors else AGENTS
+        self._ranging: dict[str, Any] = {}
+        self._ranging |= {"lidars": list(lidars)} if lidars else {}
+        self._ranging |= {"radars": list(radars)} if radars else {}
+        self._rows = {"lidar": points, "radar": DETECTIONS}
+        if points < 1:
+            raise ValueError(f"points is {points!r}; give rows of each LiDAR, 1 or more")
+        blind = not sensors and not self._ranging
+        self._agents = agents if agents is not None else AGENTS if blind else 0
         if self._agents < 0:
             raise ValueError(f"agents is {agents!r}; give how many road users are shown, 0 or more")
         self._options = dict(options or {})
         self._fixed = {"action": "control"} | ({"privileged": True} if self._agents else {})
         self._images: dict[str, NDArray[Any]] = {}
+        self._clouds: dict[str, NDArray[np.float32]] = {}
         with contextlib.ExitStack() as opened:
             self._client = connect(url, token=token)
             opened.callback(self._client.close)
@@ -188,7 +213,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
 
     def _begin(self, seed: int, options: Mapping[str, Any] | None = None) -> Observation:
         chosen: Any = self._options | dict(options or {}) | {"seed": seed} | self._fixed
-        return self._session.reset(sensors=self._sensors, **chosen)
+        return self._session.reset(sensors=self._sensors, **self._ranging | chosen)
 
     def _space(self, obs: Observation) -> Any:
         parts: dict[str, spaces.Space[Any]] = {
@@ -198,6 +223,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         for name, image in _images_in(obs):
             most, dtype = FORMS[name.partition("/")[2] or "rgb"]
             parts[name] = spaces.Box(0, most, image.shape, dtype)
+        for name, cloud in obs.clouds.items():
+            shape = (self._rows[cloud.modality], 3 + len(CLOUD_FIELDS[cloud.modality]))
+            parts[name] = spaces.Box(-FAR, FAR, shape, np.float32)
         if self._agents:
             parts["agents"] = spaces.Box(-FAR, FAR, (self._agents, AGENT_FIELDS), np.float32)
         return spaces.Dict(parts)
@@ -215,7 +243,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         for name, image in _images_in(obs):
             most, dtype = FORMS[name.partition("/")[2] or "rgb"]
             self._images[name] = np.minimum(image, most).astype(dtype)
-        return seen | self._images
+        for name, cloud in obs.clouds.items():
+            self._clouds[name] = _rows_of(cloud, self._rows[cloud.modality])
+        return seen | self._images | self._clouds
 
     @staticmethod
     def _info(obs: Observation) -> dict[str, Any]:
@@ -232,6 +262,17 @@ def _images_in(obs: Observation) -> Iterator[tuple[str, NDArray[Any]]]:
         for modality in modalities:
             name = camera if modality == "rgb" else f"{camera}/{modality}"
             yield name, obs.image(camera, modality)
+
+
+def _rows_of(cloud: PointCloud, count: int) -> NDArray[np.float32]:
+    """[count, 3 + columns]; see :class:`DriveEnv`."""
+    columns = [cloud.points, *(cloud.columns[n][:, None] for n in CLOUD_FIELDS[cloud.modality])]
+    found = np.concatenate(columns, axis=1).astype(np.float32)
+    if len(found) > count and cloud.modality == "lidar":
+        found = found[np.arange(count) * len(found) // count]
+    rows = np.zeros((count, found.shape[1]), np.float32)
+    rows[: len(found)] = np.clip(found[:count], -FAR, FAR)
+    return rows
 
 
 def _nearest_agents(obs: Observation, count: int) -> NDArray[np.float32]:

@@ -22,8 +22,8 @@ SEMANTIC_CLASSES: dict[str, int] = {
     "bicycle": 33,
 }
 """Number in the image by name. ``static`` is the background, ``ground`` the part of it that is
-driven or walked on where that is told apart (exported data sets), ``dynamic`` an object of another
-category, ``unlabeled`` where nothing is and the scene has no sky."""
+driven or walked on (what is within 15 cm of the fitted ground's height), ``dynamic`` an object of
+another category, ``unlabeled`` where nothing is and the scene has no sky."""
 
 CLASS_OF_CATEGORY = {
     "car": "car",

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from real2sim_proto.semantics import GROUND, STATIC
 
 from ..geometry.rotation import Float
-from ..scene import Ground
+from ..scene import Camera, Ground
+from .lens_view import tables_of
 
 TOLERANCE = 0.15
 """What is nearer to the ground's height than this shows it [m]."""
@@ -51,3 +52,41 @@ def with_ground(
     above = shown[:, 2] - ground.height_at(shown[:, :2])
     found[background] = np.where(np.abs(above) < tolerance, GROUND, STATIC)
     return found
+
+
+def with_ground_seen(
+    semantic: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    camera: Camera,
+    T_world_camera: Float,
+    ground: Ground,
+) -> NDArray[np.uint8]:
+    """The same by any camera, also with a lens; points are found of the background alone.
+
+    Args:
+        semantic: [H, W], in which the ground is ``static``.
+        depth: [H, W] median depth of the same pass, as the camera's lens has it [m].
+        camera: that looks.
+        T_world_camera: [4, 4], in the middle of a read-out.
+        ground: of the scene.
+    """
+    found = semantic.copy()
+    rows, columns = np.nonzero((semantic == STATIC) & (depth > 0))
+    points = _rays(camera, rows, columns) * depth[rows, columns, None]
+    turn = T_world_camera[:3, :3].astype(np.float32)
+    shown = points @ turn.T + T_world_camera[:3, 3].astype(np.float32)
+    near = np.abs(shown[:, 2] - ground.height_at(shown[:, :2])) < TOLERANCE
+    found[rows[near], columns[near]] = GROUND
+    return found
+
+
+def _rays(camera: Camera, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Of pixels, [P, 3] in the camera's frame, to where its depth images have depth 1."""
+    if camera.is_pinhole:
+        K = camera.K
+        x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
+        return np.stack([x, y, np.ones(len(x))], axis=-1).astype(np.float32)
+    rays: NDArray[np.float32] = tables_of(camera).rays[rows, columns]
+    if camera.lens is None or camera.lens.perspective:
+        rays = (rays / np.maximum(rays[:, 2:], 1e-6)).astype(np.float32)
+    return rays

@@ -7,16 +7,36 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from real2sim_proto import encode
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
+from real2sim_server.geometry.transform import transform_from
+from real2sim_server.world.ranging import Cloud
 from real2sim_server.world.recording.mcap_file import mcap_bytes, recording_in, save_mcap
+from real2sim_server.world.recording.recorded_clouds import cloud_document
 from real2sim_server.world.recording.recording import RecordingError, record, to_bytes
 from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
 
+CLOUD = Cloud(
+    sensor="top",
+    modality="lidar",
+    t_us=5_300_000,
+    duration_us=100_000,
+    frame="sensor",
+    compensated=True,
+    T_vehicle_sensor=np.eye(4),
+    T_world_sensor=transform_from(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0, 0, 0])),
+    columns={
+        "points": np.array([[1, 2, 3], [4, 5, 6]], np.float32),
+        "intensity": np.array([0.25, 0.5], np.float32),
+        "ring": np.array([7, 9], np.uint16),
+    },
+)
 PICTURE = b"\xff\xd8 a picture"
 
 
@@ -30,7 +50,9 @@ def recording(make_scene, moving):
         plan = TrajectoryPlan(times_us=times, poses=[(k + 1.0, 0.0, 0.0) for k in range(10)])
         log.append(Entry("action", step, action_payload(plan)))
     made = record(Replayer.on(scene, ScenarioState.of(scene)), log, scene_hash="abc")
-    return replace(made, frames={"frames/front/rgb/000002.jpg": PICTURE})
+    frames = {"frames/front/rgb/000002.jpg": PICTURE}
+    frames["frames/top/lidar/000003.cloud"] = encode(cloud_document(CLOUD))
+    return replace(made, frames=frames)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +67,29 @@ def messages(recording, tmp_path_factory):
             content = json.loads(message.data)
             found.setdefault(channel.topic, []).append((schema.name, message.log_time, content))
     return found
+
+
+def test_point_clouds_are_those_that_viewers_know(messages):
+    [(schema, at, cloud)] = messages["/lidar/top"]
+    assert (schema, at) == ("foxglove.PointCloud", 5_300_000_000)
+    assert cloud["frame_id"] == "world"
+    assert cloud["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+    assert [(f["name"], f["offset"], f["type"]) for f in cloud["fields"]] == [
+        ("x", 0, 7),
+        ("y", 4, 7),
+        ("z", 8, 7),
+        ("intensity", 12, 7),
+        ("ring", 16, 3),
+    ]
+    data = base64.b64decode(cloud["data"])
+    assert len(data) == 2 * cloud["point_stride"]
+    assert np.frombuffer(data[18:30], "<f4").tolist() == [4.0, 5.0, 6.0]
+
+
+def test_a_broken_cloud_is_refused_by_its_name(recording):
+    broken = replace(recording, frames={"frames/top/lidar/000003.cloud": b"nothing"})
+    with pytest.raises(RecordingError, match="top/lidar/3 is no point cloud"):
+        mcap_bytes(broken)
 
 
 def test_the_recording_comes_back_whole(recording, tmp_path):

@@ -88,6 +88,34 @@ class EffectImage:
             self._drawn = None
 
 
+class GroundImage:
+    """A semantic image in which the ground gets its class when somebody waits for it, on whatever
+    thread.
+
+    Attributes:
+        pixels: [H, W] uint8; whole once :meth:`ready` has returned.
+    """
+
+    def __init__(
+        self,
+        drawn: NDArray[np.uint8],
+        wait: Callable[[], object],
+        find: Callable[[], NDArray[np.uint8]],
+    ) -> None:
+        self.pixels = np.empty_like(drawn)
+        self._wait, self._find = wait, find
+        self._lock = threading.Lock()
+        self._done = False
+
+    def ready(self) -> None:
+        """Return when the pixels are there; any number of times."""
+        with self._lock:
+            if not self._done:
+                self._wait()
+                self.pixels[:] = self._find()
+                self._done = True
+
+
 def blurred(
     view: RigView, blur: MotionBlurSpec, draw: Callable[[RigView], NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:

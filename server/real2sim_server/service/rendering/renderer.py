@@ -33,6 +33,7 @@ from ...render import (
 )
 from ...render.backends import device_of
 from ...render.frame import at_once
+from ...render.ground_class import with_ground_seen
 from ...render.jpeg import JpegEncoder, jpeg_encoder_for, turbo_jpeg
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
@@ -44,7 +45,7 @@ from ..library.memory import MemoryBudget
 from .frames import EncodedFrame, RenderedImage, encode_frame
 from .lens_kernels import LensKernels
 from .levels import DetailLevels
-from .optics import EffectImage, blurred, camera_with
+from .optics import EffectImage, GroundImage, blurred, camera_with
 
 log = structlog.get_logger(__name__)
 
@@ -295,6 +296,8 @@ class Renderer:
             frame.ready,
             camera,
         )
+        if name == "semantic":
+            return _with_ground(image, request.scene, frame, camera)
         effects = sensor.effects
         if effects is None or name != "rgb" or not effects.names:
             return image
@@ -353,13 +356,26 @@ def _sensors_by_options(sensors: Sequence[SensorSpec]) -> dict[RasterOptions, li
     found: dict[RasterOptions, list[int]] = {}
     for i, sensor in enumerate(sensors):
         options = replace(DEFAULT_OPTIONS, detail=sensor.detail)
-        found.setdefault(options_for(sensor.modalities, options), []).append(i)
+        found.setdefault(options_for(_modalities([sensor]), options), []).append(i)
     return found
 
 
+def _with_ground(image: RenderedImage, scene: Scene, frame: Frame, camera: Camera) -> RenderedImage:
+    """A semantic image in which the ground has its own class."""
+
+    def found() -> NDArray[np.uint8]:
+        depth = frame.images["median_depth"]
+        return with_ground_seen(image.pixels, depth, camera, frame.T_world_camera, scene.ground)
+
+    made = GroundImage(image.pixels, image.ready, found)
+    return replace(image, pixels=made.pixels, ready=made.ready)
+
+
 def _modalities(sensors: Iterable[SensorSpec]) -> tuple[str, ...]:
-    """Everything that one of the sensors wants, each once."""
+    """Everything that one of the sensors wants, each once, and what it is found by."""
     wanted = {name for sensor in sensors for name in sensor.modalities}
+    if "semantic" in wanted:
+        wanted.add("median_depth")
     return tuple(name for name in modality_names() if name in wanted)
 
 

@@ -59,6 +59,7 @@ class EncodedObservation:
         message: for all who get it, whole.
         timing_ms: by stage.
         placed: for the client that is answered, where its images lie in shared memory.
+        clouds: of the message.
     """
 
     world: World
@@ -66,6 +67,7 @@ class EncodedObservation:
     message: EncodedMessage
     timing_ms: Mapping[str, float]
     placed: EncodedMessage | None = None
+    clouds: Sequence[Cloud] = ()
 
     @property
     def answer(self) -> EncodedMessage:
@@ -104,4 +106,6 @@ def with_frames(
     placed = None
     if lying is not None:
         placed = pack_with_frames(kind, members, lying, timer, clouds=clouds)
-    return EncodedObservation(rendered.world, frames, message, timer.timing_ms, placed)
+    return EncodedObservation(
+        rendered.world, frames, message, timer.timing_ms, placed, rendered.clouds
+    )

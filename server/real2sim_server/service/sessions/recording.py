@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from real2sim_proto import ErrorCode
+from real2sim_proto import ErrorCode, encode
 
 from ...world import World
+from ...world.ranging import MountedLidar, MountedRadar, RangingSensors
+from ...world.recording.recorded_clouds import cloud_document
 from ...world.recording.recording import Recording, record, to_bytes
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ..http.problems import ServiceError
 from ..rendering.frames import EncodedFrame
+from .observation import EncodedObservation
 from .pipeline import StepPipeline
 from .registry import Sessions
 from .session import EpisodeStart, Session
@@ -83,9 +86,16 @@ async def _frames(
         world = await pipeline.on_world_thread(replayer.apply, entry)
         if entry.kind not in {"reset", "action"}:
             continue
-        for frame in await _drawn(pipeline, world):
+        shown = await _drawn(pipeline, world)
+        if shown is None:
+            continue
+        for frame in shown.frames:
             images[_name(frame, world.steps)] = bytes(frame.data)
             total += len(frame.data)
+        for cloud in shown.clouds:
+            packed = encode(cloud_document(cloud))
+            images[f"frames/{cloud.sensor}/{cloud.modality}/{world.steps:06d}.cloud"] = packed
+            total += len(packed)
         if total > MAX_FRAMES_BYTES:
             raise ServiceError(
                 ErrorCode.PAYLOAD_TOO_LARGE,
@@ -95,12 +105,18 @@ async def _frames(
     return images
 
 
-async def _drawn(pipeline: StepPipeline, world: World) -> list[EncodedFrame]:
+async def _drawn(pipeline: StepPipeline, world: World) -> EncodedObservation | None:
+    """What the sensors that are due show; None where none is."""
     sensors = [
         s.model_copy(update={"codec": "png"}) if s.codec == "raw" else s
         for s in world.due_sensors()
     ]
-    return list((await pipeline.view(world, sensors)).frames) if sensors else []
+    due = world.due_ranging()
+    ranging = RangingSensors(
+        tuple(m for m in due if isinstance(m, MountedLidar)),
+        tuple(m for m in due if isinstance(m, MountedRadar)),
+    )
+    return await pipeline.view(world, sensors, ranging=ranging) if sensors or due else None
 
 
 def _name(frame: EncodedFrame, step: int) -> str:

@@ -21,6 +21,7 @@ from typing import Any
 
 from .. import scoring
 from ..scoring import Instant
+from .recorded_clouds import SUFFIX, foxglove_cloud
 from .recording import Recording, RecordingError, recording_of_bytes, to_bytes
 
 MEDIA_TYPE = "application/vnd.real2sim.episode"
@@ -36,10 +37,11 @@ EGO: Topic = ("/ego", "real2sim.Ego")
 METRICS: Topic = ("/metrics", "real2sim.Metrics")
 CONTACT: Topic = ("/contact", "real2sim.Contact")
 IMAGE_SCHEMA = "foxglove.CompressedImage"
+CLOUD_SCHEMA = "foxglove.PointCloud"
 
 
 def save_mcap(recording: Recording, path: Path) -> Path:
-    """Write the episode atomically: poses, objects, plans, contacts, scores and images by topic.
+    """Write the episode atomically: poses, objects, plans, contacts, scores, images and clouds.
 
     Raises:
         RecordingError: the ``mcap`` extra is not installed.
@@ -130,6 +132,11 @@ def _messages(recording: Recording) -> Iterator[tuple[Topic, int, dict[str, Any]
         metrics = scoring.running_metrics(accumulator, recording.context)
         yield METRICS, t_us, {"timestamp": stamp, **metrics}
         for name, suffix, data in frames.get(instant.step, ()):
+            if suffix == SUFFIX:
+                sensor, modality = name.split("/")
+                cloud = foxglove_cloud(data, f"{name}/{instant.step}", stamp)
+                yield (f"/{modality}/{sensor}", CLOUD_SCHEMA), t_us, cloud
+                continue
             yield (f"/camera/{name}", IMAGE_SCHEMA), t_us, _image(name, suffix, data, stamp)
 
 
@@ -248,7 +255,7 @@ def _colour(colour: tuple[float, float, float]) -> dict[str, float]:
 def _channel(writer: Any, name: str, schema: str, example: dict[str, Any]) -> int:
     """A topic whose JSON schema says what its first message shows."""
     described = _described(example) | {"title": schema}
-    if schema == IMAGE_SCHEMA:
+    if schema in {IMAGE_SCHEMA, CLOUD_SCHEMA}:
         described["properties"]["data"]["contentEncoding"] = "base64"
     data = json.dumps(described).encode()
     schema_id = writer.register_schema(schema, "jsonschema", data)

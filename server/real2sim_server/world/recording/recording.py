@@ -8,7 +8,8 @@ The file is a zip archive:
 - ``instants.msgpack``: what the scores need of every step, and a digest of its observation;
 - ``context.msgpack``: what stays the same for the scores;
 - ``state.msgpack``: how the scenario differed from the scene, where it began from one;
-- ``frames/<camera>/<step>.jpg`` and ``.png``: images, where requested.
+- ``frames/<camera>/<modality>/<step>.jpg`` and ``.png``: images, where requested, and
+  ``frames/<sensor>/lidar|radar/<step>.cloud``: point clouds (msgpack).
 
 Everything but the frames is the same bytes for the same episode.
 """

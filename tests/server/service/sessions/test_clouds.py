@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 import zlib
 
 import numpy as np
 import pytest
 
+import real2sim
 from real2sim_proto import decode
 from real2sim_server.render.cast.warm_up import warm_up_casting
+from real2sim_server.world.recording.recording import load_recording
 
 pytestmark = pytest.mark.network
 
@@ -26,6 +29,13 @@ EPISODE = {"dt_us": 50_000, "lidars": [TOP], "radars": [{"radar": "corner"}]}
 def casting_kernels():
     """On disk, so that no reset waits for them."""
     warm_up_casting()
+
+
+def wait_until(holds):
+    until = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 def columns(cloud):
@@ -158,3 +168,55 @@ def test_snapshots_bring_back_the_sweep(planner):
     planner.act(2)
     again = planner.ask("restore", name="here")
     assert [c["data"] for c in again["clouds"]] == [c["data"] for c in there["clouds"]]
+
+
+def test_a_session_that_is_rebuilt_goes_on_with_the_same_sweep(site, join):
+    whole = join(site.create())
+    whole.reset(**EPISODE)
+    expected = [whole.act(step) for step in range(4)][-1]["clouds"]
+    info = site.create()
+    first = join(info)
+    first.reset(**EPISODE)
+    for step in range(3):
+        first.act(step)
+    first.stack.close()
+    session = site.session(info)
+    wait_until(lambda: not session.connected)
+    site.worker.sessions.evict(session)
+    again = join(info)
+    assert [c["data"] for c in again.act(3)["clouds"]] == [c["data"] for c in expected]
+
+
+def test_recordings_keep_clouds_beside_images(site, tmp_path):
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        session.reset(dt_us=50_000, action="control", lidars=[TOP])
+        for _ in range(2):
+            obs = session.step({"kind": "control", "acceleration": 0.5, "steering": 0.0})
+        path = session.save_recording(tmp_path / "drive.r2e", frames=True)
+    kept = load_recording(path).frames
+    assert sorted(kept) == ["frames/top/lidar/000000.cloud", "frames/top/lidar/000002.cloud"]
+    found = dict(decode(kept["frames/top/lidar/000002.cloud"])["columns"])
+    np.testing.assert_array_equal(found["points"], obs.lidar("top").points)
+
+
+def test_clouds_of_the_sdk_go_to_files_and_to_the_world(site, tmp_path):
+    with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+        deflated = TOP | {"codec": "deflate", "frame": "vehicle"}
+        session.reset(dt_us=50_000, lidars=[TOP], privileged=True)
+        view = session.render(lidars=[deflated])
+        plain = session.render(lidars=[TOP])
+    packed, raw = view.lidar("top"), plain.lidar("top")
+    np.testing.assert_allclose(packed.in_world(), raw.in_world(), atol=1e-4)
+    for suffix in ("ply", "npz"):
+        assert raw.save(tmp_path / f"sweep.{suffix}").stat().st_size > 12 * raw.count
+    with pytest.raises(KeyError, match="top"):
+        view.radar("top")
+
+
+def test_semantic_images_tell_the_ground(planner):
+    sensors = [{"camera": "front", "modalities": ["semantic", "instance"], "detail": "full"}]
+    frames = planner.reset(sensors=sensors)["frames"]
+    semantic = np.frombuffer(frames[0]["data"], np.uint8)
+    assert (semantic == 6).any()
+    instance = np.frombuffer(frames[1]["data"], np.uint16)
+    assert not (semantic[instance > 0] == 6).any()

@@ -48,6 +48,27 @@ def test_seeds_change_nothing_where_nothing_is_randomized(env):
     assert all((first[k] == other[k]).all() for k in first)
 
 
+def test_lidars_and_radars_are_rows_of_numbers(site):
+    made = real2sim.make_env(
+        url=site.url, scene="tiny", lidars=["vlp-16"], radars=["corner"], points=64
+    )
+    try:
+        assert made.observation_space["vlp-16"].shape == (64, 4)
+        obs, _ = made.reset(seed=0)
+        assert made.observation_space.contains(obs)
+        assert obs["vlp-16"].any()
+        assert obs["corner"].shape == (256, 5)
+        # Every so manieth return, not the first ones.
+        sweep = made.last.lidar("vlp-16")
+        assert sweep.count > 64
+        np.testing.assert_array_equal(
+            obs["vlp-16"][:, :3], sweep.points[np.arange(64) * sweep.count // 64]
+        )
+        assert "agents" not in obs
+    finally:
+        made.close()
+
+
 def test_an_episode_by_random_actions_ends(env):
     env.action_space.seed(0)
     obs, _ = env.reset(seed=1)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import real2sim
+from real2sim_server.render.cast.warm_up import warm_up_casting
 from real2sim_server.scene.io import save_scene
 
 from ...worker_processes import KillableWorker, killable_worker
@@ -140,6 +141,13 @@ def test_an_unknown_snapshot_is_refused(site):
 
 # --- a worker that is killed ------------------------------------------------------------------
 
+BEAMS = {"kind": "spinning", "elevation_deg": [-2, 0, 2], "columns": 90}
+FAN = {
+    "lidar": "fan",
+    "model": {"name": "fan", "beams": BEAMS, "range_noise_m": 0.05},
+    "period_us": 200_000,
+}
+
 
 @pytest.fixture(scope="module")
 def killable(tmp_path_factory, tiny_scene) -> Iterator[KillableWorker]:
@@ -157,11 +165,15 @@ def drive(
 
     Kills come ``delay`` seconds after the episode has reached a step, whatever it does then.
     """
+    warm_up_casting()  # on disk, so that no reset waits for it
     killers = ThreadPoolExecutor(1)
     with killers, real2sim.connect(worker.url) as client:
         client.wait_ready(120)  # the kill before may have come after the last answer
         with client.session(scene="tiny", reconnect=240) as session:
-            seen = [hashed(session.reset(seed=5, sensors=SENSORS, privileged=True))]
+            first = session.reset(
+                seed=5, sensors=SENSORS, lidars=[FAN], radars=["corner"], privileged=True
+            )
+            seen = [hashed(first)]
             for step in range(STEPS):
                 if step == 4:
                     session.edit([{"op": "translate", "object_id": "post", "y": -1.0}])
@@ -180,6 +192,8 @@ def plan(step: int) -> dict:
 def hashed(obs: real2sim.Observation) -> str:
     digest = hashlib.sha256(obs.image("front").tobytes())
     digest.update(obs.image("front", "depth").tobytes() + np.ascontiguousarray(obs.route).tobytes())
+    for cloud in obs.clouds.values():
+        digest.update(cloud.wire.data)
     digest.update(obs.ego.model_dump_json().encode())
     digest.update(json.dumps([a.model_dump() for a in obs.agents]).encode())
     digest.update(json.dumps([e.model_dump() for e in obs.events]).encode())
