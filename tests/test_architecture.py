@@ -27,6 +27,7 @@ LAYERS = (
     "_nvrtc",
     "_confined",
     "_npy",
+    "_records",
     "console",
     "settings",
     "geometry",

@@ -17,6 +17,8 @@ ANSWER_S = 60.0
 SPEED = 8.0
 PLAN_POSES = 20
 PLAN_PERIOD_US = 100_000
+AHEAD_US = [k * PLAN_PERIOD_US for k in range(1, PLAN_POSES + 1)]
+POSES = [[SPEED * us * 1e-6, 0.0, 0.0] for us in AHEAD_US]
 
 
 class DriveProbe:
@@ -124,9 +126,4 @@ def action(obs: Mapping[str, Any]) -> dict[str, Any]:
 
 def straight_on(t_us: int) -> dict[str, Any]:
     """A trajectory plan over the next two seconds."""
-    ahead = range(1, PLAN_POSES + 1)
-    return {
-        "kind": "trajectory",
-        "times_us": [t_us + k * PLAN_PERIOD_US for k in ahead],
-        "poses": [[SPEED * k * PLAN_PERIOD_US * 1e-6, 0.0, 0.0] for k in ahead],
-    }
+    return {"kind": "trajectory", "times_us": [t_us + us for us in AHEAD_US], "poses": POSES}

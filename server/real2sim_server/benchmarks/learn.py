@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 
 import real2sim
-from real2sim_proto import decode
+from real2sim_proto.codec import unpack
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 
@@ -239,7 +239,7 @@ def _sessions(url: str, count: int, steps: int) -> float:
             answered = 0
             for key, _ in waiting.select():
                 probe: DriveProbe = key.data
-                probe.send(action(decode(bytes(probe.socket.recv(ANSWER_S)))))
+                probe.send(action(unpack(bytes(probe.socket.recv(ANSWER_S)))))
                 answered += 1
             return answered
 

@@ -9,6 +9,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from .._records import made_quickly
 from ..geometry.rotation import slerp
 from ..geometry.transform import transform_from
 from ..scene import Trajectory
@@ -29,6 +30,7 @@ class HasTrajectory(Protocol):
 T = TypeVar("T", bound=HasTrajectory)
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class PlacedObjects(Generic[T]):
     """The K objects that exist at one instant.

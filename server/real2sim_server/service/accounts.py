@@ -128,6 +128,11 @@ class Account:
         """What limits of engine time count: on the engine, or instead of it."""
         return self.engine_seconds + self.world_seconds
 
+    @property
+    def is_limited(self) -> bool:
+        """Whether a message may be refused, or what it asks for."""
+        return not (self._requests is None and self._bytes is None and self._engine is None)
+
     def limit(self, limits: TokenLimits) -> None:
         """Other limits from now on; what was taken up to now does not count against them."""
         self.limits = limits
@@ -222,6 +227,16 @@ def admit_message() -> None:
     if payer is not None:
         payer.account.admit()
         payer.on_engine = False
+
+
+def admitted_at_once() -> Account | None:
+    """Let a message in and count it where no limit has to be asked, neither of messages nor of
+    computing; whose it is, None where it has to go by :func:`admit_message`."""
+    payer = PAYER.get()
+    if payer is None or payer.waits or payer.account.revoked or payer.account.is_limited:
+        return None
+    payer.account.requests += 1
+    return payer.account
 
 
 def count_sent(nbytes: int) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from .._records import made_quickly
 from .agents import Agents, agent_fields
 from .ego.motion import Motion
 from .ego.route import Command
@@ -14,6 +15,7 @@ from .events import Event
 from .path import Float
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class Observation:
     """The world at one instant, as the policy gets it.

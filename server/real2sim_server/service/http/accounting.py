@@ -9,7 +9,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..accounts import PAYER, Account, Payer
-from .websocket import EXTENSION, Part
+from .websocket import EXTENSION, TAKING, Part, Taker
 
 USAGE_KEY = "real2sim.usage"
 
@@ -80,6 +80,8 @@ class Accounting:
         extensions = scope.get("extensions") or {}
         if EXTENSION in extensions:
             extensions[EXTENSION] = _counted_parts(extensions[EXTENSION], usage)
+        if TAKING in extensions:
+            extensions[TAKING] = _counted_taking(extensions[TAKING], usage)
         try:
             await self._app(scope, counted_receive, counted_send)
         finally:
@@ -97,6 +99,20 @@ def _counted_parts(
         return sent
 
     return counted
+
+
+def _counted_taking(offer: Callable[[Taker | None], None], usage: Usage) -> Callable[[Taker], None]:
+    def offered(taker: Taker) -> None:
+        def counted(data: bytes) -> bool:
+            taken = taker(data)
+            if taken:
+                usage.received += len(data)
+                usage.pay()
+            return taken
+
+        offer(counted)
+
+    return offered
 
 
 def _size(message: Message) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
@@ -29,6 +29,16 @@ Part = bytes | memoryview
 
 EXTENSION = "websocket.send_parts"
 """Holds a function that writes the parts of a binary message, or returns False."""
+
+TAKING = "websocket.take_messages"
+"""Holds a function that is told who may take binary messages in the very call that has read them,
+see :func:`let_take`."""
+
+Taker = Callable[[bytes], bool]
+"""Takes a binary message, or returns False: then it comes by ``receive``, as all others do."""
+
+JOINED_BYTES = 16_384
+"""Messages up to this size are written in one piece: that takes less than to gather their parts."""
 
 MAX_REASON_BYTES = 123
 FIN = 0x80
@@ -53,6 +63,15 @@ def try_send_parts(websocket: WebSocket, parts: Sequence[Part]) -> bool:
     """
     send = websocket.scope.get("extensions", {}).get(EXTENSION)
     return send is not None and bool(send(parts))
+
+
+def let_take(websocket: WebSocket, taker: Taker) -> None:
+    """Let ``taker`` have each binary message of one frame before anybody who awaits one, as long as
+    none waits to be received; for connections of servers that offer this. It must not raise.
+    """
+    offer = websocket.scope.get("extensions", {}).get(TAKING)
+    if offer is not None:
+        offer(taker)
 
 
 async def receive_text(websocket: WebSocket) -> str:
@@ -95,6 +114,7 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         self._watch = connections
         self._backlog = Backlog(connections.limits.write_s)
         self._has_spoken = False
+        self._taker: Taker | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection on which a handshake has begun."""
@@ -119,6 +139,7 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         if not self.close_sent and not self.config.ws_per_message_deflate:
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[EXTENSION] = self._send_parts
+            extensions[TAKING] = self._let_take
 
     async def send(self, message: Any) -> None:
         """Send one message, unless the connection is ending by what the client did."""
@@ -149,7 +170,8 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
                 self.conn.send_close(CLOSED_NO_UTF8)
                 self.handle_parser_exception()
             return
-        super().send_receive_event_to_app()
+        if not self._is_taken():
+            super().send_receive_event_to_app()
 
     def overdue(self, now: float) -> DropReason | None:
         """Why this connection has to go, if it has to: pings and the handshake end other waits."""
@@ -159,11 +181,28 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         """End the connection."""
         self.transport.abort()
 
+    def _let_take(self, taker: Taker) -> None:
+        self._taker = taker
+
+    def _is_taken(self) -> bool:
+        """Whether the message that is whole now needs no task that awaits it."""
+        if self._taker is None or self.curr_msg_data_type != "bytes" or len(self.frames) != 1:
+            return False
+        if self.close_sent or not self.queue.empty() or not self._taker(self.frames[0]):
+            return False
+        self.frames = []
+        return True
+
     def _send_parts(self, parts: Sequence[Part]) -> bool:
         """Write one binary message, if nothing has to be waited for."""
         if self.disconnected or self.conn.state is not State.OPEN or not self.writable.is_set():
             return False
-        self.transport.writelines([_header(sum(map(len, parts))), *parts])
+        size = sum(map(len, parts))
+        framed = (_header(size), *parts)
+        if size <= JOINED_BYTES:
+            self.transport.write(b"".join(framed))
+        else:
+            self.transport.writelines(framed)
         return True
 
 

@@ -34,7 +34,7 @@ from real2sim_proto.drive import (
 from ..accounts import admit_message
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, service_error
-from ..http.websocket import send_parts, try_send_parts
+from ..http.websocket import let_take, send_parts, try_send_parts
 from .deadline_timer import DeadlineTimer
 from .describe import result_fields, welcome_fields
 from .handshake import (
@@ -50,6 +50,7 @@ from .observers import ObserverQueue
 from .registry import Sessions
 from .segment import FrameSlot, Segment
 from .session import Session, controller_taken
+from .steps_at_once import StepsAtOnce
 from .views import looking
 from .wire import EncodedMessage, pack_message
 
@@ -99,7 +100,7 @@ class Connection:
                 async with self._as_controller(hello):
                     await self._welcome(hello)
                     await self._resend_missed_observation(hello)
-                    await self._serve_messages(hello.role)
+                    await self._serve_messages(hello.role, self._steps_at_once())
             else:
                 await self._welcome(hello)
                 async with self._as_observer():
@@ -193,11 +194,34 @@ class Connection:
 
     # --- messages ---------------------------------------------------------------------------
 
-    async def _serve_messages(self, role: str) -> None:
-        """Answer every message with one message, in order, until bye."""
+    def _steps_at_once(self) -> StepsAtOnce:
+        """Those of the controller, which take its actions from now on."""
+        sessions = self._sessions
+        steps = StepsAtOnce(
+            self._session,
+            sessions.stepper,
+            sessions.metrics,
+            timer=self._deadline_timer,
+            is_driving=self._is_driving,
+            write=self._write_at_once,
+            send=self._send,
+        )
+        let_take(self._socket, steps.take)
+        return steps
+
+    def _is_driving(self) -> bool:
+        """Whether this is the controller, and its client has said about shared memory what there
+        was to say."""
+        is_settled = self._segment is None or self._segment.attached
+        return self._session.controller is self and is_settled
+
+    async def _serve_messages(self, role: str, at_once: StepsAtOnce | None = None) -> None:
+        """Answer every message that ``at_once`` does not take with one message, in order, until
+        bye."""
         while True:
             try:
-                received = await self._receive()
+                receive = self._receive
+                received = await (at_once.between(receive) if at_once is not None else receive())
                 if (answer := await self._answer(received, role)) is not None:
                     await self._send(answer, received.message.id)
                 if role == "controller" and not self._deadline_timer.waiting:

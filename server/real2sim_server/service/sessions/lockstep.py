@@ -76,6 +76,10 @@ class LockStep(Generic[A]):
             )
         return None
 
+    def is_due(self, step: int) -> bool:
+        """Whether an action for ``step`` is the one that the clock waits for."""
+        return step == self.step and not self.over
+
     def advance(self, content: bytes, answer: A, *, over: bool) -> None:
         """The due action was taken; ``answer`` is kept until the next one."""
         self._move(1, over=over)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ..._records import made_quickly
 from ..storage.store import SessionEntry, Store
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class LogWrite:
     """Writes entries when it is called, never on the event loop.

@@ -17,6 +17,7 @@ from real2sim_proto import (
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES, unpack
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage
 
+from ..._records import made_quickly
 from ...world.recording.replay import plan_payload
 from ..http.problems import ServiceError
 
@@ -29,6 +30,7 @@ TYPES = (
 )
 
 
+@made_quickly
 @dataclass(frozen=True)
 class ReceivedMessage:
     """One message of a client.
@@ -40,6 +42,14 @@ class ReceivedMessage:
 
     message: ClientMessage
     content: bytes = b""
+
+
+@made_quickly
+@dataclass(frozen=True)
+class ReceivedAction(ReceivedMessage):
+    """An action of a client."""
+
+    message: Action
 
 
 class BadMessageError(Exception):
@@ -64,14 +74,14 @@ def read_message(data: bytes) -> ReceivedMessage:
     Raises:
         BadMessageError: not a message; one of another protocol version is fatal.
     """
-    if (action := _action_in(data)) is not None:
-        return ReceivedMessage(action, plan_payload(action.plan))
+    if (action := action_in(data)) is not None:
+        return action
     message = read_as(CLIENT_MESSAGE, data)
     content = plan_payload(message.plan) if isinstance(message, Action) else b""
     return ReceivedMessage(message, content)
 
 
-def _action_in(data: bytes) -> Action | None:
+def action_in(data: bytes) -> ReceivedAction | None:
     """An action, by far the commonest of messages; None for anything else and for whatever has to
     be refused. Nobody looks at each of its values twice: its model leaves no place for any that
     the wire does not carry."""
@@ -79,7 +89,8 @@ def _action_in(data: bytes) -> Action | None:
         fields = unpack(data)
         if fields["type"] == "action" and type(fields["v"]) is int:
             message = CLIENT_MESSAGE.validator.validate_python(fields)
-            return message if isinstance(message, Action) else None
+            if isinstance(message, Action):
+                return ReceivedAction(message, plan_payload(message.plan))
     except Exception:
         # Found out once more, where it is said what is wrong.
         return None

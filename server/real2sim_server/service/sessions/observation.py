@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from real2sim_proto.episode import SensorSpec
 
+from ..._records import made_quickly
 from ...scene import Camera
 from ...world import Observation, World
 from ...world.ranging import Cloud
@@ -27,6 +28,7 @@ class Seen(NamedTuple):
     observation: Observation
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class RenderedObservation:
     """An instant before its images are encoded.
@@ -49,6 +51,7 @@ class RenderedObservation:
     slot: FrameSlot | None = None
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class EncodedObservation:
     """An instant as a message.

@@ -21,7 +21,9 @@ phase         runs on                what happens
 
 A world without sensors moves on a thread of its own: it needs no device, and its planner should not
 wait while other sessions are rendered. Steps that wait for that thread are made in one go, phase by
-phase: their log entries are one transaction, and they wake the event loop once.
+phase: their log entries are one transaction, and they wake the event loop once. The action that is
+due there is received and checked in the call that reads it from the socket, and no task is woken
+for its observation (`steps_at_once`); all else goes as above.
 
 Where the backend draws images of several worlds in one go (the serving kernels all, the CPU's small
 ones), steps of sessions on one scene that wait for the engine together pass the phases together, as
@@ -195,6 +197,25 @@ class StepPipeline:
             transition.account = await computing_account()
             observation = await self._steps.call(transition)
         return await self._finish(observation)
+
+    def begin(
+        self,
+        transition: Transition,
+        done: Callable[[EncodedObservation | Exception], object],
+    ) -> None:
+        """As :meth:`run`, of a world without sensors whose account may compute: ``done`` is called
+        on the event loop with the observation, written where that could be done at once, or with
+        what was raised. It must not raise."""
+
+        def ended(outcome: EncodedObservation | Exception) -> None:
+            if isinstance(outcome, Exception):
+                done(outcome)
+                return
+            self.send(transition, outcome)
+            done(outcome)
+            self._count(outcome)
+
+        self._steps.begin(transition, ended)
 
     async def _on_engine(self, transition: Transition) -> RenderedObservation | EncodedObservation:
         told = partial(self.send, transition)

@@ -30,6 +30,7 @@ from ...world.recording.replay import (
     reset_payload,
     stop_payload,
 )
+from ..accounts import Account
 from ..http.problems import ServiceError
 from ..storage.errors import StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply, now_us
@@ -64,11 +65,21 @@ class DueAction(NamedTuple):
         session: whose world moves.
         plan: what the ego does.
         payload: canonical bytes of the plan.
+        latency_us: wall-clock time from the observation to this action.
     """
 
     session: Session
     plan: Plan | None
     payload: bytes
+    latency_us: int = 0
+
+
+class BrokenStep(NamedTuple):
+    """A step that has not taken effect, and why."""
+
+    action: DueAction
+    transition: Transition
+    error: Exception
 
 
 class Stepper:
@@ -171,12 +182,7 @@ class Stepper:
             WorldError: the plan is refused.
             QueueFullError: too much waits for the engine; the same action may be sent again.
         """
-        measured = session.spec.latency.model == "measured"
-        latency_us, missed = latency_us if measured else 0, session.late
-        entry = payload
-        if latency_us or missed:
-            entry = action_payload(plan, latency_us=latency_us, missed=missed)
-        change = partial(_moved, session.running_world(), plan, latency_us, missed)
+        change, entry = _movement(DueAction(session, plan, payload, latency_us))
         observation, written = await self._step(session, change, entry, write=write, slot=slot)
         # Given once more, its images come with it: the slot may hold others by then.
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
@@ -212,18 +218,45 @@ class Stepper:
                 await self._failed(action, transition, outcome)
         return found
 
+    def begin_step(
+        self,
+        action: DueAction,
+        account: Account,
+        *,
+        write: Callable[[EncodedMessage], bool],
+        done: Callable[[tuple[EncodedObservation, bool] | BrokenStep], object],
+    ) -> None:
+        """Take the due action of a session without sensors; no task waits for it.
+
+        Args:
+            action: the caller holds the lock of its session until ``done`` is called.
+            account: that pays.
+            write: hands the observation to the socket, see :class:`~.transition.Transition`.
+            done: called on the event loop once the step has taken effect, with the observation and
+                whether it is written; or with why it has not.
+        """
+        transition = self._transition(action, {})
+        transition.write, transition.account = write, account
+
+        def ended(outcome: EncodedObservation | Exception) -> None:
+            if isinstance(outcome, Exception):
+                done(BrokenStep(action, transition, outcome))
+                return
+            _commit(action, outcome.world, outcome.message)
+            done((outcome, transition.sent))
+
+        self._pipeline.begin(transition, ended)
+
+    async def withdraw(self, broken: BrokenStep) -> None:
+        """Take back what a step that has not taken effect may have left on record."""
+        await self._failed(*broken)
+
     def _transition(self, action: DueAction, cameras: Mapping[str, Camera]) -> Transition:
-        session, plan, payload = action
-        return Transition(
-            partial(_moved, session.running_world(), plan, 0, session.late),
-            cameras,
-            record=LogWrite(
-                self._store,
-                session.session_id,
-                _entries(session, [_action_record(session, plan, payload)]),
-                session.log_unsure,
-            ),
-        )
+        session = action.session
+        change, entry = _movement(action)
+        entries = _entries(session, [("action", session.running_world().steps, entry)])
+        write = LogWrite(self._store, session.session_id, entries, session.log_unsure)
+        return Transition(change, cameras, record=write)
 
     async def _failed(self, action: DueAction, transition: Transition, error: Exception) -> None:
         """A step that has not taken effect leaves nothing on record."""
@@ -447,14 +480,18 @@ class Stepper:
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
 
 
-def _action_record(session: Session, plan: Plan | None, payload: bytes) -> LogRecord:
-    entry = action_payload(plan, missed=True) if session.late else payload
-    return ("action", session.running_world().steps, entry)
+def _movement(action: DueAction) -> tuple[Callable[[], World], bytes]:
+    """What makes the next world, and what is recorded of it."""
+    session, plan, payload, latency_us = action
+    latency_us = latency_us if session.spec.latency.model == "measured" else 0
+    if latency_us or session.late:
+        payload = action_payload(plan, latency_us=latency_us, missed=session.late)
+    return partial(_moved, session.running_world(), plan, latency_us, session.late), payload
 
 
 def _commit(action: DueAction, world: World, message: EncodedMessage) -> None:
     """A step takes effect; it is on record. ``message``: shows it."""
-    session, _, payload = action
+    session, payload = action.session, action.payload
     session.next_seq, session.log_unsure = session.next_seq + 1, False
     session.world, session.late = world, False
     session.lockstep.advance(payload, message, over=world.over)

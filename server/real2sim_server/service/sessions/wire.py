@@ -12,6 +12,7 @@ import msgpack
 
 from real2sim_proto import PROTOCOL_VERSION
 
+from ..._records import made_quickly
 from ..rendering.frames import EncodedFrame, Part, array_header, map_header, pack_pairs
 
 FRAMES: bytes = msgpack.packb("frames")
@@ -33,6 +34,7 @@ class PhaseTimer:
         self._since = now
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class EncodedMembers:
     """Members of a message, encoded.
@@ -46,6 +48,7 @@ class EncodedMembers:
     encoded: bytes
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class EncodedMessage:
     """An encoded message that lacks only its id, so that one encoding serves all who get it.

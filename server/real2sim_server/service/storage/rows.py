@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ..._records import made_quickly
+
 
 @dataclass(frozen=True)
 class ScenarioRow:
@@ -57,6 +59,7 @@ class SessionRow:
     owner: str = "default"
 
 
+@made_quickly
 @dataclass(frozen=True)
 class SessionEntry:
     """One entry of a session's log.

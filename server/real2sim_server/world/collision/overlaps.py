@@ -12,6 +12,7 @@ import numpy as np
 
 from real2sim_proto.episode import ResetSpec
 
+from ..._records import made_quickly
 from ...edit import ObjectState
 from ...geometry.box_kernels import boxes_overlap
 from ...geometry.rotation import quaternion_yaw
@@ -53,6 +54,7 @@ class OverlapContact:
         return data
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class EgoContacts:
     """Contacts of the ego at an instant where no momentum is exchanged.

@@ -11,6 +11,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import EgoSpec, ResetSpec
 from real2sim_proto.plans import Control, Gear, PoseCommand, TrajectoryPlan
 
+from ..._records import made_quickly
 from ...edit.tracks import sample
 from ...scene import Trajectory
 from ..driving import Command
@@ -45,6 +46,7 @@ class Controller(Protocol):
         """The controller of an ego that was put back over the seam."""
 
 
+@made_quickly
 @dataclass(frozen=True)
 class ConstantCommand:
     """The same command all the time.
@@ -103,6 +105,7 @@ class Teleport:
         return replace(self, pose=(x, y, yaw))
 
 
+@made_quickly
 @dataclass(frozen=True)
 class PendingPlan:
     """A plan that has not taken effect yet.
@@ -130,6 +133,7 @@ class PendingPlan:
         return self
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class EgoController:
     """The active controller of the ego and the pending plans. Immutable.

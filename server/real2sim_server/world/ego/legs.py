@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._records import made_quickly
 from ..path import Float
 from .motion import Motion
 from .reference import PlannedTrajectory, SinglePose, ways_along
@@ -26,6 +27,7 @@ CREEPING = 0.1
 wherever the vehicle is [m/s]."""
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class Leg:
     """A part of a plan.

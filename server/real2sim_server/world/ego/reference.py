@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.episode import EgoSpec
 
+from ..._records import made_quickly
 from ..driving import NO_POSE, curve_at, placed_poses, plan_curve, vehicle_parameters
 from ..path import Float
 from ..seam import Seam
@@ -31,6 +32,7 @@ LONGEST_GAP_US = 1_000_000
 """A plan of a single pose goes on from the one before where their poses are this near in time."""
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class PlannedTrajectory:
     """Where a planner wants to be when.

@@ -10,6 +10,7 @@ import numpy as np
 
 from real2sim_proto.episode import EgoSpec
 
+from ..._records import made_quickly
 from ..driving import KINDS, LQR, MOVING, Command
 from ..seam import Seam
 from .gear import advance_in_gear, backwards_spec, can_reverse, command_in_gear, mirrored
@@ -18,6 +19,7 @@ from .motion import Motion, advance_motion, commanded, teleported
 from .reference import PlannedTrajectory, ReferenceTrajectory, SinglePose
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class ControlledTracker:
     """A controller in the vehicle, bound by the vehicle's limits; knows nothing of the past, so

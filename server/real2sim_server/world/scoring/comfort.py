@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from .comfort_kernels import derivatives, plans_alike, push_sample
@@ -65,6 +66,7 @@ class ComfortSample(NamedTuple):
         )
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class ComfortAccumulator:
     """Comfort of a drive so far.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from ..._records import made_quickly
 from .instant import EgoSample, Instant, ScoringContext
 from .window import Window
 
@@ -41,6 +42,7 @@ SETTLED = 0.2
 Samples = Window[tuple[EgoSample, float]]
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class Feasibility:
     """The motion of the ego so far.

@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from ..seam import Seam
@@ -43,6 +44,7 @@ class EgoSample(NamedTuple):
     z: float
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class ObjectSamples:
     """Objects at one instant, K of them.
@@ -88,6 +90,7 @@ class ContactRecord:
     since: float = 1.0
 
 
+@made_quickly
 @dataclass(frozen=True, eq=False)
 class Instant:
     """One committed instant.

@@ -55,6 +55,7 @@ class MetricValue(NamedTuple):
 
 
 Formula = Callable[[MetricAccumulator, ScoringContext], MetricValue]
+Running = Callable[[MetricAccumulator, ScoringContext], float | None]
 
 
 NO_STEP = "a step that counts"
@@ -68,7 +69,8 @@ class Metric:
         name: on the wire and in recordings.
         version: raised when a value may change for the same episode.
         formula: of the accumulator; must not depend on anything else.
-        streamed: whether its value is part of every observation.
+        running: the value of the formula alone, without what it is made of: it is part of every
+            observation; None for a metric that is not.
         begin, update: where the accumulator lacks something: ``begin(instant, context)`` makes
             state of the metric's own where the scores begin, ``update(state, instant, context)`` a
             new state one step later; ``accumulator.states[name]`` has it. Both or neither.
@@ -79,10 +81,15 @@ class Metric:
     name: str
     version: str
     formula: Formula
-    streamed: bool = False
+    running: Running | None = None
     begin: Callable[[Instant, ScoringContext], Any] | None = None
     update: Callable[[Any, Instant, ScoringContext], Any] | None = None
     sees: frozenset[Aspect] | None = None
+
+    @property
+    def streamed(self) -> bool:
+        """Whether its value is part of every observation."""
+        return self.running is not None
 
     def score(self, accumulator: MetricAccumulator, context: ScoringContext) -> Score:
         """The score of an episode so far."""
@@ -111,11 +118,13 @@ def metric(
     *,
     version: str,
     streamed: bool = False,
+    running: Running | None = None,
     begin: Callable[[Instant, ScoringContext], Any] | None = None,
     update: Callable[[Any, Instant, ScoringContext], Any] | None = None,
     sees: Iterable[Aspect] | None = None,
 ) -> Callable[[Formula], Formula]:
-    """Register a formula as a metric; see :class:`Metric` for the arguments.
+    """Register a formula as a metric; see :class:`Metric` for the arguments, of which ``streamed``
+    stands for a ``running`` that is the value of the formula.
 
     Raises:
         ValueError: the name is taken, or only one of ``begin`` and ``update`` is given.
@@ -127,10 +136,15 @@ def metric(
         if name in METRICS:
             raise ValueError(f"there is a metric {name!r} already")
         seen = None if sees is None else frozenset(sees)
-        METRICS[name] = Metric(name, version, formula, streamed, begin, update, seen)
+        value = _value_of(formula) if streamed and running is None else running
+        METRICS[name] = Metric(name, version, formula, value, begin, update, seen)
         return formula
 
     return register
+
+
+def _value_of(formula: Formula) -> Running:
+    return lambda accumulator, context: formula(accumulator, context).value
 
 
 def scores_of(accumulator: MetricAccumulator, context: ScoringContext) -> list[Score]:

@@ -62,9 +62,28 @@ def navsim_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
     return min(way / max(way * clear, expert), 1.0)
 
 
+def nuplan_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """EP of nuPlan."""
+    way, expert = progress_along_route(accumulator), expert_progress(accumulator, context)
+    return min(1.0, max(way, 0.1) / max(expert, 0.1))
+
+
+def speed_limits(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """SL of nuPlan; 1 where no limit is known."""
+    if context.speed_limit is None:
+        return 1.0
+    seconds = max(accumulator.steps * context.dt, context.dt)
+    return max(0.0, 1 - accumulator.overspeed / (2.23 * seconds))
+
+
 def feasible(accumulator: MetricAccumulator) -> float:
     """1 while a car could have moved so, else 0; no score counts what no car can do."""
     return float(not accumulator.feasibility.steps)
+
+
+def hugsim_mean(accumulator: MetricAccumulator) -> float:
+    """Mean of HUGSIM's score of the steps."""
+    return accumulator.hugsim / accumulator.steps if accumulator.steps else 1.0
 
 
 def lane_share(accumulator: MetricAccumulator) -> float:
@@ -72,6 +91,23 @@ def lane_share(accumulator: MetricAccumulator) -> float:
     if accumulator.distance <= 0:
         return 1.0
     return max(1 - accumulator.outside / accumulator.distance, 0.0)
+
+
+def infractions(accumulator: MetricAccumulator) -> dict[str, int]:
+    """Contacts begun, by kind (CARLA leaderboard)."""
+    counts = {"vru": 0, "vehicle": 0, "object": 0}
+    for category, n in accumulator.contacts.items():
+        counts[fault_class(category)] += n
+    return counts
+
+
+def carla_penalty(accumulator: MetricAccumulator) -> float:
+    """Product of the penalties, and the share of the way in lanes."""
+    lanes = lane_share(accumulator)
+    if not accumulator.contacts:
+        return lanes
+    counts = infractions(accumulator)
+    return lanes * math.prod([CARLA_PENALTIES[kind] ** n for kind, n in counts.items()])
 
 
 def ttc_within_bound(accumulator: MetricAccumulator) -> float:
@@ -82,7 +118,15 @@ def ttc_within_bound(accumulator: MetricAccumulator) -> float:
 # --- scores -----------------------------------------------------------------------------------
 
 
-@metric("pdms", version="5", streamed=True, sees=NAVSIM_SEES)
+def pdms_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """The value of :func:`pdms`."""
+    weighted = 5 * navsim_progress(accumulator, context) + 5 * ttc_within_bound(accumulator)
+    weighted += 2 * float(accumulator.comfort.comfortable)
+    possible = feasible(accumulator) * no_collision(accumulator) * float(not accumulator.off_road)
+    return possible * weighted / 12
+
+
+@metric("pdms", version="5", running=pdms_so_far, sees=NAVSIM_SEES)
 def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven; F
     is :func:`feasible`, as in all scores below."""
@@ -94,8 +138,7 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue
         "TTC": ttc_within_bound(accumulator),
         "C": float(accumulator.comfort.comfortable),
     }
-    weighted = 5 * terms["EP"] + 5 * terms["TTC"] + 2 * terms["C"]
-    value = terms["feasible"] * terms["NC"] * terms["DAC"] * weighted / 12
+    value = pdms_so_far(accumulator, context)
     return MetricValue(value, terms, assumed=(NO_MAP, *assumed_progress(accumulator, context)))
 
 
@@ -123,41 +166,64 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
     return MetricValue(math.prod(multipliers) * weighted / 16, terms, assumed=assumed)
 
 
-@metric("nuplan_cls", version="5", streamed=True, sees={*NAVSIM_SEES, "direction", "speed_limit"})
+def nuplan_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """The value of :func:`nuplan`."""
+    progress, limits = nuplan_progress(accumulator, context), speed_limits(accumulator, context)
+    weighted = 5 * (progress + ttc_within_bound(accumulator)) + 4 * limits
+    weighted += 2 * float(accumulator.comfort.comfortable)
+    possible = feasible(accumulator) * nuplan_no_collision(accumulator)
+    possible *= float(not accumulator.far_off_road)
+    possible *= direction(accumulator)
+    return possible * float(progress >= 0.2) * weighted / 16
+
+
+@metric(
+    "nuplan_cls",
+    version="5",
+    running=nuplan_so_far,
+    sees={*NAVSIM_SEES, "direction", "speed_limit"},
+)
 def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
-    way, expert = progress_along_route(accumulator), expert_progress(accumulator, context)
-    limit, seconds = context.speed_limit, max(accumulator.steps * context.dt, context.dt)
+    expert, limit = expert_progress(accumulator, context), context.speed_limit
     terms = {
         "feasible": feasible(accumulator),
         "NC": nuplan_no_collision(accumulator),
         "DAC": float(not accumulator.far_off_road),
         "DDC": direction(accumulator),
-        "EP": min(1.0, max(way, 0.1) / max(expert, 0.1)),
+        "EP": nuplan_progress(accumulator, context),
         "TTC": ttc_within_bound(accumulator),
-        "SL": 1.0 if limit is None else max(0.0, 1 - accumulator.overspeed / (2.23 * seconds)),
+        "SL": speed_limits(accumulator, context),
         "C": float(accumulator.comfort.comfortable),
     }
-    weighted = 5 * (terms["EP"] + terms["TTC"]) + 4 * terms["SL"] + 2 * terms["C"]
-    makes_progress = float(terms["EP"] >= 0.2)
-    possible = terms["feasible"] * terms["NC"] * terms["DAC"] * terms["DDC"]
-    value = possible * makes_progress * weighted / 16
+    value = nuplan_so_far(accumulator, context)
     assumed = (NO_MAP,) if limit is not None else ("SL: no speed limit known", NO_MAP)
     if expert < LEAST_ROUTE:
         assumed = (*assumed, *assumed_progress(accumulator, context))
     return MetricValue(value, terms, assumed=assumed)
 
 
+def hugsim_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """The value of :func:`hugsim`."""
+    route, mean = route_completion(accumulator, context, 0.9), hugsim_mean(accumulator)
+    return feasible(accumulator) * route * mean
+
+
 @metric(
-    "hugsim_hd", version="5", streamed=True, sees=("progress", "comfort", "near_misses", "road")
+    "hugsim_hd",
+    version="5",
+    running=hugsim_so_far,
+    sees=("progress", "comfort", "near_misses", "road"),
 )
 def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
-    route = route_completion(accumulator, context, 0.9)
-    mean = accumulator.hugsim / accumulator.steps if accumulator.steps else 1.0
-    terms = {"feasible": feasible(accumulator), "RC": route, "mean": mean}
+    terms = {
+        "feasible": feasible(accumulator),
+        "RC": route_completion(accumulator, context, 0.9),
+        "mean": hugsim_mean(accumulator),
+    }
     assumed = (NO_MAP, *assumed_route(accumulator, context))
-    return MetricValue(terms["feasible"] * route * mean, terms, assumed=assumed)
+    return MetricValue(hugsim_so_far(accumulator, context), terms, assumed=assumed)
 
 
 @metric("neuroncap", version="3", sees=())
@@ -178,18 +244,24 @@ def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> Metric
     return MetricValue(4 * possible * max(0.0, 1 - ratio), terms)
 
 
-@metric("carla_ds", version="4", streamed=True, sees=("progress", "lane"))
+def carla_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """The value of :func:`carla`."""
+    completion = route_completion(accumulator, context)
+    return 100 * feasible(accumulator) * completion * carla_penalty(accumulator)
+
+
+@metric("carla_ds", version="4", running=carla_so_far, sees=("progress", "lane"))
 def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F times route completion in percent times the product of penalties (CARLA leaderboard), with
     those infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65, and the share of
     the way in lanes."""
-    counts = {"vru": 0, "vehicle": 0, "object": 0}
-    for category, n in accumulator.contacts.items():
-        counts[fault_class(category)] += n
-    lanes, possible = lane_share(accumulator), feasible(accumulator)
-    penalty = lanes * math.prod([CARLA_PENALTIES[kind] ** n for kind, n in counts.items()])
-    completion = route_completion(accumulator, context)
-    terms = {"feasible": possible, "RC": completion, "P": penalty, "in_lanes": lanes}
+    counts = infractions(accumulator)
+    terms = {
+        "feasible": feasible(accumulator),
+        "RC": route_completion(accumulator, context),
+        "P": carla_penalty(accumulator),
+        "in_lanes": lane_share(accumulator),
+    }
     terms |= {k: float(n) for k, n in counts.items()}
     if accumulator.distance > 0:
         terms["infractions_per_km"] = sum(counts.values()) / (accumulator.distance * 1e-3)
@@ -198,7 +270,7 @@ def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
         "lanes are those that were driven in the recording",
         *assumed_route(accumulator, context),
     )
-    return MetricValue(100 * possible * completion * penalty, terms, assumed=assumed)
+    return MetricValue(carla_so_far(accumulator, context), terms, assumed=assumed)
 
 
 @metric("alpasim", version="5", sees=("progress", "road", "fault"))
@@ -212,8 +284,13 @@ def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVa
     return MetricValue(value, {"feasible": possible, "progress": progress}, assumed=assumed)
 
 
-@metric("feasible", version="2", streamed=True, sees=())
-def feasible_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
+def feasible_so_far(accumulator: MetricAccumulator, _context: ScoringContext) -> float:
+    """The value of :func:`feasible_drive`."""
+    return feasible(accumulator)
+
+
+@metric("feasible", version="2", running=feasible_so_far, sees=())
+def feasible_drive(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """1 if a car could have driven every step: acceleration and curvature as in Waymax, the way as
     its speed and heading say, no faster backwards than a reverse gear; else 0. Every other score
     is multiplied by it."""
@@ -264,9 +341,7 @@ def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> 
     }
     if math.isfinite(accumulator.ttc):
         found["ttc"] = accumulator.ttc
-    for streamed in METRICS.values():
-        if streamed.streamed:
-            value = streamed.formula(accumulator, context).value
-            if value is not None:
-                found[streamed.name] = value
+    for name, each in METRICS.items():
+        if each.running is not None and (value := each.running(accumulator, context)) is not None:
+            found[name] = value
     return found
