@@ -20,8 +20,12 @@ from ..geometry.transform import invert_transform
 from ..scene import Camera
 from ..scene.camera_motion import CameraMotion
 
-CELLS = 64
+CELLS = 96
 """Cells along the edge of a face of the directory."""
+NODE = 8
+"""Numbers of a node of it."""
+STEADY = 18 / CELLS
+"""The bend of a node holds this far around it, on a face."""
 BEYOND = np.radians(5.0)
 """What lies farther beyond the image is put where a straight continuation leads."""
 STEP = 1e-4
@@ -48,7 +52,12 @@ class LensView:
     @property
     def viewmat(self) -> Float:
         """``T_camera_world`` [4, 4] in the middle of the read-out."""
-        return invert_transform(self.motion.middle())
+        return invert_transform(self.middle)
+
+    @functools.cached_property
+    def middle(self) -> Float:
+        """``T_world_camera`` [4, 4] then."""
+        return self.motion.middle()
 
     @functools.cached_property
     def moves(self) -> bool:
@@ -59,11 +68,13 @@ class LensView:
         """Time of each row (or column), -0.5 to 0.5 over the read-out."""
         return self.camera.shutter.line_times(self.camera.width, self.camera.height) - 0.5
 
+    @functools.cached_property
     def shift(self) -> Float:
         """[3] way of the camera over the read-out, in its frame in the middle [m]."""
         way: Float = self.motion.end[:3, 3] - self.motion.start[:3, 3]
-        return way @ self.motion.middle()[:3, :3]
+        return way @ self.middle[:3, :3]
 
+    @functools.cached_property
     def turn(self) -> Float:
         """[3] rotation vector of the camera over the read-out, in its own frame [rad]."""
         relative = self.motion.start[:3, :3].T @ self.motion.end[:3, :3]
@@ -82,7 +93,7 @@ class LensView:
         """[H, W, 3] directions in the camera's frame in the middle of the read-out, of any length;
         0 where the lens sees nothing."""
         table = tables_of(self.camera).rays
-        turn = self.turn()
+        turn = self.turn
         if not self.moves or not turn.any():
             return table
         angle = float(np.linalg.norm(turn))
@@ -103,11 +114,12 @@ class LensTables:
     Attributes:
         rays: [H, W, 3] float32 unit directions of pixel centres; 0 where the lens sees nothing.
         blind: [H, W] bool, where that is so.
-        directory: [6, CELLS + 1, CELLS + 1, 6] float32, position x, y [px] and its derivatives
-            x_u, x_v, y_u, y_v at the nodes of the faces of a cube of directions; face 2 k + (s < 0)
-            has component k largest, of sign s, and u, v are the next two over its magnitude.
-        slack: how far interpolated positions may be off on the image [px].
-        bend: how much derivatives change over the image, relative to them [1/rad].
+        directory: [6, CELLS + 1, CELLS + 1, NODE] float32, position x, y [px], its derivatives
+            x_u, x_v, y_u, y_v, how much these change around it relative to them [a unit of u, v]
+            and how far positions between nodes may be off [px], at the nodes of the faces of a cube
+            of directions; face 2 k + (s < 0) has component k largest, of sign s, and u, v are the
+            next two over its magnitude.
+        slack, bend: the most that the directory says of these on the image.
         reach: largest angle from the axis of a pixel [rad].
     """
 
@@ -138,8 +150,7 @@ def _make_tables(camera: Camera) -> LensTables:
     angles = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
     reach = float(angles[seen].max(initial=0.0))
     position = continued(camera, reach)
-    directory = _directory(position)
-    slack, bend = _precision(camera, position, directory)
+    directory, slack, bend = _directory(camera, position)
     return LensTables(rays.astype(np.float32), ~seen, directory, slack, bend, reach)
 
 
@@ -184,29 +195,45 @@ def _faces(u: Float, v: Float) -> Float:
     return np.stack(faces)
 
 
-def _directory(position: Callable[[Float], Float]) -> NDArray[np.float32]:
+def _directory(
+    camera: Camera, position: Callable[[Float], Float]
+) -> tuple[NDArray[np.float32], float, float]:
+    """``directory``, ``slack`` and ``bend`` of LensTables."""
     edge = np.linspace(-1, 1, CELLS + 1)
     u, v = np.meshgrid(edge, edge, indexing="ij")
     by_u = (position(_faces(u + STEP, v)) - position(_faces(u - STEP, v))) / (2 * STEP)
     by_v = (position(_faces(u, v + STEP)) - position(_faces(u, v - STEP))) / (2 * STEP)
     slopes = np.stack([by_u[..., 0], by_v[..., 0], by_u[..., 1], by_v[..., 1]], -1)
-    table = np.concatenate([position(_faces(u, v)), slopes], -1)
-    return np.ascontiguousarray(table, np.float32)
+    known = np.concatenate([position(_faces(u, v)), slopes], -1)
+    bends, slacks = _precision(camera, position, known)
+    around = [_largest_around(cells, reach) for cells, reach in ((bends, STEADY), (slacks, 0.0))]
+    table = np.concatenate([known, np.stack(around, -1)], -1)
+    return np.ascontiguousarray(table, np.float32), float(slacks.max()), float(bends.max())
 
 
 def _precision(
-    camera: Camera, position: Callable[[Float], Float], directory: NDArray[np.float32]
-) -> tuple[float, float]:
-    """``slack`` and ``bend`` of LensTables, from the middles of cells."""
+    camera: Camera, position: Callable[[Float], Float], known: Float
+) -> tuple[Float, Float]:
+    """How much slopes change over each cell [6, CELLS, CELLS] and how far interpolated positions
+    may be off [px], from the middles of cells; beside the image at most as much as on it."""
     middle = (np.arange(CELLS) + 0.5) * (2 / CELLS) - 1
     u, v = np.meshgrid(middle, middle, indexing="ij")
-    table = directory.astype(np.float64)
-    corners = [table[:, i : i + CELLS, j : j + CELLS] for i in (0, 1) for j in (0, 1)]
+    corners = [known[:, i : i + CELLS, j : j + CELLS] for i in (0, 1) for j in (0, 1)]
     exact = position(_faces(u, v))
     on_image = ((exact > -32) & (exact < [camera.width + 32, camera.height + 32])).all(-1)
     off = np.abs(sum(corner[..., :2] for corner in corners) / 4 - exact).max(-1)
     slopes = [corner[..., 2:] for corner in corners]
     scale = np.maximum(np.linalg.norm(sum(slopes) / 4, axis=-1), 1e-9)
     change = [np.linalg.norm(one - slopes[0], axis=-1) / scale for one in slopes[1:]]
-    bend = np.maximum.reduce(change)[on_image].max(initial=0.0) / (2 / CELLS)
-    return 2 * float(off[on_image].max(initial=0.0)) + 0.05, float(bend)
+    bend = np.maximum.reduce(change) / (2 / CELLS)
+    slack = 2 * off + 0.02
+    return tuple(np.minimum(values, values[on_image].max(initial=0.0)) for values in (bend, slack))
+
+
+def _largest_around(cells: Float, reach: float) -> Float:
+    """At nodes [6, CELLS + 1, CELLS + 1] the largest of the cells within ``reach`` on a face."""
+    size = 2 * (round(reach * CELLS / 2) + 1)
+    padded = np.pad(cells, ((0, 0), *((size // 2, size // 2),) * 2), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(1, 2))
+    largest: Float = windows.max((-2, -1))
+    return largest

@@ -83,7 +83,7 @@ class ReferenceBackend:
         rgb, *images, seen = blend_rays(request, placement, _covariances, self.dtype)
         behind = torch.tensor(request.options.background, dtype=self.dtype)
         if request.sky is not None and optics is not None:
-            turn = torch.from_numpy(optics.motion.middle()[:3, :3]).float()
+            turn = torch.from_numpy(optics.middle[:3, :3]).float()
             rays = torch.from_numpy(optics.rays())
             behind = request.sky.sample(torch.where(seen[..., None], rays, 1.0) @ turn.mT)
         rgb = rgb + (1 - images[0])[..., None] * behind.to(self.dtype)

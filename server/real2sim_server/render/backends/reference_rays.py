@@ -139,10 +139,10 @@ def _splats(
 def _ways(instance: Instance, optics: LensView, own: Tensor) -> Tensor:
     """How far centres go over the read-out as the camera sees it, ``own`` [N, 3] from the origin of
     their instance."""
-    ways = torch.zeros_like(own) - torch.from_numpy(optics.shift())
+    ways = torch.zeros_like(own) - torch.from_numpy(optics.shift)
     if instance.twist is None or not optics.moves:
         return ways
-    turn = optics.motion.middle()[:3, :3]
+    turn = optics.middle[:3, :3]
     linear, angular = torch.from_numpy(instance.twist.reshape(2, 3) @ turn * optics.seconds)
     found: Tensor = ways + linear + torch.linalg.cross(angular.expand_as(own), own)
     return found
@@ -157,7 +157,7 @@ def _derivatives(optics: LensView, centres: Float, ways: Float) -> tuple[Tensor,
     seen = centres
     for _ in range(ROUNDS if optics.moves else 0):
         times = _line_times(optics, position(seen))
-        turns = np.stack([turned(-time * optics.turn()) for time in times])
+        turns = np.stack([turned(-time * optics.turn) for time in times])
         seen = np.einsum("nij,nj->ni", turns, centres + ways * times[:, None])
     step = STEP * np.linalg.norm(seen, axis=1, keepdims=True)
     columns = []

@@ -134,17 +134,24 @@ def gather_lane(cluster, i, lane, planes):
     for k in range(3):
         planes[(MEAN + k) * LANES + lane] = cluster.means[i, k]
     planes[OPACITY * LANES + lane] = cluster.opacities[i]
+    gather_shape(cluster, i, SHAPE, lane, planes)
+
+
+@inlined()
+def gather_shape(cluster, i, first, lane, planes):
+    """Lay the shape of Gaussian ``i`` into a lane of the planes from ``first`` on: the upper half
+    of its covariance by rows, or where the cluster has none quaternion and scales."""
     if cluster.covars.shape[0] > 0:
-        covar, plane = cluster.covars[i], SHAPE * LANES + lane
+        covar, plane = cluster.covars[i], first * LANES + lane
         for row in range(3):
             for column in range(row, 3):
                 planes[plane] = covar[row, column]
                 plane += LANES
     else:
         for k in range(4):
-            planes[(SHAPE + k) * LANES + lane] = cluster.quats[i, k]
+            planes[(first + k) * LANES + lane] = cluster.quats[i, k]
         for k in range(3):
-            planes[(SHAPE + 4 + k) * LANES + lane] = cluster.scales[i, k]
+            planes[(first + 4 + k) * LANES + lane] = cluster.scales[i, k]
 
 
 @inlined(fastmath=FASTMATH)

@@ -8,7 +8,7 @@ is told by bits which lanes are still in question and answers with those that re
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial, reduce
 from typing import Any
 
@@ -32,6 +32,7 @@ from .records import (
     SLOPE,
     TIP_Y,
 )
+from .vectors import Vector, dot, turn_columns
 
 MEAN, OPACITY, SHAPE = RECORD, RECORD + 3, RECORD + 4
 """First planes of the centre, of the opacity, and of quaternion and scales; or, where a cluster
@@ -46,8 +47,6 @@ COVARIANCE_MAX = 1e30
 """Larger than any picture [px^2]; beyond it float32 gives out."""
 HALF_UNIT = 0.5 / EXPONENT_UNIT
 
-Vector = list[Lanes]
-
 
 class Named:
     """A named tuple of the kernel: its numbers and those of its arrays, each in all lanes."""
@@ -61,14 +60,18 @@ class Named:
 
     def three(self, name: str, *, row: int = 0) -> Vector:
         """Three neighbours of an array: a row where it has rows."""
-        kind, value = self._field(name)
-        element = DOUBLE if kind.dtype == types.float64 else FLOAT
-        data = self._context.make_array(kind)(self._context, self._builder, value).data
+        element = DOUBLE if self._field(name)[0].dtype == types.float64 else FLOAT
+        data = self.data(name)
         numbers = []
         for index in range(3 * row, 3 * row + 3):
             place = self._builder.gep(data, [I64(index)], source_etype=element)
             numbers.append(splat(self._builder, self._builder.load(place, typ=element)))
         return numbers
+
+    def data(self, name: str) -> Any:
+        """Where an array begins."""
+        kind, value = self._field(name)
+        return self._context.make_array(kind)(self._context, self._builder, value).data
 
     def _field(self, name: str) -> tuple[Any, Any]:
         index = self._kind.fields.index(name)
@@ -107,7 +110,7 @@ def _place(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any
     """
     mean = [eight.load(MEAN + k).doubles() for k in range(3)]
     offset = cluster.three("offset")
-    x, y, z = (_dot(cluster.three("linear", row=k), mean, offset[k]).floats() for k in range(3))
+    x, y, z = (dot(cluster.three("linear", row=k), mean, offset[k]).floats() for k in range(3))
     inverse = z.reciprocal()
     tx, ty = x * inverse, y * inverse
     mean_x = tx.fused(view.number("fx"), view.number("cx"))
@@ -118,7 +121,7 @@ def _place(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any
     for plane, value in zip(planes, (mean_x, mean_y, z, tx, ty), strict=True):
         eight.store(plane, value)
 
-    sigma, blur = _largest_sigma(eight, cluster, deformed=deformed), view.number("blur")
+    sigma, blur = largest_sigma(eight, cluster, deformed=deformed), view.number("blur")
     reach = (
         (view.number(focal) * inverse * (tangent.magnitude() + 1.0)).fused(sigma, blur) * REACH_MAX
         for focal, tangent in (("fx", tx), ("fy", ty))
@@ -127,12 +130,12 @@ def _place(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any
         eight.load(OPACITY).compare(">=", ALPHA_MIN),
         z.compare(">=", view.number("near_plane")),
         z.compare("<=", view.number("far_plane")),
-        *_on_image(view, mean_x, mean_y, *reach),
+        *on_image(view, mean_x, mean_y, *reach),
     ]
     return reduce(eight.builder.and_, tests)
 
 
-def _largest_sigma(eight: Planes, cluster: Named, *, deformed: bool) -> Lanes:
+def largest_sigma(eight: Planes, cluster: Named, *, deformed: bool) -> Lanes:
     """Upper bound of the standard deviation along any direction of the world [m]."""
     a, b, c = cluster.three("scale")
     largest = a.at_least(b).at_least(c)
@@ -143,7 +146,7 @@ def _largest_sigma(eight: Planes, cluster: Named, *, deformed: bool) -> Lanes:
     return s0.at_least(s1).at_least(s2) * largest
 
 
-def _on_image(view: Named, x: Lanes, y: Lanes, reach_x: Lanes, reach_y: Lanes) -> list[Any]:
+def on_image(view: Named, x: Lanes, y: Lanes, reach_x: Lanes, reach_y: Lanes) -> list[Any]:
     """Masks: a box about (x, y) meets the image; false for what is not finite."""
     return [
         (x + reach_x).compare(">", 0.0),
@@ -192,7 +195,7 @@ def _shape(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any
         cyy.compare("<", COVARIANCE_MAX),
         opacity.compare(">=", ALPHA_MIN),
         reduce(eight.builder.or_, large_enough),
-        *_on_image(view, eight.load(MEAN_X), eight.load(MEAN_Y), reach_x, reach_y),
+        *on_image(view, eight.load(MEAN_X), eight.load(MEAN_Y), reach_x, reach_y),
     ]
     return reduce(eight.builder.and_, tests)
 
@@ -214,26 +217,16 @@ def _covariance(eight: Planes, across: Vector, down: Vector) -> tuple[Lanes, Lan
 
     The turn is float64 too: gradients of needles hang on its last digits.
     """
-    w, x, y, z = (eight.load(SHAPE + k).doubles() for k in range(4))
-    norm = w.fused(w, x.fused(x, y.fused(y, z * z))).reciprocal() * 2.0
-    nx, ny, nz = x * norm, y * norm, z * norm
-    xx, yy, zz = x * nx, y * ny, z * nz
-    xy, xz, yz = x * ny, x * nz, y * nz
-    wx, wy, wz = w * nx, w * ny, w * nz
-    columns = (
-        (-(yy + zz) + 1.0, xy + wz, xz - wy),
-        (xy - wz, -(xx + zz) + 1.0, yz + wx),
-        (xz + wy, yz - wx, -(xx + yy) + 1.0),
-    )
+    columns = turn_columns([eight.load(SHAPE + k).doubles() for k in range(4)])
     scales = [eight.load(SHAPE + 4 + k).doubles() for k in range(3)]
     rows = [[number.doubles() for number in row] for row in (across, down)]
     u, v = (
-        [scale * _dot(row, column) for scale, column in zip(scales, columns, strict=True)]
+        [scale * dot(row, column) for scale, column in zip(scales, columns, strict=True)]
         for row in rows
     )
     # Lagrange's identity: |u|^2 |v|^2 - (u v)^2 without the cancellation that ruins needles.
     normal = [u[i] * v[j] - u[j] * v[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-    return _dot(u, u), _dot(u, v), _dot(v, v), _dot(normal, normal)
+    return dot(u, u), dot(u, v), dot(v, v), dot(normal, normal)
 
 
 def _deformed_covariance(
@@ -243,15 +236,9 @@ def _deformed_covariance(
     a, b = [number.doubles() for number in across], [number.doubles() for number in down]
     xx, xy, xz, yy, yz, zz = (eight.load(SHAPE + k).doubles() for k in range(6))
     matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    p, q = ([_dot(list(row), axis) for row in matrix] for axis in (a, b))
-    cxx, cxy, cyy = _dot(p, a), _dot(p, b), _dot(q, b)
+    p, q = ([dot(list(row), axis) for row in matrix] for axis in (a, b))
+    cxx, cxy, cyy = dot(p, a), dot(p, b), dot(q, b)
     return cxx, cxy, cyy, cxx * cyy - cxy * cxy
-
-
-def _dot(a: Sequence[Lanes], b: Sequence[Lanes], addend: Lanes | None = None) -> Lanes:
-    """Scalar product, plus ``addend``."""
-    last = a[2] * b[2] if addend is None else a[2].fused(b[2], addend)
-    return a[0].fused(b[0], a[1].fused(b[1], last))
 
 
 place_eight = eight_step(partial(_place, deformed=False), count=PROJECTION)

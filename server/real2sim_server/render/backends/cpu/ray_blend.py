@@ -46,13 +46,16 @@ def blend_ray_tiles(
     median = images.median
     everything = instance.shape[0] > 0 or median.shape[0] > 0
     kind = (1 if everything else 0) + (2 if lines.shape[0] > 0 else 0)
+    halves_of = values.reshape(2 * values.shape[0], values.shape[1] // 2)
     for task in prange(TASKS):
         pixels = np.empty(TILE * HALVES * RAY_PLANES * LANES, np.float32)
         for tile in range(first_tile + task, last_tile, TASKS):
             x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
             going = open_ray_tile(pixels, x0, y0, rays, lines, by_row)
             first, last = starts[tile], starts[tile + 1]
-            blend_ray_tile(values, lists, first, last, F32(x0), F32(y0), pixels, going, kind)
+            blend_ray_tile(
+                values, halves_of, lists, first, last, F32(x0), F32(y0), pixels, going, kind
+            )
             write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median)
 
 
@@ -78,10 +81,12 @@ def open_ray_tile(pixels, x0, y0, rays, lines, by_row):
 
 
 @inlined()
-def blend_ray_tile(values, lists, first, last, x0, y0, pixels, alive, kind):
+def blend_ray_tile(values, halves_of, lists, first, last, x0, y0, pixels, alive, kind):
     """Blend lists[first:last], near to far, until it ends or every pixel is finished."""
     for position in range(first, last):
-        prefetch(values, np.int64(lists[min(position + LOOK_AHEAD, last - 1)]))
+        ahead = np.int64(lists[min(position + LOOK_AHEAD, last - 1)])
+        prefetch(halves_of, 2 * ahead)
+        prefetch(halves_of, 2 * ahead + 1)
         record = values[lists[position]]
         x, y = x0 + HALF - record[MEAN_X], y0 + HALF - record[MEAN_Y]
         touched = touched_halves(
@@ -111,7 +116,7 @@ def blend_half_of_rays(pixels, half, record, kind):
 
 @inlined()
 def write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median):
-    """Put the background behind the tile and write it to the images."""
+    """Write the tile to the images, with the background behind, black where nothing is seen."""
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
         for column in range(min(TILE, width - x0)):
@@ -119,6 +124,8 @@ def write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, medi
             y, x = y0 + row, x0 + column
             left = abs(pixels[p])
             total = F32(1) - left
+            # Finished before anything was drawn: sees nothing, not even what is behind.
+            left = F32(0) if pixels[p] == F32(-1) else left
             alpha[y, x] = total
             for channel in range(3):
                 seen = pixels[p + (1 + channel) * LANES]

@@ -61,9 +61,6 @@ def draw_rays(
         )
         chunks = drawing.seen_chunks(placement)
     drawing.draw(placement, chunks)
-    blind = drawing.tables.blind
-    if blind.any():
-        images.rgb[blind] = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +85,8 @@ class RayDrawing(Drawing):
     def seen_chunks(self, placement: Placement) -> list[Chunks]:
         """Numbers of the chunks of each instance that come near the field of view."""
         reach = self._widest
-        way = float(np.linalg.norm(self.optics.shift()))
-        turn = float(np.linalg.norm(self.optics.turn()))
+        way = float(np.linalg.norm(self.optics.shift))
+        turn = float(np.linalg.norm(self.optics.turn))
         found = []
         for index, instance in enumerate(self.request.instances):
             bounds = bounds_of(instance.cloud)
@@ -121,35 +118,36 @@ class RayDrawing(Drawing):
         for index, instance in enumerate(self.request.instances):
             if len(chunks[index]):
                 cluster = cluster_of(instance, places, index)
-                drift = _drift(instance, self.optics)
-                project_rays(cluster, drift, view, base * CHUNK, chunks[index], records)
+                own = view._replace(drift=_drift(instance, self.optics))
+                project_rays(cluster, own, base * CHUNK, chunks[index], records)
             base += len(chunks[index])
         return records, total
 
     def _view(self) -> RayParameters:
         """Camera and options as the kernels take them."""
         request, options, optics = self.request, self.request.options, self.optics
-        shutter = optics.camera.shutter
+        tables, blur = self.tables, float(np.sqrt(options.eps2d))
         return RayParameters(
-            width=float(request.width),
-            height=float(request.height),
-            near_plane=float(options.near_plane),
-            far_plane=float(options.far_plane),
-            eps2d=float(options.eps2d),
-            radius_clip=float(options.radius_clip),
-            antialiased=options.rasterize_mode == "antialiased",
-            ranges=optics.camera.shows_ranges,
+            width=np.float32(request.width),
+            height=np.float32(request.height),
+            near_plane=np.float32(options.near_plane),
+            far_plane=np.float32(options.far_plane),
+            eps2d=np.float32(options.eps2d),
+            radius_clip=np.float32(options.radius_clip),
+            antialiased=np.float32(options.rasterize_mode == "antialiased"),
+            ranges=np.float32(optics.camera.shows_ranges),
             rolls=optics.moves,
-            by_row=shutter.by_row,
-            forward=shutter.direction in {"top_to_bottom", "left_to_right"},
-            slack=self.tables.slack,
-            bend=self.tables.bend,
-            cosine=float(np.cos(self._widest)),
-            sine=float(np.sin(self._widest)),
-            turned=float(np.linalg.norm(optics.turn())),
-            directory=self.tables.directory,
-            shift=np.ascontiguousarray(optics.shift()),
-            turn=np.ascontiguousarray(optics.turn()),
+            bend=np.float32(tables.bend),
+            slack=np.float32(tables.slack),
+            edge=np.float32(REACH_MAX * blur + 2.0),
+            cosine=np.float32(np.cos(self._widest)),
+            sine=np.float32(np.sin(self._widest)),
+            turned=np.float32(np.linalg.norm(optics.turn)),
+            directory=tables.directory,
+            line=_line(optics),
+            shift=np.ascontiguousarray(optics.shift),
+            turn=np.ascontiguousarray(optics.turn),
+            drift=np.zeros((2, 3)),
         )
 
     def _blend_tiles(
@@ -175,7 +173,7 @@ class RayDrawing(Drawing):
         )
 
     def _add_sky(self, sky: Sky) -> None:
-        turn = np.ascontiguousarray(self.optics.motion.middle()[:3, :3], np.float32)
+        turn = np.ascontiguousarray(self.optics.middle[:3, :3], np.float32)
         step = self._rows(1)
         for first in range(0, self.request.height, step):
             self._pause()
@@ -185,9 +183,20 @@ class RayDrawing(Drawing):
                 add_ray_sky(array_of(sky.faces), turn, self.rays[rows], rgb, alpha)
 
 
+def _line(optics: LensView) -> NDArray[np.float32]:
+    """``line`` of RayParameters."""
+    shutter = optics.camera.shutter
+    lines = optics.camera.height if shutter.by_row else optics.camera.width
+    step = 1 / max(lines - 1, 1)
+    if shutter.direction not in {"top_to_bottom", "left_to_right"}:
+        step = -step
+    start = -0.5 * step - (0.5 if step > 0 else -0.5)
+    return np.array([0, step, start] if shutter.by_row else [step, 0, start], np.float32)
+
+
 def _drift(instance: Instance, optics: LensView) -> NDArray[np.float64]:
     """[2, 3] way and rotation vector of an instance over the read-out, in the camera's frame."""
     if instance.twist is None or not optics.moves:
         return np.zeros((2, 3))
-    turn = optics.motion.middle()[:3, :3]
+    turn = optics.middle[:3, :3]
     return np.ascontiguousarray(instance.twist.reshape(2, 3) @ turn * optics.seconds)

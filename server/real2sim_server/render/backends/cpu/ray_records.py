@@ -33,31 +33,36 @@ class RayParameters(NamedTuple):
     Attributes:
         width, height: of the image [px].
         near_plane, far_plane, eps2d, radius_clip, antialiased: see RasterOptions.
-        ranges: whether depths are distances from the camera, else along z.
-        rolls, by_row, forward: of the shutter; ``forward``: the first line comes first.
-        slack, bend: see LensTables.
+        ranges: 1 where depths are distances from the camera, 0 where they are along z.
+        rolls: whether lines are taken one after the other.
+        bend, slack: see LensTables.
+        edge: how far small things reach on the image beyond their size [px].
         cosine, sine: of the angle from the axis that no ray exceeds.
         turned: length of ``turn``.
         directory: see LensTables.
+        line: [3] float32; x, y, 1 times these, within -0.5 to 0.5, is the time of a position.
         shift, turn: [3] float64, of the camera over the read-out, see LensView.
+        drift: [2, 3] float64, of the cluster over the read-out: way of its origin [m] and rotation
+            vector [rad], in the camera's frame.
     """
 
-    width: float
-    height: float
-    near_plane: float
-    far_plane: float
-    eps2d: float
-    radius_clip: float
-    antialiased: bool
-    ranges: bool
+    width: np.float32
+    height: np.float32
+    near_plane: np.float32
+    far_plane: np.float32
+    eps2d: np.float32
+    radius_clip: np.float32
+    antialiased: np.float32
+    ranges: np.float32
     rolls: bool
-    by_row: bool
-    forward: bool
-    slack: float
-    bend: float
-    cosine: float
-    sine: float
-    turned: float
+    bend: np.float32
+    slack: np.float32
+    edge: np.float32
+    cosine: np.float32
+    sine: np.float32
+    turned: np.float32
     directory: NDArray[np.float32]
+    line: NDArray[np.float32]
     shift: NDArray[np.float64]
     turn: NDArray[np.float64]
+    drift: NDArray[np.float64]

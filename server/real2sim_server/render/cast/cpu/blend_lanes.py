@@ -17,6 +17,7 @@ from ...backends.base import ALPHA_MAX
 from ...backends.cpu.lanes import FLOAT, I64, Lanes, Planes, mask_bits, splat
 from ...backends.cpu.records import EXPONENT_LIMIT
 from ...backends.cpu.simd import exponential
+from ...backends.cpu.vectors import dot, whitened
 from ..types import ECHO_MIN, HALF_LIGHT, TRANSMITTANCE_MIN
 from .records import (
     BODY,
@@ -54,14 +55,14 @@ def _build(
     direction = [rays.load(3 + k) for k in range(3)]
     mean = record[MEAN : MEAN + 3]
     whitening = record[WHITENING : WHITENING + 6]
-    start = _whitened(whitening, [o - m for o, m in zip(origin, mean, strict=True)])
-    along = _whitened(whitening, direction)
-    inverse = _dot(along, along).reciprocal()
+    start = whitened(whitening, [o - m for o, m in zip(origin, mean, strict=True)])
+    along = whitened(whitening, direction)
+    inverse = dot(along, along).reciprocal()
     # |start x along|^2 / |along|^2 keeps the digits that |start|^2 - (start along)^2 / |along|^2
     # loses.
     off = [start[i] * along[j] - start[j] * along[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-    exponent = _dot(off, off).fused(inverse, record[LEVEL])
-    tau = -(_dot(start, along) * inverse)
+    exponent = dot(off, off).fused(inverse, record[LEVEL])
+    tau = -(dot(start, along) * inverse)
     alpha = exponential(exponent)
     alpha = alpha.where(alpha.compare("<", ALPHA_MAX), ALPHA_MAX)
 
@@ -117,19 +118,6 @@ def close_echo(state: Planes, ends: Any) -> None:
     for plane, mask in ((FIRST, is_first), (STRONGEST, is_strongest), (LAST, is_return)):
         for k, value in enumerate(values):
             state.store(plane + k, value.where(mask, state.load(plane + k)))
-
-
-def _whitened(w: list[Lanes], v: list[Lanes]) -> list[Lanes]:
-    """Lower triangle times a vector."""
-    return [
-        w[0] * v[0],
-        w[1].fused(v[0], w[2] * v[1]),
-        w[3].fused(v[0], w[4].fused(v[1], w[5] * v[2])),
-    ]
-
-
-def _dot(a: list[Lanes], b: list[Lanes]) -> Lanes:
-    return a[0].fused(b[0], a[1].fused(b[1], a[2] * b[2]))
 
 
 def _cast_intrinsic(*, returns: bool) -> Any:
@@ -214,7 +202,7 @@ def place_rays(typingctx, directions, group, frame, rays, bank):  # type: ignore
         for row in range(3):
             turn = [frames.load(4 * row + k) for k in range(3)]
             out.store(row, frames.load(4 * row + 3))
-            out.store(3 + row, _dot(turn, d))
+            out.store(3 + row, dot(turn, d))
         return context.get_dummy_value()
 
     return types.void(directions, types.int64, frame, rays, types.int64), generate

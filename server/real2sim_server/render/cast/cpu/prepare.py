@@ -18,6 +18,7 @@ from numba import prange
 from ...._numba import PARALLEL_LOOPS
 from ...backends.cpu.kernel import inlined, kernel
 from ...backends.cpu.lanes import LANES
+from ...backends.cpu.project import gather_shape
 from ...backends.cpu.records import CHUNK
 from ...backends.cpu.simd import lowest_bit
 from .layout import AZIMUTH_BIN, AZIMUTH_BINS, ELEVATION_BIN, ELEVATION_BINS
@@ -107,17 +108,7 @@ def gather(body, first, count, planes):
             row = body.linear[k]
             placed = row[0] * x + row[1] * y + row[2] * z + body.offset[k]
             planes[(MEAN + k) * LANES + lane] = F32(placed)
-        if body.covars.shape[0] > 0:
-            covar, plane = body.covars[i], SHAPE * LANES + lane
-            for row_index in range(3):
-                for column in range(row_index, 3):
-                    planes[plane] = covar[row_index, column]
-                    plane += LANES
-        else:
-            for k in range(4):
-                planes[(SHAPE + k) * LANES + lane] = body.quats[i, k]
-            for k in range(3):
-                planes[(SHAPE + 4 + k) * LANES + lane] = body.scales[i, k]
+        gather_shape(body, i, SHAPE, lane, planes)
 
 
 @inlined()

@@ -15,6 +15,14 @@ from ...backends.base import ALPHA_MIN
 from ...backends.cpu.lanes import Lanes, Planes, logarithm
 from ...backends.cpu.project_lanes import LOG_255, Named, eight_step
 from ...backends.cpu.records import EXPONENT_UNIT
+from ...backends.cpu.vectors import (
+    Vector,
+    cholesky,
+    dot,
+    dot_all,
+    turn_columns,
+    whitening,
+)
 from .records import (
     FRAME,
     GAIN,
@@ -42,14 +50,12 @@ ARC = (0.99997726, -0.33262347, 0.19354346, -0.11643287, 0.05265332, -0.01172120
 """Odd series of the arc tangent on [-1, 1], to 2e-6."""
 TINY = 1e-12
 
-Vector = list[Lanes]
-
 
 def _prepare(eight: Planes, sensor: Named, body: Named, *, deformed: bool) -> Any:
     """Write the planes of a record; there remain those that a ray may meet."""
     mean = [eight.load(MEAN + k) for k in range(3)]
     turn = [[eight.load(FRAME + 4 * row + k) for k in range(3)] for row in range(3)]
-    x, y, z = (_dot(turn[row], mean, eight.load(FRAME + 4 * row + 3)) for row in range(3))
+    x, y, z = (dot(turn[row], mean, eight.load(FRAME + 4 * row + 3)) for row in range(3))
     flat = x.fused(x, y * y).at_least(TINY)
     square = z.fused(z, flat)
     along, distance = flat.root(), square.root()
@@ -62,14 +68,15 @@ def _prepare(eight: Planes, sensor: Named, body: Named, *, deformed: bool) -> An
     factors = (_deformed_factors if deformed else _factors)(eight, body)
     wide, high = distance * sensor.number("wide"), distance * sensor.number("high")
     rows = [[*factors[k], across[k] * wide, upward[k] * high] for k in range(3)]
-    _whiten(eight, rows)
+    for k, value in enumerate(whitening(rows, TINY)):
+        eight.store(WHITENING + k, value * HALF_UNIT_ROOT)
 
     opacity = eight.load(OPACITY)
     level = -logarithm(opacity.at_least(TINY))
     eight.store(LEVEL, level * (1 / EXPONENT_UNIT))
     reach = ((-level + LOG_255).at_least(0.0) * 2.0).root()
     seen = [_spread(direction, rows, reach) for direction in (radial, across, turn[2])]
-    extent = reduce(Lanes.__add__, (_dot_all(v, v) for v in seen)).root()
+    extent = reduce(Lanes.__add__, (dot_all(v, v) for v in seen)).root()
     gain = sensor_gain(body, (distance - extent).at_least(0.1))
     eight.store(GAIN, gain)
     eight.store(RANGE, distance)
@@ -91,34 +98,19 @@ def sensor_gain(body: Named, nearest: Lanes) -> Lanes:
 
 def _factors(eight: Planes, body: Named) -> list[Vector]:
     """[3][3]: linear R diag(s), whose product with its transpose is the covariance."""
-    w, x, y, z = (eight.load(SHAPE + k) for k in range(4))
-    norm = w.fused(w, x.fused(x, y.fused(y, z * z))).at_least(TINY).reciprocal() * 2.0
-    nx, ny, nz = x * norm, y * norm, z * norm
-    xx, yy, zz = x * nx, y * ny, z * nz
-    xy, xz, yz = x * ny, x * nz, y * nz
-    wx, wy, wz = w * nx, w * ny, w * nz
-    columns = (
-        (-(yy + zz) + 1.0, xy + wz, xz - wy),
-        (xy - wz, -(xx + zz) + 1.0, yz + wx),
-        (xz + wy, yz - wx, -(xx + yy) + 1.0),
-    )
+    columns = turn_columns([eight.load(SHAPE + k) for k in range(4)])
     scales = [eight.load(SHAPE + 4 + k) for k in range(3)]
     linear = _linear(body)
-    return [[_dot(linear[row], columns[k]) * scales[k] for k in range(3)] for row in range(3)]
+    return [[dot(linear[row], columns[k]) * scales[k] for k in range(3)] for row in range(3)]
 
 
 def _deformed_factors(eight: Planes, body: Named) -> list[Vector]:
     """The same from the upper half of a covariance: linear times its Cholesky factor."""
-    xx, xy, xz, yy, yz, zz = (eight.load(SHAPE + k).doubles() for k in range(6))
-    a = xx.at_least(TINY).root()
-    b, c = xy / a, xz / a
-    d = (yy - b * b).at_least(TINY).root()
-    e = (yz - b * c) / d
-    f = (zz - c * c - e * e).at_least(TINY).root()
-    a, b, c, d, e, f = (number.floats() for number in (a, b, c, d, e, f))
+    upper = [eight.load(SHAPE + k).doubles() for k in range(6)]
+    a, b, c, d, e, f = cholesky(upper, TINY)
     rows = []
     for own in _linear(body):
-        rows.append([_dot(own, (a, b, c)), own[1].fused(d, own[2] * e), own[2] * f])
+        rows.append([dot(own, (a, b, c)), own[1].fused(d, own[2] * e), own[2] * f])
     return rows
 
 
@@ -126,32 +118,10 @@ def _linear(body: Named) -> list[Vector]:
     return [[number.floats() for number in body.three("linear", row=k)] for k in range(3)]
 
 
-def _whiten(eight: Planes, rows: Sequence[Vector]) -> None:
-    """Write the inverse of the lower triangle L with L L^T = rows rows^T (Gram and Schmidt, which
-    keeps the digits of flat Gaussians that a covariance loses)."""
-    first, second, third = rows
-    l11 = _dot_all(first, first).at_least(TINY).root()
-    w11 = l11.reciprocal()
-    q1 = [v * w11 for v in first]
-    l21, l31 = _dot_all(second, q1), _dot_all(third, q1)
-    second = [v - l21 * q for v, q in zip(second, q1, strict=True)]
-    third = [v - l31 * q for v, q in zip(third, q1, strict=True)]
-    w22 = _dot_all(second, second).at_least(TINY).root().reciprocal()
-    q2 = [v * w22 for v in second]
-    l32 = _dot_all(third, q2)
-    third = [v - l32 * q for v, q in zip(third, q2, strict=True)]
-    w33 = _dot_all(third, third).at_least(TINY).root().reciprocal()
-    w21 = -(l21 * w11 * w22)
-    w32 = -(l32 * w22 * w33)
-    w31 = -((l31 * w11 + l32 * w21) * w33)
-    for k, value in enumerate((w11, w21, w22, w31, w32, w33)):
-        eight.store(WHITENING + k, value * HALF_UNIT_ROOT)
-
-
 def _spread(direction: Vector, rows: Sequence[Vector], reach: Lanes) -> Vector:
     """How far the ellipsoid reaches along a direction, as a vector whose products give all."""
     columns = zip(*rows, strict=True)
-    return [_dot(direction, column) * reach for column in columns]
+    return [dot(direction, column) * reach for column in columns]
 
 
 def _angles(  # noqa: PLR0917
@@ -162,12 +132,12 @@ def _angles(  # noqa: PLR0917
     radial, across, upward = seen
     flat = along * along
     left, right, near_axis = _tangents(
-        flat, _dot_all(radial, radial), _dot_all(radial, across), _dot_all(across, across)
+        flat, dot_all(radial, radial), dot_all(radial, across), dot_all(across, across)
     )
     inverse = square.root().reciprocal()
     u = [(a * along + b * z) * inverse for a, b in zip(radial, upward, strict=True)]
     v = [(b * along - a * z) * inverse for a, b in zip(radial, upward, strict=True)]
-    down, up, near = _tangents(square, _dot_all(u, u), _dot_all(u, v), _dot_all(v, v))
+    down, up, near = _tangents(square, dot_all(u, u), dot_all(u, v), dot_all(v, v))
     half = left.magnitude().at_least(right.magnitude())
     widened = gain * half.fused(sensor.number("period"), sensor.number("spread")) + SLACK
     return {
@@ -235,18 +205,6 @@ def _series(ratio: Lanes) -> Lanes:
     for coefficient in ARC[-2::-1]:
         value = value.fused(square, coefficient)
     return value * ratio
-
-
-def _dot(a: Sequence[Lanes], b: Sequence[Lanes], addend: Lanes | None = None) -> Lanes:
-    last = a[2] * b[2] if addend is None else a[2].fused(b[2], addend)
-    return a[0].fused(b[0], a[1].fused(b[1], last))
-
-
-def _dot_all(a: Sequence[Lanes], b: Sequence[Lanes]) -> Lanes:
-    total = a[0] * b[0]
-    for left, right in zip(a[1:], b[1:], strict=True):
-        total = left.fused(right, total)
-    return total
 
 
 prepare_eight = eight_step(partial(_prepare, deformed=False), count=PREPARATION)
