@@ -57,6 +57,7 @@ FORMS: dict[str, tuple[float, type[np.generic]]] = {
     "instance": (65535, np.uint16),
     "median_depth": (FAR, np.float32),
     "semantic": (255, np.uint8),
+    "uncertainty": (1, np.float32),
 }
 """Largest value and dtype of images by modality."""
 

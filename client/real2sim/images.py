@@ -21,9 +21,16 @@ from .errors import ImageDecodeError, MalformedReplyError
 if TYPE_CHECKING:
     from real2sim_proto.drive import Frame as WireFrame
 
-DEPTHS = ("depth", "median_depth")
 DEPTH_PNG_UNIT = 1 / 256
 """Metres of one level of depth sent as 16-bit png."""
+UNCERTAINTY_PNG_UNIT = 1 / 65535
+"""Of one level of uncertainty sent as 16-bit png."""
+PNG_UNITS = {
+    "depth": DEPTH_PNG_UNIT,
+    "median_depth": DEPTH_PNG_UNIT,
+    "uncertainty": UNCERTAINTY_PNG_UNIT,
+}
+"""Of images of float32, by modality."""
 AS_SENT = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
 """Suffixes of files that hold the bytes of a codec."""
 
@@ -37,9 +44,11 @@ class Image:
         codec: ``raw``, ``jpeg`` or ``png``.
         modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` or ``median_depth`` (float32 [H, W], metres
             along the camera z axis, 0 where nothing was hit), ``instance`` (uint16 [H, W], 0 is
-            background) or ``semantic`` (uint8 [H, W], numbers of
-            ``real2sim_proto.SEMANTIC_CLASSES``).
-        dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``.
+            background), ``semantic`` (uint8 [H, W], numbers of
+            ``real2sim_proto.SEMANTIC_CLASSES``) or ``uncertainty`` (float32 [H, W], absolute error
+            of the colour, of 1, that training lets expect).
+        dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``, ``uint16``
+            uncertainty in steps of ``UNCERTAINTY_PNG_UNIT``.
         shape: of the array; empty where only the image itself tells.
 
     Examples:
@@ -72,8 +81,8 @@ class Image:
                 f"{self.codec} image holds {array.dtype} {array.shape} where "
                 f"{self.dtype} {self.shape or ''} was announced"
             )
-        if self.modality in DEPTHS and array.dtype == np.uint16:
-            return array * np.float32(DEPTH_PNG_UNIT)
+        if self.modality in PNG_UNITS and array.dtype == np.uint16:
+            return array * np.float32(PNG_UNITS[self.modality])
         return array
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:

@@ -14,7 +14,7 @@ Identifier = Annotated[str, Field(pattern=ID_PATTERN)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 Microseconds = Annotated[int, Field(ge=-(2**62), le=2**62)]
 Codec = Literal["raw", "jpeg", "png"]
-Modality = Literal["rgb", "depth", "instance", "median_depth", "semantic"]
+Modality = Literal["rgb", "depth", "instance", "median_depth", "semantic", "uncertainty"]
 Vector3 = tuple[Metres, Metres, Metres]
 
 

@@ -21,5 +21,8 @@ CONVENTIONS: dict[str, str] = {
     "median_depth": "as depth, of the Gaussian that takes half of the light; no mean over edges",
     "semantic": "uint8 [H, W], "
     + ", ".join(f"{number} {name}" for name, number in SEMANTIC_CLASSES.items()),
+    "uncertainty": "float32 [H, W], expected absolute error of the colour, of 1, mean of the "
+    "channels, as far as training rays tell; 0.25 for what none has met",
+    "uncertainty_png": "16 bit, steps of 1/65535",
 }
 """What each convention says, by its name."""

@@ -23,7 +23,7 @@ class SensorSpec(Model):
     """One camera of an observation."""
 
     camera: Identifier
-    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=5)
+    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=6)
     width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
     codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
     quality: int = Field(default=90, ge=1, le=100, description="of jpeg")

@@ -77,6 +77,9 @@ class SceneInfo(Reply):
     extent_max: tuple[float, float, float] | None = None
     ego: Track | None = Field(default=None, description="T_world_vehicle of the recording")
     provenance: dict[str, Any] = Field(default_factory=dict)
+    has_uncertainties: bool = Field(
+        default=False, description="whether it has images of modality `uncertainty`"
+    )
 
 
 class SceneList(Reply):

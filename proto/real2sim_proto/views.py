@@ -40,7 +40,7 @@ class FreeCamera(Model):
     )
     lens: LensSpec = PinholeLens()
     pose: Pose = Field(description="T_world_camera; x right, y down, z forward")
-    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=5)
+    modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=6)
     codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
     quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
     effects: CameraEffects | None = Field(

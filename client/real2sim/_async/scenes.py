@@ -128,7 +128,8 @@ class AsyncScenes:
             camera: name of one of its cameras.
             t_us: instant; default: the start of the recording.
             width: pixels; default: as recorded.
-            modality: ``rgb``, ``depth``, ``instance``, ``median_depth`` or ``semantic``.
+            modality: ``rgb``, ``depth``, ``instance``, ``median_depth``, ``semantic`` or
+                ``uncertainty``.
             codec: ``raw``, ``jpeg``, ``png``, or ``auto``: raw on this machine, else jpeg.
 
         Raises:

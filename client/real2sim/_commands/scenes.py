@@ -38,6 +38,7 @@ class Modality(StrEnum):
     INSTANCE = "instance"
     MEDIAN_DEPTH = "median_depth"
     SEMANTIC = "semantic"
+    UNCERTAINTY = "uncertainty"
 
 
 @app.command()

@@ -29,6 +29,7 @@ ENCODINGS = {
     "instance": "16UC1",
     "median_depth": "32FC1",
     "semantic": "8UC1",
+    "uncertainty": "32FC1",
 }
 """Of images, by modality."""
 

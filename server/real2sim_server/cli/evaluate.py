@@ -123,6 +123,14 @@ def _table(result: Evaluation) -> dict[str, object]:
             "vehicles' other sides [dB]": result.around.psnr_unseen,
             "of these covered": result.around.coverage_unseen,
         }
+    if result.uncertainty is not None:
+        figures |= {
+            "uncertainty against error, Spearman by pixel": result.uncertainty.spearman,
+            "of squares of 9 pixels": result.uncertainty.spearman_regions,
+            "sparsification (0 best, 1 chance)": result.uncertainty.sparsification,
+            "uncertainty, mean": result.uncertainty.uncertainty,
+            "error, mean": result.uncertainty.error,
+        }
     if result.lidar is not None:
         figures |= _lidar_figures(result.lidar)
     return figures

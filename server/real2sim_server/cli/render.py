@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..scene import Scene
 
 CODEC_BY_SUFFIX = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
-MODALITIES = ("rgb", "depth", "instance", "median_depth", "semantic")
+MODALITIES = ("rgb", "depth", "instance", "median_depth", "semantic", "uncertainty")
 
 
 @command("render")
@@ -37,7 +37,7 @@ def render(
     t_us: Annotated[int | None, typer.Option(help="Or a time stamp [us].")] = None,
     width: Annotated[int | None, typer.Option(min=16, max=8192, help="[px]")] = None,
     modality: Annotated[
-        str, typer.Option(help="rgb, depth, instance, median_depth or semantic")
+        str, typer.Option(help="rgb, depth, instance, median_depth, semantic or uncertainty")
     ] = "rgb",
     lidar: Annotated[
         str | None, typer.Option(help="Cast a sweep instead: name or JSON file of a LiDAR.")

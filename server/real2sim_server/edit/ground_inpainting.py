@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.transform import invert_transform
-from ..scene import GaussianCloud, Scene
+from ..scene import UNSEEN, GaussianCloud, Scene
 from .state import ObjectState, ScenarioState
 from .tracks import Float
 
@@ -62,12 +62,15 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
 def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
     """The background with the ground coloured like that around it where objects ``left`` stood.
 
-    Gaussians inside a box and above its ground become invisible: they belonged to the object.
+    Gaussians inside a box and above its ground become invisible: they belonged to the object. What
+    is coloured by guess has the uncertainty of what was never seen.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.
     """
     opacities, sh = background.opacities.clone(), background.sh.clone()
+    known = background.uncertainties
+    uncertainties = None if known is None else known.clone()
     for object_id in left:
         parked = scene.object(object_id)
         track = parked.trajectory
@@ -79,9 +82,12 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
         height = local[:, 2] + half[2]
         level = height.abs() <= LOW
         opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
-        known = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
-        _recolour(sh, local[:, :2], level & (beyond <= MARGIN), known)
-    return replace(background, opacities=opacities, sh=sh)
+        around = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
+        beneath = level & (beyond <= MARGIN)
+        _recolour(sh, local[:, :2], beneath, around)
+        if uncertainties is not None:
+            uncertainties[beneath] = UNSEEN
+    return replace(background, opacities=opacities, sh=sh, uncertainties=uncertainties)
 
 
 @lru_cache(maxsize=4096)

@@ -19,8 +19,12 @@ from .initialise.views import chosen_frames
 from .options import InitialiseOptions, ReconstructError
 from .stages import OnProgress, Stages
 from .training import OnTraining, TrainOptions, held_out_frames, train, with_box_noise
+from .uncertainty import VIEWS, fit_uncertainties
 
 EVALUATED_FRAMES = 4
+LEAST_VIEWS, STEPS_A_VIEW = 4, 60
+"""Views that uncertainty is found by after a training, at least, and one more a so many steps: a
+view costs about as much as two of them."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +163,11 @@ def reconstruct(
             stages=_Callbacks(on_progress, on_training, timing_s),
             backend=options.backend,
         )
+        with stages("uncertainty") as report_step:
+            views = max(LEAST_VIEWS, min(VIEWS, figures.iterations // STEPS_A_VIEW))
+            scene, _ = fit_uncertainties(
+                scene, log, views=views, backend=options.backend, on_view=report_step
+            )
     with stages("write"):
         scene = save_scene(scene, out, overwrite=overwrite)
     with stages("evaluate"):

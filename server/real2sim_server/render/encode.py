@@ -15,6 +15,8 @@ RGB_CODECS = ("raw", "jpeg", "png")
 EXACT_CODECS = ("raw", "png")
 DEPTH_PNG_UNIT = 1 / 256
 """Metres of one level of a depth png, as in KITTI: 4 mm steps up to 255.99 m."""
+UNCERTAINTY_PNG_UNIT = 1 / 65535
+"""Of one level of an uncertainty png."""
 PNG_COMPRESSION = 1
 """zlib level; higher ones are several times slower and shrink pictures little more."""
 
@@ -27,7 +29,7 @@ class EncodedImage:
         data: the bytes; of codec ``raw`` the array in C order, little-endian.
         codec: ``raw``, ``jpeg`` or ``png``.
         dtype: of the decoded array: ``uint8``, ``uint16`` or ``float32``. Depth as ``uint16``
-            is in steps of DEPTH_PNG_UNIT.
+            is in steps of DEPTH_PNG_UNIT, uncertainty in steps of UNCERTAINTY_PNG_UNIT.
         shape: of the decoded array.
     """
 
@@ -70,6 +72,16 @@ def encode_depth(depth: NDArray[np.float32], codec: str, *, name: str = "depth")
         return depth.astype("<f4", order="C", copy=False).tobytes()
     levels = np.clip(np.rint(depth / DEPTH_PNG_UNIT), 1, np.iinfo(np.uint16).max)
     return _png(np.where(depth > 0, levels, 0).astype(np.uint16))
+
+
+def encode_uncertainty(image: NDArray[np.float32], codec: str) -> bytes:
+    """Uncertainty [H, W] float32 in [0, 1] as raw float32, or 16-bit png in steps of
+    UNCERTAINTY_PNG_UNIT."""
+    _check_codec("uncertainty", codec, EXACT_CODECS)
+    _check_array("uncertainty", image, np.float32, 2)
+    if codec == "raw":
+        return image.astype("<f4", order="C", copy=False).tobytes()
+    return _png(np.rint(np.clip(image, 0, 1) / UNCERTAINTY_PNG_UNIT).astype(np.uint16))
 
 
 def encode_instance(instance: NDArray[np.uint16], codec: str) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from .lens_view import LensView, tables_of
 from .modalities import modalities_drawn, modality_of, options_for
 from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
+from .uncertainty import UNCERTAINTY, uncertainty_request
 
 
 def at_once() -> None:
@@ -42,7 +44,8 @@ class Frame:
         images: by modality: ``rgb`` [H, W, 3] uint8, ``depth`` [H, W] float32 along the camera z
             axis [m], 0 where alpha is below 0.5, ``instance`` [H, W] uint16 ids, 0 is background,
             ``median_depth`` [H, W] float32 [m], 0 where alpha is below 0.5, ``semantic`` [H, W]
-            uint8, see SEMANTIC_CLASSES.
+            uint8, see SEMANTIC_CLASSES, ``uncertainty`` [H, W] float32, expected absolute error
+            of a colour, of 1.
         T_world_camera: [4, 4] float64, OpenCV camera frame to world.
         timing_ms: by stage; cameras drawn together share their time equally.
         ready: returns when the images are whole; nobody has to ask but who asked not to wait.
@@ -254,7 +257,24 @@ class _Drawn:
 def _drawn(
     requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
 ) -> Iterator[_Drawn]:
-    """What comes of each request."""
+    """What comes of each request; uncertainty by a pass of its own."""
+    if UNCERTAINTY not in modalities:
+        yield from _drawn_in_colour(requests, modalities, backend)
+        return
+    others = [name for name in modalities if name != UNCERTAINTY]
+    uncertain = [uncertainty_request(request) for request in requests]
+    seen = _drawn_in_colour(requests, others, backend) if others else repeat(_Drawn({}, {}))
+    for drawn, output in zip(seen, _rasterized(uncertain, backend), strict=False):
+        own = replace(output, uncertainty=output.rgb[..., 0])
+        images = {**drawn.images, UNCERTAINTY: modality_of(UNCERTAINTY).pixels(own)}
+        timing = {**drawn.timing_ms, UNCERTAINTY: sum(output.timing_ms.values())}
+        yield _Drawn(images, timing, drawn.ready)
+
+
+def _drawn_in_colour(
+    requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
+) -> Iterator[_Drawn]:
+    """By the passes that draw colours."""
     if requests and isinstance(backend, FrameBackend) and draws_together(backend, modalities):
         start = time.perf_counter()
         started = backend.start_frames(requests, modalities)

@@ -143,6 +143,7 @@ class RenderOutput:
             to 0.5 or below; 0 where it never does. None when not asked for.
         median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none, and
             without gradients. None when not asked for.
+        uncertainty: [C, H, W] float32, see :mod:`.uncertainty`; None where nobody asked.
         classes: [65536] uint8, of ``instance`` by id; None where nobody asked.
         behind: class of a pixel at which transmittance stays above 0.5.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
@@ -158,6 +159,7 @@ class RenderOutput:
     screen: ScreenStatistics | None = None
     between: Callable[[], object] | None = None
     median_depth: Tensor | None = None
+    uncertainty: Tensor | None = None
     classes: NDArray[np.uint8] | None = None
     behind: int = UNLABELED
 

@@ -6,7 +6,7 @@ Knows neither the passing of time nor HTTP.
 from .asset import Asset
 from .camera import Camera, CameraRig
 from .camera_motion import CameraMotion
-from .cloud import GaussianCloud
+from .cloud import UNSEEN, GaussianCloud
 from .colour import TimeColour
 from .errors import (
     BundleError,
@@ -28,6 +28,7 @@ from .sky import Sky
 from .trajectory import Trajectory
 
 __all__ = [
+    "UNSEEN",
     "Asset",
     "Beams",
     "BrownConrady",

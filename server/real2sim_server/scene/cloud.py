@@ -15,6 +15,8 @@ from .errors import SceneError
 from .spherical_harmonics import rotate_sh
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
+UNSEEN = 0.25
+"""Uncertainty of what no training ray has met: about the absolute error of a guessed colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,8 @@ class GaussianCloud:
         sh: [N, K, 3] float32, spherical harmonics, K = (degree + 1)^2, degree 0 to 3; RGB is
             ``clamp(sum_k sh_k Y_k(direction) + 0.5, min=0)`` with the direction in the cloud's
             own frame, the basis of :func:`~.spherical_harmonics.sh_basis`.
+        uncertainties: [N] float32 in [0, 1], expected absolute error of the colour where training
+            rays tell it, UNSEEN where none does; None where it is not known.
 
     Raises:
         SceneError: on shapes that do not fit together, a dtype other than float32, or tensors on
@@ -40,14 +44,17 @@ class GaussianCloud:
     scales: Tensor
     opacities: Tensor
     sh: Tensor
+    uncertainties: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.means.ndim != 2:
             raise SceneError(f"means must be [N, 3], not {list(self.means.shape)}")
         n = self.means.shape[0]
         expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+        expected["uncertainties"] = (n,)
+        parts = self.tensors()
         for name, shape in expected.items():
-            given = tuple(getattr(self, name).shape)
+            given = tuple(parts[name].shape) if name in parts else shape
             if given != shape:
                 raise SceneError(f"{name} of a cloud of {n} Gaussians must be {shape}, not {given}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3:
@@ -58,18 +65,22 @@ class GaussianCloud:
             raise SceneError(
                 f"sh has {self.sh.shape[1]} coefficients; allowed are {sorted(SH_DEGREES)}"
             )
-        for field in fields(self):
-            tensor = getattr(self, field.name)
+        for name, tensor in parts.items():
             if tensor.dtype != torch.float32:
-                raise SceneError(f"{field.name} of a cloud must be float32, not {tensor.dtype}")
+                raise SceneError(f"{name} of a cloud must be float32, not {tensor.dtype}")
             if tensor.device != self.means.device:
                 raise SceneError(
-                    f"{field.name} is on {tensor.device}, means are on {self.means.device}; "
+                    f"{name} is on {tensor.device}, means are on {self.means.device}; "
                     "a cloud lives on one device"
                 )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by name, without what is not known."""
+        named = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return {name: tensor for name, tensor in named if tensor is not None}
 
     @property
     def sh_degree(self) -> int:
@@ -84,10 +95,7 @@ class GaussianCloud:
     @property
     def nbytes(self) -> int:
         """Memory of all tensors [bytes]."""
-        return sum(
-            getattr(self, f.name).numel() * getattr(self, f.name).element_size()
-            for f in fields(self)
-        )
+        return sum(tensor.numel() * tensor.element_size() for tensor in self.tensors().values())
 
     @classmethod
     def empty(cls, *, sh_degree: int = 0) -> GaussianCloud:
@@ -105,11 +113,11 @@ class GaussianCloud:
         """The cloud on another device; itself when it is there already."""
         if torch.device(device) == self.device:
             return self
-        return GaussianCloud(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return GaussianCloud(**{name: t.to(device) for name, t in self.tensors().items()})
 
     def select(self, index: Tensor) -> GaussianCloud:
         """The Gaussians picked by a mask [N] bool or indices [M] int64."""
-        return GaussianCloud(*(getattr(self, f.name)[index].contiguous() for f in fields(self)))
+        return GaussianCloud(**{name: t[index].contiguous() for name, t in self.tensors().items()})
 
     def with_sh_degree(self, degree: int) -> GaussianCloud:
         """The same Gaussians with SH padded by zeros, or cut, to ``degree``."""
@@ -120,6 +128,12 @@ class GaussianCloud:
         kept = min(k, int(self.sh.shape[1]))
         sh[:, :kept] = self.sh[:, :kept]
         return replace(self, sh=sh)
+
+    def with_uncertainties(self) -> GaussianCloud:
+        """The same Gaussians with uncertainties: their own, or UNSEEN where none are known."""
+        if self.uncertainties is not None:
+            return self
+        return replace(self, uncertainties=torch.full_like(self.opacities, UNSEEN))
 
     def moved(self, T_dst_src: ArrayLike, *, scale: float = 1.0) -> GaussianCloud:
         """The Gaussians in another frame: scaled about the origin, then placed by ``T_dst_src``.
@@ -147,6 +161,7 @@ class GaussianCloud:
             self.scales * scale,
             self.opacities,
             rotate_sh(self.sh, matrix[:3, :3]),
+            self.uncertainties,
         )
 
     def check_values(self, what: str) -> None:
@@ -156,25 +171,32 @@ class GaussianCloud:
             what: name of the cloud for the message.
 
         Raises:
-            SceneError: values that are not finite, scales not positive, opacities outside [0, 1]
-                or quaternions that are not unit length, each with the count.
+            SceneError: values that are not finite, scales not positive, opacities or uncertainties
+                outside [0, 1] or quaternions that are not unit length, each with the count.
         """
-        for field in fields(self):
-            _refuse(~torch.isfinite(getattr(self, field.name)), what, f"{field.name} not finite")
+        parts = self.tensors()
+        for name, tensor in parts.items():
+            _refuse(~torch.isfinite(tensor), what, f"{name} not finite")
         _refuse(self.scales <= 0, what, "scales not positive")
-        _refuse((self.opacities < 0) | (self.opacities > 1), what, "opacities outside [0, 1]")
+        for name in ("opacities", "uncertainties"):
+            if name in parts:
+                _refuse((parts[name] < 0) | (parts[name] > 1), what, f"{name} outside [0, 1]")
         _refuse((self.quats.norm(dim=-1) - 1).abs() > 1e-3, what, "quats not of unit length")
 
     @staticmethod
     def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
-        """All Gaussians of ``clouds`` (one frame, one device) in one, at the highest SH degree."""
+        """All Gaussians of ``clouds`` (one frame, one device) in one, at the highest SH degree.
+
+        Where only some have uncertainties, those of the others are UNSEEN.
+        """
         if not clouds:
             return GaussianCloud.empty()
         degree = max(c.sh_degree for c in clouds)
         padded = [c.with_sh_degree(degree) for c in clouds]
-        return GaussianCloud(
-            *(torch.cat([getattr(c, f.name) for c in padded]) for f in fields(GaussianCloud))
-        )
+        if any(c.uncertainties is not None for c in padded):
+            padded = [c.with_uncertainties() for c in padded]
+        parts = [c.tensors() for c in padded]
+        return GaussianCloud(**{name: torch.cat([p[name] for p in parts]) for name in parts[0]})
 
 
 def _hamilton(left: Tensor, right: Tensor) -> Tensor:

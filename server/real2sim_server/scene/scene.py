@@ -181,6 +181,11 @@ class Scene:
         return len(self.background) + sum(len(o.cloud) for o in self.objects.values())
 
     @property
+    def has_uncertainties(self) -> bool:
+        """Whether it is known how well training rays tell what it shows."""
+        return self.background.uncertainties is not None
+
+    @property
     def nbytes(self) -> int:
         """Memory of all Gaussians, the sky, the stored ground and what LiDARs see [bytes]."""
         sky = self.sky.nbytes if self.sky else 0

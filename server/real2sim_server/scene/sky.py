@@ -20,9 +20,12 @@ class Sky:
         faces: [6, R, R, 3] float32 RGB in [0, 1], order +x -x +y -y +z -z. On each face the pixel
             (row, column) centre at u, v = (column + 0.5, row + 0.5) / R * 2 - 1 looks along the
             direction of :func:`face_directions`.
+        uncertainties: [6, R, R] float32 in [0, 1] of the texels, as those of a cloud's Gaussians;
+            None where they are not known.
     """
 
     faces: Tensor
+    uncertainties: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.faces.shape)
@@ -36,6 +39,12 @@ class Sky:
             raise SceneError(f"sky faces must be [6, R, R, 3], not {list(shape)}")
         if self.faces.dtype != torch.float32:
             raise SceneError(f"sky faces must be float32, not {self.faces.dtype}")
+        given = self.uncertainties
+        if given is not None and (given.shape != shape[:3] or given.dtype != torch.float32):
+            raise SceneError(
+                f"uncertainties of a sky must be {list(shape[:3])} float32, "
+                f"not {list(given.shape)} {given.dtype}"
+            )
 
     @property
     def resolution(self) -> int:
@@ -45,7 +54,20 @@ class Sky:
     @property
     def nbytes(self) -> int:
         """Memory [bytes]."""
-        return self.faces.numel() * self.faces.element_size()
+        return sum(t.numel() * t.element_size() for t in self.tensors().values())
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by name, without what is not known."""
+        known = {} if self.uncertainties is None else {"uncertainties": self.uncertainties}
+        return {"faces": self.faces, **known}
+
+    def check_values(self) -> None:
+        """Look at every value. Raises SceneError for those not finite or out of range."""
+        if not bool(torch.isfinite(self.faces).all()):
+            raise SceneError("sky: faces hold values that are not finite")
+        given = self.uncertainties
+        if given is not None and not bool(((given >= 0) & (given <= 1)).all()):
+            raise SceneError("sky: uncertainties hold values outside [0, 1]")
 
     @classmethod
     def uniform(cls, rgb: tuple[float, float, float], *, resolution: int = 1) -> Sky:
@@ -56,7 +78,9 @@ class Sky:
 
     def to(self, device: torch.device | str) -> Sky:
         """The sky on another device."""
-        return self if torch.device(device) == self.faces.device else Sky(self.faces.to(device))
+        if torch.device(device) == self.faces.device:
+            return self
+        return Sky(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     def sample(self, directions: Tensor) -> Tensor:
         """Bilinear colour [..., 3] along world ``directions`` [..., 3] (any length, not zero)."""

@@ -8,7 +8,7 @@ once. Any affine motion of the particles is reproduced exactly.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -116,23 +116,25 @@ class Embedding:
 def deform_cloud(cloud: GaussianCloud, deformed: Deformed) -> GaussianCloud:
     """The Gaussians moved: mean, covariance F S F^T, colours turned by the rotation part of F.
 
-    Opacities stay. Covariances are decomposed into unit quaternions and scales again.
+    Opacities and uncertainties stay. Covariances are decomposed into unit quaternions and scales
+    again.
     """
     axes = quaternion_to_matrix(cloud.quats.detach().cpu().numpy())
     scales = cloud.scales.detach().cpu().numpy().astype(np.float64)
     left, stretch, _ = np.linalg.svd(deformed.F @ (axes * scales[:, None, :]))
     left[:, :, 2] *= np.sign(np.linalg.det(left))[:, None]
-    return GaussianCloud(
+    return replace(
+        cloud,
         means=_tensor(deformed.positions, cloud),
         quats=_tensor(matrix_to_quaternion(left), cloud),
         scales=_tensor(stretch, cloud),
-        opacities=cloud.opacities,
         sh=_turned(cloud, deformed.rotations),
     )
 
 
 def replaced_rows(cloud: GaussianCloud, rows: torch.Tensor, part: GaussianCloud) -> GaussianCloud:
-    """The cloud with other Gaussians ``part`` in ``rows`` [P] int64; opacities stay."""
+    """The cloud with other Gaussians ``part`` in ``rows`` [P] int64; opacities and uncertainties
+    stay."""
 
     def replaced(name: str) -> torch.Tensor:
         values: torch.Tensor = getattr(cloud, name).detach().clone()
@@ -140,7 +142,7 @@ def replaced_rows(cloud: GaussianCloud, rows: torch.Tensor, part: GaussianCloud)
         return values
 
     means, quats, scales, sh = (replaced(name) for name in ("means", "quats", "scales", "sh"))
-    return GaussianCloud(means, quats, scales, cloud.opacities, sh)
+    return replace(cloud, means=means, quats=quats, scales=scales, sh=sh)
 
 
 def stretched(cloud: GaussianCloud, factors: tuple[float, float, float]) -> GaussianCloud:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from real2sim_proto.operations import Delete, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, vacated_parking
 from real2sim_server.edit.ground_inpainting import inpaint_ground
-from real2sim_server.scene import GaussianCloud
+from real2sim_server.scene import UNSEEN, GaussianCloud
 from real2sim_server.scene.spherical_harmonics import SH_C0
 
 PARKED = "post"
@@ -80,3 +82,16 @@ def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(t
     assert torch.allclose(seen, torch.full_like(seen, 0.4), atol=1e-5)
     assert float(clean.opacities[-1]) == 0.0
     assert torch.equal(clean.opacities[:-1], smeared.opacities[:-1])
+
+
+def test_ground_coloured_by_guess_was_never_seen(tiny_scene):
+    known = replace(
+        tiny_scene.background, uncertainties=torch.full((len(tiny_scene.background),), 0.02)
+    )
+    pose = tiny_scene.object(PARKED).trajectory.transform(tiny_scene.start_us)
+    beneath = torch.tensor(pose[:3, 3] - [0, 0, tiny_scene.object(PARKED).size[2] / 2]).float()
+    known = replace(known, means=known.means.clone())
+    known.means[5] = beneath
+    clean = inpaint_ground(tiny_scene, known, (PARKED,))
+    assert float(clean.uncertainties[5]) == UNSEEN
+    assert float(clean.uncertainties.min()) == pytest.approx(0.02)

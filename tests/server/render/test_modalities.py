@@ -33,6 +33,7 @@ def output() -> RenderOutput:
         instance=(values * 100).to(torch.uint16),
         median_depth=values * 49,
         classes=np.arange(65_536, dtype=np.uint8),
+        uncertainty=values,
     )
 
 

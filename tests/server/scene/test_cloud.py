@@ -6,7 +6,7 @@ import torch
 
 from real2sim_server.geometry.rotation import quaternion_to_matrix
 from real2sim_server.geometry.transform import apply_transform, transform_from
-from real2sim_server.scene import GaussianCloud, SceneError
+from real2sim_server.scene import UNSEEN, GaussianCloud, SceneError
 from real2sim_server.scene.spherical_harmonics import sh_basis
 
 
@@ -135,3 +135,32 @@ def test_moving_with_a_scale_that_is_not_positive_is_refused(make_cloud, scale):
 def test_moving_by_what_is_not_rigid_is_refused(make_cloud):
     with pytest.raises(SceneError, match="rigid"):
         make_cloud().moved(np.diag([1.0, 2, 1, 1]))
+
+
+def with_uncertainties(cloud: GaussianCloud) -> GaussianCloud:
+    return replace(cloud, uncertainties=torch.linspace(0, 1, len(cloud)))
+
+
+def test_uncertainties_go_with_their_gaussians(make_cloud):
+    cloud = with_uncertainties(make_cloud(9))
+    picked = torch.tensor([7, 2, 2])
+    assert torch.equal(cloud.select(picked).uncertainties, cloud.uncertainties[picked])
+    turned = transform_from([1, 2, 3], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    for changed in (cloud.moved(turned, scale=2.0), cloud.with_sh_degree(0), cloud.to("meta")):
+        assert changed.uncertainties.shape == (9,)
+    assert torch.equal(cloud.moved(turned).uncertainties, cloud.uncertainties)
+    assert cloud.nbytes == make_cloud(9).nbytes + 9 * 4
+
+
+def test_what_is_joined_without_uncertainties_counts_as_never_seen(make_cloud):
+    known, unknown = with_uncertainties(make_cloud(3)), make_cloud(2)
+    joined = GaussianCloud.concatenate([known, unknown])
+    assert joined.uncertainties.tolist() == [0, 0.5, 1, UNSEEN, UNSEEN]
+    assert GaussianCloud.concatenate([unknown, unknown]).uncertainties is None
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5, float("nan")])
+def test_uncertainties_out_of_range_are_found(make_cloud, value):
+    bad = replace(make_cloud(4), uncertainties=torch.tensor([0, 0, 1, value]))
+    with pytest.raises(SceneError, match="1 of 4 values: uncertainties"):
+        bad.check_values("x")

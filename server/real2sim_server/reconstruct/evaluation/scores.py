@@ -26,6 +26,7 @@ from .selection import select_cameras, select_frames
 from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
 from .sweeps import LidarScore, evaluate_sweeps
 from .truth import find_truth
+from .uncertainty import UncertaintyScore, evaluate_uncertainty
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ class Evaluation:
         lane_band: the road from beside the path against what other images show of it.
         around: vehicles from all sides; None unless asked for, or where no truth exists.
         lidar: sweeps against what was there; None unless asked for, or without sweeps.
+        uncertainty: drawn uncertainty against true errors; None where the scene knows none.
     """
 
     scene: str
@@ -159,6 +161,7 @@ class Evaluation:
     lane_band: tuple[LaneBandScore, ...] = ()
     around: AroundScore | None = None
     lidar: LidarScore | None = None
+    uncertainty: UncertaintyScore | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
@@ -168,8 +171,9 @@ class Evaluation:
         """
         values = _plain(asdict(self))
         values.pop("no_shifted" if self.shifted else "shifted")
-        if self.lidar is None:
-            values.pop("lidar")
+        for name in ("lidar", "uncertainty"):
+            if values[name] is None:
+                values.pop(name)
         return dict(values)
 
 
@@ -215,6 +219,8 @@ def evaluate_scene(
         lane_band = _lane_band(scene, log, cameras[0], chosen.frames, options)
     with stages("around"):
         around = _around(scene, log) if options.around else None
+    with stages("uncertainty"):
+        uncertainty = evaluate_uncertainty(scene, log, pairs, backend=options.backend)
     with stages("lidar"):
         lidar = evaluate_sweeps(scene, log, chosen.frames) if options.lidar else None
     return Evaluation(
@@ -234,6 +240,7 @@ def evaluate_scene(
         lane_band=lane_band,
         around=around,
         lidar=lidar,
+        uncertainty=uncertainty,
         timing_s=timing_s,
         **asdict(_summary(views, errors)),
     )

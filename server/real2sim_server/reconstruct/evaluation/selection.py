@@ -40,7 +40,7 @@ def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) ->
     Raises:
         ReconstructError: an unknown word, no frame, or one the log or the scene's path lacks.
     """
-    listed = _held_out(scene)
+    listed = listed_held_out(scene)
     if frames == "held-out":
         chosen = (
             listed or held_out_frames(log.frame_count, DEFAULT_HOLD_OUT) or [log.frame_count // 2]
@@ -75,7 +75,8 @@ def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Ca
     )
 
 
-def _held_out(scene: Scene) -> list[int]:
+def listed_held_out(scene: Scene) -> list[int]:
+    """Frames that the scene says were not used to make it; none where it says nothing."""
     reconstruction = scene.provenance.get("reconstruction")
     listed = reconstruction.get("held_out_frames") if isinstance(reconstruction, dict) else None
     return sorted({int(frame) for frame in listed}) if listed else []

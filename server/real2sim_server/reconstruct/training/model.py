@@ -241,7 +241,7 @@ class SceneModel:
 
 
 def _own(cloud: GaussianCloud) -> GaussianCloud:
-    copies = {name: tensor.detach().cpu().clone() for name, tensor in vars(cloud).items()}
+    copies = {name: tensor.detach().cpu().clone() for name, tensor in cloud.tensors().items()}
     return GaussianCloud(**copies)
 
 

@@ -1,6 +1,6 @@
 """Kinds of images that a camera gives: each one module with its registration."""
 
-from . import rgb, depth, instance, median_depth, semantic  # noqa: F401, I001, registered in this order
+from . import rgb, depth, instance, median_depth, semantic, uncertainty  # noqa: F401, I001, registered in this order
 from .base import (
     SensorModality,
     encode_image,

@@ -118,7 +118,8 @@ def encode_image(
 
     Args:
         image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` or
-            ``median_depth`` [m], [H, W] uint16 ``instance``, or [H, W] uint8 ``semantic``.
+            ``median_depth`` [m], [H, W] uint16 ``instance``, [H, W] uint8 ``semantic``, or [H, W]
+            float32 ``uncertainty``.
         modality: name of a registered one.
         codec: ``raw``, ``jpeg`` or ``png``.
         quality: of jpeg, 1 to 100.

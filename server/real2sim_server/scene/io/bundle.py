@@ -25,6 +25,7 @@ from ..scene import Scene, SceneObject
 from ..sky import Sky
 from .container import read_container, write_container
 from .document import (
+    UNCERTAINTIES,
     AssetContent,
     AssetDocument,
     Bounds,
@@ -227,9 +228,8 @@ def _outgoing_colour(scene_object: SceneObject) -> dict[str, Tensor]:
 def _outgoing_sky(sky: Sky | None) -> dict[str, Tensor]:
     if sky is None:
         return {}
-    if not bool(torch.isfinite(sky.faces).all()):
-        raise SceneError("sky: faces hold values that are not finite")
-    return {"faces": sky.faces.detach().cpu().contiguous()}
+    sky.check_values()
+    return {name: tensor.detach().cpu().contiguous() for name, tensor in sky.tensors().items()}
 
 
 def _outgoing_ground(ground: Ground) -> dict[str, Tensor]:
@@ -324,7 +324,7 @@ def _open(folder: Path, name: str, sizes: Mapping[str, int], verify: bool) -> Te
 
 
 def _cloud(file: TensorFile, prefix: str, part: CloudPart, what: str) -> GaussianCloud:
-    shapes = cloud_shapes(part.gaussians, part.sh_degree)
+    shapes = cloud_shapes(part.gaussians, part.sh_degree, known=part.tensors)
     cloud = GaussianCloud(**file.take(prefix, shapes=shapes, hashes=part.tensors))
     if file.verify:
         cloud.check_values(what)
@@ -363,9 +363,12 @@ def _sky(folder: Path, document: SceneDocument, verify: bool) -> Sky | None:
         return None
     file = _open(folder, SKY_FILE, document.files, verify)
     r = part.resolution
-    sky = Sky(**file.take("", shapes={"faces": (6, r, r, 3)}, hashes=part.tensors))
-    if verify and not bool(torch.isfinite(sky.faces).all()):
-        raise SceneError("sky: faces hold values that are not finite")
+    shapes: dict[str, tuple[int, ...]] = {"faces": (6, r, r, 3)}
+    if UNCERTAINTIES in part.tensors:
+        shapes[UNCERTAINTIES] = (6, r, r)
+    sky = Sky(**file.take("", shapes=shapes, hashes=part.tensors))
+    if verify:
+        sky.check_values()
     return sky
 
 

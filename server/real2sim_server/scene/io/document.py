@@ -17,6 +17,8 @@ Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Bounds = tuple[Vector3, Vector3]
+UNCERTAINTIES = "uncertainties"
+"""Tensor that a cloud or sky may have, from version 5 on."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
@@ -245,7 +247,9 @@ class SceneContent(_Part):
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
-        if self.lidar is not None:
+        stored = [self.background.tensors, *(o.cloud.tensors for o in self.objects)]
+        stored += [] if self.sky is None else [self.sky.tensors]
+        if self.lidar is not None or any(UNCERTAINTIES in tensors for tensors in stored):
             return 5
         if any(camera.has_optics for camera in self.cameras):
             return 4
@@ -268,7 +272,7 @@ class AssetContent(_Part):
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
-        return 1
+        return 5 if UNCERTAINTIES in self.cloud.tensors else 1
 
 
 class _Document(_Part):

@@ -34,17 +34,21 @@ from ..errors import BundleError
 from ..ground import Ground
 from ..scene import Scene, SceneObject
 from ..sky import Sky
-from .document import CameraPart, TrajectoryPart
+from .document import UNCERTAINTIES, CameraPart, TrajectoryPart
 
 FORMAT, VERSION = "real2sim-packed", 2
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
 """Of all arrays when unpacked; a small file cannot ask for more memory than this."""
 MEAN_STEPS, QUAT_STEPS, OPACITY_STEPS, SH_STEPS = 65535, 127, 255, 127
+UNCERTAINTY_STEPS = 255
+"""Of their square roots."""
 HEIGHT_STEP = 0.001
 """Of the ground [m]."""
 LOG_SCALE_STEPS, LOWEST_LOG_SCALE = 3276, -13.0
 """Of an axis: 16 bits from 2 micrometres to a kilometre."""
+
+SKY_UNCERTAINTIES = f"sky.{UNCERTAINTIES}"
 
 Arrays = dict[str, NDArray[Any]]
 Vector3 = tuple[float, float, float]
@@ -118,6 +122,8 @@ def write_packed(scene: Scene, path: str | PathLike[str]) -> None:
     if scene.sky is not None:
         faces = (scene.sky.faces.detach().cpu().clamp(0, 1) * 255).round()
         arrays["sky"] = faces.to(torch.uint8).numpy()
+        if scene.sky.uncertainties is not None:
+            arrays[SKY_UNCERTAINTIES] = _root_steps(scene.sky.uncertainties.detach())
     with (
         atomic_file(Path(path)) as file,
         zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
@@ -232,6 +238,8 @@ def _pack_cloud(cloud: GaussianCloud, key: str, arrays: Arrays) -> _PackedCloud:
         "colours": cloud.sh[:, 0].numpy().astype(np.float16),
         "sh": (rest / max(sh_range, 1e-12) * SH_STEPS).round().astype(np.int8),
     }
+    if cloud.uncertainties is not None:
+        packed[UNCERTAINTIES] = _root_steps(cloud.uncertainties)
     for name, values in packed.items():
         arrays[f"{key}.{name}"] = np.ascontiguousarray(values[order])
     if f"{key}.fourier" in arrays:
@@ -266,12 +274,11 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
             trajectory=part.trajectory.build(),
             colour=colour,
         )
-    sky = arrays.get("sky")
     return Scene(
         name=document.name,
         background=_cloud(document.background, "background", arrays),
         objects=objects,
-        sky=None if sky is None else Sky(torch.from_numpy(sky.astype(np.float32) / 255)),
+        sky=_sky(arrays),
         rig=CameraRig(tuple(camera.build() for camera in document.cameras)),
         ego=document.ego.build(),
         frame_times_us=np.array(document.frame_times_us, dtype=np.int64),
@@ -279,6 +286,14 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
         provenance=document.provenance,
         stored_ground=_unpack_ground(document.ground, arrays) if document.ground else None,
     )
+
+
+def _sky(arrays: Arrays) -> Sky | None:
+    faces, known = arrays.get("sky"), arrays.get(SKY_UNCERTAINTIES)
+    if faces is None:
+        return None
+    uncertainties = None if known is None else _from_root_steps(known)
+    return Sky(torch.from_numpy(faces.astype(np.float32) / 255), uncertainties)
 
 
 def _cloud(part: _PackedCloud, key: str, arrays: Arrays) -> GaussianCloud:
@@ -291,15 +306,26 @@ def _cloud(part: _PackedCloud, key: str, arrays: Arrays) -> GaussianCloud:
     sh = np.concatenate(
         [held["colours"][:, None].astype(np.float32), held["sh"] / SH_STEPS * part.sh_range], axis=1
     )
+    known = arrays.get(f"{key}.{UNCERTAINTIES}")
     cloud = GaussianCloud(
         means=_tensor(means),
         quats=torch.nn.functional.normalize(_tensor(held["quats"]), dim=1),
         scales=_tensor(np.exp(log_scales)),
         opacities=_tensor(held["opacities"] / OPACITY_STEPS),
         sh=_tensor(sh),
+        uncertainties=None if known is None else _from_root_steps(known),
     )
     cloud.check_values(key)
     return cloud
+
+
+def _root_steps(uncertainties: Tensor) -> NDArray[np.uint8]:
+    """Small ones finer than large ones."""
+    return (uncertainties.cpu().sqrt() * UNCERTAINTY_STEPS).round().numpy().astype(np.uint8)
+
+
+def _from_root_steps(steps: NDArray[Any]) -> Tensor:
+    return _tensor((steps / UNCERTAINTY_STEPS) ** 2)
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:

@@ -19,7 +19,7 @@ from ..ground import Ground
 from ..trajectory import Trajectory
 from .bundle import load_ground
 from .container import read_container
-from .document import AssetDocument, Bounds, SceneDocument, Vector3
+from .document import UNCERTAINTIES, AssetDocument, Bounds, SceneDocument, Vector3
 from .tensors import check_file, cloud_shapes
 
 
@@ -51,6 +51,7 @@ class SceneSummary:
         sky_resolution: edge length of the sky's faces [px], 0 without sky.
         bounds: lowest and highest Gaussian centre of the background [m], None without any.
         nbytes: bytes of the tensor files, nearly what the scene takes in memory.
+        has_uncertainties: as of Scene.
     """
 
     path: Path
@@ -66,6 +67,7 @@ class SceneSummary:
     sky_resolution: int
     bounds: Bounds | None
     nbytes: int
+    has_uncertainties: bool
 
     @cached_property
     def ground(self) -> Ground:
@@ -136,7 +138,7 @@ def read_asset_summary(path: str | PathLike[str]) -> AssetSummary:
     for name, nbytes in document.files.items():
         check_file(folder / Path(name).name, nbytes)
     cloud = document.content.cloud
-    shapes = cloud_shapes(cloud.gaussians, cloud.sh_degree)
+    shapes = cloud_shapes(cloud.gaussians, cloud.sh_degree, known=cloud.tensors)
     return AssetSummary(
         asset_id=document.name,
         category=document.content.category,
@@ -157,6 +159,7 @@ def _summary(folder: Path, document: SceneDocument) -> SceneSummary:
         rig=content.build_rig(),
         ego=content.ego.trajectory.build(),
         ego_size=content.ego.size,
+        has_uncertainties=UNCERTAINTIES in content.background.tensors,
         frame_times_us=np.array(content.frame_times_us, dtype=np.int64),
         provenance=document.provenance,
         objects=tuple(

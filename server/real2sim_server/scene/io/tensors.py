@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Container, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -16,31 +15,37 @@ from torch import Tensor
 from ..cloud import GaussianCloud
 from ..errors import BundleError
 from ..lidar_surfaces import Reflector
-
-CLOUD_FIELDS = tuple(f.name for f in fields(GaussianCloud))
+from .document import UNCERTAINTIES
 
 
 def cloud_tensors(cloud: GaussianCloud) -> dict[str, Tensor]:
     """Tensors of a cloud by field name, on the CPU and contiguous."""
-    return {name: getattr(cloud, name).detach().cpu().contiguous() for name in CLOUD_FIELDS}
+    return {name: tensor.detach().cpu().contiguous() for name, tensor in cloud.tensors().items()}
 
 
-def cloud_shapes(gaussians: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of a cloud's tensors by field name."""
+def cloud_shapes(
+    gaussians: int, sh_degree: int, *, known: Container[str] = ()
+) -> dict[str, tuple[int, ...]]:
+    """Shapes of a cloud's tensors by field name; of those that may be missing if ``known``."""
     n = gaussians
-    return {
+    shapes: dict[str, tuple[int, ...]] = {
         "means": (n, 3),
         "quats": (n, 4),
         "scales": (n, 3),
         "opacities": (n,),
         "sh": (n, (sh_degree + 1) ** 2, 3),
     }
+    if UNCERTAINTIES in known:
+        shapes[UNCERTAINTIES] = (n,)
+    return shapes
 
 
 def reflector_tensors(reflector: Reflector) -> dict[str, Tensor]:
-    """Tensors of what LiDARs see by name, on the CPU and contiguous; colours are not kept."""
+    """Tensors of what LiDARs see by name, on the CPU and contiguous;
+    colours and what is known of them are not kept."""
     tensors = cloud_tensors(reflector.cloud)
-    del tensors["sh"]
+    for name in ("sh", UNCERTAINTIES):
+        tensors.pop(name, None)
     return tensors | {"attributes": reflector.attributes.detach().cpu().contiguous()}
 
 

@@ -64,7 +64,7 @@ class LibraryAsset:
         with self._lock:
             clouds = [self.asset.cloud, *self._lit.values()]
         # Clouds in another light share all tensors but their colours.
-        tensors = [t for cloud in clouds for t in vars(cloud).values()]
+        tensors = [t for cloud in clouds for t in cloud.tensors().values()]
         return sum({t.data_ptr(): t.nbytes for t in tensors}.values())
 
     @property

@@ -44,6 +44,7 @@ def scene_info(
         extent_max=high,
         ego=track(summary.ego) if tracks else None,
         provenance=dict(summary.provenance),
+        has_uncertainties=summary.has_uncertainties,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 from real2sim_proto.episode import SensorSpec
 
@@ -17,6 +18,7 @@ from ...render import (
     uses_levels,
     without_levels,
 )
+from ...render.uncertainty import UNCERTAINTY, shown_as_colour
 from ...scene import Camera
 from ..library.memory import IdleItem, MemoryBudget
 
@@ -69,14 +71,21 @@ class DetailLevels:
         Raises:
             ServiceError: OUT_OF_MEMORY.
         """
-        if any(
-            uses_levels(self._backend, camera.width, camera.height, sensor.detail)
+        small = [
+            sensor
             for sensor, camera in zip(sensors, cameras, strict=True)
-        ):
-            await asyncio.get_running_loop().run_in_executor(self._thread, self._make, things)
+            if uses_levels(self._backend, camera.width, camera.height, sensor.detail)
+        ]
+        if small:
+            uncertain = any(UNCERTAINTY in sensor.modalities for sensor in small)
+            make = partial(self._make, things, uncertain=uncertain)
+            await asyncio.get_running_loop().run_in_executor(self._thread, make)
 
-    def _make(self, things: Callable[[], Sequence[Instance]]) -> None:
-        missing = without_levels(things())
+    def _make(self, things: Callable[[], Sequence[Instance]], *, uncertain: bool) -> None:
+        shown = list(things())
+        missing = without_levels(shown)
+        if uncertain:
+            missing += without_levels(map(shown_as_colour, shown))
         if not missing:
             return
         if self._budget is not None:

@@ -36,6 +36,7 @@ from ...render.frame import at_once
 from ...render.ground_class import with_ground_seen
 from ...render.jpeg import JpegEncoder, jpeg_encoder_for, turbo_jpeg
 from ...render.modalities import modality_names, modality_of, options_for
+from ...render.uncertainty import UNCERTAINTY, WITHOUT
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, lower_priority
 from ..http.metrics import Metrics
@@ -156,12 +157,13 @@ class Renderer:
         """Render and encode all sensors of a request.
 
         Raises:
-            ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST for too many pixels, or OUT_OF_MEMORY
-                for levels of detail.
+            ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST for too many pixels or images that the
+                scene lacks, or OUT_OF_MEMORY for levels of detail.
             QueueFullError, RenderError: as the engine and the rasterizer do.
         """
         rig = request.rig or request.scene.rig
         cameras = check_sensors(rig, request.sensors, max_pixels=self._max_pixels)
+        check_known(request.scene, request.sensors)
         await self.ready(request.sensors, cameras, lambda: request.instances)
         submitted = time.perf_counter()
         lane = _lane(cameras, stream)
@@ -396,6 +398,21 @@ def _samples() -> Iterator[RenderedImage]:
             sensor = SensorSpec(camera="warm-up", codec=codec)
             pixels = np.zeros(modality.shape(16, 16), modality.dtype)
             yield RenderedImage(sensor, name, 0, np.eye(4), np.eye(3), pixels)
+
+
+def check_known(scene: Scene, sensors: Iterable[SensorSpec]) -> None:
+    """Refuse images that need more than the scene holds.
+
+    Raises:
+        ServiceError: INVALID_REQUEST, uncertainty of a scene of which none is known.
+    """
+    asked = any(UNCERTAINTY in sensor.modalities for sensor in sensors)
+    if asked and not scene.has_uncertainties:
+        raise ServiceError(
+            ErrorCode.INVALID_REQUEST,
+            f"scene {scene.name!r} has no images {UNCERTAINTY!r}: {WITHOUT}",
+            hint="ask for the other modalities, or for a scene whose has_uncertainties is true",
+        )
 
 
 def check_sensors(

@@ -6,7 +6,7 @@ import asyncio
 import json
 import struct
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import WebSocket, WebSocketDisconnect
@@ -19,11 +19,14 @@ from real2sim_proto.operations import Operation
 
 from ...edit import EditError, instances_at, replay_operations
 from ...render import Instance, RenderError
+from ...render.encode import encode_rgb
+from ...render.uncertainty import UNCERTAINTY, uncertainty_picture
 from ...scene import Scene, SceneError
 from ..accounts import RevokedError, admit_message, owner_name
 from ..engine import QueueFullError
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import receive_text
+from ..rendering.frames import EncodedFrame
 from ..rendering.renderer import RenderRequest
 from ..worker import Worker
 
@@ -43,6 +46,7 @@ class ViewRequest(Model):
             None for the recorded place.
         operations: applied to this picture alone: the preview of an edit in the making.
         job: finished simulation to show instead of the scenario.
+        shows: what the picture is of; ``uncertainty`` comes in colours, see uncertainty_picture.
         pick: (across, down) in shares of the picture: ask for the object there instead.
     """
 
@@ -53,6 +57,7 @@ class ViewRequest(Model):
     T_world_camera: list[float] | None = Field(default=None, min_length=16, max_length=16)
     operations: list[Operation] = Field(default_factory=list, max_length=16)
     job: Identifier | None = None
+    shows: Literal["rgb", "uncertainty"] = "rgb"
     pick: tuple[Fraction, Fraction] | None = None
 
 
@@ -195,7 +200,10 @@ class ViewConnection:
             "timing_ms": {k: round(v, 2) for k, v in rendered.timing_ms.items()},
         }
         self._sent_revision = view.revision
-        await self._socket.send_bytes(pack_frame_message(header, bytes(frame.data)))
+        data = bytes(frame.data)
+        if request.shows == UNCERTAINTY:
+            data = await asyncio.to_thread(_in_colours, frame)
+        await self._socket.send_bytes(pack_frame_message(header, data))
 
     async def _send_event(self, kind: str, **values: Any) -> None:
         await self._socket.send_text(json.dumps({"type": kind, **values}))
@@ -223,6 +231,12 @@ def instance_at(ids: NDArray[np.uint16], place: tuple[float, float], *, reach: i
     return int(near[rows[nearest], columns[nearest]])
 
 
+def _in_colours(frame: EncodedFrame) -> bytes:
+    """The jpeg of a raw uncertainty image."""
+    pixels = np.frombuffer(frame.data, "<f4").reshape(frame.shape)
+    return encode_rgb(uncertainty_picture(pixels), "jpeg")
+
+
 def pack_frame_message(header: dict[str, Any], data: bytes) -> bytes:
     """One binary message: length of the header (uint32, little endian), header as JSON, data."""
     head = json.dumps(header, separators=(",", ":")).encode()
@@ -239,10 +253,11 @@ def _render_request(
         if camera is not None:
             T_world_camera = np.asarray(request.T_world_camera, np.float64).reshape(4, 4)
             vehicle = T_world_camera @ np.linalg.inv(camera.T_vehicle_camera)
+    shows = "instance" if request.pick else request.shows
     sensor = SensorSpec(
         camera=request.camera,
-        modalities=["instance" if request.pick else "rgb"],
+        modalities=[shows],
         width=PICK_WIDTH if request.pick else request.width,
-        codec="raw" if request.pick else "jpeg",
+        codec="jpeg" if shows == "rgb" else "raw",
     )
     return RenderRequest(scene, instances, vehicle, request.t_us, (sensor,))

@@ -11,7 +11,7 @@ from real2sim_proto.episode import SensorSpec
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
 from ..http.problems import ServiceError
-from ..rendering.renderer import check_sensors
+from ..rendering.renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
 """Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
@@ -21,9 +21,11 @@ def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) 
     """Cameras of sensors, in their order, at the sizes that these name.
 
     Raises:
-        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels or bytes.
+        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels or bytes, and for
+            images that the scene lacks.
     """
     cameras = check_sensors(scene.rig, sensors, max_pixels=max_pixels)
+    check_known(scene, sensors)
     check_message_bytes(raw_image_bytes(sensors, cameras))
     return cameras
 

@@ -17,6 +17,7 @@ function write() {
     t: model.t,
     selected: model.selected,
     run: model.job,
+    shows: model.shows === "rgb" ? null : model.shows,
   };
   const query = new URLSearchParams(Object.entries(values).filter(([, v]) => v !== null));
   history.replaceState(null, "", `?${query}`);

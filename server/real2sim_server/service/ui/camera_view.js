@@ -25,6 +25,8 @@ export function startView() {
   on("scenario run", () => requestFrame(false));
   on("selection draft scenario", outline);
   new ResizeObserver(outline).observe($("stage"));
+  $("uncertainty").hidden = !model.scene.has_uncertainties;
+  $("uncertainty").classList.toggle("on", model.shows !== "rgb");
   fly($("stage"));
   requestFrame(false);
 }
@@ -35,6 +37,7 @@ function viewRequest(width) {
     t_us: model.t,
     width,
     job: model.job,
+    shows: model.shows,
     T_world_camera: model.free,
     operations: model.job ? [] : draftOperations(),
   };
@@ -135,6 +138,15 @@ function outline() {
       pen.lineTo(...corners[b]);
       pen.stroke();
     }
+  }
+}
+
+// Only of scenes that know it.
+export function toggleUncertainty() {
+  if (model.scene.has_uncertainties) {
+    model.shows = model.shows === "rgb" ? "uncertainty" : "rgb";
+    $("uncertainty").classList.toggle("on", model.shows !== "rgb");
+    emit("camera");
   }
 }
 

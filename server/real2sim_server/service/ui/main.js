@@ -3,7 +3,7 @@ import { addressParameters, startAddress } from "./address.js";
 import { model, open, on, undo, redo, fork, exportFile, select, setTime } from "./model.js";
 import { attempt, notify } from "./messages.js";
 import { startPage } from "./start.js";
-import { startView, toggleFree } from "./camera_view.js";
+import { startView, toggleFree, toggleUncertainty } from "./camera_view.js";
 import { startMosaic } from "./mosaic.js";
 import { startMap, fit, centre } from "./map.js";
 import { startProperties } from "./properties.js";
@@ -25,6 +25,9 @@ async function main() {
   const { start_us: firstUs, end_us: lastUs } = model.scenario;
   model.camera = names.includes(address.camera) ? address.camera : names[0];
   model.mosaic = address.camera === "*";
+  if (address.shows === "uncertainty" && model.scene.has_uncertainties) {
+    model.shows = address.shows;
+  }
   model.t = Math.min(lastUs, Math.max(firstUs, Number(address.t ?? firstUs)));
   $("studio").hidden = false;
   [
@@ -66,6 +69,7 @@ function bar() {
   $("undo").onclick = undo;
   $("redo").onclick = redo;
   $("free").onclick = toggleFree;
+  $("uncertainty").onclick = toggleUncertainty;
   $("fit").onclick = fit;
   $("centre").onclick = centre;
   $("fork").onclick = attempt(() => copyAs(`${model.scenario.name} (fork)`));

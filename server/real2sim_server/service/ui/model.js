@@ -14,6 +14,7 @@ export const model = {
   job: null,
   playback: null,
   free: null,
+  shows: "rgb",
   mosaic: false,
   when: "always",
   box: null,

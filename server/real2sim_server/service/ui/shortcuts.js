@@ -1,7 +1,7 @@
 // Keys, and the page that lists them.
 import { model, undo, redo, edit, select } from "./model.js";
 import { toggle, step } from "./timeline.js";
-import { toggleFree, shift } from "./camera_view.js";
+import { toggleFree, toggleUncertainty, shift } from "./camera_view.js";
 import { fit, centre } from "./map.js";
 import { duplicate } from "./properties.js";
 import { choose } from "./mosaic.js";
@@ -42,6 +42,7 @@ const KEYS = [
   ],
   [null, "", "]", selected((id) => edit([{ op: "rotate", object_id: id, angle: -0.0872665 }]))],
   ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree],
+  ["U", "uncertainty of what is shown, where the scene knows it", "u", toggleUncertainty],
   ["W A S D", "fly", "w", flying(0, 0, 0.5)],
   [null, "", "s", flying(0, 0, -0.5)],
   [null, "", "a", flying(-0.5, 0, 0)],

@@ -242,13 +242,8 @@ def _split(cloud: GaussianCloud, changed: NDArray[np.int64], F: Float) -> Gaussi
     scales[each, longest] *= 0.7
     means, sizes = cloud.means.clone(), cloud.scales.clone()
     means[rows], sizes[rows] = part.means + along, scales
-    return GaussianCloud(
-        torch.cat([means, part.means - along]),
-        torch.cat([cloud.quats, part.quats]),
-        torch.cat([sizes, scales]),
-        torch.cat([cloud.opacities, part.opacities]),
-        torch.cat([cloud.sh, part.sh]),
-    )
+    other = replace(part, means=part.means - along, scales=scales)
+    return GaussianCloud.concatenate([replace(cloud, means=means, scales=sizes), other])
 
 
 def _axes(quats: torch.Tensor) -> torch.Tensor:

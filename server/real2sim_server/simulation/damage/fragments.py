@@ -80,7 +80,7 @@ def fragment_cloud(
         for breakage in broken
         if breakage.time_s <= time_s
     ]
-    return _joined(clouds) if clouds else None
+    return GaussianCloud.concatenate(clouds) if clouds else None
 
 
 def _cloud(breakage: Breakage, age: float, heights: Heights) -> GaussianCloud:
@@ -172,11 +172,6 @@ def _tumbling(tumbled: Float, random: np.random.Generator) -> Float:
     c, s = np.cos(yaw / 2), np.sin(yaw / 2)
     w, x, y, z = turn.T
     return np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=1)
-
-
-def _joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return GaussianCloud(*(torch.cat([getattr(c, name) for c in clouds]) for name in names))
 
 
 def _tensor(values: NDArray[np.float64]) -> torch.Tensor:

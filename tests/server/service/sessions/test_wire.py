@@ -40,6 +40,7 @@ def image(codec: str, modality: str = "rgb", height: int = 20, width: int = 30) 
         "instance": rng.integers(0, 65535, (height, width)).astype(np.uint16),
         "median_depth": rng.uniform(0, 90, (height, width)).astype(np.float32),
         "semantic": rng.integers(0, 34, (height, width)).astype(np.uint8),
+        "uncertainty": rng.uniform(0, 1, (height, width)).astype(np.float32),
     }[modality]
     sensor = SensorSpec(camera="front", modalities=[modality], codec=codec)
     return RenderedImage(sensor, modality, 7, np.eye(4), np.eye(3), pixels)

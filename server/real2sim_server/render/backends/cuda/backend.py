@@ -126,7 +126,7 @@ class CudaBackend:
     def _on_device(self, cloud: GaussianCloud) -> GaussianCloud:
         if cloud.device.type == self.device.type:
             return cloud
-        if any(tensor.requires_grad for tensor in vars(cloud).values()):
+        if any(tensor.requires_grad for tensor in cloud.tensors().values()):
             return cloud.to(self.device)
         if cloud not in self._resident:
             self._resident[cloud] = cloud.to(self.device)
