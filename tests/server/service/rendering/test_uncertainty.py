@@ -55,15 +55,21 @@ def test_sessions_show_them_and_refuse_them_before_they_begin(known):
     sensors = [{"camera": "front", "modalities": ["uncertainty"], "codec": "png", "width": 48}]
 
     def begin(scene):
-        return known.post("/v1/sessions", params={"scene": scene}, json={"sensors": sensors})
+        return known.post(
+            "/v1/sessions", params={"scene": scene}, json={"reset": {"sensors": sensors}}
+        )
 
     refused = begin("tiny")
     assert (refused.status_code, refused.json()["code"]) == (422, ErrorCode.INVALID_REQUEST)
     assert "has no images 'uncertainty'" in refused.json()["detail"]
     begun = begin("known")
     assert begun.status_code == 201, begun.text
-    session = begun.json()["session_id"]
-    view = known.post(f"/v1/sessions/{session}/render", json={"sensors": sensors}, headers=MSGPACK)
+    info = begun.json()
+    view = known.post(
+        f"/v1/sessions/{info['session_id']}/render",
+        json={"sensors": sensors},
+        headers=MSGPACK | {"Authorization": f"Bearer {info['token']}"},
+    )
     assert view.status_code == 200, view.text
     [frame] = decode(view.content)["frames"]
     assert (frame["modality"], frame["dtype"], frame["codec"]) == ("uncertainty", "uint16", "png")
