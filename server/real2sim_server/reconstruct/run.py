@@ -22,9 +22,9 @@ from .training import OnTraining, TrainOptions, held_out_frames, train, with_box
 from .uncertainty import VIEWS, fit_uncertainties
 
 EVALUATED_FRAMES = 4
-LEAST_VIEWS, STEPS_A_VIEW = 4, 60
+LEAST_VIEWS, STEPS_A_VIEW = 4, 30
 """Views that uncertainty is found by after a training, at least, and one more a so many steps: a
-view costs about as much as two of them."""
+view costs about as much as one of them."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,7 +88,7 @@ def fit_uncertainties(
     Args:
         scene: made of ``log``.
         log: the same part of it.
-        views: at most so many images, drawn from all of them; always the same.
+        views: at most so many images, evenly over all of them.
         backend: of the renderer; it must carry gradients.
         on_view: called with views done and views in all.
 
@@ -110,7 +109,7 @@ def fit_uncertainties(
             _add_view(scene, log, camera, frame, backend=drawing, sums=sums, sky=sky)
             if on_view is not None:
                 on_view(done + 1, len(chosen))
-    weights, errors = (torch.cat([getattr(s, name) for s in sums]) for name in _NAMES)
+    weights, errors = torch.cat([s.weights for s in sums]), torch.cat([s.errors for s in sums])
     report = UncertaintyReport(
         views=len(chosen),
         seen=float((weights > prior).double().mean()) if len(weights) else 0.0,
@@ -119,30 +118,30 @@ def fit_uncertainties(
     return _with(scene, sums, sky, prior), report
 
 
-_NAMES = ("weights", "errors")
-
-
 def _views(scene: Scene, log: DrivingLog, count: int) -> list[tuple[Camera, int]]:
-    """Cameras and frames, drawn from those that training saw."""
+    """Cameras and frames, evenly over those that training saw, each camera at frames of its own."""
     held_out = set(listed_held_out(scene))
     cameras = [
         camera.resized(min(WIDTH, camera.width))
         for camera in select_cameras(scene, log, None)
         if camera.is_pinhole
     ]
-    pairs = [
-        (camera, frame)
-        for frame in range(log.frame_count)
-        for camera in cameras
-        if frame not in held_out and scene.ego.covers(image_time(log, camera.name, frame))
-    ]
-    if not pairs:
+    chosen = []
+    for place, camera in enumerate(cameras):
+        frames = [
+            frame
+            for frame in range(log.frame_count)
+            if frame not in held_out and scene.ego.covers(image_time(log, camera.name, frame))
+        ]
+        own = min(len(frames), count // len(cameras) + (place < count % len(cameras)))
+        shift = (place + 0.5) / len(cameras)
+        chosen += [(camera, frames[int((k + shift) * len(frames) / own)]) for k in range(own)]
+    if not chosen:
         raise ReconstructError(
             f"log {log.name!r} has no image of a pinhole camera that scene {scene.name!r} was "
             "trained on"
         )
-    rng = np.random.Generator(np.random.Philox(key=[0, 0]))
-    return [pairs[i] for i in sorted(rng.permutation(len(pairs))[:count].tolist())]
+    return chosen
 
 
 def _add_view(

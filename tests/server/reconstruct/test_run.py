@@ -50,7 +50,10 @@ def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
     assert report.training.steps == 6
     assert report.training.held_out_frames == report.evaluated_frames == [2]
     assert report.training.psnr > 15
-    provenance = load_scene(tmp_path / "out.r2s").provenance["reconstruction"]
+    assert report.timing_s["uncertainty"] > 0
+    made = load_scene(tmp_path / "out.r2s")
+    assert made.has_uncertainties
+    provenance = made.provenance["reconstruction"]
     assert (provenance["iterations"], provenance["held_out_frames"]) == (6, [2])
     folder = tmp_path / "out.r2s.training"
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 3

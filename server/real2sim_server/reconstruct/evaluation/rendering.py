@@ -51,6 +51,26 @@ def render_view(
     return frame
 
 
+def render_uncertainty(
+    scene: Scene, camera: Camera, t_us: int, *, backend: str = "auto"
+) -> NDArray[np.float32]:
+    """Uncertainty [H, W] of what ``camera`` on the recording vehicle sees at ``t_us``.
+
+    Raises:
+        RenderError: the scene knows none.
+        TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
+    """
+    [frame] = render_cameras(
+        scene_instances(scene, t_us),
+        [camera],
+        scene.ego.transform(t_us),
+        sky=scene.sky,
+        modalities=("uncertainty",),
+        backend=backend,
+    )
+    return frame.images["uncertainty"]
+
+
 def render_logged_view(
     scene: Scene, camera: Camera, t_us: int, *, backend: str = "auto"
 ) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ import numpy as np
 from ..._files import atomic_file
 from ...logs import DrivingLog, same_part
 from ...render import Frame
+from ...render.uncertainty import uncertainty_picture
 from ...scene import Camera, Scene
 from ..training.data import image_time
 from .pictures import (
@@ -26,7 +27,7 @@ from .pictures import (
     jpeg,
     object_crops,
 )
-from .rendering import render_view
+from .rendering import render_uncertainty, render_view
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
 from .selection import select_cameras
 from .shifted import true_view
@@ -99,6 +100,7 @@ def write_report(
         _heading(evaluation),
         _figures(evaluation),
         _shift_figures(evaluation) + _around_figures(evaluation),
+        _uncertainty_figures(evaluation),
     ]
     parts.append("<h2>Recorded and rendered</h2>")
     parts.append(
@@ -175,6 +177,18 @@ def _around_figures(evaluation: Evaluation) -> str:
     return "<h2>Vehicles from all around</h2>" + _table(head, rows)
 
 
+def _uncertainty_figures(evaluation: Evaluation) -> str:
+    score = evaluation.uncertainty
+    if score is None:
+        return ""
+    head = ("views", "Spearman by pixel", "of squares of 9 pixels",
+            "sparsification (0 best, 1 chance)", "mean", "mean error")  # fmt: skip
+    figures = (score.spearman, score.spearman_regions, score.sparsification)
+    means = (_number(100 * value) + " %" for value in (score.uncertainty, score.error))
+    row = (str(score.views), *map(_number, figures), *means)
+    return "<h2>Uncertainty against error</h2>" + _table(head, [row])
+
+
 def _view_figures(evaluation: Evaluation) -> str:
     head = ("view", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
             "LiDAR depth error, median [m]", "90th percentile [m]", "LiDAR points",
@@ -194,15 +208,18 @@ def _view(subject: _ReportContext, camera: Camera, frame: int) -> str:
     assert rendered.depth is not None
     score = next(v for v in evaluation.views if (v.camera, v.frame) == (camera.name, frame))
     title = f"<h3>Frame {frame}, {escape(camera.name)}: {_number(score.psnr)} dB</h3>"
-    views = _row(
-        [
-            _Figure(image, "recorded"),
-            _Figure(rendered.rgb, "rendered"),
-            _Figure(error_image(rendered.rgb, image), "error"),
-            _Figure(depth_image(rendered.depth), "rendered depth"),
-        ]
-    )
-    return title + views + _objects(log, camera, frame, image, rendered)
+    shown = [
+        _Figure(image, "recorded"),
+        _Figure(rendered.rgb, "rendered"),
+        _Figure(error_image(rendered.rgb, image), "error"),
+        _Figure(depth_image(rendered.depth), "rendered depth"),
+    ]
+    if subject.scene.has_uncertainties:
+        t_us = image_time(log, camera.name, frame)
+        drawn = render_uncertainty(subject.scene, camera, t_us, backend=subject.backend)
+        uncertain = _Figure(uncertainty_picture(drawn), "uncertainty, in the colours of errors")
+        shown.insert(3, uncertain)
+    return title + _row(shown) + _objects(log, camera, frame, image, rendered)
 
 
 def _objects(log: DrivingLog, camera: Camera, frame: int, image: Image, rendered: Frame) -> str:

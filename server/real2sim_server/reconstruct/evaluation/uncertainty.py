@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...logs import DrivingLog
-from ...render import render_cameras
 from ...scene import Camera, Scene
 from ..training.data import image_time, resized
-from .rendering import scene_instances
+from .rendering import render_logged_view, render_uncertainty
 
 Values = NDArray[np.float32]
 """An image [H, W], or a part of one."""
@@ -121,13 +120,6 @@ def _images(
     """Drawn uncertainty and true error [H, W]."""
     t_us = image_time(log, camera.name, frame)
     image = resized(log.image(camera.name, frame), camera)
-    [drawn] = render_cameras(
-        scene_instances(scene, t_us),
-        [camera],
-        scene.ego.transform(t_us),
-        sky=scene.sky,
-        modalities=("rgb", "uncertainty"),
-        backend=backend,
-    )
-    error = np.abs(drawn.rgb.astype(np.float32) - image).mean(axis=-1) / np.float32(255)
-    return drawn.images["uncertainty"], error
+    drawn = render_logged_view(scene, camera, t_us, backend=backend)
+    error = np.abs(drawn.astype(np.float32) - image).mean(axis=-1) / np.float32(255)
+    return render_uncertainty(scene, camera, t_us, backend=backend), error

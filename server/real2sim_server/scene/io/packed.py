@@ -293,7 +293,9 @@ def _sky(arrays: Arrays) -> Sky | None:
     if faces is None:
         return None
     uncertainties = None if known is None else _from_root_steps(known)
-    return Sky(torch.from_numpy(faces.astype(np.float32) / 255), uncertainties)
+    sky = Sky(torch.from_numpy(faces.astype(np.float32) / 255), uncertainties)
+    sky.check_values()
+    return sky
 
 
 def _cloud(part: _PackedCloud, key: str, arrays: Arrays) -> GaussianCloud:

@@ -99,7 +99,17 @@ def test_the_commands_fit_and_judge_it(scene, street, tmp_path):
     save_scene(scene, tmp_path / "a.r2s")
     for arguments in (
         ["fit-uncertainty", "a.r2s", "log", "--json", "fitted.json"],
-        ["evaluate", "a.r2s", "log", "--shifts", "none", "--json", "judged.json"],
+        [
+            "evaluate",
+            "a.r2s",
+            "log",
+            "--shifts",
+            "none",
+            "--json",
+            "judged.json",
+            "--report",
+            "page.d",
+        ],
         ["render", "a.r2s", "--modality", "uncertainty", "--out", "a.png"],
     ):
         given = [str(tmp_path / a) if "." in a or a == "log" else a for a in arguments]
@@ -107,6 +117,7 @@ def test_the_commands_fit_and_judge_it(scene, street, tmp_path):
         assert result.exit_code == 0, result.output
     assert load_scene(tmp_path / "a.r2s").has_uncertainties
     assert json.loads((tmp_path / "fitted.json").read_text())["views"] == 4
+    assert "Uncertainty against error" in (tmp_path / "p.d" / "report.html").read_text()
     assert json.loads((tmp_path / "judged.json").read_text())["uncertainty"]["spearman"] > 0.6
 
 
