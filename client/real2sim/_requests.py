@@ -179,6 +179,12 @@ def export_scenario(scenario_id: str) -> Call[ScenarioDocument]:
     return Call(request, model_of(ScenarioDocument, whole=True))
 
 
+def scenario_points(scenario_id: str, t_us: int | None, part: str) -> Call[bytes]:
+    params = {"part": part} | ({} if t_us is None else {"t_us": str(t_us)})
+    request = Request("GET", f"{_scenario(scenario_id)}/points", params, long_timeout=True)
+    return Call(request, lambda reply: reply.content)
+
+
 def import_scenario(document: ScenarioDocument) -> Call[ScenarioInfo]:
     return Call(post("/v1/scenarios/import", document, long_timeout=True), model_of(ScenarioInfo))
 

@@ -7,7 +7,9 @@ missed; ``refresh()`` and decide again.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Awaitable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from real2sim_proto.jobs import CalibrateRequest, Observations, SimulateRequest
@@ -27,7 +29,8 @@ from .._object_edits import (
 )
 from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
 from .._scenario_state import Objects, ScenarioState
-from ..images import Image
+from ..images import Image, write_atomically
+from .concurrency import run_blocking
 from .jobs import AsyncJob
 from .transport import AsyncTransport
 
@@ -326,6 +329,26 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             ['delete']
         """
         return await self._transport.send(_requests.export_scenario(self.scenario_id))
+
+    async def points(
+        self, path: str | os.PathLike[str], *, t_us: int | None = None, part: str = "all"
+    ) -> Path:
+        """Write a point cloud with colour, normal, class and instance: the centres of Gaussians.
+
+        Args:
+            path: of the ply file.
+            t_us: instant; default: the start.
+            part: ``all``, ``background`` or ``objects``.
+
+        Examples:
+            >>> path = await scenario.points(folder / "objects.ply", part="objects")
+            >>> path.read_bytes()[:3]
+            b'ply'
+        """
+        call = _requests.scenario_points(self.scenario_id, t_us, part)
+        content = await self._transport.send(call)
+        await run_blocking(write_atomically, Path(path), content)
+        return Path(path)
 
     async def undo(self) -> OperationResult:
         """Take the newest edit back.

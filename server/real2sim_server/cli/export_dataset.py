@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from ..datasets.drive import Drive
     from ..datasets.labels.noise import BoxNoise
     from ..datasets.perturbed import Perturbation
+    from ..datasets.variants import Variant
     from ..edit import AssetLookup, ScenarioState
     from ..scene import Scene
 
@@ -32,7 +34,9 @@ def export_dataset(
     format_: Annotated[
         list[str],
         typer.Option(
-            "--format", "-f", help="labels, kitti, coco, nuscenes, argoverse2, webdataset, pictures"
+            "--format",
+            "-f",
+            help="labels, kitti, kitti_raw, coco, nuscenes, argoverse2, webdataset, mcap, pictures",
         ),
     ],
     operations: Annotated[
@@ -78,6 +82,16 @@ def export_dataset(
             "missed=0.1,false=0.5."
         ),
     ] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, max=1024, help="Processes that hold the scene each.")
+    ] = 1,
+    executor: Annotated[
+        str, typer.Option(help="Who makes clips: processes (of this machine), or ray.")
+    ] = "processes",
+    ray_address: Annotated[
+        str | None,
+        typer.Option(help="Of an existing cluster (auto: the environment's); default: one here."),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say how many frames, bytes and minutes.")
     ] = False,
@@ -89,12 +103,11 @@ def export_dataset(
 
     Stopped and called again it goes on after the last whole clip, and gives the same bytes.
     """
-    from ..datasets.drive import ScenarioDrive
+    from ..datasets.executors import executor_of
     from ..datasets.export import estimate
     from ..datasets.export import export_dataset as export
     from ..datasets.plan import ExportPlan
     from ..datasets.rig import read_rig
-    from ..datasets.variants import Variant, swept
     from ..scene.io import load_scene
 
     backend = chosen_backend(backend, device)
@@ -116,16 +129,26 @@ def export_dataset(
     )
     if rig is not None and (cameras or width or lidar):
         raise CommandError("--rig says all of cameras, width and lidar: leave those out")
-    loaded = load_scene(scene)
-    drive, made_of = _drive(loaded, operations, episode, assets)
-    variants = [Variant(drive)]
-    if sweep is not None:
-        if episode is not None:
-            raise CommandError("--episode is exported as it went: leave --sweep out")
-        assert isinstance(drive, ScenarioDrive)
-        asked = _sweep(sweep)
-        variants = swept(loaded, drive.state, asked, seed)
-        made_of["sweep"] = asked.model_dump(mode="json", exclude_none=True)
+    recipe = partial(
+        _variants,
+        scene,
+        operations=operations,
+        episode=episode,
+        assets=assets,
+        sweep=sweep,
+        seed=seed,
+    )
+    variants, made_of = _swept(
+        load_scene(scene),
+        operations=operations,
+        episode=episode,
+        assets=assets,
+        sweep=sweep,
+        seed=seed,
+    )
+    loaded, maker = variants[0].drive.scene, None
+    if workers > 1 or executor != "processes":
+        maker = executor_of(executor, recipe, workers=workers, backend=backend, address=ray_address)
     if dry_run:
         guess = estimate(variants, plan, backend=backend)
         figures: dict[str, Any] = {
@@ -136,7 +159,15 @@ def export_dataset(
         }
     else:
         with staged_progress() as report:
-            export(variants, plan, out, made_of=made_of, backend=backend, on_progress=report)
+            export(
+                variants,
+                plan,
+                out,
+                made_of=made_of,
+                backend=backend,
+                executor=maker,
+                on_progress=report,
+            )
         manifest = json_module.loads((out / "manifest.json").read_bytes())
         files = manifest["files"].values()
         figures = {
@@ -152,6 +183,36 @@ def export_dataset(
     if not dry_run:
         console.print("labels and how they are made: manifest.json and docs/datasets.md")
     write_json(json, figures)
+
+
+def _variants(path: Path, **options: Any) -> list[Variant]:
+    """What is exported, made anew in a process of its own."""
+    from ..scene.io import load_scene
+
+    return _swept(load_scene(path), **options)[0]
+
+
+def _swept(
+    scene: Scene,
+    *,
+    operations: Path | None,
+    episode: Path | None,
+    assets: Path | None,
+    sweep: Path | None,
+    seed: int,
+) -> tuple[list[Variant], dict[str, Any]]:
+    """What is exported, and what decided on it."""
+    from ..datasets.drive import ScenarioDrive
+    from ..datasets.variants import Variant, swept
+
+    drive, made_of = _drive(scene, operations, episode, assets)
+    if sweep is None:
+        return [Variant(drive)], made_of
+    if not isinstance(drive, ScenarioDrive):
+        raise CommandError("--episode is exported as it went: leave --sweep out")
+    asked = _sweep(sweep)
+    made_of["sweep"] = asked.model_dump(mode="json", exclude_none=True)
+    return swept(scene, drive.state, asked, seed), made_of
 
 
 def _drive(

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from ..render import Backend
-from ..scene import Camera, Scene
+from ..scene import Scene
 from .clips import Clip, write_shard
 from .drive import Drive
 from .errors import DatasetError
+from .executors import Executor, InProcess
 from .labels import HOW
 from .plan import ROOF, ExportPlan, PlannedClip, planned_cameras, planned_lidar, planned_shards
 from .previews import write_previews
@@ -93,6 +94,7 @@ def export_dataset(
     *,
     made_of: Mapping[str, Any] | None = None,
     backend: str | Backend = "auto",
+    executor: Executor | None = None,
     on_progress: Callable[[str, int, int], None] = lambda _stage, _done, _total: None,
 ) -> Path:
     """Label a drive and write it to the new folder ``out``, which appears only when it is whole.
@@ -107,6 +109,7 @@ def export_dataset(
         made_of: what else decided on the drive (operations, episode ...), for the manifest; JSON
             values only.
         backend: draws.
+        executor: makes the clips, of the same drive; None for this process.
         on_progress: called with (stage, done, total): frames that are labelled, formats written.
 
     Returns:
@@ -130,9 +133,8 @@ def export_dataset(
     lidar = planned_lidar(plan)
     digest = _digest(variants, plan, made_of or {})
     work = _work_folder(target, digest)
-    opened = _labelled_clips(
-        variants, plan, cameras, clips, work=work, backend=backend, on_progress=on_progress
-    )
+    maker = executor or InProcess(variants, cameras, backend)
+    opened = _labelled_clips(plan, clips, work=work, executor=maker, on_progress=on_progress)
     content = LabelledDrive(
         name=scene.name,
         digest=digest,
@@ -191,32 +193,28 @@ def _work_folder(target: Path, digest: str) -> Path:
 
 
 def _labelled_clips(
-    variants: Sequence[Variant],
     plan: ExportPlan,
-    cameras: Sequence[Camera],
     clips: Sequence[PlannedClip],
     *,
     work: Path,
-    backend: str | Backend,
+    executor: Executor,
     on_progress: Callable[[str, int, int], None],
 ) -> list[Clip]:
-    total, done = sum(len(clip.times_us) for clip in clips), 0
-    (work / "clips").mkdir(exist_ok=True)
+    folder = work / "clips"
+    folder.mkdir(exist_ok=True)
+    left = [clip for clip in clips if not (folder / clip.name).exists()]
+    total = sum(len(clip.times_us) for clip in clips)
+    done = total - sum(len(clip.times_us) for clip in left)
 
-    def step() -> None:
+    def step(frames: int) -> None:
         nonlocal done
-        done += 1
+        done += frames
         on_progress("frames", done, total)
 
-    for clip in clips:
-        folder = work / "clips" / clip.name
-        if folder.exists():
-            done += len(clip.times_us)
-            on_progress("frames", done, total)
-        else:
-            variant = variants[clip.variant]
-            write_shard(variant, plan, cameras, clip, folder, backend=backend, on_frame=step)
-    return [Clip.open(work / "clips" / clip.name) for clip in clips]
+    if done:
+        on_progress("frames", done, total)
+    executor.run(plan, left, folder, step)
+    return [Clip.open(folder / clip.name) for clip in clips]
 
 
 def _licence(provenance: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import tarfile
 from itertools import pairwise
@@ -52,7 +53,12 @@ def boxes_of_log(log, t_us: int):
 
 @pytest.mark.parametrize(
     ("folder", "sequence"),
-    [("kitti/tracking", "0000"), ("nuscenes", "scene-0000"), ("argoverse2", None)],
+    [
+        ("kitti/tracking", "0000"),
+        ("kitti_raw/2011_09_26", "2011_09_26_drive_0000_sync"),
+        ("nuscenes", "scene-0000"),
+        ("argoverse2", None),
+    ],
 )
 def test_our_own_reader_finds_every_box_where_it_is(exported, folder, sequence):
     log = open_first_clip(exported, folder, sequence)
@@ -71,7 +77,12 @@ def test_our_own_reader_finds_every_box_where_it_is(exported, folder, sequence):
 
 @pytest.mark.parametrize(
     ("folder", "sequence"),
-    [("kitti/tracking", "0000"), ("nuscenes", "scene-0000"), ("argoverse2", None)],
+    [
+        ("kitti/tracking", "0000"),
+        ("kitti_raw/2011_09_26", "2011_09_26_drive_0000_sync"),
+        ("nuscenes", "scene-0000"),
+        ("argoverse2", None),
+    ],
 )
 def test_our_own_reader_finds_camera_images_and_points(exported, tiny_scene, folder, sequence):
     log = open_first_clip(exported, folder, sequence)
@@ -197,3 +208,23 @@ def test_webdataset_keeps_the_files_of_a_sample_together(exported):
             keys += [member.name.split(".", maxsplit=1)[0] for member in members]
     changes = sum(one != two for one, two in pairwise(keys))
     assert changes + 1 == len(set(keys)) == FRAMES * CAMERAS
+
+
+def test_mcap_holds_labelled_points_boxes_and_images(exported):
+    reader = pytest.importorskip("mcap.reader")
+    with (exported / "mcap" / "0000.mcap").open("rb") as file:
+        found = {}
+        for _, channel, message in reader.make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append(json.loads(message.data))
+    frames = labels(exported)["frames"]
+    assert len(found["/lidar"]) == len(found["/boxes"]) == len(frames)
+    cloud = found["/lidar"][0]
+    stride, fields = cloud["point_stride"], {f["name"]: f["offset"] for f in cloud["fields"]}
+    data = np.frombuffer(base64.b64decode(cloud["data"]), np.uint8).reshape(-1, stride)
+    points = np.load(exported / "labels/0000/points/000000.npy")
+    place = fields["instance"]
+    assert (data[:, place : place + 2].copy().view("<u2")[:, 0] == points["instance"]).all()
+    ids = [entity["id"] for entity in found["/boxes"][0]["entities"]]
+    assert ids == [subject["object_id"] for subject in frames[0]["objects"]]
+    image = base64.b64decode(found["/camera/front/instance"][0]["data"])
+    assert image == (exported / "labels/0000/instance/front/000000.png").read_bytes()

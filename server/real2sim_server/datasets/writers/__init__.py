@@ -4,7 +4,9 @@ from ..errors import DatasetError
 from .argoverse2 import Argoverse2Writer
 from .coco import CocoWriter
 from .kitti import KittiWriter
+from .kitti_raw import KittiRawWriter
 from .labels import LabelsWriter
+from .mcap import McapWriter
 from .nuscenes import NuScenesWriter
 from .pictures import PicturesWriter
 from .webdataset import WebDatasetWriter
@@ -13,10 +15,12 @@ from .writer import DatasetWriter, LabelledDrive
 WRITERS: list[DatasetWriter] = [
     LabelsWriter(),
     KittiWriter(),
+    KittiRawWriter(),
     CocoWriter(),
     NuScenesWriter(),
     Argoverse2Writer(),
     WebDatasetWriter(),
+    McapWriter(),
     PicturesWriter(),
 ]
 """All registered writers."""

@@ -76,7 +76,7 @@ def _write_sequence(root: Path, name: str, clip: Clip, camera: Camera) -> None:
     seen, all_around = [], []
     for k, frame in enumerate(clip.frames):
         shutil.copyfile(clip.file("rgb", camera.name, k), root / "image_02" / name / f"{k:06d}.png")
-        _write_scan(root / "velodyne" / name / f"{k:06d}.bin", clip, camera, k)
+        write_scan(root / "velodyne" / name / f"{k:06d}.bin", clip, camera, k)
         for row in _seen_rows(frame, camera):
             seen.append(f"{k} {tracks[row['object_id']]} {_columns(row)}")
         for row in _all_rows(frame, camera):
@@ -89,7 +89,7 @@ def _write_sequence(root: Path, name: str, clip: Clip, camera: Camera) -> None:
         invert_transform(first) @ np.array(f["T_world_ego"]) @ camera.T_vehicle_camera
         for f in clip.frames
     ]
-    _write_lines(root / "poses" / f"{name}.txt", [_numbers(p[:3].ravel()) for p in poses])
+    _write_lines(root / "poses" / f"{name}.txt", [numbers(p[:3].ravel()) for p in poses])
     start = clip.frames[0]["t_us"]
     times = [f"{(f['t_us'] - start) * 1e-6:.6f}" for f in clip.frames]
     _write_lines(root / "times" / f"{name}.txt", times)
@@ -102,7 +102,7 @@ def _write_object_frame(
     for part in ("image_2", "velodyne"):
         (root / part).mkdir(parents=True, exist_ok=True)
     shutil.copyfile(clip.file("rgb", camera.name, index), root / "image_2" / f"{name}.png")
-    _write_scan(root / "velodyne" / f"{name}.bin", clip, camera, index)
+    write_scan(root / "velodyne" / f"{name}.bin", clip, camera, index)
     labels = [_columns(row) for row in _seen_rows(frame, camera)]
     _write_lines(root / "label_2" / f"{name}.txt", labels)
     _write_lines(root / "calib" / f"{name}.txt", _calibration(camera, "R0_rect", "Tr_velo_to_cam"))
@@ -154,7 +154,7 @@ def _columns(row: Mapping[str, Any]) -> str:
     occluded = sum(row["visibility"] < least for least in OCCLUDED)
     values = [alpha, *pixels, height, width, length, x, y + height / 2, z, heading]
     kind = CLASSES.get(row["category"], "Misc")
-    return f"{kind} {row['truncation']:.6f} {occluded} {_numbers(values)}"
+    return f"{kind} {row['truncation']:.6f} {occluded} {numbers(values)}"
 
 
 def _wrapped(angle: float) -> float:
@@ -166,17 +166,17 @@ def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[s
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     projection = np.concatenate([K, np.zeros((3, 1))], axis=1)
-    T_camera_velo = _T_camera_velo(camera)
-    imu = invert_transform(_shift(VELODYNE))
+    T_camera_velo = velodyne_in_camera(camera)
+    imu = invert_transform(shift(VELODYNE))
     return [
-        *(f"P{k}: {_numbers(projection.ravel())}" for k in range(4)),
-        f"{rectification}: {_numbers(np.eye(3).ravel())}",
-        f"{velo_to_cam}: {_numbers(T_camera_velo[:3].ravel())}",
-        f"Tr_imu_to_velo: {_numbers(imu[:3].ravel())}",
+        *(f"P{k}: {numbers(projection.ravel())}" for k in range(4)),
+        f"{rectification}: {numbers(np.eye(3).ravel())}",
+        f"{velo_to_cam}: {numbers(T_camera_velo[:3].ravel())}",
+        f"Tr_imu_to_velo: {numbers(imu[:3].ravel())}",
     ]
 
 
-def _T_camera_velo(camera: Camera) -> Float:
+def velodyne_in_camera(camera: Camera) -> Float:
     """The scanner looks where the camera does, as KITTI's layout has it: a vehicle frame whose x
     axis is the camera's."""
     T_vehicle_velo = np.eye(4)
@@ -186,21 +186,25 @@ def _T_camera_velo(camera: Camera) -> Float:
     return invert_transform(camera.T_vehicle_camera) @ T_vehicle_velo
 
 
-def _shift(position: Sequence[float]) -> Float:
+def vehicle_in_ego(camera: Camera) -> Float:
+    """Pose of the vehicle of KITTI's layout, which looks where the camera does."""
+    return camera.T_vehicle_camera @ velodyne_in_camera(camera) @ invert_transform(shift(VELODYNE))
+
+
+def shift(position: Sequence[float]) -> Float:
+    """A place [m] as a transform."""
     matrix = np.eye(4)
     matrix[:3, 3] = position
     return matrix
 
 
-def _write_scan(path: Path, clip: Clip, camera: Camera, frame: int) -> None:
+def write_scan(path: Path, clip: Clip, camera: Camera, frame: int) -> None:
     """x, y, z and reflectance of each point, float32, as a scanner that moves measures them."""
     rows = clip.points(frame)
-    T_vehicle_velo = _shift(VELODYNE)
-    T_ego_vehicle = (
-        camera.T_vehicle_camera @ _T_camera_velo(camera) @ invert_transform(T_vehicle_velo)
-    )
-    poses = np.array([f["T_world_ego"] for f in clip.frames]) @ T_ego_vehicle
-    points = apply_transform(invert_transform(T_ego_vehicle), rows["xyz"].astype(np.float64))
+    T_vehicle_velo = shift(VELODYNE)
+    vehicle = vehicle_in_ego(camera)
+    poses = np.array([f["T_world_ego"] for f in clip.frames]) @ vehicle
+    points = apply_transform(invert_transform(vehicle), rows["xyz"].astype(np.float64))
     to_velo = invert_transform(T_vehicle_velo)
     scan = np.empty((len(rows), 4), "<f4")
     scan[:, :3] = apply_transform(to_velo, _as_measured(points, poses, frame, to_velo))
@@ -219,7 +223,8 @@ def _as_measured(points: Float, poses: Float, frame: int, to_velo: Float) -> Flo
     return measured
 
 
-def _numbers(values: Any) -> str:
+def numbers(values: Any) -> str:
+    """With nine digits, as tables of KITTI have them."""
     return " ".join(f"{value + 0.0:.9g}" for value in np.asarray(values).tolist())
 
 

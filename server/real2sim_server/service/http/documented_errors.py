@@ -79,6 +79,7 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
     "scenarios-create": _OF_SCENES,
     "scenarios-edit": _OF_EDITS,
     "scenarios-import_": (*_OF_SCENES, *_OF_EDITS),
+    "scenarios-points": (*_OF_SCENES, C.TIME_OUT_OF_RANGE),
     "scenarios-redo": (C.NOTHING_TO_REDO,),
     "scenarios-simulate": (C.QUOTA_EXCEEDED, C.UNSUPPORTED, C.UNKNOWN_OBJECT),
     "scenarios-undo": (C.NOTHING_TO_UNDO,),

@@ -11,7 +11,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Identifier
+from real2sim_proto.base import Identifier, Microseconds
 from real2sim_proto.jobs import CalibrateRequest, JobInfo, SimulateRequest
 from real2sim_proto.scenarios import (
     History,
@@ -24,6 +24,7 @@ from real2sim_proto.scenarios import (
     ScenarioList,
 )
 
+from ...edit.points import Part, ply_of_points, points_at
 from ..http.auth import TokenRoute
 from ..http.clients import ClientName
 from ..http.disconnects import cancel_on_disconnect
@@ -46,6 +47,7 @@ IfMatch = Annotated[
         examples=['"r41"'],
     ),
 ]
+PLY = "application/octet-stream"
 _ETAG = re.compile(r'"r(0|[1-9][0-9]{0,8})"')
 
 
@@ -275,6 +277,41 @@ async def preview(
     render_request = await asyncio.to_thread(query.render_request, scene, view.state, media_type)
     rendered = await cancel_on_disconnect(request, worker.renderer.render(render_request))
     return frame_response(rendered, media_type, revision=view.revision)
+
+
+@router.get(
+    "/{scenario_id}/points",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "a binary ply file",
+            "content": {PLY: {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def points(
+    worker: WorkerOf,
+    scenario_id: Identifier,
+    t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
+    part: Annotated[Part, Query(description="of the scene")] = "all",
+) -> Response:
+    """The centres of the Gaussians of the scenario as it is now at an instant: a point cloud with
+    colour, normal, semantic class and instance. Faint ones are left out."""
+    view = await worker.scenarios.view(scenario_id)
+    scene = await worker.scene_cache.get(view.row.scene)
+    first, last = view.state.clock
+    instant = first if t_us is None else t_us
+    if not first <= instant <= last:
+        raise ServiceError(
+            ErrorCode.TIME_OUT_OF_RANGE, f"t_us {instant}; the scenario has {first} to {last} us"
+        )
+
+    def made() -> bytes:
+        return b"".join(ply_of_points(points_at(scene, view.state, instant, part=part)))
+
+    name = f"{scenario_id}.ply"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(await asyncio.to_thread(made), media_type=PLY, headers=headers)
 
 
 def expected_revision(if_match: str | None) -> int | None:

@@ -10,6 +10,7 @@ import { startProperties } from "./properties.js";
 import { startLog } from "./log.js";
 import { startAssets } from "./assets.js";
 import { startPhysics, show } from "./physics.js";
+import { startDatasets } from "./datasets.js";
 import { startTimeline } from "./timeline.js";
 import { startShortcuts } from "./shortcuts.js";
 
@@ -37,6 +38,7 @@ async function main() {
     startLog,
     startAssets,
     startPhysics,
+    startDatasets,
     startMosaic,
     startView,
     startShortcuts,

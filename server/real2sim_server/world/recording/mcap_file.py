@@ -69,7 +69,7 @@ def mcap_bytes(recording: Recording) -> bytes:
     for topic, t_us, message in _messages(recording):
         name, schema = topic
         if name not in channels:
-            channels[name] = _channel(writer, name, schema, message)
+            channels[name] = json_channel(writer, name, schema, message)
         body = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
         writer.add_message(channels[name], t_us * 1000, body, t_us * 1000)
     first = recording.instants[0].t_us * 1000
@@ -120,7 +120,7 @@ def _messages(recording: Recording) -> Iterator[tuple[Topic, int, dict[str, Any]
     """Topic, time and content of every message, by time."""
     frames = _frames_by_step(recording.frames)
     for instant, accumulator in zip(recording.instants, recording.accumulators(), strict=True):
-        t_us, stamp = instant.t_us, _stamp(instant.t_us)
+        t_us, stamp = instant.t_us, stamp_of(instant.t_us)
         yield TRANSFORM, t_us, _transform(instant, stamp)
         yield SCENE, t_us, _scene(recording, instant, stamp)
         yield EGO, t_us, {"timestamp": stamp, **instant.ego._asdict()}
@@ -149,7 +149,8 @@ def _frames_by_step(frames: Mapping[str, bytes]) -> dict[int, list[tuple[str, st
     return found
 
 
-def _stamp(t_us: int) -> dict[str, int]:
+def stamp_of(t_us: int) -> dict[str, int]:
+    """A time as Foxglove's schemas have it."""
     return {"sec": t_us // 1_000_000, "nsec": t_us % 1_000_000 * 1000}
 
 
@@ -252,7 +253,7 @@ def _colour(colour: tuple[float, float, float]) -> dict[str, float]:
 # --- schemas ----------------------------------------------------------------------------------
 
 
-def _channel(writer: Any, name: str, schema: str, example: dict[str, Any]) -> int:
+def json_channel(writer: Any, name: str, schema: str, example: dict[str, Any]) -> int:
     """A topic whose JSON schema says what its first message shows."""
     described = _described(example) | {"title": schema}
     if schema in {IMAGE_SCHEMA, CLOUD_SCHEMA}:

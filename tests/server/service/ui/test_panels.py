@@ -168,3 +168,21 @@ def test_a_fork_goes_its_own_way(studio):
     studio.goto(address)
     studio.wait_for_selector("body[data-ready]")
     kept(studio, 2)
+
+
+@pytest.mark.slow
+def test_a_data_set_is_made_and_looked_at(studio):
+    studio.click('[data-tab="datasets"]')
+    enter(studio, "dataset-period", 1.0)
+    enter(studio, "dataset-width", 96)
+    studio.click("#estimate-dataset")
+    studio.wait_for_selector("#dataset-told")
+    assert "3 frames, 6 images" in studio.inner_text("#dataset-told")
+    studio.click("#make-dataset")
+    studio.wait_for_selector(".dataset-entry[open] .sheets img")
+    until(lambda: studio.evaluate("document.querySelector('.sheets img').naturalWidth > 0"))
+    rows = studio.inner_text(".dataset-entry[open] table")
+    assert "car\t6" in rows
+    assert studio.locator(".shares").count() >= 3
+    studio.locator(".sheets img").first.click()
+    assert studio.evaluate("document.getElementById('sheet').open")

@@ -1,0 +1,116 @@
+"""Whoever makes the clips: the same bytes, also after one of the makers has died."""
+
+from __future__ import annotations
+
+import os
+import signal
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from real2sim_server.datasets.drive import ScenarioDrive
+from real2sim_server.datasets.errors import DatasetError
+from real2sim_server.datasets.executors import RayWorkers, executor_of
+from real2sim_server.datasets.export import export_dataset
+from real2sim_server.datasets.plan import ExportPlan
+from real2sim_server.datasets.variants import Variant
+from real2sim_server.edit import ScenarioState
+from real2sim_server.scene.io import load_scene, save_scene
+
+from .test_export import contents
+
+PLAN = ExportPlan(
+    formats=("labels", "coco"),
+    cameras=("front",),
+    width=48,
+    period_us=250_000,
+    end_us=1_500_000,
+    clip_s=0.5,
+)
+DIES_AT = 750_000
+
+
+class DyingDrive(ScenarioDrive):
+    """Whoever looks at a certain instant first dies of it."""
+
+    mark: Path
+
+    def at(self, t_us: int):
+        if t_us == DIES_AT and not self.mark.exists():
+            self.mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().at(t_us)
+
+
+def variants(path: Path, mark: Path | None = None) -> list[Variant]:
+    scene = load_scene(path)
+    state = ScenarioState.of(scene)
+    if mark is None:
+        return [Variant(ScenarioDrive(scene, state))]
+    drive = DyingDrive(scene, state)
+    object.__setattr__(drive, "mark", mark)
+    return [Variant(drive)]
+
+
+@pytest.fixture(scope="module")
+def scene_file(tiny_scene, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "tiny.r2s"
+    save_scene(tiny_scene, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def alone(scene_file, tmp_path_factory) -> dict[str, str]:
+    out = tmp_path_factory.mktemp("alone") / "out"
+    return contents(export_dataset(variants(scene_file), PLAN, out, backend="cpu"))
+
+
+def made_by(name: str, scene_file: Path, out: Path, *, mark: Path | None = None, workers=2):
+    recipe = partial(variants, scene_file, mark)
+    executor = executor_of(name, recipe, workers=workers, backend="cpu")
+    frames = []
+    export_dataset(
+        variants(scene_file),
+        PLAN,
+        out,
+        executor=executor,
+        on_progress=lambda stage, done, total: frames.append((stage, done, total)),
+    )
+    assert ("frames", 7, 7) in frames
+    return contents(out)
+
+
+def test_an_executor_that_is_none_is_refused(scene_file):
+    with pytest.raises(DatasetError, match="allowed are processes, ray"):
+        executor_of("threads", partial(variants, scene_file), workers=2, backend="cpu")
+    with pytest.raises(DatasetError, match="at least 1"):
+        executor_of("processes", partial(variants, scene_file), workers=0, backend="cpu")
+
+
+def test_without_ray_its_extra_is_named(monkeypatch, scene_file):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(DatasetError, match=r"real2sim\[ray\]"):
+        RayWorkers(partial(variants, scene_file), workers=1, backend="cpu")
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_bytes_of_one(scene_file, alone, tmp_path):
+    assert made_by("processes", scene_file, tmp_path / "out") == alone
+
+
+@pytest.mark.slow
+def test_clips_of_a_process_that_dies_are_made_again(scene_file, alone, tmp_path):
+    mark = tmp_path / "died"
+    assert made_by("processes", scene_file, tmp_path / "out", mark=mark) == alone
+    assert mark.exists()
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+@pytest.mark.parametrize("dies", [False, True])
+def test_ray_gives_the_bytes_of_one_process_also_when_one_dies(scene_file, alone, tmp_path, dies):
+    pytest.importorskip("ray")
+    mark = tmp_path / "died" if dies else None
+    assert made_by("ray", scene_file, tmp_path / "out", mark=mark) == alone
+    assert mark is None or mark.exists()
