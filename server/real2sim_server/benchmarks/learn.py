@@ -6,26 +6,19 @@ single world, small images beside those of all Gaussians, many sessions beside o
 
 from __future__ import annotations
 
-import contextlib
-import selectors
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-import real2sim
-from real2sim_proto.codec import unpack
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 
 from ..console import print_figures
-from ..demo.street import SHIPPED, unpack_street
-from ..demo.worker import worker_process
+from ..demo.street import SHIPPED
 from ..edit import ScenarioState, instances_at
 from ..learning import VectorDriveEnv
 from ..learning.batch_images import fitted
@@ -34,8 +27,7 @@ from ..scene import Scene
 from ..scene.io import read_packed
 from ..world import World
 from ..world.batch import BatchWorld
-from .batch_probe import BatchProbe
-from .drive_probe import ANSWER_S, DriveProbe, action
+from . import socket_sessions
 
 Figures = dict[str, Any]
 
@@ -43,7 +35,6 @@ SIZE = 84
 LARGER = 6
 """How many times as large the image is that is scaled down as the truth."""
 IMAGE_TIMES_S = (0.0, 2.0, 5.0, 8.0)
-SHORT_STEP_US = 1_000
 FULL = RasterOptions(depth=False, instance=False)
 REDUCED = RasterOptions(depth=False, instance=False, detail="auto")
 
@@ -184,70 +175,13 @@ def _small_image(scene: Scene, seconds: float, repetitions: int) -> dict[str, fl
 
 
 def sessions_over_sockets(_scene: Scene, options: LearnBenchOptions) -> Figures:
-    """Steps a second of sessions without cameras: of one, and in sum of many at once, on a socket
-    each and by one message a step."""
-    with tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder:
-        root = Path(folder)
-        unpack_street(root / "scenes", "street.r2s")
-        log_file = root / "worker.log"
-        with worker_process(scenes=root / "scenes", data=root, log_file=log_file) as worker:
-            one = _sessions(worker.url, 1, options.socket_steps)
-            many = _sessions(worker.url, options.sessions, options.socket_steps)
-            batch = _sessions_by_one_message(worker.url, options.sessions, options.socket_steps)
-    return {
-        "sessions": options.sessions,
-        "steps_per_s": many,
-        "one_session_steps_per_s": one,
-        "ratio": many / one,
-        "by_one_message_steps_per_s": batch,
-        "by_one_message_ratio": batch / many,
-    }
+    """Steps a second of sessions without cameras, see :mod:`.socket_sessions`."""
+    return socket_sessions.of_one_worker(options.sessions, options.socket_steps)
 
 
-def _sessions_by_one_message(url: str, count: int, steps: int) -> float:
-    with real2sim.connect(url) as client:
-        client.wait_ready()
-        infos = [client.sessions.create(scene="street") for _ in range(count)]
-        with BatchProbe(infos) as probe:
-            obs = probe.reset(dt_us=SHORT_STEP_US)
-
-            def step() -> int:
-                nonlocal obs
-                obs = probe.act(obs)
-                return count
-
-            step()
-            rate = _rate(step, steps)
-        for info in infos:
-            client.sessions.delete(info.session_id)
-    return rate
-
-
-def _sessions(url: str, count: int, steps: int) -> float:
-    with real2sim.connect(url) as client, contextlib.ExitStack() as open_sockets:
-        client.wait_ready()
-        infos = [client.sessions.create(scene="street") for _ in range(count)]
-        waiting = open_sockets.enter_context(selectors.DefaultSelector())
-        for info in infos:
-            probe = open_sockets.enter_context(DriveProbe(info))
-            obs, _ = probe.reset([], dt_us=SHORT_STEP_US)
-            waiting.register(probe.socket.socket, selectors.EVENT_READ, probe)
-            probe.send(action(obs))
-
-        def step() -> int:
-            """Planners answer each on their own, as soon as an observation is there."""
-            answered = 0
-            for key, _ in waiting.select():
-                probe: DriveProbe = key.data
-                probe.send(action(unpack(bytes(probe.socket.recv(ANSWER_S)))))
-                answered += 1
-            return answered
-
-        step()
-        rate = _rate_until(step, count * steps)
-        for info in infos:
-            client.sessions.delete(info.session_id)
-    return rate
+def sessions_of_two_workers(_scene: Scene, options: LearnBenchOptions) -> Figures:
+    """The same sessions, half of them in a second worker on the same machine."""
+    return socket_sessions.of_two_workers(options.sessions, options.socket_steps)
 
 
 PARTS: dict[str, Callable[[Scene, LearnBenchOptions], Figures]] = {
@@ -255,6 +189,7 @@ PARTS: dict[str, Callable[[Scene, LearnBenchOptions], Figures]] = {
     "batched_worlds": batched_worlds,
     "vector_environment": vector_environment,
     "sessions_over_sockets": sessions_over_sockets,
+    "sessions_of_two_workers": sessions_of_two_workers,
 }
 
 
@@ -262,14 +197,6 @@ def _rate(call: Callable[[], int], times: int) -> float:
     """What calls say that they did, a second."""
     started = time.perf_counter()
     done = sum(call() for _ in range(times))
-    return done / (time.perf_counter() - started)
-
-
-def _rate_until(call: Callable[[], int], wanted: int) -> float:
-    """The same, called until that much is done."""
-    started, done = time.perf_counter(), 0
-    while done < wanted:
-        done += call()
     return done / (time.perf_counter() - started)
 
 

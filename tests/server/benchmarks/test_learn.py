@@ -35,6 +35,14 @@ def test_sessions_are_driven_over_sockets() -> None:
     assert figures["sessions"] == 2
 
 
+@pytest.mark.slow
+@pytest.mark.network
+def test_sessions_are_driven_on_two_workers_at_once() -> None:
+    figures = learn.sessions_of_two_workers(read_packed(SHIPPED), OPTIONS)
+    assert figures["steps_per_s"] > 0
+    assert figures["sessions"] == 2
+
+
 def _values(value: object) -> list[float]:
     if isinstance(value, dict):
         return [v for part in value.values() for v in _values(part)]

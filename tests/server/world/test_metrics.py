@@ -67,6 +67,14 @@ def test_streamed_metrics_are_part_of_every_observation(driven):
     assert streamed <= driven.metrics().keys()
 
 
+def test_streamed_values_are_those_of_the_scores(driven):
+    shown = driven.metrics()
+
+    scores = {s.name: s.value for s in driven.scores() if s.name in shown}
+    assert len(scores) > 3
+    assert {name: shown[name] for name in scores} == scores
+
+
 def test_a_metric_accumulates_state_of_its_own(driven):
     found = {s.name: s for s in driven.scores()}[NAME]
 

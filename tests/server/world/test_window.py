@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from real2sim_server.world.scoring.window import Window
+import numpy as np
+import pytest
+
+from real2sim_server.world.scoring.window import RowWindow, Window
 
 
 def test_the_last_entries_are_kept() -> None:
@@ -27,3 +30,18 @@ def test_all_entries_can_be_changed() -> None:
     window = Window(1, 2)
     assert list(window.mapped(lambda k: 10 * k)) == [10, 20]
     assert list(window) == [1, 2]
+
+
+@pytest.mark.parametrize("most", [1, 4, 20])
+def test_the_last_rows_are_one_array(most: int) -> None:
+    window, rows = RowWindow(np.zeros((0, 2))), np.arange(100.0).reshape(50, 2)
+    for k, row in enumerate(rows.tolist()):
+        window = window.pushed(row, most)
+        np.testing.assert_array_equal(window.rows, rows[max(0, k + 1 - most) : k + 1])
+        assert window.rows.flags.c_contiguous
+
+
+def test_windows_of_rows_that_part_do_not_see_each_other() -> None:
+    start = RowWindow(np.zeros((0, 1))).pushed((1.0,), 8)
+    one, other = start.pushed((2.0,), 8), start.pushed((3.0,), 8)
+    assert [w.rows.ravel().tolist() for w in (start, one, other)] == [[1], [1, 2], [1, 3]]

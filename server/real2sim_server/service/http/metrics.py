@@ -236,6 +236,14 @@ class LoopHistogram(Collector):
         self._series: dict[tuple[str, ...], Durations] = {}
         registry.register(self)
 
+    def observe_ms(self, named: Mapping[str, float]) -> None:
+        """Count one duration [ms] of each of several values of the label."""
+        for name, ms in named.items():
+            series = self._series.get((name,)) or self.labels(name)
+            seconds = ms / 1e3
+            series.counts[bisect_left(self._bounds, seconds)] += 1
+            series.total += seconds
+
     def labels(self, *value: str) -> Durations:
         """Those of a value of the label."""
         found = self._series.get(value)

@@ -1,8 +1,9 @@
 """Calls that wait for a thread, made in one go.
 
 To wake a thread and be woken by it takes longer than what many calls do there, and leaves caches
-cold. What waits when the thread is free is therefore handed over together; a call that waits alone
-is made alone, at once.
+cold. What waits when the thread is free is therefore handed over together, with what comes in the
+same turn of the event loop: the thread could not have run before that has ended. A call that waits
+alone is made alone.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ class GatheredCalls(Generic[T, R]):
     def _append(self, call: _Call[T, R]) -> None:
         self._waiting.append(call)
         if not self._busy:
-            self._begin()
+            self._busy = True
+            asyncio.get_running_loop().call_soon(self._begin)
 
     def _begin(self) -> None:
         """Hand over what waits."""

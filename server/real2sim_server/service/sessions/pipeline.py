@@ -211,7 +211,11 @@ class StepPipeline:
             if isinstance(outcome, Exception):
                 done(outcome)
                 return
-            self.send(transition, outcome)
+            try:
+                self.send(transition, outcome)
+            except Exception as error:
+                done(error)
+                return
             done(outcome)
             self._count(outcome)
 
@@ -368,7 +372,6 @@ class StepPipeline:
         return observation
 
     def _count(self, observation: EncodedObservation) -> None:
-        for stage, ms in observation.timing_ms.items():
-            self._metrics.stages.labels(stage).observe(ms / 1e3)
+        self._metrics.stages.observe_ms(observation.timing_ms)
         for frame in observation.frames:
             self._metrics.frames.labels("drive", frame.codec).inc()

@@ -37,7 +37,8 @@ class MetricAccumulator:
         ttc: time to collision now [s].
         min_ttc: smallest so far [s].
         comfort, comfort_with_history: of the drive; with the log before the start prepended.
-        backward: [n] float64, ways made against the route in the steps of the last second [m].
+        backward: [n] float64, ways made against the route in the steps of the last second [m];
+            empty while there were none.
         oncoming: longest way against the route within a second [m].
         lane_run: how long the offset has been too large [s].
         left_lane: whether it was so for 2 s.

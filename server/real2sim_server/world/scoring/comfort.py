@@ -12,7 +12,8 @@ import numpy as np
 from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
-from .comfort_kernels import derivatives, plans_alike, push_sample
+from .comfort_kernels import derivatives, plans_alike
+from .window import RowWindow
 
 WINDOW_S = 1.5
 ORDER = 3
@@ -75,53 +76,58 @@ class ComfortAccumulator:
     middle of that window; so the first and last 0.75 s of a drive are not evaluated.
 
     Attributes:
-        samples: [n, 2] float64, speed [m/s] and continuous yaw [rad] of the last 1.5 s.
+        window: rows of speed [m/s] and continuous yaw [rad] of the last 1.5 s.
         comfortable: whether all bounds held so far.
         worst: greatest magnitudes so far, in the order of :class:`ComfortSample`.
         newest: in the middle of the newest window; None before there is one.
     """
 
-    samples: Float = field(default_factory=lambda: np.zeros((0, 2)))
+    window: RowWindow = field(default_factory=lambda: RowWindow(np.zeros((0, 2))))
     comfortable: bool = True
     worst: tuple[float, ...] = (0.0,) * 6
     newest: ComfortSample | None = None
 
+    @property
+    def samples(self) -> Float:
+        """[n, 2] float64, the rows of the window."""
+        return self.window.rows
+
     def begun_anew(self) -> ComfortAccumulator:
         """With the same samples and no verdict yet."""
-        return ComfortAccumulator(self.samples)
+        return ComfortAccumulator(self.window)
 
     def updated(self, speed: float, yaw: float, dt: float) -> ComfortAccumulator:
         """After one more clock step."""
-        return self._with(*_newest(self.samples, speed, yaw, dt))
+        return self._with(*_newest(self.window, speed, yaw, dt))
 
     def updated_beside(
         self, other: ComfortAccumulator, speed: float, yaw: float, dt: float
     ) -> tuple[ComfortAccumulator, ComfortAccumulator]:
         """This one and another that has got the same samples since this one began: after one more
         clock step. What both hold is kept, and looked at, once."""
-        samples, sample = _newest(self.samples, speed, yaw, dt)
+        window, sample = _newest(self.window, speed, yaw, dt)
         # A window that is full has room for nothing older.
-        shared = other.samples is self.samples or sample is not None
-        after = other._with(samples, sample) if shared else other.updated(speed, yaw, dt)
-        return self._with(samples, sample), after
+        shared = other.window is self.window or sample is not None
+        after = other._with(window, sample) if shared else other.updated(speed, yaw, dt)
+        return self._with(window, sample), after
 
-    def _with(self, samples: Float, sample: ComfortSample | None) -> ComfortAccumulator:
+    def _with(self, window: RowWindow, sample: ComfortSample | None) -> ComfortAccumulator:
         if sample is None:
-            return ComfortAccumulator(samples, self.comfortable, self.worst)
+            return ComfortAccumulator(window, self.comfortable, self.worst)
         worst = tuple(
             [a if a > w else w for w, a in zip(self.worst, map(abs, sample), strict=True)]
         )
         comfortable = self.comfortable and sample.comfortable
-        return ComfortAccumulator(samples, comfortable, worst, sample)
+        return ComfortAccumulator(window, comfortable, worst, sample)
 
 
 def _newest(
-    samples: Float, speed: float, yaw: float, dt: float
-) -> tuple[Float, ComfortSample | None]:
+    window: RowWindow, speed: float, yaw: float, dt: float
+) -> tuple[RowWindow, ComfortSample | None]:
     """Samples with one more at their end, and what they say once the window is full."""
-    window = comfort_window(dt)
-    samples = push_sample(samples, speed, yaw, window)
-    return samples, comfort_sample(samples, dt) if len(samples) == window else None
+    full = comfort_window(dt)
+    window = window.pushed((speed, yaw), full)
+    return window, comfort_sample(window.rows, dt) if len(window) == full else None
 
 
 @lru_cache(maxsize=16)

@@ -18,18 +18,6 @@ SHORTEST_OVERLAP = 6
 
 
 @kernel
-def push_sample(samples, speed, yaw, window):
-    """Samples [n, 2] of speed and yaw with one more at their end, the last ``window`` of them."""
-    kept = min(len(samples), window - 1)
-    found = np.empty((kept + 1, 2))
-    first = len(samples) - kept
-    for k in range(kept):
-        found[k, 0], found[k, 1] = samples[first + k, 0], samples[first + k, 1]
-    found[kept, 0], found[kept, 1] = speed, yaw
-    return found
-
-
-@kernel
 def windowed_sum(values, value, window):
     """Values [n] with one more at their end, the last ``window`` of them; and their sum."""
     kept = min(len(values), window - 1)

@@ -10,6 +10,7 @@ from ..seam import Seam
 from .accumulator import MetricAccumulator
 from .comfort import ComfortAccumulator
 from .instant import EgoSample
+from .window import RowWindow
 
 
 def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
@@ -38,4 +39,4 @@ def _moved(ego: EgoSample, seam: Seam) -> EgoSample:
 
 
 def _turned(comfort: ComfortAccumulator, seam: Seam) -> ComfortAccumulator:
-    return replace(comfort, samples=comfort.samples + np.array([0.0, seam.turn]))
+    return replace(comfort, window=RowWindow(comfort.samples + np.array([0.0, seam.turn])))

@@ -6,8 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from ..ego.reference import PlannedTrajectory
 from ..evolve import evolved
+from ..path import Float
 from .accumulator import MetricAccumulator
 from .comfort import ComfortAccumulator, plans_agree
 from .comfort_kernels import windowed_sum
@@ -28,6 +31,8 @@ HUGSIM_TTC = 1.0
 """Longest shift of the plan in HUGSIM's time to collision [s]."""
 HUGSIM_REACHED = 3.0
 """Distance from the route within which a point of it counts as reached [m]."""
+
+NONE_AGAINST = np.zeros(0)
 
 BEND, SHORT_CUT = 3.0, 10.0
 """Inside a bend way along the route is at most this many times the way driven; jumps of the nearest
@@ -88,9 +93,7 @@ def update_accumulator(
     way = math.hypot(ego.x - before.x, ego.y - before.y)
     left_out = _left_out(ego.s - before.s, way)
     gain, cut = ego.s - before.s - left_out, accumulator.cut + left_out
-    backward, oncoming = windowed_sum(
-        accumulator.backward, max(-gain, 0.0), max(round(ONCOMING_WINDOW_S / dt), 1)
-    )
+    backward, oncoming = _against_route(accumulator.backward, max(-gain, 0.0), dt)
     lane_run = accumulator.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
     backing = ego.speed < 0 and math.cos(ego.yaw - ego.path_yaw) < 0
     tail_first = accumulator.tail_first + (max(gain, 0.0) if backing else 0.0)
@@ -125,6 +128,15 @@ def update_accumulator(
         ego=ego,
         states=_updated_states(accumulator, instant, context),
     )
+
+
+def _against_route(backward: Float, way: float, dt: float) -> tuple[Float, float]:
+    """Ways made against the route within a second, one more of which is ``way``, and their sum [m].
+    Nothing is kept while there is none: what lies before the first adds nothing."""
+    if not way and not len(backward):
+        return backward, 0.0
+    backward, total = windowed_sum(backward, way, max(round(ONCOMING_WINDOW_S / dt), 1))
+    return (backward, total) if total else (NONE_AGAINST, 0.0)
 
 
 def _left_out(gain: float, way: float) -> float:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Generic, TypeVar
 
+import numpy as np
+
+from ..path import Float
+
 T = TypeVar("T")
+
+ROOM = 8
+"""Rows that a window of rows has room for at least."""
 
 
 class Window(Generic[T]):
@@ -55,4 +62,44 @@ class Window(Generic[T]):
     def _own(self, entries: list[T], length: int) -> None:
         self._entries, self._length = entries, length
         self._end = len(entries)
+        self._unclaimed = [True]
+
+
+class RowWindow:
+    """The same of rows of numbers, which kernels take as one array.
+
+    Attributes:
+        rows: [n, C] float64, newest last; nobody writes into it.
+    """
+
+    __slots__ = ("_buffer", "_end", "_unclaimed", "rows")
+
+    def __init__(self, rows: Float) -> None:
+        self._own(rows, 0, len(rows))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def pushed(self, row: Sequence[float], most: int) -> RowWindow:
+        """With one more row, the last ``most`` of them."""
+        kept = min(len(self.rows), most - 1)
+        buffer, end = self._buffer, self._end
+        try:
+            # As in Window.
+            self._unclaimed.pop()
+            shared = end < len(buffer)
+        except IndexError:
+            shared = False
+        if not shared:
+            buffer = np.empty((max(2 * kept, ROOM), self.rows.shape[1]))
+            buffer[:kept] = self.rows[len(self.rows) - kept :]
+            end = kept
+        buffer[end] = row
+        found = RowWindow.__new__(RowWindow)
+        found._own(buffer, end - kept, end + 1)
+        return found
+
+    def _own(self, buffer: Float, begin: int, end: int) -> None:
+        self._buffer, self._end = buffer, end
+        self.rows = buffer[begin:end]
         self._unclaimed = [True]

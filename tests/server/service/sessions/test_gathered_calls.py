@@ -40,8 +40,10 @@ def run(work: Work, numbers: Sequence[int], *, cancel: Sequence[int] = ()) -> li
             calls = GatheredCalls(
                 work, executor, on_result=lambda n, result: work.shown.append((n, result))
             )
-            tasks = [asyncio.create_task(calls.call(number)) for number in numbers]
+            tasks = [asyncio.create_task(calls.call(numbers[0]))]
             await asyncio.sleep(0.05)
+            tasks += [asyncio.create_task(calls.call(number)) for number in numbers[1:]]
+            await asyncio.sleep(0)
             for k in cancel:
                 tasks[k].cancel()
             await asyncio.sleep(0)
@@ -56,6 +58,24 @@ def test_what_waits_is_made_together() -> None:
     assert run(work, [1, 2, 3, 4]) == [2, 4, 6, 8]
     assert work.groups == [[1], [2, 3, 4]]
     assert work.shown == [(1, 2), (2, 4), (3, 6), (4, 8)]
+
+
+def test_what_comes_in_one_turn_of_the_loop_is_made_together() -> None:
+    work = Work()
+    work.let.set()
+    told: list[int | Exception] = []
+
+    async def main() -> list[int]:
+        with ThreadPoolExecutor(1) as executor:
+            calls = GatheredCalls(work, executor, on_result=lambda *_: None)
+            calls.begin(1, told.append)
+            calls.begin(-1, told.append)
+            return await asyncio.gather(calls.call(2), calls.call(3))
+
+    assert asyncio.run(main()) == [4, 6]
+    assert work.groups == [[1, -1], [2, 3]]
+    assert told[0] == 2
+    assert isinstance(told[1], ValueError)
 
 
 def test_no_more_than_some_are_made_together() -> None:

@@ -78,6 +78,17 @@ def test_an_observation_that_cannot_be_written_at_once_arrives_once(planner, mon
     assert woken == []
 
 
+def test_a_step_whose_answer_cannot_be_written_is_due_still(planner, monkeypatch):
+    def broken(_socket: object, parts: list[bytes]) -> bool:
+        monkeypatch.undo()
+        raise OSError("no such socket")
+
+    planner.reset(sensors=[])
+    monkeypatch.setattr(connection, "try_send_parts", broken)
+    assert planner.act(0)["code"] == "INTERNAL"
+    assert planner.act(0)["step"] == 1
+
+
 def test_whoever_has_limits_is_asked_each_time(site, planner, monkeypatch, woken):
     account: Account = site.worker.accounts.default
     planner.reset(sensors=[])
