@@ -12,11 +12,14 @@ class DirectionOptions:
     Attributes:
         lobe_prior: variance of the directions at which objects keep half of a colour that depends
             on the direction; 0 leaves colours as they were learnt.
+        paint: whether sides of vehicles that images show only edge on have the colours of
+            initialisation from ahead; what images show of them stays.
         sides: whether sides of vehicles that images show only edge on are taken from
             initialisation: right for edits, but recorded views lose by it.
         views: that are asked.
     """
 
     lobe_prior: float = 0.03
+    paint: bool = True
     sides: bool = False
     views: int = 32

@@ -110,6 +110,14 @@ def unseen_sides(
     Args:
         bodies: of the objects; None where there is none to tell by.
     """
+    normals, known = _body_normals(model, bodies)
+    facing = viewing_directions(model, viewpoints, normals=normals, objects_only=True).facing
+    return known & (facing < GRAZING)
+
+
+def _body_normals(model: SceneModel, bodies: Sequence[VehicleBody | None]) -> tuple[Tensor, Tensor]:
+    """Outward normals [N, 3] of the bodies where Gaussians are nearest to them, and [N] bool:
+    where there is one."""
     gaussians, starts = model.gaussians, model.gaussians.starts
     normals = torch.zeros_like(gaussians.means)
     known = torch.zeros(len(gaussians), dtype=torch.bool, device=model.device)
@@ -120,8 +128,53 @@ def unseen_sides(
             found = torch.from_numpy(body.normals[body.nearest(means)])
             normals[rows] = found.to(normals)
             known[rows] = True
-    facing = viewing_directions(model, viewpoints, normals=normals, objects_only=True).facing
-    return known & (facing < GRAZING)
+    return normals, known
+
+
+@torch.no_grad()
+def paint_unseen_sides(
+    model: SceneModel, viewpoints: Sequence[Viewpoint], bodies: Sequence[VehicleBody | None]
+) -> None:
+    """Give sides of vehicles that images show only edge on the colours of stage 0 from ahead.
+
+    The colour of a Gaussian there goes linearly from what was learnt, in the mean direction of the
+    images, to what initialisation has at its place, against the normal. What images show stays.
+    """
+    normals, known = _body_normals(model, bodies)
+    seen = viewing_directions(model, viewpoints, normals=normals, objects_only=True)
+    sh = model.gaussians.sh
+    rows = (known & (seen.facing < GRAZING)).nonzero()[:, 0]
+    if sh.shape[1] < 4 or not len(rows):
+        return
+    signs = sh.new_tensor([-1.0, -1.0, 1.0])[:, None]
+    slopes = sh[rows, 1:4].roll(1, dims=1) * signs * SH_C1
+    mean = seen.means[rows]
+    shown = 0.5 + SH_C0 * sh[rows, 0] + (slopes * mean[:, :, None]).sum(1)
+    wanted = _initial_colours(model, rows)
+    way = -normals[rows] - mean
+    way /= way.square().sum(-1, keepdim=True).clamp(min=0.5)
+    slopes = way[:, :, None] * (wanted - shown)[:, None]
+    constant = shown - (slopes * mean[:, :, None]).sum(1)
+    sh[rows, 0] = (constant - 0.5) / SH_C0
+    sh[rows, 1:4] = (slopes * signs / SH_C1).roll(-1, dims=1)
+    sh[rows, 4:] = 0
+
+
+def _initial_colours(model: SceneModel, rows: Tensor) -> Tensor:
+    """Colours [M, 3] that stage 0 has where the Gaussians ``rows`` [M] of objects are."""
+    from scipy.spatial import cKDTree
+
+    starts = model.gaussians.starts
+    colours = torch.zeros(len(rows), 3, device=model.device)
+    for index, item in enumerate(model.scene.objects.values()):
+        mine = (rows >= starts[index + 1]) & (rows < starts[index + 2])
+        if not bool(mine.any()) or not len(item.cloud):
+            continue
+        tree = cKDTree(item.cloud.means.detach().cpu().numpy())
+        _, near = tree.query(model.gaussians.means[rows[mine]].detach().cpu().numpy(), k=1)
+        constant = item.cloud.sh[torch.from_numpy(near), 0]
+        colours[mine] = (0.5 + SH_C0 * constant).to(colours)
+    return colours
 
 
 @torch.no_grad()

@@ -22,7 +22,12 @@ from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .data import TrainingView, TrainingViews, held_out_frames, image_time
 from .densify import STRATEGIES, ScreenSums, TrainingStep
-from .directions import plain_lobes, unseen_sides, viewing_directions
+from .directions import (
+    paint_unseen_sides,
+    plain_lobes,
+    unseen_sides,
+    viewing_directions,
+)
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
 from .model import RenderedView, SceneModel
@@ -247,10 +252,14 @@ class Trainer:
     def _settle_colours(self, done: int) -> None:
         """After the last step: objects' colours in directions from which none shows them."""
         options = self.options.directions
-        if done == self.options.iterations and options.lobe_prior > 0 and self.model.scene.objects:
-            viewpoints = self.views.sample_viewpoints(options.views)
+        if done != self.options.iterations or not self.model.scene.objects:
+            return
+        viewpoints = self.views.sample_viewpoints(options.views)
+        if options.lobe_prior > 0:
             seen = viewing_directions(self.model, viewpoints, objects_only=True)
             plain_lobes(self.model, seen, prior=options.lobe_prior)
+        if options.paint:
+            paint_unseen_sides(self.model, viewpoints, _bodies(self.model.scene))
 
     def _report(
         self, terms: dict[str, float], clock: RateMeter, on_progress: OnTraining | None

@@ -11,12 +11,13 @@ from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
 from real2sim_server.reconstruct.training import SceneModel
 from real2sim_server.reconstruct.training.directions import (
     ViewingDirections,
+    paint_unseen_sides,
     plain_lobes,
     unseen_sides,
     viewing_directions,
 )
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
-from real2sim_server.scene.spherical_harmonics import evaluate_sh
+from real2sim_server.scene.spherical_harmonics import SH_C0, evaluate_sh
 
 from .conftest import TINY
 
@@ -79,7 +80,12 @@ def test_directions_lead_from_the_camera_to_what_it_sees(model, tiny_scene):
 SALOON = (4.7, 1.82, 1.46)
 
 
-def test_of_a_car_seen_from_behind_the_flanks_are_unseen(tiny_scene):
+RED = torch.tensor([0.8, 0.1, 0.1])
+
+
+@pytest.fixture
+def followed(tiny_scene):
+    """A red car that was followed, as it was before training, the views of it, and its body."""
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     times = np.array([tiny_scene.start_us, tiny_scene.end_us])
     pose = tiny_scene.ego.transform(tiny_scene.start_us) @ np.array(
@@ -92,12 +98,32 @@ def test_of_a_car_seen_from_behind_the_flanks_are_unseen(tiny_scene):
         torch.tensor([[1.0, 0, 0, 0]]).expand(4, 4),
         torch.full((4, 3), 0.05),
         torch.full((4,), 0.9),
-        torch.zeros(4, 1, 3),
+        ((RED - 0.5) / SH_C0).expand(4, 1, 3),
     )
     car = SceneObject("car", "car", SALOON, cloud, path)
     scene = replace(tiny_scene, objects={"car": car}, content_hash="")
     model = SceneModel(scene, replace(TINY, refine_poses=False), times, backend="cpu")
-    viewpoints = [(camera, scene.start_us) for camera in scene.rig]
+    return model, [(camera, scene.start_us) for camera in scene.rig], body
+
+
+def test_of_a_car_seen_from_behind_the_flanks_are_unseen(followed):
+    model, viewpoints, body = followed
     unseen = unseen_sides(model, viewpoints, [body])[-4:]
     assert unseen.tolist() == [False, True, True, True]
     assert not unseen_sides(model, viewpoints, [None]).any()
+
+
+def test_unseen_flanks_keep_what_is_seen_of_them_and_show_paint_from_ahead(followed):
+    model, viewpoints, body = followed
+    with torch.no_grad():
+        model.gaussians.sh[-4:] = torch.randn(4, 4, 3, generator=torch.Generator().manual_seed(3))
+    learnt = model.gaussians.sh.detach()[-4:].clone()
+    seen = viewing_directions(model, viewpoints, objects_only=True).means[-4:]
+    paint_unseen_sides(model, viewpoints, [body])
+    painted = model.gaussians.sh.detach()[-4:]
+    assert torch.equal(painted[0], learnt[0])
+    as_seen = [evaluate_sh(sh[1:3], seen[1:3]) for sh in (painted, learnt)]
+    np.testing.assert_allclose(*as_seen, atol=1e-4)
+    from_ahead = torch.tensor([[0.0, -1, 0], [0, 1, 0]])
+    shown = evaluate_sh(painted[1:3], from_ahead) + 0.5
+    np.testing.assert_allclose(shown, RED.expand(2, 3), atol=0.02)

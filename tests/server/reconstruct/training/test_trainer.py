@@ -16,6 +16,7 @@ from real2sim_server.reconstruct.training import (
     held_out_frames,
     score_held_out,
 )
+from real2sim_server.reconstruct.training.direction_options import DirectionOptions
 from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
 from real2sim_server.reconstruct.training.threads import one_torch_thread
@@ -195,6 +196,22 @@ def test_resuming_with_other_options_is_refused(tiny_log, tiny_scene, tmp_path):
 def test_nothing_to_resume_is_said(tiny_log, tiny_scene, tmp_path):
     with pytest.raises(ReconstructError, match="no checkpoint"):
         Trainer(tiny_log, tiny_scene, TINY, folder=tmp_path).resume()
+
+
+@pytest.mark.parametrize("paint", [True, False])
+def test_unseen_sides_are_painted_once_after_the_last_step_if_asked(
+    tiny_log, tiny_scene, monkeypatch, paint
+):
+    painted = []
+    monkeypatch.setattr(
+        "real2sim_server.reconstruct.training.trainer.paint_unseen_sides",
+        lambda model, viewpoints, bodies: painted.append(len(bodies)),
+    )
+    directions = DirectionOptions(paint=paint, views=1)
+    trainer = Trainer(tiny_log, tiny_scene, replace(TINY, directions=directions))
+    for done in (TINY.iterations - 1, TINY.iterations):
+        trainer._settle_colours(done)
+    assert painted == ([len(tiny_scene.objects)] if paint else [])
 
 
 def test_held_out_frames_lie_between_seen_ones():
