@@ -16,6 +16,7 @@ from real2sim_proto.scenarios import HistoryEntry
 
 from ._models import read_json
 from ._retry import parse_retry_after
+from .clouds import LidarCloud, cloud_from_wire
 from .errors import ErrorDetails, InvalidValue, MalformedReplyError, Real2SimError, error_for
 from .images import Image, frame_from_wire
 from .observation import View, view_from_frames
@@ -121,6 +122,13 @@ def parse_image(reply: Reply, modality: str) -> Image:
         raise MalformedReplyError(f"the worker sent {reply.media_type!r} where an image was asked")
     dtype = "uint8" if modality in ("rgb", "semantic") else "uint16"
     return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype)
+
+
+def parse_sweep(reply: Reply) -> LidarCloud:
+    cloud = cloud_from_wire(_wire_cloud(_decoded(reply)))
+    if not isinstance(cloud, LidarCloud):
+        raise MalformedReplyError(f"the worker sent a {cloud.modality} cloud for a sweep")
+    return cloud
 
 
 def parse_view(reply: Reply) -> View:

@@ -61,8 +61,10 @@ from ._replies import (
     model_of,
     nothing,
     parse_image,
+    parse_sweep,
     parse_view,
 )
+from .clouds import LidarCloud
 from .images import Image
 from .observation import View
 
@@ -167,6 +169,17 @@ def history(scenario_id: str, after: int | None) -> Call[History]:
 
 def preview(scenario_id: str, view: ViewRequest) -> Call[Image]:
     return image(f"{_scenario(scenario_id)}/preview", view)
+
+
+def sweep(scenario_id: str, lidar: str, t_us: int | None) -> Call[LidarCloud]:
+    request = Request(
+        "GET",
+        f"{_scenario(scenario_id)}/sweep",
+        params={"lidar": lidar} | ({} if t_us is None else {"t_us": str(t_us)}),
+        headers={"Accept": MSGPACK},
+        long_timeout=True,
+    )
+    return Call(request, parse_sweep)
 
 
 def fork_scenario(scenario_id: str, name: str | None, revision: int | None) -> Call[ScenarioInfo]:

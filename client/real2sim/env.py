@@ -225,6 +225,8 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             most, dtype = FORMS[name.partition("/")[2] or "rgb"]
             parts[name] = spaces.Box(0, most, image.shape, dtype)
         for name, cloud in obs.clouds.items():
+            if name in parts:
+                raise ValueError(f"two sensors are called {name!r}; name the {cloud.modality} anew")
             shape = (self._rows[cloud.modality], 3 + len(CLOUD_FIELDS[cloud.modality]))
             parts[name] = spaces.Box(-FAR, FAR, shape, np.float32)
         if self._agents:

@@ -138,6 +138,9 @@ class RadarModel(Model):
     detection_range_m: Metres = Field(
         default=140.0, description="where a target of 10 m^2 is just detected"
     )
+    min_rcs_dbsm: Annotated[float, Field(ge=-100, le=60)] = Field(
+        default=-20.0, description="weaker targets are not reported, however near"
+    )
     ray_spacing_deg: Annotated[float, Field(ge=0.05, le=10)] = Field(
         default=0.4, description="of the rays that look for targets"
     )

@@ -150,6 +150,7 @@ def test_drive_asks_for_what_its_flags_say(run: Run, worker: FakeWorker) -> None
     done = run(
         *("drive", "--scene", "street", "--steps", "1", "--url", worker.url),
         *("--beyond-log", "loop", "--spawn", '{"density": 30}', "--seed", "4"),
+        *("--lidar", "vlp-16,os1-128", "--radar", "corner"),
         *("--randomization", '{"latency_us": 5000}', "--reset", '{"agents": {"default": "idm"}}'),
     )
     assert done.returncode == 0, done.stderr
@@ -158,6 +159,8 @@ def test_drive_asks_for_what_its_flags_say(run: Run, worker: FakeWorker) -> None
     assert (spec.seed, spec.beyond_log, spec.horizon) == (4, "loop", 36_000)
     assert (spec.agents.default, spec.agents.spawn.density) == ("idm", 30)
     assert spec.randomization.latency_us == 5000
+    assert [s.lidar for s in spec.lidars] == ["vlp-16", "os1-128"]
+    assert [s.radar for s in spec.radars] == ["corner"]
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from .._object_edits import (
 )
 from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
 from .._scenario_state import Objects, ScenarioState
+from ..clouds import LidarCloud
 from ..images import Image, write_atomically
 from .concurrency import run_blocking
 from .jobs import AsyncJob
@@ -423,6 +424,24 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         codec = self._transport.target.image_codec(codec, modality)
         view = ViewRequest(camera, t_us, width, modality, codec)
         return await self._transport.send(_requests.preview(self.scenario_id, view))
+
+    async def sweep(self, *, lidar: str, t_us: int | None = None) -> LidarCloud:
+        """What a LiDAR on the recording vehicle would measure now; its last ray is fired at
+        ``t_us``.
+
+        Args:
+            lidar: name in the worker's catalogue.
+            t_us: default: start of the scenario.
+
+        Raises:
+            InvalidRequestError: no such LiDAR, or a time outside the recording.
+
+        Examples:
+            >>> cloud = await scenario.sweep(lidar="vlp-16")
+            >>> cloud.modality, cloud.t_us
+            ('lidar', 0)
+        """
+        return await self._transport.send(_requests.sweep(self.scenario_id, lidar, t_us))
 
     def _edit(self, operation: Operation) -> Awaitable[OperationResult]:
         return self.apply([operation])

@@ -87,8 +87,15 @@ def drive(
             "those that have flags of their own are not taken from here.",
         ),
     ] = None,
+    lidar: Annotated[
+        str, typer.Option(help="LiDARs of the worker's catalogue, comma-separated.")
+    ] = "",
+    radar: Annotated[
+        str, typer.Option(help="Radars of the worker's catalogue, comma-separated.")
+    ] = "",
     out: Annotated[
-        Path | None, typer.Option(help="Save frames there: CAMERA/STEP.jpg, summary.json.")
+        Path | None,
+        typer.Option(help="Save there: CAMERA/STEP.jpg, LIDAR/STEP.ply, summary.json."),
     ] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
@@ -107,7 +114,9 @@ def drive(
         connected(url, token, timeout) as client,
         _session(client, scene=scene, scenario=scenario, codec=codec) as session,
     ):
-        names = session.cameras if cameras == "all" else [c for c in cameras.split(",") if c]
+        names = session.cameras if cameras == "all" else _names(cameras)
+        for kind, named in (("lidars", _names(lidar)), ("radars", _names(radar))):
+            options |= {kind: named} if named else {}
         with _progress(steps) as advance, _saver(out) as save:
 
             def on_observation(obs: Observation) -> None:
@@ -131,6 +140,10 @@ def drive(
                 },
             )
     _report(summary, out=out, json_file=json_file)
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
 
 
 def _reset_options(
@@ -211,6 +224,9 @@ def _saver(folder: Path | None) -> Iterator[Callable[[Observation], None]]:
                 if "rgb" in modalities:
                     path = folder / camera / f"{obs.step:06d}.jpg"
                     pending.append(pool.submit(modalities["rgb"].save, path))
+            for sensor, cloud in obs.clouds.items():
+                path = folder / sensor / f"{obs.step:06d}.ply"
+                pending.append(pool.submit(cloud.save, path))
 
         yield save
         for future in pending:

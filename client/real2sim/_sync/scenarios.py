@@ -30,6 +30,7 @@ from .._object_edits import (
 )
 from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
 from .._scenario_state import Objects, ScenarioState
+from ..clouds import LidarCloud
 from ..images import Image, write_atomically
 from .concurrency import run_blocking
 from .jobs import Job
@@ -422,6 +423,24 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
         codec = self._transport.target.image_codec(codec, modality)
         view = ViewRequest(camera, t_us, width, modality, codec)
         return self._transport.send(_requests.preview(self.scenario_id, view))
+
+    def sweep(self, *, lidar: str, t_us: int | None = None) -> LidarCloud:
+        """What a LiDAR on the recording vehicle would measure now; its last ray is fired at
+        ``t_us``.
+
+        Args:
+            lidar: name in the worker's catalogue.
+            t_us: default: start of the scenario.
+
+        Raises:
+            InvalidRequestError: no such LiDAR, or a time outside the recording.
+
+        Examples:
+            >>> cloud = scenario.sweep(lidar="vlp-16")
+            >>> cloud.modality, cloud.t_us
+            ('lidar', 0)
+        """
+        return self._transport.send(_requests.sweep(self.scenario_id, lidar, t_us))
 
     def _edit(self, operation: Operation) -> OperationResult:
         return self.apply([operation])

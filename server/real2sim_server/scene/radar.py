@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from real2sim_proto.ranging import RadarModel
 
@@ -51,10 +50,22 @@ MOUNT = (3.6, 0.0, 0.5)
 """Of radars whose session names no pose, from the vehicle's rear axle [m]."""
 
 
-def _at_mount() -> Float:
+def at_mount() -> Float:
+    """``T_vehicle_radar`` [4, 4] at MOUNT, looking ahead."""
     pose = np.eye(4)
     pose[:3, 3] = MOUNT
     return pose
+
+
+def catalogue_radar(name: str) -> RadarModel:
+    """The radar of that name in the catalogue.
+
+    Raises:
+        RadarError: it has none; with those it has.
+    """
+    if name not in RADARS:
+        raise RadarError(f"no radar {name!r} in the catalogue; it has {', '.join(RADARS)}")
+    return RADARS[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,25 +83,13 @@ class Radar:
 
     name: str
     model: RadarModel
-    T_vehicle_radar: Float
+    T_vehicle_radar: Float = field(default_factory=at_mount)
 
     def __post_init__(self) -> None:
         pose = np.array(self.T_vehicle_radar, dtype=np.float64)
         if not is_rigid(pose):
             raise RadarError(f"radar {self.name!r}: T_vehicle_radar is not a rigid transform")
         object.__setattr__(self, "T_vehicle_radar", pose)
-
-    @classmethod
-    def named(cls, name: str, model: str, T_vehicle_radar: ArrayLike | None = None) -> Radar:
-        """A radar of the catalogue.
-
-        Raises:
-            RadarError: it has none of that name; with those it has.
-        """
-        if model not in RADARS:
-            raise RadarError(f"no radar {model!r} in the catalogue; it has {', '.join(RADARS)}")
-        pose = _at_mount() if T_vehicle_radar is None else np.asarray(T_vehicle_radar)
-        return cls(name, RADARS[model], pose)
 
     @cached_property
     def rays(self) -> Lidar:

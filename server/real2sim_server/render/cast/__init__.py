@@ -4,7 +4,7 @@
 of it (a :class:`Sweep`). Nothing here is compiled before the first call.
 """
 
-from .call import cast, select_caster
+from .call import cast, prepare_rays, select_caster
 from .detect import Sweep, detect
 from .recorded import SweepScene, recorded_scene, recorded_sweep, sensor_poses
 from .types import CastBackend, CastRequest, Echo, Return
@@ -18,6 +18,7 @@ __all__ = [
     "SweepScene",
     "cast",
     "detect",
+    "prepare_rays",
     "recorded_scene",
     "recorded_sweep",
     "select_caster",

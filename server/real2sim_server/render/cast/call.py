@@ -67,6 +67,14 @@ def checked_request(
     )
 
 
+def prepare_rays(lidar: Lidar) -> None:
+    """Make what casting on the CPU keeps of a sensor's rays, on any thread: half a million of them
+    take a second at their first sweep otherwise."""
+    from .cpu.layout import layout_of
+
+    layout_of(lidar.beams)
+
+
 @cache
 def select_caster(name: str = "auto") -> CastBackend:
     """The backend of that name, made on first use.

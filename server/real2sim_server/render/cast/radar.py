@@ -190,7 +190,8 @@ def _snr(rcs: Float, distance: Float, radar: Radar) -> Float:
 
 def _above_threshold(cells: Detections, radar: Radar) -> Detections:
     snr = _snr(cells.rcs, cells.range, radar)
-    return _picked(_with(cells, snr=snr), np.flatnonzero(snr >= 0))
+    seen = (snr >= 0) & (cells.rcs >= radar.model.min_rcs_dbsm)
+    return _picked(_with(cells, snr=snr), np.flatnonzero(seen))
 
 
 def _measured(found: Detections, radar: Radar, seed: int) -> Detections:

@@ -36,6 +36,7 @@ from ..rendering.responses import FRAME_RESPONSES, frame_response
 from ..scenarios.scenarios import created_headers, tag
 from ..worker import Worker, WorkerOf
 from .frame_query import FrameQueryOf
+from .sweep_query import SWEEP_RESPONSES, SweepQueryOf, sweep_response
 
 router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"], route_class=TokenRoute)
 
@@ -312,6 +313,25 @@ async def points(
     name = f"{scenario_id}.ply"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(await asyncio.to_thread(made), media_type=PLY, headers=headers)
+
+
+@router.get("/{scenario_id}/sweep", responses=SWEEP_RESPONSES, response_class=Response)
+async def sweep(
+    worker: WorkerOf, scenario_id: Identifier, query: SweepQueryOf, request: Request
+) -> Response:
+    """What a LiDAR of the catalogue measures in the scenario as it is now, on the recording
+    vehicle; its last ray is fired at ``t_us``."""
+    media_type = query.media_type()
+    mounted = await asyncio.to_thread(query.mounted)
+    view = await worker.scenarios.view(scenario_id)
+    scene = await worker.scene_cache.get(view.row.scene)
+    cloud = await cancel_on_disconnect(
+        request,
+        worker.sessions.pipeline.recorded_sweep(
+            scene, view.state, mounted, query.instant(view.state)
+        ),
+    )
+    return await asyncio.to_thread(sweep_response, cloud, media_type, revision=view.revision)
 
 
 def expected_revision(if_match: str | None) -> int | None:

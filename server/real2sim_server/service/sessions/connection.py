@@ -263,7 +263,7 @@ class Connection:
                 session.check_open()
                 world, slot = session.running_world(), self._slot(message.slot)
                 view = await self._sessions.pipeline.view(
-                    world, message.sensors, ranging=looking(world, message), slot=slot
+                    world, message.sensors, ranging=await looking(world, message), slot=slot
                 )
                 return view.answer
             case Attach() | Agent() | Snapshot() | Restore() | Fork():

@@ -111,7 +111,7 @@ class StepPhases:
     ) -> Images:
         """Images of a world, its objects deformed first."""
         deform(world, timer)
-        images = self._images.of(world, sensors, cameras)
+        images = self._images.of(world, sensors, cameras) if sensors else ()
         timer.stage("render")
         return images
 

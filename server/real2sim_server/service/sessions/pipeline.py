@@ -48,7 +48,7 @@ from ...edit import ScenarioState, compose, instances_at, things_at_start
 from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
-from ...world.ranging import NO_SENSORS, RangingSensors
+from ...world.ranging import NO_SENSORS, Cloud, MountedLidar, RangingSensors
 from ..accounts import computing_account, count_sent, counted_world_time
 from ..engine import Engine
 from ..http.metrics import Metrics
@@ -338,6 +338,20 @@ class StepPipeline:
         clouds = self._phases.measure(world, ranging.all, timer)
         members = pack_members({"t_us": world.t_us, "revision": world.revision})
         return RenderedObservation(world, images, clouds, "view", members, timer)
+
+    async def recorded_sweep(
+        self, scene: Scene, state: ScenarioState, mounted: MountedLidar, t_us: int
+    ) -> Cloud:
+        """The sweep of a LiDAR on the recording vehicle that ends at ``t_us`` [us].
+
+        Raises:
+            ServiceError: INVALID_REQUEST for too many rays.
+            TimeOutOfRangeError: ``t_us`` is outside the recording.
+            QueueFullError: too much waits for the engine.
+        """
+        await self._clouds.ready(RangingSensors((mounted,)))
+        cast = partial(self._clouds.recorded, scene, state, mounted, t_us)
+        return await self._engine.call(cast, label="sweep")
 
     async def first_render(self, scene: Scene, state: ScenarioState) -> None:
         """Render a scene from its first camera, to have everything compiled and in memory.

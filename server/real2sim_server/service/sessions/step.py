@@ -20,7 +20,6 @@ from real2sim_proto.operations import Operation
 from ...edit import EditOutcome
 from ...scene import Camera, Scene
 from ...world import Event, Plan, World
-from ...world.ranging import mounted_sensors
 from ...world.recording.replay import (
     KEPT_PLAN,
     action_payload,
@@ -42,6 +41,7 @@ from .segment import FrameSlot
 from .session import Session
 from .transition import Transition
 from .wire import DeferredMessage, EncodedMessage
+from .world_clouds import mounted_beside
 
 LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
@@ -145,7 +145,7 @@ class Stepper:
         """Cameras of an episode, once all that it would wait for on the way is there."""
         start = session.start
         cameras = self._pipeline.cameras(start.scene, spec.sensors)
-        ranging = mounted_sensors(spec.lidars, spec.radars, spec.dt_us)
+        ranging = await mounted_beside(spec.lidars, spec.radars, spec.dt_us)
         await self._pipeline.ranging_ready(ranging, spec.sensors, cameras)
         await self._kernels.ready(spec)
         await self._pipeline.levels_ready(start.scene, start.state, spec.sensors, cameras)

@@ -11,17 +11,18 @@ from real2sim_proto.episode import SensorSpec
 from real2sim_proto.sessions import SessionRender
 
 from ...world import World
-from ...world.ranging import RangingSensors, mounted_sensors
+from ...world.ranging import RangingSensors
 from ..http.responses import choose_among, etag
 from ..rendering.responses import CODEC_OF, choose_media_type
 from .pipeline import StepPipeline
+from .world_clouds import mounted_beside
 
 MSGPACK = "application/msgpack"
 
 
-def looking(world: World, asked: SessionRender | Render) -> RangingSensors:
+async def looking(world: World, asked: SessionRender | Render) -> RangingSensors:
     """LiDARs and radars of a look aside. Raises WorldError: INVALID_REQUEST."""
-    return mounted_sensors(asked.lidars, asked.radars, world.spec.dt_us)
+    return await mounted_beside(asked.lidars, asked.radars, world.spec.dt_us)
 
 
 async def view_response(
@@ -36,7 +37,7 @@ async def view_response(
         ServiceError: NOT_ACCEPTABLE, or as StepPipeline.view().
     """
     sensors: Sequence[SensorSpec] = asked.sensors
-    ranging = looking(world, asked)
+    ranging = await looking(world, asked)
     single = not ranging and len(sensors) == 1 and len(sensors[0].modalities) == 1
     if single:
         media_type = choose_media_type(accept, sensors[0].modalities[0])

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from functools import partial
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.ranging import LidarSpec, RadarSpec
 
-from ...render.cast import CastBackend, select_caster
+from ...edit import ScenarioState
+from ...render.cast import CastBackend, prepare_rays, select_caster
 from ...render.cast.warm_up import kernels_of_casting_on_disk, warm_up_casting
+from ...scene import Scene
 from ...world import World
-from ...world.ranging import Cloud, Mounted, RangingSensors
-from ...world.sensing import clouds_of
+from ...world.ranging import (
+    NO_SENSORS,
+    Cloud,
+    Mounted,
+    MountedLidar,
+    RangingSensors,
+    mounted_sensors,
+)
+from ...world.sensing import clouds_of, recorded_cloud
 from ..engine import Engine
 from ..first_run import compile_beside
 from ..http.problems import ServiceError
@@ -20,6 +31,25 @@ from .image_limits import check_message_bytes
 
 POINT_BYTES = 40
 """Of a point with all its columns, or a detection of a radar; with room."""
+
+
+async def mounted_beside(
+    lidars: Sequence[LidarSpec], radars: Sequence[RadarSpec], dt_us: int
+) -> RangingSensors:
+    """As :func:`.mounted_sensors`, and their rays prepared, beside event loop and engine. Raises
+    WorldError: INVALID_REQUEST."""
+    if not lidars and not radars:
+        return NO_SENSORS
+
+    def mounted() -> RangingSensors:
+        sensors = mounted_sensors(lidars, radars, dt_us)
+        for lidar in sensors.lidars:
+            prepare_rays(lidar.lidar)
+        for radar in sensors.radars:
+            prepare_rays(radar.radar.rays)
+        return sensors
+
+    return await asyncio.to_thread(mounted)
 
 
 class WorldClouds:
@@ -70,11 +100,18 @@ class WorldClouds:
 
     def of(self, world: World, due: Sequence[Mounted]) -> list[Cloud]:
         """Clouds of the sensors that are due, in their order."""
-        if not due:
-            return []
+        return clouds_of(world, due, self._chosen()) if due else []
+
+    def recorded(
+        self, scene: Scene, state: ScenarioState, mounted: MountedLidar, t_us: int
+    ) -> Cloud:
+        """A sweep from the recording vehicle. Raises TimeOutOfRangeError."""
+        return recorded_cloud(scene, state, mounted, t_us, self._chosen())
+
+    def _chosen(self) -> CastBackend:
         if self._caster is None:
             self._caster = select_caster()
-        return clouds_of(world, due, self._caster)
+        return self._caster
 
 
 def _most_bytes(mounted: Mounted) -> int:

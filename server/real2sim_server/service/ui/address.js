@@ -3,7 +3,7 @@ import { model, on } from "./model.js";
 export const addressParameters = () => Object.fromEntries(new URLSearchParams(location.search));
 let waiting = null;
 export function startAddress() {
-  on("scenario selection time camera run mosaic", () => {
+  on("scenario selection time camera run mosaic lidar", () => {
     waiting ??= setTimeout(write, 250);
   });
   write();
@@ -18,6 +18,7 @@ function write() {
     selected: model.selected,
     run: model.job,
     shows: model.shows === "rgb" ? null : model.shows,
+    lidar: model.lidar,
   };
   const query = new URLSearchParams(Object.entries(values).filter(([, v]) => v !== null));
   history.replaceState(null, "", `?${query}`);

@@ -3,6 +3,7 @@ import { model, on, emit, object, poseOf, draftOperations, select, refresh } fro
 import { ViewSocket } from "./view_socket.js";
 import { project, rotate, present } from "./poses.js";
 import { attempt, notify } from "./messages.js";
+import { drawSweepInPicture } from "./sweep.js";
 
 const $ = (id) => document.getElementById(id);
 const MOVING_WIDTH = 640;
@@ -23,7 +24,7 @@ export function startView() {
   });
   on("time draft camera", () => requestFrame(true));
   on("scenario run", () => requestFrame(false));
-  on("selection draft scenario", outline);
+  on("selection draft scenario sweep", outline);
   new ResizeObserver(outline).observe($("stage"));
   $("uncertainty").hidden = !model.scene.has_uncertainties;
   $("uncertainty").classList.toggle("on", model.shows !== "rgb");
@@ -109,12 +110,16 @@ function outline() {
     : model.free || model.mosaic
       ? ""
       : "Click an object to select it";
-  if (!header || !subject || !present(subject, model.t)) {
+  if (!header) {
     return;
   }
   const { scale, left, top } = frameBox();
   const pen = canvas.getContext("2d");
   pen.scale(devicePixelRatio, devicePixelRatio);
+  drawSweepInPicture(pen, header, { scale, left, top });
+  if (!subject || !present(subject, model.t)) {
+    return;
+  }
   const { position, quaternion } = poseOf(subject);
   const corners = [...Array(8).keys()].map((i) => {
     const offset = subject.size.map((s, axis) => ((i >> axis) & 1 ? s : -s) / 2);

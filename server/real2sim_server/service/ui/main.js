@@ -12,6 +12,7 @@ import { startAssets } from "./assets.js";
 import { startPhysics, show } from "./physics.js";
 import { startDatasets } from "./datasets.js";
 import { startTimeline } from "./timeline.js";
+import { startSweep, chooseLidar } from "./sweep.js";
 import { startShortcuts } from "./shortcuts.js";
 
 const $ = (id) => document.getElementById(id);
@@ -52,6 +53,10 @@ async function main() {
     const t = model.t;
     await attempt(show)(address.run);
     setTime(t);
+  }
+  await attempt(startSweep)();
+  if (address.lidar) {
+    chooseLidar(address.lidar);
   }
   startAddress();
   document.body.dataset.ready = "yes";

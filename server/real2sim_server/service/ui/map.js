@@ -2,15 +2,9 @@
 import { model, on, emit, object, poseOf, select, edit, draftOperations } from "./model.js";
 import { yawOf, poseAt, present } from "./poses.js";
 import { fromAbove } from "./colliders.js";
+import { drawSweepAbove } from "./sweep.js";
+import { colourOf } from "./categories.js";
 
-const COLOURS = {
-  car: "#5aa9ff",
-  truck: "#b48cff",
-  van: "#62d0c4",
-  bus: "#b48cff",
-  pedestrian: "#ff8fa3",
-  cyclist: "#ffd166",
-};
 let canvas;
 let pen;
 let view = { x: 0, y: 0, scale: 6 };
@@ -23,7 +17,7 @@ export function startMap() {
   canvas.addEventListener("pointermove", move);
   canvas.addEventListener("pointerup", up);
   canvas.addEventListener("wheel", zoom, { passive: false });
-  on("scenario selection time draft run camera box", draw);
+  on("scenario selection time draft run camera box sweep", draw);
   new ResizeObserver(draw).observe(canvas);
   centre();
 }
@@ -66,6 +60,7 @@ function draw() {
   pen.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
   grid();
   line(model.scene.ego.positions, "#3f5a46", 2);
+  drawSweepAbove(pen, toScreen, poseAt(model.scene.ego, model.t));
   for (const o of shown()) {
     if (o.trajectory.positions.length > 1) {
       line(o.trajectory.positions, o.object_id === model.selected ? "#ffb45499" : "#33425680", 1.2);
@@ -90,7 +85,7 @@ function draw() {
     box(
       poseOf(o),
       o.size,
-      o.object_id === model.selected ? "#ffb454" : (COLOURS[o.category] ?? "#5aa9ff"),
+      o.object_id === model.selected ? "#ffb454" : colourOf(o),
       true,
       o.object_id,
     );

@@ -18,6 +18,8 @@ export const model = {
   mosaic: false,
   when: "always",
   box: null,
+  lidar: null,
+  sweep: null,
 };
 const listeners = {};
 export const on = (names, fn) => names.split(" ").forEach((n) => (listeners[n] ??= []).push(fn));

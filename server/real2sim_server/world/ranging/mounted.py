@@ -11,17 +11,17 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Pose
-from real2sim_proto.ranging import LidarModel, LidarSpec, RadarSpec
+from real2sim_proto.ranging import LidarModel, LidarSpec, RadarModel, RadarSpec
 
 from ...geometry.rotation import Float
 from ...geometry.transform import transform_from
 from ...scene import Beams, Lidar, LidarError, Radar, RadarError
 from ...scene.lidar_catalogue import catalogue_lidar, lidar_of
-from ...scene.radar import RADARS
+from ...scene.radar import catalogue_radar
 from ..errors import WorldError
 
 KEPT_LIDARS = 32
-"""Sensors whose tables are kept for the next episode."""
+"""Sensors whose rays are kept for the next episode."""
 LONGEST_US = 1_000_000
 """Of sweeps; what happened before is forgotten."""
 
@@ -167,15 +167,10 @@ def _mounted_lidar(spec: LidarSpec, dt_us: int) -> MountedLidar:
 
 def _mounted_radar(spec: RadarSpec, dt_us: int) -> MountedRadar:
     what = f"radar {spec.radar!r}"
-    pose = None if spec.pose is None else _transform(spec.pose)
-    given = spec.model or spec.radar
+    model = spec.model or spec.radar
     try:
-        if isinstance(given, str):
-            radar = replace(Radar.named(given, given, pose), name=spec.radar)
-        else:
-            mount = Radar.named(spec.radar, next(iter(RADARS)), pose).T_vehicle_radar
-            radar = Radar(spec.radar, given, mount)
-        radar.rays  # noqa: B018, refuses what is out of range
+        known = catalogue_radar(model) if isinstance(model, str) else model
+        radar = _radar(spec.radar, known, spec.pose)
     except (RadarError, LidarError) as error:
         raise _refused(f"{what}: {error}") from error
     period_us = spec.period_us or dt_us
@@ -203,6 +198,14 @@ def _lidar(spec: LidarSpec) -> Lidar:
 
 def _key(spec: LidarSpec) -> tuple[str, Pose | None, float | None]:
     return spec.lidar, spec.pose, spec.rate_hz
+
+
+@lru_cache(maxsize=KEPT_LIDARS)
+def _radar(name: str, model: RadarModel, pose: Pose | None) -> Radar:
+    """With its rays, so that they are refused here where they are none."""
+    radar = Radar(name, model) if pose is None else Radar(name, model, _transform(pose))
+    assert radar.rays.beams.count == model.ray_count
+    return radar
 
 
 @lru_cache(maxsize=KEPT_LIDARS)

@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...edit import ScenarioState
+from ...edit.sweep import sweep_of
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
+from ...render.cast.call import checked_request
 from ...render.cast.detect import Sweep, detect
+from ...render.cast.recorded import sensor_poses
 from ...render.cast.types import CastBackend, CastRequest, Echo
-from ...scene import Lidar
+from ...scene import Lidar, Scene
 from ..ranging import Cloud, MountedLidar, in_frame
 from ..world import World
 from .met import MetThings, sweep_request
@@ -26,12 +30,69 @@ def sweep_cloud(
 ) -> Cloud:
     """The sweep of a LiDAR that ends at the instant of ``world``; the same bits again for the same
     episode."""
+    return measured_sweep(
+        sweep_request(world, mounted.lidar, things),
+        mounted,
+        caster,
+        t_us=world.t_us,
+        seed=sensor_seed(world, mounted.name),
+        T_world_vehicle=world.T_world_body,
+        T_world_told=world.T_world_estimate,
+    )
+
+
+def recorded_cloud(
+    scene: Scene, state: ScenarioState, mounted: MountedLidar, t_us: int, caster: CastBackend
+) -> Cloud:
+    """The sweep of a LiDAR on the recording vehicle that ends at ``t_us``, all objects as edited.
+
+    Raises:
+        TimeOutOfRangeError: ``t_us`` is outside the recording.
+    """
+    lidar = mounted.lidar
+    T_world_vehicle = scene.ego.transform(t_us)
+    met = sweep_of(scene, state, lidar, t_us)
+    poses = sensor_poses(scene.ego, lidar, t_us)
+    request = checked_request(
+        met.instances, lidar, poses, object_poses=met.poses, attributes=met.attributes
+    )
+    return measured_sweep(
+        request,
+        mounted,
+        caster,
+        t_us=t_us,
+        seed=0,
+        T_world_vehicle=T_world_vehicle,
+        T_world_told=T_world_vehicle,
+    )
+
+
+def measured_sweep(
+    request: CastRequest,
+    mounted: MountedLidar,
+    caster: CastBackend,
+    *,
+    t_us: int,
+    seed: int,
+    T_world_vehicle: Float,
+    T_world_told: Float,
+) -> Cloud:
+    """What a LiDAR makes of the rays of a sweep.
+
+    Args:
+        request: of the sweep.
+        mounted: the LiDAR.
+        caster: follows the rays.
+        t_us: when the last one is fired [us].
+        seed: of noise and losses.
+        T_world_vehicle: [4, 4], where the vehicle is then.
+        T_world_told: [4, 4], where it takes itself to be.
+    """
     spec, lidar = mounted.spec, mounted.lidar
-    request = sweep_request(world, lidar, things)
     echo = caster.cast(request)
-    sweep = detect(echo, lidar, seed=sensor_seed(world, mounted.name))
-    returned = _returns(sweep, echo, mounted)
-    points = _points(world, returned, request, mounted)
+    returned = _returns(detect(echo, lidar, seed=seed), echo, mounted)
+    T_world_lidar = T_world_vehicle @ lidar.T_vehicle_lidar
+    points = _points(returned, request, mounted, T_world_lidar)
     columns: dict[str, NDArray[Any]] = {
         "points": in_frame(points, spec.frame, lidar.T_vehicle_lidar)
     }
@@ -39,12 +100,12 @@ def sweep_cloud(
     return Cloud(
         sensor=mounted.name,
         modality="lidar",
-        t_us=world.t_us,
+        t_us=t_us,
         duration_us=mounted.duration_us,
         frame=spec.frame,
         compensated=spec.compensated,
         T_vehicle_sensor=lidar.T_vehicle_lidar,
-        T_world_sensor=world.T_world_estimate @ lidar.T_vehicle_lidar,
+        T_world_sensor=T_world_told @ lidar.T_vehicle_lidar,
         columns=columns,
         codec=spec.codec,
     )
@@ -95,16 +156,18 @@ def _rings(lidar: Lidar) -> NDArray[np.uint16]:
 
 
 def _points(
-    world: World, returned: Mapping[str, NDArray[Any]], request: CastRequest, mounted: MountedLidar
+    returned: Mapping[str, NDArray[Any]],
+    request: CastRequest,
+    mounted: MountedLidar,
+    T_world_lidar: Float,
 ) -> Float:
-    """[N, 3] in the sensor's frame, at the instant of ``world`` where the cloud is compensated."""
+    """[N, 3] in the sensor's frame, of a compensated cloud in that of ``T_world_lidar``."""
     lidar, ray = mounted.lidar, returned["ray"]
     directions = lidar.beams.directions.reshape(-1, 3)[ray]
     points: Float = directions * returned["range"][:, None].astype(np.float64)
     if not mounted.spec.compensated:
         return points
-    T_world_now = world.T_world_body @ lidar.T_vehicle_lidar
-    relative = invert_transform(T_world_now) @ request.T_world_lidar
+    relative = invert_transform(T_world_lidar) @ request.T_world_lidar
     of_ray = relative[lidar.beams.slots[1].ravel()[ray]]
     turned: Float = np.einsum("nij,nj->ni", of_ray[:, :3, :3], points) + of_ray[:, :3, 3]
     return turned

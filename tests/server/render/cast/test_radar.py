@@ -105,6 +105,12 @@ def test_a_reference_target_is_detected_up_to_its_range_and_no_farther():
     assert found.snr[0] == pytest.approx(40 * np.log10(100 / 90.1), abs=0.5)
 
 
+def test_targets_that_are_too_small_are_not_reported_however_near():
+    near = patches((2.1, 0.3, -12.0))
+    assert len(radar_detections(near, radar(min_rcs_dbsm=-40))) == 1
+    assert len(radar_detections(near, radar(min_rcs_dbsm=-20))) == 0
+
+
 def test_velocities_beyond_the_largest_fold_back():
     found = radar_detections(patches((8.1, 0.3, -25.0)), radar(max_velocity_mps=20.0))
     assert found.velocity[0] == pytest.approx(15.0)

@@ -220,3 +220,26 @@ def test_semantic_images_tell_the_ground(planner):
     assert (semantic == 6).any()
     instance = np.frombuffer(frames[1]["data"], np.uint16)
     assert not (semantic[instance > 0] == 6).any()
+
+
+def test_a_scenario_is_swept_from_the_recording_vehicle(site):
+    made = site.http.post("/v1/scenarios", json={"scene": "tiny"}).json()
+    path = f"/v1/scenarios/{made['scenario_id']}/sweep"
+    points = site.http.get(
+        path,
+        params={"lidar": "vlp-16", "t_us": 500_000},
+        headers={"Accept": "application/octet-stream"},
+    )
+    assert points.status_code == 200
+    rows = np.frombuffer(points.content, "<f4").reshape(-1, 4)
+    cloud = decode(site.http.get(path, params={"lidar": "vlp-16", "t_us": 500_000}).content)
+    assert len(rows) == cloud["count"] == int(points.headers["X-Real2Sim-Points"]) > 0
+    np.testing.assert_array_equal(rows[:, 3], columns(cloud)["intensity"])
+    for bad, status in (
+        ({"lidar": "none"}, 422),
+        ({"t_us": 2**61}, 422),
+        ({"lidar": "vlp-16", "t_us": -5}, 422),
+    ):
+        assert site.http.get(path, params=bad).status_code == status
+    picture = site.http.get(path, headers={"Accept": "image/png"})
+    assert picture.status_code == 406
