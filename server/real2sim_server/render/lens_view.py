@@ -8,7 +8,6 @@ draws knows a model of lens.
 from __future__ import annotations
 
 import functools
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ from ..geometry.rotation import Float, quaternion_to_matrix
 from ..geometry.transform import invert_transform
 from ..scene import Camera
 from ..scene.camera_motion import CameraMotion
+from .made_once import made_once
 
 CELLS = 96
 """Cells along the edge of a face of the directory."""
@@ -131,18 +131,9 @@ class LensTables:
     reach: float
 
 
-_tables: weakref.WeakKeyDictionary[Camera, LensTables] = weakref.WeakKeyDictionary()
-
-
+@made_once
 def tables_of(camera: Camera) -> LensTables:
-    """Tables of a camera; made once, in a tenth of a second."""
-    known = _tables.get(camera)
-    if known is None:
-        known = _tables[camera] = _make_tables(camera)
-    return known
-
-
-def _make_tables(camera: Camera) -> LensTables:
+    """Tables of a camera; made once, in a fifth of a second."""
     width, height = camera.width, camera.height
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays, seen = camera.unproject(np.stack([x, y], -1))

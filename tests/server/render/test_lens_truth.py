@@ -12,7 +12,8 @@ from real2sim_server import demo
 from real2sim_server.edit import posed_instances
 from real2sim_server.render import rasterize
 from real2sim_server.render.lens_view import LensView
-from real2sim_server.scene import BrownConrady, CameraMotion, Shutter
+from real2sim_server.scene import BrownConrady, Camera, CameraMotion, Fisheye, FTheta, Shutter
+from real2sim_server.scene.camera_motion import turned
 from real2sim_server.scene.io.packed import read_packed
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 
@@ -54,6 +55,54 @@ def test_rays_through_a_pinhole_lose_nothing(street):
     truth = log.render_through(camera, still, t_us)[0]
     by_rays = drawn(scene, replace(camera, lens=BrownConrady()), still, t_us)
     assert psnr(by_rays, truth) > psnr(drawn(scene, camera, still, t_us), truth) - 0.3
+
+
+def squares_by_direction(scene, log, camera, pose, t_us):
+    """Sum of squared errors by solid angle, and the solid angle [sr], within 94.5 degrees of the
+    axis of the front camera."""
+    place = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in (camera.width, camera.height))), -1)
+    rays, seen = camera.unproject(place)
+    across, down = (
+        camera.unproject(place + half)[0] - camera.unproject(place - half)[0]
+        for half in ([0.5, 0], [0, 0.5])
+    )
+    angle = np.linalg.norm(np.cross(across, down), axis=-1)
+    axis = pose[:3, :3].T @ scene.rig["front"].pose(log.ego.transform(t_us))[:3, 2]
+    angle *= seen & (rays @ axis > np.cos(np.radians(94.5)))
+    still = CameraMotion.still(pose)
+    ray_camera = replace(camera, lens=camera.lens or BrownConrady())
+    truth = log.render_through(ray_camera, still, t_us, samples=2)[0].astype(float)
+    error = ((drawn(scene, camera, still, t_us) - truth) ** 2).mean(-1)
+    return np.array([(error * angle).sum(), angle.sum()])
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [Fisheye(max_angle=np.radians(95)), FTheta((0, 1, 0.01, -0.02), linear=(1.01, 0.01, 0))],
+    ids=["fisheye", "f_theta"],
+)
+def test_wide_lenses_lose_nothing_to_pinholes_that_share_their_solid_angle(street, lens):
+    # Five pinholes of 90 degrees look at every direction of the lens, with as many pixels.
+    scene, log = street
+    focal, t_us = 60.0, int(log.frame_times_us[FRAME])
+    pose = scene.rig["front"].pose(log.ego.transform(t_us))
+    size = int(focal * np.radians(190))
+    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    wide = Camera("wide", size, size, K, np.eye(4), lens)
+    sums = squares_by_direction(scene, log, wide, pose, t_us)
+    edge = round(1.627 * focal)
+    K = np.array([[edge / 2, 0, edge / 2], [0, edge / 2, edge / 2], [0, 0, 1]])
+    flat = Camera("flat", edge, edge, K, np.eye(4))
+    turns = [np.eye(3)]
+    for angle in (np.pi / 2, -np.pi / 2):
+        turns += [turned(np.array([angle, 0, 0])), turned(np.array([0, angle, 0]))]
+    by_pinholes = np.zeros(2)
+    for turn in turns:
+        there = pose.copy()
+        there[:3, :3] = pose[:3, :3] @ turn
+        by_pinholes += squares_by_direction(scene, log, flat, there, t_us)
+    np.testing.assert_allclose(sums[1], by_pinholes[1], rtol=0.01)
+    assert 10 * np.log10(by_pinholes[0] / sums[0]) > -0.3
 
 
 def test_a_rolling_shutter_at_15_metres_a_second_is_worth_drawing(street):

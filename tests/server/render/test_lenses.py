@@ -17,6 +17,9 @@ from real2sim_server.render import (
     render_cameras,
     select_backend,
 )
+from real2sim_server.render.backends.cpu.drawing import Drawing
+from real2sim_server.render.backends.cpu.ray_drawing import RayDrawing
+from real2sim_server.render.backends.cpu.records import EXTENT_X, EXTENT_Y
 from real2sim_server.render.backends.reference import ReferenceBackend
 from real2sim_server.render.lens_view import LensView
 from real2sim_server.scene import (
@@ -163,6 +166,24 @@ def test_a_lens_without_distortion_draws_the_pinhole_picture(instances, sky):
     same = draw(Camera("none", *SIZE, K, POSE, BrownConrady()), small, sky)
     assert float((plain.rgb - same.rgb).abs().mean()) < 0.2 / 255
     assert float((plain.depth - same.depth).abs().median()) < 1e-3
+
+
+def test_a_lens_without_distortion_looks_at_as_many_pixels_as_the_pinhole(instances, monkeypatch):
+    far = transform_from([15.0, 3.0, 1.5], [1.0, 0, 0, 0])
+    things = [Instance(cloud(400, (1.5, 1.5, 0.8), (0.05, 0.3), seed=7), far)]
+    looked_at = []
+
+    def note(drawing, records, lists, starts, tiles, behind):
+        used = records.values[np.unique(lists[: starts[tiles[1]]])]
+        looked_at.append((used[:, EXTENT_X] * used[:, EXTENT_Y]).sum())
+
+    for kind in (Drawing, RayDrawing):
+        monkeypatch.setattr(kind, "_blend_tiles", note)
+    view = np.linalg.inv(POSE)[None]
+    rasterize(things, view, K[None], *SIZE, backend="cpu")
+    draw(Camera("none", *SIZE, K, POSE, BrownConrady()), things, options=RasterOptions())
+    pinhole, lens = looked_at
+    assert lens < 1.1 * pinhole
 
 
 def test_what_the_lens_does_not_see_is_black_and_of_no_class(instances, sky):

@@ -7,7 +7,6 @@ way would have been dropped one by one, so images keep their bits.
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...._numba import PARALLEL_LOOPS
 from ....scene import GaussianCloud
+from ...made_once import made_once
 from ..base import Placement, RasterRequest
 from .kernel import kernel
 from .project_lanes import REACH_MAX
@@ -53,30 +53,20 @@ class ChunkBounds(NamedTuple):
     sigmas: NDArray[np.float64]
 
 
-_arrays: weakref.WeakKeyDictionary[GaussianCloud, CloudArrays] = weakref.WeakKeyDictionary()
-_bounds: weakref.WeakKeyDictionary[GaussianCloud, ChunkBounds] = weakref.WeakKeyDictionary()
-
-
+@made_once
 def arrays_of(cloud: GaussianCloud) -> CloudArrays:
     """Arrays of a cloud; made once, since clouds are immutable."""
-    known = _arrays.get(cloud)
-    if known is None:
-        parts = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
-        known = CloudArrays(*(part.detach().cpu().contiguous().numpy() for part in parts))
-        _arrays[cloud] = known
-    return known
+    parts = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    return CloudArrays(*(part.detach().cpu().contiguous().numpy() for part in parts))
 
 
+@made_once
 def bounds_of(cloud: GaussianCloud) -> ChunkBounds:
     """Bounds of the chunks of a cloud; made once, for who draws it more than once."""
-    known = _bounds.get(cloud)
-    if known is None:
-        arrays = arrays_of(cloud)
-        table = np.empty((-(-len(cloud) // CHUNK), 7))
-        bound_chunks(arrays.means, arrays.scales, table)
-        known = ChunkBounds(table[:, :3], table[:, 3:6], table[:, 6])
-        _bounds[cloud] = known
-    return known
+    arrays = arrays_of(cloud)
+    table = np.empty((-(-len(cloud) // CHUNK), 7))
+    bound_chunks(arrays.means, arrays.scales, table)
+    return ChunkBounds(table[:, :3], table[:, 3:6], table[:, 6])
 
 
 def all_chunks(request: RasterRequest) -> list[Chunks]:

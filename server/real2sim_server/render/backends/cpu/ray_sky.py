@@ -31,9 +31,18 @@ def add_ray_sky(faces, turn, rays, rgb, alpha):
         # As in add_sky, where a row looks comes first: it has no branches.
         corners = np.empty(width, np.int32)
         columns, rows = np.empty(width, np.float32), np.empty(width, np.float32)
+        line = np.empty((3, width), np.float32)
         for row in range(task, height, TASKS):
+            least = ONE
             for x in range(width):
-                a, b, c = rays[row, x, 0], rays[row, x, 1], rays[row, x, 2]
+                least = min(least, alpha[row, x])
+            if not ONE - least > CLEAR:
+                continue
+            for x in range(width):
+                for k in range(3):
+                    line[k, x] = rays[row, x, k]
+            for x in range(width):
+                a, b, c = line[0, x], line[1, x], line[2, x]
                 direction = (
                     turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
                     turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
@@ -42,7 +51,6 @@ def add_ray_sky(faces, turn, rays, rgb, alpha):
                 corners[x], rows[x], columns[x] = texel_corner(direction, faces.shape[1])
             for x in range(width):
                 weight = ONE - alpha[row, x]
-                a, b, c = rays[row, x, 0], rays[row, x, 1], rays[row, x, 2]
-                if weight > CLEAR and (a != 0 or b != 0 or c != 0):
+                if weight > CLEAR and (line[0, x] != 0 or line[1, x] != 0 or line[2, x] != 0):
                     corner, down, right = np.uint64(corners[x]), rows[x], columns[x]
                     add_sample(texels, faces.shape[1], corner, down, right, weight, rgb[row, x])

@@ -8,7 +8,6 @@ tiles of eight rows by eight columns, tables are cut into tiles by sorting. Made
 
 from __future__ import annotations
 
-import weakref
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from ....geometry.rotation import Float
 from ....scene import Beams
 from ....scene.lidar import wrapped
 from ...backends.cpu.lanes import LANES
+from ...made_once import made_once
 
 GROUPS = 8
 """Groups of a tile."""
@@ -70,18 +70,9 @@ class BeamLayout(NamedTuple):
     rate: float
 
 
-_layouts: weakref.WeakKeyDictionary[Beams, BeamLayout] = weakref.WeakKeyDictionary()
-
-
+@made_once
 def layout_of(beams: Beams) -> BeamLayout:
     """The layout of ``beams``, made at the first call."""
-    known = _layouts.get(beams)
-    if known is None:
-        known = _layouts[beams] = _build(beams)
-    return known
-
-
-def _build(beams: Beams) -> BeamLayout:
     tiles, bands = _turning_tiles(beams) if len(beams.shape) == 2 else _table_tiles(beams)
     azimuth, elevation = beams.azimuth.ravel(), beams.elevation.ravel()
     tiles, bands = _by_azimuth(tiles, bands, azimuth, beams.slots[1].ravel())
