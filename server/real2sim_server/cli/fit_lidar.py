@@ -24,11 +24,14 @@ def fit_lidar(
         Path | None,
         typer.Option(help="initial.r2s of its training folder, which spares making it again."),
     ] = None,
+    steps: Annotated[
+        int, typer.Option(min=0, help="Steps of learning; about a second of one core each.")
+    ] = 60,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Give a scene surfaces for LiDARs, with the reflectivity that the recorded sweeps show."""
+    """Give a scene surfaces for LiDARs, learned from the recorded sweeps, with reflectivity."""
     from dataclasses import asdict
 
     from ..logs import open_log, same_part
@@ -42,6 +45,7 @@ def fit_lidar(
             loaded,
             opened,
             surfaces=load_scene(surfaces) if surfaces else None,
+            steps=steps,
             on_progress=on_progress,
         )
     target = scene if out is None else out

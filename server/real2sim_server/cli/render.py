@@ -123,7 +123,12 @@ def _render_sweep(
     met = sweep_of(loaded, _without(loaded, delete), sensor, time_us)
     poses = sensor_poses(loaded.ego, sensor, time_us)
     request = checked_request(
-        met.instances, sensor, poses, object_poses=met.poses, attributes=met.attributes
+        met.instances,
+        sensor,
+        poses,
+        object_poses=met.poses,
+        attributes=met.attributes,
+        incidence=met.incidence,
     )
     echo = select_caster().cast(request)
     sweep = detect(echo, sensor, seed=seed, request=request)

@@ -12,7 +12,7 @@ import numpy as np
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
 from ..edit.sweep import met_background, met_object, sweep_of
 from ..geometry.rotation import Float, matrix_to_quaternion
-from ..render.cast.recorded import SweepScene, sensor_poses, transforms_at
+from ..render.cast.recorded import SweepScene, incidence_of, sensor_poses, transforms_at
 from ..render.types import Instance
 from ..scene import Lidar, Scene, Trajectory
 from ..world import World
@@ -181,7 +181,7 @@ class EpisodeDrive:
         instances, known = zip(*found, strict=True)
         ego = _trajectory([(w.t_us, np.array(w.T_world_body)) for w in near])
         poses = transforms_at(ego, times) @ lidar.T_vehicle_lidar
-        return MetSweep(SweepScene(instances, tuple(moved), known), poses)
+        return MetSweep(SweepScene(instances, tuple(moved), known, incidence_of(self.scene)), poses)
 
 
 def _way(worlds: Sequence[World], object_id: str) -> Trajectory:

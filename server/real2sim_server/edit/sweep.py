@@ -5,7 +5,13 @@ from __future__ import annotations
 from real2sim_proto.semantics import semantic_class
 
 from ..geometry.rotation import Float
-from ..render.cast.recorded import Attributes, SweepScene, met_by_lidar, transforms_at
+from ..render.cast.recorded import (
+    Attributes,
+    SweepScene,
+    incidence_of,
+    met_by_lidar,
+    transforms_at,
+)
 from ..render.types import Instance
 from ..scene import GaussianCloud, Lidar, Scene
 from .compose import kept, without_regions
@@ -29,7 +35,7 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
         found.append(met_object(scene, subject, transform))
         moved.append(transforms_at(subject.trajectory, times))
     instances, known = zip(*found, strict=True)
-    return SweepScene(instances, tuple(moved), known)
+    return SweepScene(instances, tuple(moved), known, incidence_of(scene))
 
 
 def met_background(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:

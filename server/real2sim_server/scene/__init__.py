@@ -20,7 +20,7 @@ from .errors import (
 from .ground import Ground
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .lidar import Beams, Detection, Lidar
-from .lidar_surfaces import LidarSurfaces, Reflector
+from .lidar_surfaces import LidarSurfaces, Reflector, RingResponse
 from .radar import Radar
 from .scene import Scene, SceneObject
 from .shutter import Shutter
@@ -50,6 +50,7 @@ __all__ = [
     "Radar",
     "RadarError",
     "Reflector",
+    "RingResponse",
     "Scene",
     "SceneError",
     "SceneObject",

@@ -7,14 +7,24 @@ beam. So a scene may hold a second set, made of the recorded sweeps, that only L
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .cloud import GaussianCloud
 from .errors import SceneError
+
+MAX_REFLECTIVITY = 4.0
+"""Of what sends light back to where it came from (signs, number plates)."""
+RANGE_STEPS = (
+    *(0.0, 1.5, 2.0, 2.25, 2.5, 2.75, 3.0, 3.25, 3.5, 3.75, 4.0, 4.5, 5.0, 5.5, 6.0, 7.0, 8.0),
+    *(9.0, 10.0, 12.0, 14.0, 17.0, 20.0, 25.0, 30.0, 40.0, np.inf),
+)
+"""Ranges between which a ring answers alike [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +33,8 @@ class Reflector:
 
     Attributes:
         cloud: in the frame of the background or of the object.
-        attributes: [N, 2] float32 on the CPU: reflectivity, and share of rays lost there, both
-            0 to 1.
+        attributes: [N, 2] float32: reflectivity for light that meets the surface squarely, 0 to
+            MAX_REFLECTIVITY, and share of rays lost there, 0 to 1.
 
     Raises:
         SceneError: attributes of another shape or type.
@@ -41,12 +51,84 @@ class Reflector:
                 f"{tuple(self.attributes.shape)} {self.attributes.dtype}"
             )
 
+    def to(self, device: torch.device | str) -> Reflector:
+        """The same on another device."""
+        return Reflector(self.cloud.to(device), self.attributes.to(device))
+
     def check_values(self, what: str) -> None:
         """Look at every value. Raises SceneError with the count of bad ones."""
         self.cloud.check_values(what)
-        bad = ~((self.attributes >= 0) & (self.attributes <= 1))
+        most = torch.tensor([MAX_REFLECTIVITY, 1.0], device=self.attributes.device)
+        bad = ~((self.attributes >= 0) & (self.attributes <= most))
         if bool(bad.any()):
-            raise SceneError(f"{what}: {int(bad.sum())} attributes are outside [0, 1]")
+            raise SceneError(
+                f"{what}: {int(bad.sum())} attributes are outside [0, {MAX_REFLECTIVITY:g}] "
+                "(reflectivity) or [0, 1] (lost rays)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class RingResponse:
+    """How the sensor that recorded a log answers to reflectivity, ring by ring and by range.
+
+    Lasers of one sensor differ, and none is calibrated at every range. What a recorded intensity
+    is of the reflectivity there: ``gain * reflectivity + offset``.
+
+    Attributes:
+        elevation: [B] of the rings, as the scan lists them [rad].
+        gain, offset: [B, K] between RANGE_STEPS.
+
+    Raises:
+        SceneError: shapes that differ, or values that are not finite.
+    """
+
+    elevation: NDArray[np.float32]
+    gain: NDArray[np.float32]
+    offset: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        expected = (len(self.elevation), len(RANGE_STEPS) - 1)
+        for name in ("gain", "offset"):
+            shape = getattr(self, name).shape
+            if shape != expected:
+                raise SceneError(f"{name} of a LiDAR's response must be {expected}, not {shape}")
+        if not all(np.isfinite(a).all() for a in (self.elevation, self.gain, self.offset)):
+            raise SceneError("a LiDAR's response holds values that are not finite")
+
+    def applied(
+        self,
+        reflectivity: NDArray[np.float32],
+        *,
+        elevation: NDArray[np.float64],
+        ring: NDArray[np.int32],
+        distance: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Intensities [R] that the sensor makes of reflectivities [R].
+
+        Args:
+            elevation: [B'] of the rings of a sweep [rad].
+            ring: [R], of each ray; -1 for those of none.
+            distance: [R] range [m].
+        """
+        row, step = self.rows(self.elevation, elevation, ring), self.step_of(distance)
+        answered = self.gain[row, step] * reflectivity + self.offset[row, step]
+        return np.where(ring >= 0, answered, reflectivity).astype(np.float32)
+
+    @staticmethod
+    def rows(
+        known: NDArray[np.floating], elevation: NDArray[np.floating], ring: NDArray[np.int32]
+    ) -> NDArray[np.int64]:
+        """Which of the ``known`` rings each ray's is: the same number where sweeps have as many
+        rings, else that of the nearest elevation; 0 for rays of none."""
+        if len(known) == len(elevation):
+            return np.maximum(ring, 0).astype(np.int64)
+        nearest = np.abs(elevation[:, None] - known).argmin(1).astype(np.int64)
+        return np.asarray(nearest[np.maximum(ring, 0)])
+
+    @staticmethod
+    def step_of(distance: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Column of each range [m]."""
+        return np.searchsorted(RANGE_STEPS[1:-1], distance, side="right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +139,28 @@ class LidarSurfaces:
         background: in the world.
         objects: by object id, in the object's frame; an object that is missing shows its own
             Gaussians.
+        incidence: share of reflected light that does not mind how squarely it met the surface,
+            0 to 1; the rest goes with the cosine.
+        response: of the sensor that recorded the log, where its scans tell rings.
+
+    Raises:
+        SceneError: a share outside of 0 to 1.
     """
 
     background: Reflector
     objects: Mapping[str, Reflector] = field(default_factory=dict)
+    incidence: float = 1.0
+    response: RingResponse | None = None
 
     def __post_init__(self) -> None:
+        if not 0 <= self.incidence <= 1:
+            raise SceneError(f"incidence of a LiDAR's set must be 0 to 1, not {self.incidence!r}")
         object.__setattr__(self, "objects", MappingProxyType(dict(self.objects)))
+
+    def to(self, device: torch.device | str) -> LidarSurfaces:
+        """The set on another device."""
+        objects = {object_id: part.to(device) for object_id, part in self.objects.items()}
+        return replace(self, background=self.background.to(device), objects=objects)
 
     @property
     def gaussian_count(self) -> int:

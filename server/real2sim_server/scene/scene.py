@@ -213,4 +213,5 @@ class Scene:
             objects=objects,
             sky=self.sky.to(device) if self.sky else None,
             stored_ground=self.__dict__.get("ground", self.stored_ground),
+            lidar=self.lidar.to(device) if self.lidar else None,
         )

@@ -50,6 +50,7 @@ def lidar_points(
         met.T_world_lidar,
         object_poses=met.things.poses,
         attributes=met.things.attributes,
+        incidence=met.things.incidence,
     )
     echo = caster.cast(request)
     sweep = detect(echo, lidar, seed=seed)

@@ -129,7 +129,7 @@ def _against_street(
     echo = recorded_sweep(scene, lidar, t_us)
     given = rays.lidar.beams
     returned = _returned(lidar, given.azimuth, given.elevation)
-    kept = echo.hit & (drop_probability(echo, lidar) <= 0.5)
+    kept = _kept(echo, lidar)
     points = lidar.beams.directions
     return _score(
         frame,
@@ -169,15 +169,17 @@ def _against_returns(
     rings = fit_rings(rays)
     accuracy = float("nan")
     if rings is not None:
-        grid = replace(
-            rays.lidar,
-            beams=rings.beams(rays),
-            T_vehicle_lidar=rings.T_vehicle_lidar,
-            max_range=float(rays.range.max()),
+        kept = int(_kept(echo, rays.lidar).sum())
+        missing = rings.missing(rays)
+        for lidar in missing:
+            kept += int((~_kept(recorded_sweep(scene, lidar, t_us), lidar)).sum())
+        accuracy = kept / (len(rays.range) + sum(lidar.beams.count for lidar in missing))
+    response = scene.lidar.response if scene.lidar is not None else None
+    if response is not None and rings is not None:
+        answered = response.applied(
+            echo.intensity, elevation=rings.elevation, ring=rings.ring, distance=echo.range
         )
-        full = recorded_sweep(scene, grid, t_us)
-        kept = full.hit & (drop_probability(full, grid) <= 0.5)
-        accuracy = float((kept == _returned(grid, rings.azimuth, rings.height)).mean())
+        echo = replace(echo, intensity=answered)
     score = _score(
         frame,
         echo,
@@ -187,6 +189,11 @@ def _against_returns(
         drop_accuracy=accuracy,
     )
     return score, rings.residual if rings is not None else float("nan")
+
+
+def _kept(echo: Echo, lidar: Lidar) -> NDArray[np.bool_]:
+    """Rays that return more likely than not."""
+    return echo.hit & (drop_probability(echo, lidar) <= 0.5)
 
 
 def _score(

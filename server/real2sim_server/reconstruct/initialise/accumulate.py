@@ -121,17 +121,22 @@ def _usable(
 ) -> tuple[Float, NDArray[np.float32], Float]:
     """Points, intensities and offsets [us] that are within range and not on the vehicle itself."""
     points = sweep.points.astype(np.float64)
-    length, width, height = log.ego_size
     near = np.linalg.norm(points - sweep.origin, axis=1) < options.max_range
-    on_vehicle = (
+    on_vehicle = on_recording_vehicle(points, log.ego_size)
+    used = near & ~on_vehicle & np.isfinite(points).all(axis=1)
+    return points[used], sweep.intensity[used], sweep.offset_us[used].astype(np.float64)
+
+
+def on_recording_vehicle(points: Float, size: tuple[float, float, float]) -> NDArray[np.bool_]:
+    """Which points [N, 3] of the vehicle's frame are returns of its own body."""
+    length, width, height = size
+    return (
         (points[:, 0] > -0.3 * length)
         & (points[:, 0] < 0.85 * length)
         & (np.abs(points[:, 1]) < width / 2 + EGO_MARGIN)
         & (points[:, 2] > 0.1)
         & (points[:, 2] < height + 0.6)
     )
-    used = near & ~on_vehicle & np.isfinite(points).all(axis=1)
-    return points[used], sweep.intensity[used], sweep.offset_us[used].astype(np.float64)
 
 
 _BACKGROUND, _DROPPED = -1, -2
@@ -151,7 +156,7 @@ def _assign(
     for index, track in enumerate(log.tracks):
         if not track.trajectory.covers(t_us):
             continue
-        chosen, in_box = _near_box(in_world, offset_us, track, t_us)
+        chosen, in_box = near_box(in_world, offset_us, track, t_us)
         half = np.array(track.size) / 2
         outside = (np.abs(in_box) - half).max(axis=1)
         height = in_box[:, 2] + half[2]
@@ -165,7 +170,7 @@ def _assign(
     return owner, local
 
 
-def _near_box(
+def near_box(
     in_world: Float, offset_us: Float, track: ObjectTrack, t_us: int
 ) -> tuple[NDArray[np.int64], Float]:
     """Indices of points near the box and their coordinates in it when they were measured."""

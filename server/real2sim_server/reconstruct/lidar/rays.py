@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,12 @@ from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast.recorded import transforms_at
-from ...scene import Beams, Lidar
+from ...scene import Beams, Detection, Lidar
 
 FAR = 250.0
 """Recorded points beyond this are left out [m]."""
+SEES_ALL = Detection(range_m=2000.0, reflectivity=1e-6)
+"""Nobody knows the limit of the sensor; where its beams were lost the scene says."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,13 @@ class RecordedRays:
     range: Float
     intensity: NDArray[np.float32]
     points: Float
+
+    def select(self, kept: NDArray[np.bool_]) -> RecordedRays:
+        """The rays of a mask, in their order."""
+        beams = self.lidar.beams
+        chosen = Beams(beams.azimuth[kept], beams.elevation[kept], beams.time_us[kept])
+        lidar = replace(self.lidar, beams=chosen)
+        return RecordedRays(lidar, self.range[kept], self.intensity[kept], self.points[kept])
 
 
 def recorded_rays(log: DrivingLog, frame: int) -> RecordedRays | None:
@@ -68,6 +77,7 @@ def recorded_rays(log: DrivingLog, frame: int) -> RecordedRays | None:
         T_vehicle_lidar=_shift(sweep.origin),
         min_range=0.1,
         max_range=FAR,
+        detection=SEES_ALL,
     )
     return RecordedRays(lidar, distance[kept], sweep.intensity[kept], world[kept])
 

@@ -8,7 +8,7 @@ lasers of a sensor leave it at different heights, so a ring is the line z = offs
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from real2sim_proto.ranging import MAX_RAYS
 
 from ...geometry.rotation import Float
-from ...scene import Beams
+from ...scene import Beams, Lidar
 from ...scene.lidar import wrapped
 from .rays import RecordedRays
 
@@ -26,6 +26,10 @@ MIN_RING = 50
 """Fewer points make no ring."""
 ROUNDS = 5
 """Times that the farthest points of a ring are left aside and the rest is fitted again."""
+HEIGHT_STEP = 0.05
+"""Lasers whose heights differ by less leave the sensor together [m]."""
+MIN_STEP = 1e-4
+"""Of azimuth, smaller ones are no steps of a turning sensor [rad]."""
 NOT_ONE = np.radians(0.35)
 """Elevations of a ring scatter less than this [rad], or the scan is not by rings."""
 
@@ -69,6 +73,44 @@ class Rings:
             np.broadcast_to(self.elevation[:, None], shape),
             np.broadcast_to(time_us, shape),
         )
+
+    def missing(self, rays: RecordedRays) -> list[Lidar]:
+        """Rays of ``rays``' sweep that were fired and did not return.
+
+        A ring fires at even steps of azimuth, so that gaps between its returns tell how many were
+        lost there. One LiDAR for each height at which lasers leave the sensor.
+        """
+        heights = np.round(self.offset / HEIGHT_STEP).astype(int)
+        slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
+        found = []
+        for height in np.unique(heights):
+            rings = np.flatnonzero(heights == height)
+            lost = [_gaps(self.azimuth[self.ring == ring]) for ring in rings]
+            azimuth = wrapped(np.concatenate(lost))
+            if len(azimuth) == 0:
+                continue
+            pose = self.T_vehicle_lidar.copy()
+            pose[:3, 3] += pose[:3, 2] * self.offset[rings].mean()
+            elevation = np.repeat(self.elevation[rings], list(map(len, lost)))
+            beams = Beams(azimuth, elevation, wrapped(azimuth - start) / slope)
+            found.append(replace(rays.lidar, beams=beams, T_vehicle_lidar=pose))
+        return found
+
+
+def _gaps(azimuth: Float) -> Float:
+    """Azimuths between those of a ring, in the order in which it fired them, at its even steps."""
+    turned = np.unwrap(azimuth)
+    closed = np.append(turned, turned[0] + 2 * np.pi * np.sign(turned[-1] - turned[0]))
+    away = np.diff(closed)
+    step = np.median(np.abs(away))
+    step = np.median(np.abs(away)[np.abs(away) < 1.5 * step])
+    if not step > MIN_STEP:
+        return np.zeros(0)
+    lost = np.maximum(np.rint(np.abs(away) / step).astype(int) - 1, 0)
+    count = np.arange(lost.sum()) - np.repeat(np.cumsum(lost) - lost, lost)
+    share = (count + 1) / np.repeat(lost + 1, lost)
+    between: Float = np.repeat(turned, lost) + share * np.repeat(away, lost)
+    return between
 
 
 def fit_rings(rays: RecordedRays) -> Rings | None:

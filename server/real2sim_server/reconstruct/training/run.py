@@ -139,7 +139,11 @@ def _first_scene(
     scene = initialise_scene(
         seen, options=options.initialise, on_progress=on_progress, timing_s=timing_s
     )
-    scene = replace(scene, frame_times_us=log.frame_times_us)
+    # Whoever takes these surfaces can tell what they did not see.
+    made = {**scene.provenance["reconstruction"]}
+    made["held_out_frames"] = held_out_frames(log.frame_count, options.hold_out)
+    provenance = {**scene.provenance, "reconstruction": made}
+    scene = replace(scene, frame_times_us=log.frame_times_us, provenance=provenance)
     return save_scene(scene, folder / INITIAL, overwrite=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from ...geometry.rotation import Float
 from ...geometry.transform import are_rigid
 from ...scene import Lidar
 from ..types import Instance, RenderError
+from .incidence import attributes_towards
 from .types import CastBackend, CastRequest, Echo
 
 
@@ -22,6 +24,7 @@ def cast(
     *,
     object_poses: Sequence[ArrayLike | None] | None = None,
     attributes: Sequence[NDArray[np.float32] | None] | None = None,
+    incidence: float = 1.0,
     backend: str = "auto",
 ) -> Echo:
     """What every ray of one sweep meets; :func:`.detect` makes measurements of it.
@@ -38,13 +41,20 @@ def cast(
         object_poses: for each instance ``T_world_object`` [S, 4, 4] at the same instants, or None
             where it stands at its own; None for all that stand still.
         attributes: for each instance [N, 2] float32, reflectivity and share of lost rays.
+        incidence: share of the reflectivity that does not mind how squarely the light meets a
+            surface, 0 to 1; the rest goes with the cosine to its normal.
         backend: ``cpu``, ``reference``, or ``auto``.
 
     Raises:
         RenderError: poses or attributes of other shapes or values, or an unknown backend.
     """
     request = checked_request(
-        instances, lidar, T_world_lidar, object_poses=object_poses, attributes=attributes
+        instances,
+        lidar,
+        T_world_lidar,
+        object_poses=object_poses,
+        attributes=attributes,
+        incidence=incidence,
     )
     return select_caster(backend).cast(request)
 
@@ -56,15 +66,21 @@ def checked_request(
     *,
     object_poses: Sequence[ArrayLike | None] | None = None,
     attributes: Sequence[NDArray[np.float32] | None] | None = None,
+    incidence: float = 1.0,
 ) -> CastRequest:
     """The request of :func:`cast`. Raises like it."""
-    return CastRequest(
+    if not 0 <= incidence <= 1:
+        raise RenderError(f"incidence must be from 0 to 1, not {incidence!r}")
+    request = CastRequest(
         instances=tuple(instances),
         lidar=lidar,
         T_world_lidar=_poses(T_world_lidar, lidar, "T_world_lidar"),
         object_poses=_object_poses(object_poses, instances, lidar),
         attributes=_attributes(attributes, instances),
     )
+    if incidence == 1:
+        return request
+    return replace(request, attributes=attributes_towards(request, incidence))
 
 
 def prepare_rays(lidar: Lidar) -> None:

@@ -19,11 +19,12 @@ Attributes = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class SweepScene:
-    """What cast() takes, one entry for each instance."""
+    """What cast() takes, one entry for each instance, and their ``incidence``."""
 
     instances: tuple[Instance, ...]
     poses: tuple[Float | None, ...]
     attributes: tuple[Attributes | None, ...]
+    incidence: float = 1.0
 
 
 def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "auto") -> Echo:
@@ -38,6 +39,7 @@ def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "aut
         sensor_poses(scene.ego, lidar, t_us),
         object_poses=met.poses,
         attributes=met.attributes,
+        incidence=met.incidence,
         backend=backend,
     )
 
@@ -56,7 +58,7 @@ def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
         instances.append(Instance(cloud, pose, instance_id=index + 1))
         moved.append(transforms_at(item.trajectory, times))
         known.append(attributes)
-    return SweepScene(tuple(instances), tuple(moved), tuple(known))
+    return SweepScene(tuple(instances), tuple(moved), tuple(known), incidence_of(scene))
 
 
 def met_by_lidar(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, Attributes | None]:
@@ -64,8 +66,13 @@ def met_by_lidar(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, At
     if scene.lidar is not None:
         held = scene.lidar.background if object_id is None else scene.lidar.objects.get(object_id)
         if held is not None:
-            return held.cloud, held.attributes.numpy()
+            return held.cloud, held.attributes.cpu().numpy()
     return (scene.background if object_id is None else scene.object(object_id).cloud), None
+
+
+def incidence_of(scene: Scene) -> float:
+    """Share of light that the surfaces of a scene send back however they face the sensor."""
+    return 1.0 if scene.lidar is None else scene.lidar.incidence
 
 
 def sensor_poses(ego: Trajectory, lidar: Lidar, t_us: int) -> Float:

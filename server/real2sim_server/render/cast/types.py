@@ -91,6 +91,23 @@ class Echo:
         return self.range > 0
 
 
+@dataclass(frozen=True, eq=False)
+class Meetings:
+    """Which Gaussians rays meet, from near to far.
+
+    Attributes:
+        begins: [R + 1] int64, where the meetings of each ray begin among all M.
+        members: [M] int32, numbers of the Gaussians, counted over all instances in their order.
+        alpha: [M] float32, share of the arriving light that is stopped.
+        tau: [M] float32, where [m].
+    """
+
+    begins: NDArray[np.int64]
+    members: NDArray[np.int32]
+    alpha: Image
+    tau: Image
+
+
 class CastBackend(Protocol):
     """One way to cast. All members give the same echoes within rounding."""
 

@@ -20,7 +20,7 @@ from ..colour import TimeColour
 from ..errors import BundleError, SceneError
 from ..ground import Ground, of_bundle
 from ..ground_fit import BoxTrack, fit_scene_ground
-from ..lidar_surfaces import LidarSurfaces, Reflector
+from ..lidar_surfaces import RANGE_STEPS, LidarSurfaces, Reflector, RingResponse
 from ..scene import Scene, SceneObject
 from ..sky import Sky
 from .container import read_container, write_container
@@ -37,6 +37,7 @@ from .document import (
     LidarPart,
     ObjectPart,
     ReflectorPart,
+    ResponsePart,
     SceneContent,
     SceneDocument,
     SkyPart,
@@ -268,7 +269,14 @@ def _lidar_part(lidar: LidarSurfaces | None) -> LidarPart | None:
         ReflectorPart(gaussians=len(part.cloud), tensors=tensor_hashes(reflector_tensors(part)))
         for _, part in _reflectors(lidar)
     ]
-    return LidarPart(background=parts[0], objects=dict(zip(lidar.objects, parts[1:], strict=True)))
+    response = None
+    if lidar.response is not None:
+        names = ("elevation", "gain", "offset")
+        response = ResponsePart(**{n: getattr(lidar.response, n).tolist() for n in names})
+    objects = dict(zip(lidar.objects, parts[1:], strict=True))
+    return LidarPart(
+        background=parts[0], objects=objects, incidence=lidar.incidence, response=response
+    )
 
 
 def _cloud_part(tensors: Mapping[str, Tensor]) -> CloudPart:
@@ -381,7 +389,18 @@ def _lidar(folder: Path, document: SceneDocument, verify: bool) -> LidarSurfaces
         for index, (object_id, stored) in enumerate(part.objects.items())
     }
     background = _reflector(file, "background.", part.background, "lidar of the background")
-    return LidarSurfaces(background, objects)
+    return LidarSurfaces(background, objects, part.incidence, _response(part.response))
+
+
+def _response(part: ResponsePart | None) -> RingResponse | None:
+    if part is None:
+        return None
+    steps = len(RANGE_STEPS) - 1
+    if any(len(row) != steps for row in (*part.gain, *part.offset)):
+        raise SceneError(f"a LiDAR's response has {steps} numbers for each ring")
+    shape = (-1, steps)
+    tables = [np.array(rows, np.float32).reshape(shape) for rows in (part.gain, part.offset)]
+    return RingResponse(np.array(part.elevation, np.float32), *tables)
 
 
 def _reflector(file: TensorFile, prefix: str, part: ReflectorPart, what: str) -> Reflector:

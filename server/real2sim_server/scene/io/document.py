@@ -13,6 +13,7 @@ from ..shutter import GLOBAL, Shutter
 from ..trajectory import Trajectory
 
 Count = Annotated[int, Field(ge=0)]
+MAX_RINGS = 1024
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
@@ -212,11 +213,21 @@ class ReflectorPart(_Part):
     tensors: dict[str, Sha256]
 
 
+class ResponsePart(_Part):
+    """What a LiDAR makes of reflectivity, by ring and range."""
+
+    elevation: Annotated[list[float], Field(max_length=MAX_RINGS)]
+    gain: Annotated[list[list[float]], Field(max_length=MAX_RINGS)]
+    offset: Annotated[list[list[float]], Field(max_length=MAX_RINGS)]
+
+
 class LidarPart(_Part):
     """The second set of a scene; its objects' tensors are keyed by their position here."""
 
     background: ReflectorPart
     objects: dict[str, ReflectorPart]
+    incidence: Annotated[float, Field(ge=0, le=1)] = 1.0
+    response: ResponsePart | None = None
 
 
 class SceneContent(_Part):

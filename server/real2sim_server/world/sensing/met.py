@@ -11,7 +11,7 @@ from ...edit.compose import compose
 from ...edit.sweep import met_background, met_object
 from ...geometry.rotation import Float
 from ...render.cast.call import checked_request
-from ...render.cast.recorded import Attributes
+from ...render.cast.recorded import Attributes, incidence_of
 from ...render.cast.types import CastRequest
 from ...render.types import Instance
 from ...scene import Lidar
@@ -81,4 +81,5 @@ def sweep_request(world: World, lidar: Lidar, things: MetThings) -> CastRequest:
         ego @ lidar.T_vehicle_lidar,
         object_poses=moved,
         attributes=things.attributes,
+        incidence=incidence_of(world.scene),
     )

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
 
+from real2sim_server.logs import LidarSweep
+from real2sim_server.logs.driving_log import FrameSource
 from real2sim_server.reconstruct.evaluation.sweeps import evaluate_sweeps, synthetic_lidar
 from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.reconstruct.lidar import RecordedRays, fit_lidar_surfaces, recorded_rays
 from real2sim_server.reconstruct.lidar.rings import fit_rings
-from real2sim_server.reconstruct.options import InitialiseOptions
-from real2sim_server.scene import Beams, Lidar
+from real2sim_server.reconstruct.options import InitialiseOptions, ReconstructError
+from real2sim_server.scene import Beams, GaussianCloud, Lidar, Scene
+from real2sim_server.scene.lidar import wrapped
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from real2sim_server.synthetic.config import CameraSpec
 
@@ -23,9 +30,14 @@ CONFIG = SyntheticConfig(
     cameras=(CameraSpec("front"),),
     moving_cars=1,
     parked_cars=2,
-    lidar_beams=32,
-    lidar_columns=512,
+    lidar_beams=24,
+    lidar_columns=256,
     lidar_noise=0.01,
+)
+
+
+EMPTY = GaussianCloud(
+    torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 1, 3)
 )
 
 
@@ -42,7 +54,7 @@ def test_rays_start_where_the_sensor_was(log: SyntheticLog) -> None:
     beams = rays.lidar.beams
     # Rays lie on the grid on which they were cast: compare with the truth there.
     row = np.abs(beams.elevation[:, None] - lidar.beams.elevation[:, 0]).argmin(1)
-    turned = np.abs(np.exp(1j * beams.azimuth[:, None]) - np.exp(1j * lidar.beams.azimuth[0]))
+    turned = np.abs(wrapped(beams.azimuth[:, None] - lidar.beams.azimuth[0]))
     column = turned.argmin(1)
     assert np.abs(beams.elevation - lidar.beams.elevation[row, 0]).max() < 1e-4
     assert turned.min(1).max() < 1e-4
@@ -86,18 +98,58 @@ def test_rings_are_found_from_a_raw_scan() -> None:
     assert np.abs(grid.time_us[0] - expected)[np.abs(grid.azimuth[0]) < 3].max() < 200
 
 
+def test_what_a_ring_fired_and_did_not_get_back_is_found() -> None:
+    rays = ring_scan(np.radians(np.linspace(2, -24, 32)), np.radians(0.02))
+    rings = fit_rings(rays)
+    assert rings is not None
+    missing = rings.missing(rays)
+    # Each of 32 rings fired 1,000 times and got 900 back.
+    assert sum(lidar.beams.count for lidar in missing) == 3200
+    fired = np.concatenate([rings.azimuth, *(lidar.beams.azimuth for lidar in missing)])
+    steps = fired / (2 * np.pi / 1000)
+    assert np.abs(steps - np.rint(steps)).max() < 0.05
+
+
+def test_surfaces_that_may_have_seen_held_out_frames_are_refused(log: SyntheticLog) -> None:
+    scene = Scene(
+        name="made", background=EMPTY, objects={}, sky=None, rig=log.rig, ego=log.ego,
+        frame_times_us=log.frame_times_us,
+        provenance={"reconstruction": {"held_out_frames": [2]}},
+    )  # fmt: skip
+    with pytest.raises(ReconstructError, match=r"holds out 1 frames.*do not say"):
+        fit_lidar_surfaces(scene, log, surfaces=replace(scene, provenance={}))
+
+
 def test_a_scan_that_is_not_by_rings_gives_none() -> None:
     rays = ring_scan(np.radians(np.linspace(2, -24, 32)), np.radians(2.0))
     assert fit_rings(rays) is None
 
 
+@dataclass(frozen=True, eq=False)
+class Withholding:
+    """A source that keeps the sweep of a frame to itself."""
+
+    source: FrameSource
+    held_out: int
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        assert frame != self.held_out
+        return self.source.image(camera, frame)
+
+    def lidar(self, frame: int) -> LidarSweep:
+        assert frame != self.held_out
+        return self.source.lidar(frame)
+
+
 @pytest.mark.slow
-def test_surfaces_of_sweeps_measure_what_was_there(log: SyntheticLog) -> None:
+def test_surfaces_learned_from_sweeps_measure_what_was_there(log: SyntheticLog) -> None:
     options = InitialiseOptions(max_background=20_000, voxel=0.2, ground_spacing=0.2)
     scene = initialise_scene(log, options=options)
-    made, report = fit_lidar_surfaces(scene, log, surfaces=scene)
+    scene = replace(scene, provenance={"reconstruction": {"held_out_frames": [2]}})
+    seen = replace(log, source=Withholding(log.source, 2))
+    made, report = fit_lidar_surfaces(scene, seen, options=options, steps=20)
     assert made.lidar is not None
-    assert report.sweeps == 5
+    assert (report.sweeps, report.held_out) == (4, (2,))
     assert set(made.lidar.objects) == set(scene.objects)
     before, after = (evaluate_sweeps(s, log, [2]) for s in (scene, made))
     assert before is not None

@@ -15,8 +15,6 @@ from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, RenderError
 from real2sim_server.render.cast import Echo, cast
-from real2sim_server.render.cast.call import checked_request
-from real2sim_server.render.cast.cpu.backend import CpuCaster
 from real2sim_server.scene import Beams, GaussianCloud, Lidar
 
 Array = NDArray[np.float64]
@@ -278,30 +276,6 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     finally:
         numba.set_num_threads(threads)
     assert len(digests) == 1
-
-
-def test_back_projection_finds_what_each_surface_reflects() -> None:
-    walls = [
-        wall((-1.0, 0.0), 10.0, half=6.0, spacing=0.5),
-        wall((1.0, 0.0), 10.0, half=6.0, spacing=0.5),
-    ]
-    lidar = spinning()
-    request = checked_request([Instance(w) for w in walls], lidar, np.eye(4))
-    ahead = (lidar.beams.directions[..., 0] > 0).ravel()
-    known = np.stack([np.where(ahead, 0.2, 0.8), np.full(len(ahead), -1.0)], axis=1)
-    light, reflected, compared, _ = CpuCaster().gather(request, known.astype(np.float32)).T
-    met = light > 0
-    assert met.sum() > 100
-    assert np.allclose((reflected / np.where(met, light, 1))[met & first_of(walls)], 0.2, atol=1e-6)
-    assert np.allclose(
-        (reflected / np.where(met, light, 1))[met & ~first_of(walls)], 0.8, atol=1e-6
-    )
-    assert not compared.any()
-
-
-def first_of(clouds: list[GaussianCloud]) -> NDArray[np.bool_]:
-    """Which Gaussians of all are those of the first cloud."""
-    return np.arange(sum(map(len, clouds))) < len(clouds[0])
 
 
 def test_an_empty_world_gives_no_return() -> None:

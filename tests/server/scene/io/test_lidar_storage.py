@@ -5,11 +5,19 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from real2sim_server.scene import BundleError, LidarSurfaces, Reflector, SceneError
+from real2sim_server.scene import (
+    BundleError,
+    LidarSurfaces,
+    Reflector,
+    RingResponse,
+    SceneError,
+)
 from real2sim_server.scene.io import load_scene, save_scene
+from real2sim_server.scene.lidar_surfaces import RANGE_STEPS
 
 
 @pytest.fixture
@@ -34,6 +42,19 @@ def test_surfaces_come_back_as_they_were(scene, surfaces, tmp_path):
         assert torch.equal(written.attributes, back.attributes)
         for name in ("means", "quats", "scales", "opacities"):
             assert torch.equal(getattr(written.cloud, name), getattr(back.cloud, name))
+
+
+def test_incidence_and_the_response_of_rings_come_back(scene, surfaces, tmp_path):
+    steps = len(RANGE_STEPS) - 1
+    gain = np.linspace(0.5, 1.5, 2 * steps, dtype=np.float32).reshape(2, steps)
+    response = RingResponse(np.array([0.1, -0.2], np.float32), gain, gain - 1)
+    made = replace(surfaces, incidence=0.4, response=response)
+    save_scene(replace(scene, lidar=made), tmp_path / "a.r2s")
+    read = load_scene(tmp_path / "a.r2s").lidar
+    assert read is not None
+    assert read.incidence == 0.4
+    for name in ("elevation", "gain", "offset"):
+        assert np.array_equal(getattr(read.response, name), getattr(response, name))
 
 
 def test_a_scene_without_them_is_written_as_before(scene, tmp_path):
@@ -61,6 +82,6 @@ def test_attributes_of_another_number_are_refused(make_cloud):
 
 
 def test_attributes_out_of_range_are_refused(make_cloud, scene, tmp_path):
-    bad = LidarSurfaces(Reflector(make_cloud(4), torch.full((4, 2), 2.0)))
-    with pytest.raises(SceneError, match=r"8 attributes are outside \[0, 1\]"):
+    bad = LidarSurfaces(Reflector(make_cloud(4), torch.full((4, 2), 5.0)))
+    with pytest.raises(SceneError, match=r"8 attributes are outside \[0, 4\]"):
         save_scene(replace(scene, lidar=bad), tmp_path / "a.r2s")

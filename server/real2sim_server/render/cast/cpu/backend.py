@@ -15,9 +15,10 @@ from ...backends.cpu.records import CHUNK, Records
 from ...backends.cpu.sort import sort_records
 from ...backends.cpu.tile import tile_starts
 from ..motion import Motion, motions_of
-from ..types import CastRequest, Echo, Return
-from .blend import follow_rays, gather_light
+from ..types import CastRequest, Echo, Meetings, Return
+from .blend import follow_rays
 from .layout import BeamLayout, layout_of
+from .meetings import list_meetings
 from .prepare import prepare_body
 from .records import RECORD, Body, Lights, Sensor
 from .tiles import TILE_CHUNKS, count_rays, scatter_rays
@@ -53,17 +54,9 @@ class CpuCaster:
                 lights = _follow(request, motions, records, lists, starts, layout)
         return _echo(request, lights, timing)
 
-    def gather(self, request: CastRequest, known: NDArray[np.float32]) -> NDArray[np.float64]:
-        """What the light of each Gaussian brought back, for back-projection.
-
-        Args:
-            request: of a recorded sweep.
-            known: [R, 2], see :func:`.blend.gather_light`.
-
-        Returns:
-            [N, 4] over the Gaussians of all instances: light, light times reflectivity, light
-            whose loss is known, lost light.
-        """
+    def meetings(self, request: CastRequest, reach: NDArray[np.float32]) -> Meetings:
+        """What the rays of a request meet, each up to its ``reach`` [R] [m], or where that is 0
+        until its light has gone."""
         with self._lock:
             records, regions, motions = self._prepare(request)
             layout = layout_of(request.lidar.beams)
@@ -73,8 +66,10 @@ class CpuCaster:
             order = sort_records(records, regions, pairs, scratch)
             lists, starts = self._tile(records, order, layout)
             counts = np.array([len(instance.cloud) for instance in request.instances] or [0])
-            sums = np.zeros((int(counts.sum()), 4))
-            gather_light(
+            rays = request.lidar.beams.count
+            begins = np.zeros(rays + 1, np.int64)
+            none, no_shares = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+            given = (
                 records.values,
                 lists,
                 starts,
@@ -83,10 +78,15 @@ class CpuCaster:
                 _rows(invert_transform(motions.to_sensor)),
                 _limits(request),
                 (np.cumsum(counts) - counts).astype(np.int64),
-                np.ascontiguousarray(known, dtype=np.float32),
-                sums,
+                np.ascontiguousarray(reach, dtype=np.float32),
             )
-        return sums
+            list_meetings(*given, begins, none, no_shares)
+            begins = np.cumsum(begins) - begins
+            members = np.empty(max(1, int(begins[-1])), np.int32)
+            shares = np.empty((len(members), 2), np.float32)
+            list_meetings(*given, begins, members, shares)
+        found = int(begins[-1])
+        return Meetings(begins, members[:found], shares[:found, 0], shares[:found, 1])
 
     def _prepare(self, request: CastRequest) -> tuple[Records, int, Motion]:
         chunks = [-(-len(instance.cloud) // CHUNK) for instance in request.instances]

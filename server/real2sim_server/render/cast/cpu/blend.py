@@ -34,7 +34,7 @@ from .blend_lanes import (
     place_rays,
 )
 from .layout import GROUPS, TILE_RAYS
-from .records import BODY, HIGH, LOW, MEMBER
+from .records import BODY, HIGH, LOW
 
 TASKS = 64
 LOOK_AHEAD = 4
@@ -99,57 +99,6 @@ def follow_rays(values, lists, starts, layout, motions, origins, limits, modes, 
                 for group in range(GROUPS):
                     close_group(state, np.int64(group))
             write_rays(layout.rays[tile], state, out, owners, several)
-
-
-@kernel()
-def gather_light(values, lists, starts, layout, motions, origins, limits, firsts, known, sums):
-    """Add up what the light of each Gaussian brought back, see ``CpuCaster.gather``.
-
-    Goes by one tile after the other, so that sums have the same bits everywhere.
-
-    Args:
-        firsts: [bodies] int64, number of the first Gaussian of each.
-        known: [R, 2] float32, reflectivity of each ray and 1 where it was lost; below 0 where
-            that is not known.
-        sums: [N, 4] float64, added to: light and light times reflectivity of rays with a known
-            one, light and lost light of rays of which that is known.
-    """
-    near, far, pulse = limits[0], limits[1], limits[2]
-    bank = np.empty(origins.shape[0] * GROUPS * RAY * LANES, np.float32)
-    filled = np.full(origins.shape[0], -1, np.int64)
-    state = np.empty(GROUPS * STATE * LANES, np.float32)
-    frames = np.empty(12 * LANES, np.float32)
-    before = np.empty(LANES, np.float32)
-    for tile in range(layout.rays.shape[0]):
-        alive = open_rays(layout, tile, state)
-        lows, highs = layout.lows[tile], layout.highs[tile]
-        for position in range(starts[tile], starts[tile + 1]):
-            index = np.int64(lists[position])
-            record = values[index]
-            touched = met_groups(lows, highs, record[LOW], record[HIGH]) & alive
-            body = np.int64(record[BODY])
-            member, motion = firsts[body] + np.int64(record[MEMBER]), motions[body]
-            if touched != 0 and filled[motion] != tile:
-                fill_bank(layout, tile, origins[motion], motion, frames, bank)
-                filled[motion] = tile
-            while touched != 0:
-                group = lowest_bit(touched)
-                touched &= touched - 1
-                light = (group * STATE + LIGHT) * LANES
-                for lane in range(LANES):
-                    before[lane] = state[light + lane]
-                place = motion * GROUPS + group
-                cast_single(bank, state, place, group, values, index, near, far, pulse)
-                for lane in range(LANES):
-                    weight = np.float64(before[lane] - state[light + lane])
-                    ray = layout.rays[tile, group * LANES + lane]
-                    if weight > 0 and ray >= 0:
-                        if known[ray, 0] >= 0:
-                            sums[member, 0] += weight
-                            sums[member, 1] += weight * known[ray, 0]
-                        if known[ray, 1] >= 0:
-                            sums[member, 2] += weight
-                            sums[member, 3] += weight * known[ray, 1]
 
 
 @inlined()

@@ -1,0 +1,241 @@
+"""How much of a beam each Gaussian sends back, from the intensities that sweeps recorded.
+
+A recorded intensity is what the surfaces along a ray send back, by the light that each stops, times
+what the sensor makes of it. Surfaces are taken as reflecting partly alike in all directions and
+partly with the cosine of incidence; the share is one number for a scene. Lasers of one sensor
+answer differently, and that with the range: each ring has a gain and an offset of its own by range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...logs import DrivingLog
+from ...render.cast.incidence import facing_of_request
+from ...scene import Scene
+from ...scene.lidar_surfaces import MAX_REFLECTIVITY, RANGE_STEPS, RingResponse
+from .gaussians import SurfaceTable
+from .learn import SeenSweep
+from .meetings import meet, part_of
+
+RAYS = 60_000
+"""Of each sweep, evenly spread."""
+LITTLE = 0.01
+"""Smaller shares of a ray's light are left out."""
+INCIDENCES = (1.0, 0.8, 0.6, 0.4, 0.25, 0.15)
+"""Shares of light that does not mind incidence, from which the best is taken."""
+PRIOR = 0.5
+"""Light that the mean reflectivity of all counts for."""
+TRUST = 20.0
+"""Rays that a ring's answer being like the others' counts for."""
+ROUNDS, INNER = 5, 4
+DARKEST = 1e-3
+"""What returned reflects something."""
+UNKNOWN = 0.3
+"""Reflectivity where no sweep met anything in a scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedReflectivity:
+    """What was found.
+
+    Attributes:
+        incidence: see ``LidarSurfaces``.
+        response: of the rings; None where sweeps are not by rings.
+        known: share of the Gaussians that a ray met.
+        residual: root mean square of recorded less explained intensities.
+    """
+
+    incidence: float
+    response: RingResponse | None
+    known: float
+    residual: float
+
+
+@dataclass(frozen=True, eq=False)
+class LitRays:
+    """Rays of all sweeps that returned, and what they met.
+
+    Attributes:
+        ray, member: [M] which ray met which Gaussian.
+        share: [M] of the light that the ray loses.
+        facing: [M] cosine of the incidence.
+        intensity: [R] float64, as recorded.
+        cell: [R] int64, ring and step of range of a response.
+        rings: [B] elevations of the rings [rad]; [0] where scans are not by rings.
+        every: [sweeps] of so many rays of each sweep one was taken.
+    """
+
+    ray: NDArray[np.int32]
+    member: NDArray[np.int32]
+    share: NDArray[np.float32]
+    facing: NDArray[np.float32]
+    intensity: NDArray[np.float64]
+    cell: NDArray[np.int64]
+    rings: NDArray[np.float64]
+    every: tuple[int, ...]
+
+
+def light_of(
+    table: SurfaceTable,
+    scene: Scene,
+    log: DrivingLog,
+    sweeps: list[SeenSweep],
+    *,
+    on_sweep: Callable[[int, int], None],
+) -> LitRays:
+    """Follow the rays of all sweeps until their light has gone."""
+    placed = table.placed(scene)
+    rings = sweeps[0].elevations
+    columns: list[tuple[NDArray[Any], ...]] = []
+    every: list[int] = []
+    rays_so_far = 0
+    for done, sweep in enumerate(sweeps):
+        rays = sweep.rays
+        every.append(max(1, -(-len(rays.range) // RAYS)))
+        chosen = np.arange(0, len(rays.range), every[-1])
+        lidar = part_of(rays.lidar, chosen)
+        met = meet(
+            table, placed, log, frame=sweep.frame, lidar=lidar,
+            reach=np.zeros(len(chosen), np.float32),
+        )  # fmt: skip
+        found = met.meetings
+        row = np.zeros(len(chosen), np.int64)
+        if len(rings) and len(sweep.elevations):
+            row = RingResponse.rows(rings, sweep.elevations, sweep.ring[chosen])
+        ray = np.repeat(np.arange(len(chosen)), np.diff(found.begins))
+        share = stopped_shares(found.alpha, found.begins, ray)
+        # The facing of a Gaussian is that of its centre, as in a cast.
+        facing = np.concatenate(facing_of_request(met.request))
+        kept = share > LITTLE
+        columns.append(
+            (
+                (ray[kept] + rays_so_far).astype(np.int32),
+                found.members[kept],
+                share[kept],
+                facing[met.of_request[kept]],
+                rays.intensity[chosen].astype(np.float64),
+                row * (len(RANGE_STEPS) - 1) + RingResponse.step_of(rays.range[chosen]),
+            )
+        )
+        rays_so_far += len(chosen)
+        on_sweep(done + 1, len(sweeps))
+    joined: list[Any] = [np.concatenate(parts) for parts in zip(*columns, strict=True)]
+    return LitRays(*joined, rings=rings, every=tuple(every))
+
+
+def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
+    """Fit the reflectivity of each Gaussian, in place, and what all have in common."""
+    cells = max(len(lit.rings), 1) * (len(RANGE_STEPS) - 1)
+    gain, offset = np.ones(cells), np.zeros(cells)
+    incidence = min(INCIDENCES, key=lambda given: _misfit(lit, given, len(table)))
+    lambert = lit.share * (incidence + (1 - incidence) * lit.facing)
+    values = np.full(len(table), lit.intensity.mean() if len(lit.intensity) else UNKNOWN)
+    for _ in range(ROUNDS):
+        values = _reflectivities(lit, lambert, values, gain, offset)
+        explained = np.bincount(lit.ray, lambert * values[lit.member], len(lit.intensity))
+        if len(lit.rings):
+            gain, offset = _responses(lit, explained, cells)
+    met = np.bincount(lit.member, lit.share, len(table)) > 0
+    off = lit.intensity - explained * gain[lit.cell] - offset[lit.cell]
+    table.attributes[:, 0] = np.clip(values, DARKEST, MAX_REFLECTIVITY)
+    if met.any():
+        table.attributes[~met, 0] = np.median(table.attributes[met, 0])
+    response = None
+    if len(lit.rings):
+        shape = (len(lit.rings), len(RANGE_STEPS) - 1)
+        response = RingResponse(
+            lit.rings.astype(np.float32),
+            gain.reshape(shape).astype(np.float32),
+            offset.reshape(shape).astype(np.float32),
+        )
+    residual = float(np.sqrt(np.mean(off**2))) if len(off) else float("nan")
+    return FittedReflectivity(incidence, response, float(met.mean()), residual)
+
+
+def stopped_shares(
+    alpha: NDArray[np.float32], begins: NDArray[np.int64], ray: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Share [M] of the light that a ray loses which it loses at each of its meetings."""
+    passed = np.log1p(-np.minimum(alpha, 0.9999).astype(np.float64))
+    total = np.cumsum(passed)
+    before = total - passed - np.concatenate([[0.0], total])[begins[:-1]][ray]
+    weight = alpha * np.exp(before)
+    stopped = np.bincount(ray, weight, len(begins) - 1)
+    return (weight / np.maximum(stopped, 1e-9)[ray]).astype(np.float32)
+
+
+def _misfit(lit: LitRays, incidence: float, count: int) -> float:
+    """Mean square of what one pass of back-projection leaves unexplained."""
+    lambert = lit.share * (incidence + (1 - incidence) * lit.facing)
+    start = np.full(count, lit.intensity.mean() if len(lit.intensity) else UNKNOWN)
+    one = np.ones(1)
+    values = _reflectivities(lit, lambert, start, one, 0 * one)
+    off = lit.intensity - np.bincount(lit.ray, lambert * values[lit.member], len(lit.intensity))
+    return float(np.mean(off**2)) if len(off) else 0.0
+
+
+def _reflectivities(
+    lit: LitRays,
+    lambert: NDArray[np.float32],
+    values: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    offset: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """A few rounds of simultaneous iterative reconstruction (SIRT) from ``values`` [N] on."""
+    one = len(gain) == 1
+    factor = lambert if one else lambert * gain[lit.cell][lit.ray]
+    wanted = lit.intensity if one else lit.intensity - offset[lit.cell]
+    # Each meeting counts by its share: of the light on a Gaussian, not of its own part alone.
+    light = np.bincount(lit.member, factor * factor / np.maximum(lit.share, 1e-6), len(values))
+    mean = float(np.average(values, weights=light)) if light.sum() > 0 else UNKNOWN
+    for _ in range(INNER):
+        off = wanted - np.bincount(lit.ray, factor * values[lit.member], len(wanted))
+        pull = np.bincount(lit.member, factor * off[lit.ray], len(values))
+        lean = PRIOR * (mean - values)
+        values = values + (pull + lean) / (light + PRIOR)
+    return values
+
+
+def _responses(
+    lit: LitRays, explained: NDArray[np.float64], cells: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gain and offset of each cell by least squares, leaning on those of its ring, which lean on
+    1 and 0."""
+    steps = len(RANGE_STEPS) - 1
+    mean_square = float(np.mean(explained**2))
+    moments = np.stack(
+        [
+            np.bincount(lit.cell, values, cells)
+            for values in (
+                explained**2,
+                explained,
+                np.ones(len(explained)),
+                explained * lit.intensity,
+                lit.intensity,
+            )
+        ]
+    )
+    of_ring = moments.reshape(5, -1, steps).sum(2)
+    one = np.ones(of_ring.shape[1])
+    gain, offset = _line(of_ring, one, 0 * one, mean_square)
+    return _line(moments, np.repeat(gain, steps), np.repeat(offset, steps), mean_square)
+
+
+def _line(
+    moments: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    mean_square: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lines through rays given by sums of xx, x, 1, xy and y, leaning on others by TRUST."""
+    xx, x, one, xy, y = moments
+    xx, xy = xx + TRUST * mean_square, xy + TRUST * mean_square * gain
+    one, y = one + TRUST, y + TRUST * offset
+    determinant = xx * one - x**2
+    return (one * xy - x * y) / determinant, (xx * y - x * xy) / determinant
