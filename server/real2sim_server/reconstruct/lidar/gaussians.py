@@ -82,9 +82,9 @@ class SurfaceTable:
         for body in range(len(self.firsts) - 1):
             part = slice(self.firsts[body], self.firsts[body + 1])
             own = (torch.from_numpy(np.ascontiguousarray(column[part])) for column in columns)
-            means, quats, scales_of, opacities = own
+            means_of, quats, scales_of, opacities = own
             cloud = GaussianCloud(
-                means, quats, scales_of, opacities, sh=torch.zeros(len(means), 1, 3)
+                means_of, quats, scales_of, opacities, sh=torch.zeros(len(means_of), 1, 3)
             )
             attributes = torch.from_numpy(self.attributes[part].copy())
             parts.append(Reflector(cloud, attributes))
