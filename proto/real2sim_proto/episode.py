@@ -450,6 +450,13 @@ class ContactSpec(Model):
         "nearer to each other, and its normal turns with the body whose face was struck; false: "
         "all of it at one place, as in episodes recorded before this option was there",
     )
+    progressive: bool = Field(
+        default=True,
+        description="force between two vehicles grows with the speed at which they come nearer and "
+        "progressively with depth, as that of their matter does, so that slow impacts last longer; "
+        "needs `distributed`; false: by depth alone, as in episodes recorded before this option "
+        "was there",
+    )
     dents: bool = Field(
         default=True,
         description="images show struck objects deformed, by the material point method",

@@ -187,7 +187,7 @@ def test_the_energy_that_is_lost_is_reported_with_an_estimate_of_crush(make_worl
 def test_a_car_hit_off_centre_turns_and_so_does_the_ego(make_world, moving):
     world = make_world(car=moving(20, 1.2, z=0.8), spec=GO_ON)
     drive_until_contact(world)
-    for _ in range(10):
+    for _ in range(15):
         world.step(COAST)
     w, _, _, z = agent_of(world)["quaternion"]
     assert abs(2 * math.atan2(z, w)) > 0.05

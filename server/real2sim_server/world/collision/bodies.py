@@ -10,7 +10,7 @@ from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ...edit import ObjectState
 from ...simulation.masses import default_mass, yaw_inertia
-from ...simulation.structure import stiffness_of
+from ...simulation.structure import STRUCTURES, stiffness_of
 from ..driving import vehicle_parameters
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
@@ -73,6 +73,7 @@ def object_properties(
         friction=friction,
         drag=IMPACTED_DRAG if rolls else 0.0,
         stiffness=stiffness_of(subject.category),
+        vehicle=subject.category in STRUCTURES,
     )
 
 

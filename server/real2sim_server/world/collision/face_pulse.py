@@ -4,6 +4,10 @@ Force acts only where two bodies still come nearer to each other, and there grow
 are in one another, as on the points around a vehicle in SMAC (McHenry 1971). So where one turns
 away, force stays on the part that the other still runs into, and moves along the face with it; at
 the middle of all contact it would be over as soon as that middle stops.
+
+The force of vehicles is progressive: what is outermost folds at little force, which grows with how
+fast it is folded, and rails behind it carry the published stiffness. So an impact of 10 m/s lasts
+longer than one of 30.
 """
 
 from __future__ import annotations
@@ -24,6 +28,11 @@ from .manifold import (
 from .pulse import Patch, Pulse, mutual_stiffness
 
 STRIPS = 16
+SHALLOW, DEEPENING, RATE = 0.2, 0.35, 0.015
+"""Share of the stiffness of two vehicles that acts at no depth, how much comes with each metre of
+depth, and what depth closing by 1 m/s counts as [m]. Fitted to forces between the matter's cars:
+57 kN at once and 88 kN at 0.5 m in a rear end of 10 m/s, 153 kN at once and 435 kN at 1.25 m head
+on at 30 m/s; and to how long they push."""
 
 
 class Strip(NamedTuple):
@@ -79,7 +88,13 @@ def face_contact(
 
 
 def advance_face_pulse(
-    bodies: Bodies, pulse: Pulse, contact: FaceContact, h: float, *, friction: float
+    bodies: Bodies,
+    pulse: Pulse,
+    contact: FaceContact,
+    h: float,
+    *,
+    friction: float,
+    progressive: bool = False,
 ) -> tuple[Pulse, list[Push]]:
     """What the two exchange in the next ``h`` seconds, one push after the other.
 
@@ -89,27 +104,39 @@ def advance_face_pulse(
         contact: where they overlap now.
         h: [s].
         friction: tangential per normal impulse at most.
+        progressive: force grows with the closing speed and more than in proportion to depth.
     """
     nx, ny = pulse.along(bodies)
     if contact.patch.depth > pulse.depth:
         pulse = pulse._replace(depth=contact.patch.depth, width=contact.patch.width)
     # Impulse per depth of a strip [N s/m].
     stiffness = mutual_stiffness(bodies, nx, ny) * contact.patch.width / STRIPS * h
-    pulse, pushes = _compressed(bodies, pulse, contact, stiffness, friction)
+    rate = RATE if progressive else 0.0
+    loading = _progressive(contact, 0.0) if progressive else contact
+    pulse, pushes = _compressed(bodies, pulse, loading, (stiffness, rate), friction)
     for push in pushes:
         bodies = push.on(bodies)
     if not pulse.loading:
+        if progressive:
+            contact = _progressive(contact, pulse.restitution)
         pulse, back = _restored(bodies, pulse, contact, stiffness, friction)
         pushes += back
     return pulse, pushes
 
 
 def _compressed(
-    bodies: Bodies, pulse: Pulse, contact: FaceContact, stiffness: float, friction: float
+    bodies: Bodies,
+    pulse: Pulse,
+    contact: FaceContact,
+    law: tuple[float, float],
+    friction: float,
 ) -> tuple[Pulse, list[Push]]:
-    """The push of strips whose bodies come nearer, at most what stops them."""
+    """The push of strips whose bodies come nearer, at most what stops them; ``law``: impulse per
+    depth of a strip [N s/m], and depth that speed counts as [s]."""
     nx, ny = pulse.along(bodies)
-    approaching = [s for s in contact.strips if _parting(bodies, s, nx, ny) < 0.0]
+    stiffness, rate = law
+    parting = [(s, _parting(bodies, s, nx, ny)) for s in contact.strips]
+    approaching = [s._replace(depth=s.depth - rate * v) for s, v in parting if v < 0.0]
     depth, place = _resultant(approaching, nx, ny)
     if depth <= 0.0:
         return pulse._replace(loading=False, settled=contact.patch.depth), []
@@ -136,6 +163,19 @@ def _restored(
     motion = relative_motion(bodies, place)
     pulse = pulse._replace(restored=pulse.restored + back)
     return pulse, [Push(place.x, place.y, motion.limited(back, friction))]
+
+
+def _progressive(contact: FaceContact, restitution: float) -> FaceContact:
+    """A contact with those depths at which the stiffness of two vehicles gives their force.
+
+    What is wholly given back takes all the stiffness: how fast it was folded has added to what
+    there is to be given.
+    """
+    strips = []
+    for s in contact.strips:
+        share = min(SHALLOW + DEEPENING * s.depth, 1.0)
+        strips.append(s._replace(depth=(share + restitution * (1.0 - share)) * s.depth))
+    return contact._replace(strips=tuple(strips))
 
 
 def _resultant(

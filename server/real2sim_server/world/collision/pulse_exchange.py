@@ -49,7 +49,14 @@ def exchange(state: SolverState, a: str, b: str, manifold: ContactManifold, h: f
         pair_impulse(state, (a, b), manifold, approach=0.0)
         return False
     if face is not None:
-        pulse, pushes = advance_face_pulse(bodies, pulse, face, h, friction=contact.friction)
+        pulse, pushes = advance_face_pulse(
+            bodies,
+            pulse,
+            face,
+            h,
+            friction=contact.friction,
+            progressive=contact.progressive and all(b is None or b[1].vehicle for b in bodies),
+        )
     else:
         pulse, impulse = advance_pulse(bodies, pulse, patch, h, friction=contact.friction)
         pushes = [] if impulse is None else [Push(patch.x, patch.y, impulse)]

@@ -32,6 +32,7 @@ class BodyProperties:
         friction: of tyres or body on the ground.
         drag: deceleration per gravity along rolling wheels.
         stiffness: of its front, rear and sides, per width of what is crushed [N/m^2].
+        vehicle: whether it yields as a vehicle does.
     """
 
     mass: float
@@ -43,6 +44,7 @@ class BodyProperties:
     friction: float = 0.7
     drag: float = 0.0
     stiffness: tuple[float, float, float] = (474e3, 430e3, 870e3)
+    vehicle: bool = True
 
     def shortened(self, front: float, rear: float) -> BodyProperties:
         """With its ends so much nearer to its middle [m]."""

@@ -70,11 +70,12 @@ def solve_collisions(step: CollisionStep) -> CollisionResult:
         motion = _move_ego(state, motion, sliding, begin, end)
         _move_objects(state, begin, end)
         state.now_us = end
-        if _resolve_contacts(state, (end - begin) * 1e-6):
-            sliding = True
-        if sliding:
+        pushed = _resolve_contacts(state, (end - begin) * 1e-6)
+        if pushed or sliding:
             motion = ego_motion(state.bodies[EGO], motion, step.spec)
-            sliding = not is_rolling(motion, step.spec)
+            # What is pushed for long is pushed by little at a time: wheels must not undo it.
+            going_on = pushed and step.contact.progressive
+            sliding = going_on or not is_rolling(motion, step.spec)
     return CollisionResult(
         motion,
         sliding,

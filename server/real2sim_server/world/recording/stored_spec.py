@@ -19,6 +19,7 @@ BEFORE: Mapping[str, Any] = {
         "pulse": False,
         "residual_crush": False,
         "distributed": False,
+        "progressive": False,
         "breakage": False,
     },
 }
