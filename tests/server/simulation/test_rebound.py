@@ -113,8 +113,8 @@ def test_balls_of_a_cradle_hand_on_what_they_have(gap, requested, last, kept):
     options = SimulateOptions(
         objects=dict.fromkeys("abc", ObjectPhysics()),
         gravity=(0.0, 0.0, 0.0),
-        duration=0.6,
-        frame_rate=5,
+        duration=0.3,
+        frame_rate=10,
     )
     simulate_bodies(bodies, options)
     speeds = np.array([-b.motion.velocity @ turn[:, 2] for b in bodies])
