@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from real2sim_proto.base import Pose
 from real2sim_proto.operations import Delete, Duplicate, EraseRegion, Scale, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, instances_at
+from real2sim_server.edit.lighting import relit
 from real2sim_server.scene import Scene, SceneObject
 from real2sim_server.scene.errors import UnknownObjectError
 
@@ -120,3 +124,15 @@ def test_erased_regions_hide_their_gaussians_and_share_the_rest(street):
     np.testing.assert_array_equal(shown.opacities.numpy() == 0, inside)
     assert shown.means is street.background.means
     assert instances_at(street, state, 100)[0].cloud is shown
+
+
+def test_uncertainties_stay_with_objects_that_move_and_with_their_copies(tiny_scene):
+    red = tiny_scene.object("car_red")
+    known = replace(red.cloud, uncertainties=torch.full((len(red.cloud),), 0.1))
+    objects = dict(tiny_scene.objects) | {"car_red": replace(red, cloud=known)}
+    scene = replace(tiny_scene, objects=objects)
+    edits = [Translate(object_id="car_red", y=2.0), Duplicate(object_id="car_red", y=3.0)]
+    state = apply_operations(ScenarioState.of(scene), edits).state
+    shown = [i.cloud for i in instances_at(scene, state, scene.start_us)]
+    assert sum(cloud is known for cloud in shown) == 2
+    assert relit(known, (1.2, 0.9, 0.8)).uncertainties is known.uncertainties

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -9,7 +11,13 @@ from real2sim_server.geometry.rotation import quaternion_to_matrix
 from real2sim_server.physics import Body, FixedCorotated, Solver, SolverOptions, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.simulation.embedding import Embedding, deform_cloud
+from real2sim_server.simulation.damage.appearance import _split
+from real2sim_server.simulation.embedding import (
+    Deformed,
+    Embedding,
+    deform_cloud,
+    replaced_rows,
+)
 from real2sim_server.simulation.rigid import rotation_of
 
 
@@ -45,6 +53,26 @@ def test_an_affine_motion_moves_means_and_covariances_exactly():
     expected = F @ covariances(cloud) @ F.T
     np.testing.assert_allclose(covariances(moved), expected, atol=1e-7)
     assert torch.equal(moved.opacities, cloud.opacities)
+
+
+def test_dented_gaussians_keep_their_uncertainties():
+    cloud = random_cloud(np.random.default_rng(2))
+    cloud = replace(cloud, uncertainties=torch.linspace(0, 1, len(cloud)))
+    still = np.repeat(np.eye(3)[None], len(cloud), axis=0)
+    moved = deform_cloud(cloud, Deformed(cloud.means.numpy() + 0.1, 1.1 * still, still))
+    assert torch.equal(moved.uncertainties, cloud.uncertainties)
+    rows = torch.arange(5)
+    part = replaced_rows(cloud, rows, moved.select(rows))
+    assert torch.equal(part.uncertainties, cloud.uncertainties)
+    assert torch.equal(part.means[:5], moved.means[:5])
+
+
+def test_gaussians_split_by_a_dent_have_the_uncertainty_of_the_one_they_were():
+    cloud = random_cloud(np.random.default_rng(2), 6)
+    cloud = replace(cloud, uncertainties=torch.linspace(0, 1, 6))
+    stretched = np.repeat(np.diag([5.0, 1, 1])[None], 2, axis=0)
+    split = _split(cloud, np.array([1, 4]), stretched)
+    assert torch.equal(split.uncertainties[6:], cloud.uncertainties[[1, 4]])
 
 
 def test_a_rotation_of_the_matter_is_a_rotation_of_the_cloud_colours_included():

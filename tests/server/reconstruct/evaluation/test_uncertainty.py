@@ -94,6 +94,7 @@ def test_without_any_image_to_compare_it_is_refused(scene, street):
         fit_uncertainties(everything, street)
 
 
+@pytest.mark.slow
 def test_the_commands_fit_and_judge_it(scene, street, tmp_path):
     write_native_log(street, tmp_path / "log")
     save_scene(scene, tmp_path / "a.r2s")
@@ -117,7 +118,7 @@ def test_the_commands_fit_and_judge_it(scene, street, tmp_path):
         assert result.exit_code == 0, result.output
     assert load_scene(tmp_path / "a.r2s").has_uncertainties
     assert json.loads((tmp_path / "fitted.json").read_text())["views"] == 4
-    assert "Uncertainty against error" in (tmp_path / "p.d" / "report.html").read_text()
+    assert "Uncertainty against error" in (tmp_path / "page.d" / "report.html").read_text()
     assert json.loads((tmp_path / "judged.json").read_text())["uncertainty"]["spearman"] > 0.6
 
 
