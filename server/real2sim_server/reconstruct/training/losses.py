@@ -33,7 +33,8 @@ class LossWeights:
         needle_ratio: that ratio (drivestudio: 10).
         smooth: squared second differences of refined object poses [m, rad] (drivestudio: 0.01).
         opacity, scale: mean opacity and mean size [m] (MCMC, Kheradmand et al. 2024: 0.01).
-        exposure: squared distance of exposures from the identity.
+        exposure: squared distance of exposures from the identity, and squared logarithms of the
+            gains of images.
     """
 
     ssim: float = 0.2

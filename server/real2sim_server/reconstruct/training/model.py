@@ -14,6 +14,7 @@ from ...render import Instance, RasterOptions, RenderOutput, rasterize
 from ...render.backends import Backend, device_of, select_backend
 from ...scene import Camera, GaussianCloud, Scene, Sky, TimeColour
 from . import gaussians as packing
+from .exposure import ImageGains
 from .gaussians import Gaussians
 from .poses import ObjectPoses
 from .schedule import TrainOptions
@@ -28,7 +29,7 @@ class RenderedView:
 
     Attributes:
         output: images of one camera; carries gradients.
-        rgb: [H, W, 3], with the camera's exposure.
+        rgb: [H, W, 3], as the camera exposes it.
         drawn: indices of the trained instances drawn: 0 for the background, then 1 + object;
             those of priors come behind them.
     """
@@ -78,6 +79,7 @@ class SceneModel:
         self.sky = packing.leaf(_sky_faces(scene.sky, options.sky_resolution), self.device)
         cameras = len(scene.rig)
         self.exposure = packing.leaf(torch.eye(3, 4).expand(cameras, 3, 4), self.device)
+        self.gains = ImageGains(cameras, key_times_us, device=self.device)
         self.cameras = torch.zeros(cameras, 6, device=self.device, requires_grad=True)
         vehicles = [o.category in SYMMETRIC_CATEGORIES for o in scene.objects.values()]
         self.mirrored = tuple(options.mirror > 0 and vehicle for vehicle in vehicles)
@@ -93,6 +95,7 @@ class SceneModel:
             "pose_yaw": self.poses.yaws,
             "pose_tilt": self.poses.tilts,
             "exposure": self.exposure,
+            "image_exposure": self.gains.logarithms,
             "camera": self.cameras,
         }
 
@@ -105,6 +108,8 @@ class SceneModel:
         self.poses.yaws = packing.leaf(tensors["pose_yaw"], self.device)
         self.poses.tilts = packing.leaf(tensors["pose_tilt"], self.device)
         self.exposure = packing.leaf(tensors["exposure"], self.device)
+        if "image_exposure" in tensors:
+            self.gains.logarithms = packing.leaf(tensors["image_exposure"], self.device)
         self.cameras = packing.leaf(tensors["camera"], self.device)
 
     def render(
@@ -142,11 +147,15 @@ class SceneModel:
             backend=self.backend,
             check_values=False,
         )
-        rgb = output.rgb[0]
-        if self.options.learning_rates.exposure > 0:
-            affine = self.exposure[self.scene.rig.names.index(camera.name)]
+        return RenderedView(output, self.exposed(output.rgb[0], camera, t_us), tuple(drawn))
+
+    def exposed(self, rgb: Tensor, camera: Camera, t_us: int) -> Tensor:
+        """Colours as a camera records them at a time, as far as that is learnt."""
+        index, rates = self.scene.rig.names.index(camera.name), self.options.learning_rates
+        if rates.exposure > 0:
+            affine = self.exposure[index]
             rgb = rgb @ affine[:, :3].T + affine[:, 3]
-        return RenderedView(output, rgb, tuple(drawn))
+        return rgb * self.gains.at(index, t_us) if rates.image_exposure > 0 else rgb
 
     def objects_alpha(self, camera: Camera, t_us: int) -> Tensor:
         """[H, W] accumulated opacity of the objects alone; carries gradients."""

@@ -104,10 +104,10 @@ class SelectiveAdam:
         }
 
     def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
-        """Take over what :meth:`state` gave after ``steps`` steps."""
+        """Take over what :meth:`state` gave after ``steps`` steps; what it lacks begins."""
         self.steps = steps
-        self.first = {k: state[f"first.{k}"] for k in self.first}
-        self.second = {k: state[f"second.{k}"] for k in self.second}
+        self.first = {k: state.get(f"first.{k}", held) for k, held in self.first.items()}
+        self.second = {k: state.get(f"second.{k}", held) for k, held in self.second.items()}
 
 
 def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction: float) -> None:

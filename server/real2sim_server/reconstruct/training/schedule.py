@@ -32,6 +32,7 @@ class LearningRates:
         pose_tilt: of their roll and pitch [rad].
         camera: of camera poses [m, rad]; 0 leaves them as calibrated.
         exposure: of each camera's affine colour; 0 leaves colours as they are.
+        image_exposure: of the gains of each image; 0 leaves them at 1.
 
     Sources: Kerbl et al. 2023; Street Gaussians (poses, sky); drivestudio (cameras).
     """
@@ -48,6 +49,7 @@ class LearningRates:
     pose_tilt: tuple[float, float] = (1e-3, 1e-5)
     camera: float = 0.0
     exposure: float = 0.0
+    image_exposure: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -233,6 +235,7 @@ def learning_rates_at(
         "pose_yaw": poses_move * exponential_decay(rates.pose_yaw, fraction),
         "pose_tilt": poses_move * exponential_decay(rates.pose_tilt, fraction),
         "exposure": rates.exposure,
+        "image_exposure": rates.image_exposure,
         "camera": rates.camera,
     }
 

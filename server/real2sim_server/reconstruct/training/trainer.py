@@ -200,6 +200,8 @@ class Trainer:
         if weights.exposure > 0 and self.options.learning_rates.exposure > 0:
             change = model.exposure - torch.eye(3, 4, device=model.device)
             terms["exposure"] = weights.exposure * change.square().sum()
+        if weights.exposure > 0 and self.options.learning_rates.image_exposure > 0:
+            terms["image_exposure"] = weights.exposure * model.gains.squares()
         late = self.iteration >= self.options.densify.stop * self.options.iterations
         if weights.object_entropy > 0 and objects and late:
             inside = torch.from_numpy(box_mask(model.scene, view.camera, view.t_us))
@@ -221,7 +223,14 @@ class Trainer:
             visible[part] = (radii > 0).any(0)
         masks = {name: visible for name in FIELDS if name not in OBJECT_FIELDS}
         masks |= dict.fromkeys(OBJECT_FIELDS, visible[gaussians.counts[0] :])
-        for name in ("pose_translation", "pose_yaw", "pose_tilt", "exposure", "camera"):
+        for name in (
+            "pose_translation",
+            "pose_yaw",
+            "pose_tilt",
+            "exposure",
+            "image_exposure",
+            "camera",
+        ):
             gradient = parameters[name].grad
             if gradient is not None:
                 masks[name] = gradient.reshape(len(gradient), -1).any(1)

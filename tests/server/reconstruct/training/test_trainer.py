@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
+from real2sim_server.logs import DrivingLog, LidarSweep
 from real2sim_server.reconstruct import ReconstructError
 from real2sim_server.reconstruct.evaluation import render_logged_view
 from real2sim_server.reconstruct.evaluation.rendering import scene_instances
@@ -21,6 +22,8 @@ from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
 from real2sim_server.reconstruct.training.threads import one_torch_thread
 from real2sim_server.render import RasterOptions, rasterize
+from real2sim_server.render.effects import to_display, to_light
+from real2sim_server.scene import Scene
 from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.scene.spherical_harmonics import sh_basis
 
@@ -65,6 +68,53 @@ def test_a_grey_scene_learns_its_colours_to_several_decibels(tiny_log, tiny_scen
     before = mean_psnr(trainer)
     trainer.run()
     assert mean_psnr(trainer) > before + 3
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """Images of a log, and those of a camera beside "front" half a stop brighter, or of frames."""
+
+    log: DrivingLog
+    bright_frames: tuple[int, ...]
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        image = self.log.image("front", frame)
+        if camera == "front" and frame not in self.bright_frames:
+            return image
+        return to_display(to_light(image) * np.float32(2**0.5))
+
+    def lidar(self, frame: int) -> LidarSweep:
+        return self.log.lidar(frame)
+
+
+def exposed(log: DrivingLog, scene: Scene, *, by_camera: bool) -> tuple[DrivingLog, Scene]:
+    cameras = [log.rig["front"]]
+    if by_camera:
+        cameras.append(replace(log.rig["front"], name="bright"))
+    rig = replace(log.rig, cameras=tuple(cameras))
+    source = Exposed(log, () if by_camera else (1, 4, 5))
+    return replace(log, rig=rig, source=source, image_times_us={}), replace(scene, rig=rig)
+
+
+@pytest.mark.parametrize("by_camera", [True, False], ids=["camera", "image"])
+def test_images_of_half_a_stop_more_light_are_told_from_the_scene(tiny_log, tiny_scene, by_camera):
+    log, scene = exposed(tiny_log, tiny_scene, by_camera=by_camera)
+    learnt = {"exposure": 0.01} if by_camera else {"image_exposure": 0.02}
+    rates = replace(TINY.learning_rates, **learnt)
+    still = replace(TINY, densify=DensifyOptions(method="none"), iterations=40)
+    with_it = Trainer(log, scene, replace(still, learning_rates=rates))
+    without = Trainer(log, scene, still)
+    with_it.run()
+    without.run()
+    assert mean_psnr(with_it) > mean_psnr(without) + 0.5
+    grey, times = torch.full((1, 1, 3), 0.5), log.frame_times_us
+    model = with_it.model
+    bright, frame = ("bright", 3) if by_camera else ("front", 4)
+    with torch.no_grad():
+        more = model.exposed(grey, log.rig[bright], int(times[frame])).mean()
+        less = model.exposed(grey, log.rig["front"], int(times[3])).mean()
+    # Half a stop is a factor of 1.17 of what is stored, about the middle.
+    assert 1.05 < float(more / less) < 1.3
 
 
 def test_held_out_views_are_scored_whole_and_over_moving_objects(trained, tiny_log):
