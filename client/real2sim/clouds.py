@@ -245,7 +245,7 @@ def _columns(wire: WireCloud) -> dict[str, NDArray[Any]]:
         if wire.codec == "deflate":
             planes = np.frombuffer(part, np.uint8).reshape(dtype.itemsize, -1)
             part = np.ascontiguousarray(planes.T).tobytes()
-        column = np.frombuffer(part, dtype)
+        column = np.frombuffer(part, dtype).astype(form.dtype, copy=False)
         found[form.name] = column.reshape(wire.count, form.width) if form.width > 1 else column
     return found
 

@@ -75,8 +75,11 @@ class View:
             KeyError: this instant has none of that name; the sentence names those it has.
 
         Examples:
-            >>> obs.lidar("vlp-16").return_number.min()
-            1
+            >>> client = real2sim.connect()
+            >>> with client.session(scene="street") as session:
+            ...     obs = session.reset(lidars=["vlp-16"])
+            >>> obs.lidar("vlp-16").frame
+            'sensor'
         """
         return self._cloud(name, LidarCloud)
 
@@ -84,6 +87,9 @@ class View:
         """The scan of a radar. Raises KeyError as :meth:`lidar`.
 
         Examples:
+            >>> client = real2sim.connect()
+            >>> with client.session(scene="street") as session:
+            ...     obs = session.reset(radars=["corner"])
             >>> bool((obs.radar("corner").range > 0).all())
             True
         """
