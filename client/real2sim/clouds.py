@@ -45,8 +45,8 @@ class PointCloud:
         >>> client = real2sim.connect()
         >>> with client.session(scene="street") as session:
         ...     cloud = session.reset(lidars=["vlp-16"]).lidar("vlp-16")
-        >>> cloud.points.shape == (cloud.count, 3), cloud.points.dtype
-        (True, dtype('float32'))
+        >>> cloud.points.shape == (cloud.count, 3), cloud.modality
+        (True, 'lidar')
     """
 
     sensor: str
@@ -245,7 +245,7 @@ def _columns(wire: WireCloud) -> dict[str, NDArray[Any]]:
         if wire.codec == "deflate":
             planes = np.frombuffer(part, np.uint8).reshape(dtype.itemsize, -1)
             part = np.ascontiguousarray(planes.T).tobytes()
-        column = np.frombuffer(part, dtype).astype(form.dtype, copy=False)
+        column = np.frombuffer(part, dtype)
         found[form.name] = column.reshape(wire.count, form.width) if form.width > 1 else column
     return found
 

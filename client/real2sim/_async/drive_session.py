@@ -115,8 +115,8 @@ class AsyncDriveSession(SessionBase):
             ['car_blue', 'car_red', 'post']
             >>> obs = await session.reset(lidars=["vlp-16"], radars=["corner"])
             >>> sweep, scan = obs.lidar("vlp-16"), obs.radar("corner")
-            >>> sweep.points.shape[1], sweep.t_us, scan.velocity.dtype
-            (3, 0, dtype('float32'))
+            >>> sweep.points.shape[1], sweep.t_us, scan.modality
+            (3, 0, 'radar')
         """
         spec = reset_spec(sensors, self._codec, options)
         return await self._observe(self._protocol.reset(spec))

@@ -116,8 +116,8 @@ class DriveSession(SessionBase):
             ['car_blue', 'car_red', 'post']
             >>> obs = session.reset(lidars=["vlp-16"], radars=["corner"])
             >>> sweep, scan = obs.lidar("vlp-16"), obs.radar("corner")
-            >>> sweep.points.shape[1], sweep.t_us, scan.velocity.dtype
-            (3, 0, dtype('float32'))
+            >>> sweep.points.shape[1], sweep.t_us, scan.modality
+            (3, 0, 'radar')
         """
         spec = reset_spec(sensors, self._codec, options)
         return self._observe(self._protocol.reset(spec))
