@@ -75,10 +75,9 @@ class View:
             KeyError: this instant has none of that name; the sentence names those it has.
 
         Examples:
-            >>> client = real2sim.connect()
-            >>> with client.session(scene="street") as session:
-            ...     obs = session.reset(lidars=["vlp-16"])
-            >>> obs.lidar("vlp-16").frame
+            >>> with real2sim.connect() as other, other.session(scene="street") as driven:
+            ...     seen = driven.reset(lidars=["vlp-16"])
+            >>> seen.lidar("vlp-16").frame
             'sensor'
         """
         return self._cloud(name, LidarCloud)
@@ -87,10 +86,9 @@ class View:
         """The scan of a radar. Raises KeyError as :meth:`lidar`.
 
         Examples:
-            >>> client = real2sim.connect()
-            >>> with client.session(scene="street") as session:
-            ...     obs = session.reset(radars=["corner"])
-            >>> bool((obs.radar("corner").range > 0).all())
+            >>> with real2sim.connect() as other, other.session(scene="street") as driven:
+            ...     seen = driven.reset(radars=["corner"])
+            >>> bool((seen.radar("corner").range > 0).all())
             True
         """
         return self._cloud(name, RadarCloud)
