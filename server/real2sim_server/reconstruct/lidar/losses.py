@@ -57,9 +57,13 @@ def fit_losses(
             before += len(chosen)
         on_sweep(done + 1, len(sweeps))
     if before > returned:
-        columns = (np.concatenate(parts) for parts in (rays, members, shares))
-        lost = np.repeat([0.0, 1.0], [returned, before - returned])
-        table.attributes[:, 1] = _solved(*columns, lost, len(table))
+        table.attributes[:, 1] = _solved(
+            np.concatenate(rays),
+            np.concatenate(members),
+            np.concatenate(shares),
+            np.repeat([0.0, 1.0], [returned, before - returned]),
+            len(table),
+        )
 
 
 def _solved(

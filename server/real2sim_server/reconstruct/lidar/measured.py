@@ -96,7 +96,9 @@ class MeasuredPoints:
             points = points.select(well_supported(points.points, 0.1 + 0.02 * distance))
             levels = voxel_levels(path_distance(points.points, self._path), VOXEL, VOXEL_PER_METRE)
             points = thin_to(points, VOXEL, MAX_BACKGROUND, levels)
-        distance = path_distance(points.points, self._path) if len(points) else np.zeros(0)
+        distance = np.zeros(0, np.float32)
+        if len(points):
+            distance = path_distance(points.points, self._path)
         largest = (VOXEL + 0.03 + 0.008 * distance).astype(np.float32)
         surfels = fit_surfels(points.points, largest=largest, smallest=SMALLEST)
         away = path_distance(completion.means.numpy(), self._path)

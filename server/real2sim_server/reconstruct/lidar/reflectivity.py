@@ -125,8 +125,12 @@ def light_of(
         )
         rays_so_far += len(chosen)
         on_sweep(done + 1, len(sweeps))
-    joined: list[Any] = [np.concatenate(parts) for parts in zip(*columns, strict=True)]
-    return LitRays(*joined, rings=rings, every=tuple(every))
+    ray_of, member, share_of, facing_of, intensity, cell = (
+        np.concatenate(parts) for parts in zip(*columns, strict=True)
+    )
+    return LitRays(
+        ray_of, member, share_of, facing_of, intensity, cell, rings=rings, every=tuple(every)
+    )
 
 
 def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
@@ -138,7 +142,8 @@ def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
     values = np.full(len(table), lit.intensity.mean() if len(lit.intensity) else UNKNOWN)
     for _ in range(ROUNDS):
         values = _reflectivities(lit, lambert, values, gain, offset)
-        explained = np.bincount(lit.ray, lambert * values[lit.member], len(lit.intensity))
+        light = lambert * values[lit.member]
+        explained = np.bincount(lit.ray, light, len(lit.intensity)).astype(np.float64)
         if len(lit.rings):
             gain, offset = _responses(lit, explained, cells)
     met = np.bincount(lit.member, lit.share, len(table)) > 0
@@ -167,7 +172,8 @@ def stopped_shares(
     before = total - passed - np.concatenate([[0.0], total])[begins[:-1]][ray]
     weight = alpha * np.exp(before)
     stopped = np.bincount(ray, weight, len(begins) - 1)
-    return (weight / np.maximum(stopped, 1e-9)[ray]).astype(np.float32)
+    share: NDArray[np.float32] = (weight / np.maximum(stopped, 1e-9)[ray]).astype(np.float32)
+    return share
 
 
 def _misfit(lit: LitRays, incidence: float, count: int) -> float:
@@ -211,7 +217,7 @@ def _responses(
     mean_square = float(np.mean(explained**2))
     moments = np.stack(
         [
-            np.bincount(lit.cell, values, cells)
+            np.bincount(lit.cell, values, cells).astype(np.float64)
             for values in (
                 explained**2,
                 explained,
