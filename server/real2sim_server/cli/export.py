@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from ..console import print_figures, refuse_existing, write_json
@@ -52,6 +51,8 @@ def export(
 def _write_points(
     scene: Scene, out: Path, t_us: int | None, objects: list[str] | None
 ) -> tuple[Path, ...]:
+    import numpy as np
+
     from .._files import atomic_file, atomic_folder
     from ..edit import ScenarioState
     from ..edit.points import ply_of_points, points_at

@@ -49,7 +49,12 @@ class Service:
         metrics = Metrics()
         renderer = Renderer(self.engine, backend, metrics, max_pixels=10**7)
         self.pipeline = StepPipeline(
-            self.engine, renderer, metrics, deformation=cast(Any, None), max_pixels=10**7
+            self.engine,
+            renderer,
+            metrics,
+            deformation=cast(Any, None),
+            max_pixels=10**7,
+            max_rays=10**6,
         )
         self._closing = [self.pipeline.close, renderer.close, self.engine.stop]
 

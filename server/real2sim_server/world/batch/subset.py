@@ -24,7 +24,8 @@ def check_batchable(spec: ResetSpec) -> None:
     outside = [
         f"{name}={getattr(spec, name)!r}"
         for name, field in type(spec).model_fields.items()
-        if name not in FREE | CHECKED and getattr(spec, name) != field.get_default()
+        if name not in FREE | CHECKED
+        and getattr(spec, name) != field.get_default(call_default_factory=True)
     ]
     allowed = {
         "action": spec.action in {"control", "trajectory"},
