@@ -96,7 +96,10 @@ def exposed(log: DrivingLog, scene: Scene, *, by_camera: bool) -> tuple[DrivingL
     return replace(log, rig=rig, source=source, image_times_us={}), replace(scene, rig=rig)
 
 
-@pytest.mark.parametrize("by_camera", [True, False], ids=["camera", "image"])
+@pytest.mark.parametrize(
+    "by_camera",
+    [pytest.param(True, id="camera", marks=pytest.mark.slow), pytest.param(False, id="image")],
+)
 def test_images_of_half_a_stop_more_light_are_told_from_the_scene(tiny_log, tiny_scene, by_camera):
     log, scene = exposed(tiny_log, tiny_scene, by_camera=by_camera)
     learnt = {"exposure": 0.01} if by_camera else {"image_exposure": 0.02}
