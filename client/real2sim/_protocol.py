@@ -180,7 +180,8 @@ class ProtocolState:
     ) -> PendingRequest[View]:
         """Asks for images of the current instant, and clouds of LiDARs and radars."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors), **ranging)
-        return self._request_for(message, View, "images", has_images=True)
+        # A LiDAR or a lens that no step has needed may need kernels that are not yet compiled.
+        return self._request_for(message, View, "images", long_timeout=True, has_images=True)
 
     def agent(
         self,

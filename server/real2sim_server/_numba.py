@@ -28,21 +28,29 @@ the compiler. :func:`fingerprint` covers all of these: it walks from the functio
 name and closure cell it can reach, as they are at the first call. It reads no source file, so
 importing costs nothing, and comments or docstrings elsewhere compile nothing anew.
 
-Out of its sight stays what Numba finds by type or by registration and not by name: bodies given to
-``numba.extending.overload`` and options given to ``register_jitable`` (its functions are seen).
+Processes that need the same kernel at once compile it once: the first holds a lock on a file beside
+what is kept, and the others load what it leaves. Who holds it may compile other kernels on the way,
+those that the first calls, so nobody ever waits in a circle; who waited for two minutes compiles.
+
+Out of sight of the fingerprint stays what Numba finds by type or by registration and not by name:
+bodies given to ``numba.extending.overload`` and options given to ``register_jitable`` (its
+functions are seen).
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
+from pathlib import Path
 from types import CellType, CodeType, FunctionType, ModuleType
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 import numpy as np
 from numba import njit, types
@@ -53,9 +61,13 @@ from numba.core.caching import (
     IndexDataCacheFile,
     UserProvidedCacheLocator,
 )
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.cpu_options import ParallelOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
+
+LONGEST_WAIT_S = 120.0
+"""For another process that compiles the same kernel; the longest take half a minute."""
 
 PARALLEL_LOOPS = ParallelOptions(
     {"comprehension": False, "reduction": False, "numpy": False, "setitem": False}
@@ -81,7 +93,9 @@ def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any
         return functools.partial(kernel, **options)
     compiled = func(function, **options)
     if isinstance(compiled, Dispatcher):  # else NUMBA_DISABLE_JIT is set
-        compiled._cache = _KernelCache(compiled)  # type: ignore[attr-defined]
+        cache = _KernelCache(compiled)
+        compiled._cache = cache  # type: ignore[attr-defined]
+        compiled.compile = cache.compiled_once(compiled.compile)  # type: ignore[method-assign,assignment]
     return compiled
 
 
@@ -148,11 +162,33 @@ class _KernelCache(FunctionCache):
     def __init__(self, compiled: Dispatcher) -> None:
         super().__init__(compiled.py_func)  # type: ignore[no-untyped-call]
         self._compiled = compiled
+        self._until_kept: contextlib.ExitStack | None = None
         self._cache_file = _Index(  # type: ignore[no-untyped-call]
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
             source_stamp=self._impl.locator.get_source_stamp(),
         )
+
+    def compiled_once(self, compile_: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A dispatcher's ``compile`` that keeps others from compiling the same at the same time."""
+
+        def load_or_compile(signature: Any) -> Any:
+            with global_compiler_lock, contextlib.ExitStack() as until_kept:
+                outer, self._until_kept = self._until_kept, until_kept
+                try:
+                    return compile_(signature)
+                finally:
+                    self._until_kept = outer
+
+        return load_or_compile
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What is kept for a signature; None if this process is to compile it."""
+        kept = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        if kept is None and self._until_kept is not None:
+            self._until_kept.enter_context(_locked(f"{self._cache_file._index_path}.lock"))
+            kept = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        return kept
 
     def _index_key(self, sig: tuple[Any, ...], codegen: Any) -> tuple[Any, ...]:
         return sig, codegen.magic_tuple(), self._fingerprint, tuple(_tuple_fields(sig))
@@ -183,6 +219,35 @@ class _Index(IndexDataCacheFile):
             # since: then nothing that is kept can be used.
             return {}
         return kept
+
+
+@contextlib.contextmanager
+def _locked(path: str) -> Iterator[None]:
+    """No other process is in such a block with the same path; without effect where files cannot be
+    locked, and after ``LONGEST_WAIT_S``. Belongs to who has the compiler's lock."""
+    if path in _LOCKED:
+        yield
+        return
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            file = stack.enter_context(open(path, "a"))
+            _wait_for(file)
+            stack.callback(fcntl.flock, file, fcntl.LOCK_UN)
+        _LOCKED.add(path)
+        stack.callback(_LOCKED.discard, path)
+        yield
+
+
+def _wait_for(file: IO[str]) -> None:
+    deadline = time.monotonic() + LONGEST_WAIT_S
+    while time.monotonic() < deadline:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.02)
+        else:
+            return
 
 
 def _tuple_fields(signature: Any) -> Iterator[tuple[str, ...]]:
@@ -315,5 +380,6 @@ def _of_library(module: str | None) -> bool:
     return root in _LIBRARIES or (root in sys.stdlib_module_names and root != "__main__")
 
 
+_LOCKED: set[str] = set()
 _LIBRARIES = frozenset({"llvmlite", "numba", "numpy"})
 _ADDRESS = re.compile(r"0x[0-9a-f]+")

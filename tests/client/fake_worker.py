@@ -267,6 +267,8 @@ class FakeWorker:
             episode.revision += 1
             answer = {"type": "edited", "revision": episode.revision, "created": ["car_3_copy1"]}
         elif isinstance(message, Render):
+            if self.mischief == "late images":
+                await asyncio.sleep(0.6)
             answer = {
                 "type": "view",
                 "t_us": episode.t_us,

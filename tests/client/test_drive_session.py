@@ -139,6 +139,13 @@ def test_after_a_timeout_the_same_plan_moves_the_worker_only_once(worker: FakeWo
         assert session.step(STRAIGHT).step == 2
 
 
+def test_images_that_need_kernels_of_their_own_may_take_longer(worker: FakeWorker) -> None:
+    with connect(worker, timeout=0.3) as client, client.session(scene="street") as session:
+        session.reset()
+        worker.mischief = "late images"
+        assert session.render().t_us == 0
+
+
 def test_a_worker_that_leaves_is_reported_with_its_reason(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street", reconnect=0) as session:
         session.reset()

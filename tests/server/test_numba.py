@@ -4,6 +4,7 @@ A small package in a temporary folder takes parts of its kernel from a second fi
 is a process of its own that reports what the kernel returned and whether it was compiled.
 """
 
+import fcntl
 import json
 import os
 import shutil
@@ -112,6 +113,14 @@ def run(
     before: str = "",
 ) -> tuple[float, str]:
     """What the kernel gave, and whether it was kept; ``is_on_disk`` looks at no signature."""
+    result, misses, there = finished(started(folder, seed, cache=cache, before=before))
+    assert there == (misses == 0 or other_signature)
+    return result, "compiled" if misses else "kept"
+
+
+def started(
+    folder: Path, seed: int = 0, *, cache: Path | None = None, before: str = ""
+) -> subprocess.Popen[str]:
     environment = {
         **os.environ,
         "PYTHONPATH": f"{folder}{os.pathsep}{Path(real2sim_server.__file__).parents[1]}",
@@ -121,18 +130,24 @@ def run(
     environment.pop("NUMBA_CACHE_DIR", None)
     if cache is not None:
         environment["NUMBA_CACHE_DIR"] = str(cache)
-    done = subprocess.run(
+    return subprocess.Popen(
         [sys.executable, "-c", before + RUN],
-        check=False,
         env=environment,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=120,
     )
-    assert done.returncode == 0, done.stderr
-    result, misses, there = json.loads(done.stdout)
-    assert there == (misses == 0 or other_signature)
-    return result, "compiled" if misses else "kept"
+
+
+def finished(process: subprocess.Popen[str]) -> tuple[float, int, bool]:
+    """Result, number of compilations, and whether anything was there before."""
+    try:
+        printed, errors = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    result, misses, there = json.loads(printed)
+    return result, misses, there
 
 
 def change(package: Path, old: str, new: str, *, file: str = "parts.py") -> None:
@@ -156,6 +171,23 @@ def test_a_kernel_that_cannot_be_kept_is_compiled_each_time(package):
 
 def test_a_kernel_is_compiled_once(package):
     assert run(package, seed=1) == (BEFORE, "kept")
+
+
+def test_processes_that_need_a_kernel_at_once_compile_it_once(package):
+    change(package, "FACTOR = 2.0", "FACTOR = 3.0")
+    both = [started(package), started(package)]
+    (first, its_misses, _), (second, other_misses, _) = map(finished, both)
+    assert first == second == BEFORE + 2.0
+    assert its_misses + other_misses == 1
+
+
+def test_a_lock_that_another_never_gives_back_delays_only(package):
+    change(package, "FACTOR = 2.0", "FACTOR = 3.0")
+    (lock,) = package.rglob("*.lock")
+    impatient = "import real2sim_server._numba as n; n.LONGEST_WAIT_S = 0.2\n"
+    with lock.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert run(package, before=impatient) == (BEFORE + 2.0, "compiled")
 
 
 @pytest.mark.parametrize(
