@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..console import print_figures, staged_progress, write_json
 from .command import command
+from .fit import FitFiles, Fitted, fit_scene
 from .options import JsonFile, LogFormat, SceneBundle, Sequence
+
+if TYPE_CHECKING:
+    from ..logs import DrivingLog
+    from ..scene import Scene
 
 
 @command("fit-lidar")
@@ -34,13 +39,10 @@ def fit_lidar(
     """Give a scene surfaces for LiDARs, learned from the recorded sweeps, with reflectivity."""
     from dataclasses import asdict
 
-    from ..logs import open_log, same_part
     from ..reconstruct.lidar import fit_lidar_surfaces
-    from ..scene.io import load_scene, save_scene
+    from ..scene.io import load_scene
 
-    loaded = load_scene(scene)
-    opened = same_part(open_log(log, format=log_format, sequence=sequence), loaded.provenance)
-    with staged_progress() as on_progress:
+    def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
         made, report = fit_lidar_surfaces(
             loaded,
             opened,
@@ -48,9 +50,8 @@ def fit_lidar(
             steps=steps,
             on_progress=on_progress,
         )
-    target = scene if out is None else out
-    save_scene(made, target, overwrite=out is None)
-    figures: dict[str, object] = {"scene": str(target), **asdict(report)}
-    figures.pop("timing_s")
-    print_figures(f"{target.name}, surfaces for LiDARs", figures)
-    write_json(json, figures)
+        figures = asdict(report)
+        del figures["timing_s"]
+        return made, figures
+
+    fit_scene(FitFiles(scene, log, out, log_format, sequence, json), "surfaces for LiDARs", fit)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..console import print_figures, staged_progress, write_json
 from .command import command
 from .device import chosen_backend
+from .fit import FitFiles, Fitted, fit_scene
 from .options import JsonFile, LogFormat, RenderBackend, RenderDevice, SceneBundle, Sequence
+
+if TYPE_CHECKING:
+    from ..logs import DrivingLog
+    from ..scene import Scene
 
 
 @command("fit-uncertainty")
@@ -31,13 +36,9 @@ def fit_uncertainty(
     """Give a scene images of its uncertainty, as training does with new ones."""
     from dataclasses import asdict
 
-    from ..logs import open_log, same_part
     from ..reconstruct.uncertainty import fit_uncertainties
-    from ..scene.io import load_scene, save_scene
 
-    loaded = load_scene(scene)
-    opened = same_part(open_log(log, format=log_format, sequence=sequence), loaded.provenance)
-    with staged_progress() as on_progress:
+    def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
         made, report = fit_uncertainties(
             loaded,
             opened,
@@ -45,8 +46,6 @@ def fit_uncertainty(
             backend=chosen_backend(backend, device),
             on_view=lambda done, total: on_progress("views", done, total),
         )
-    target = scene if out is None else out
-    save_scene(made, target, overwrite=out is None)
-    figures: dict[str, object] = {"scene": str(target), **asdict(report)}
-    print_figures(f"{target.name}, uncertainty", figures)
-    write_json(json, figures)
+        return made, asdict(report)
+
+    fit_scene(FitFiles(scene, log, out, log_format, sequence, json), "uncertainty", fit)

@@ -110,7 +110,7 @@ def _render_sweep(
 ) -> None:
     from ..edit.sweep import sweep_of
     from ..render.cast import detect, sensor_poses
-    from ..render.cast.call import checked_request, select_caster
+    from ..render.cast.call import select_caster
     from ..render.cast.files import SUFFIXES, write_sweep
     from ..scene.io import load_scene
     from ..scene.lidar_catalogue import find_lidar
@@ -121,15 +121,7 @@ def _render_sweep(
     time_us = _frame_time(loaded, moment.frame or 0) if moment.t_us is None else moment.t_us
     loaded.ego.pose(time_us)
     met = sweep_of(loaded, _without(loaded, delete), sensor, time_us)
-    poses = sensor_poses(loaded.ego, sensor, time_us)
-    request = checked_request(
-        met.instances,
-        sensor,
-        poses,
-        object_poses=met.poses,
-        attributes=met.attributes,
-        incidence=met.incidence,
-    )
+    request = met.request(sensor, sensor_poses(loaded.ego, sensor, time_us))
     echo = select_caster().cast(request)
     sweep = detect(echo, sensor, seed=seed, request=request)
     picture = out.with_suffix(".png")

@@ -15,9 +15,9 @@ from real2sim_proto.ranging import LidarModel, SpinningBeams
 from real2sim_server.edit import ScenarioState
 from real2sim_server.geometry.rotation import quaternion_to_matrix, yaw_quaternion
 from real2sim_server.render.cast import select_caster
-from real2sim_server.scene import GaussianCloud
+from real2sim_server.scene import GaussianCloud, LidarSurfaces, Reflector
 from real2sim_server.world import World, WorldError
-from real2sim_server.world.sensing import clouds_of
+from real2sim_server.world.sensing import clouds_of, recorded_cloud
 
 SPEED = 15.0
 WALL_AT = 40.0
@@ -160,6 +160,21 @@ def test_a_car_that_is_neared_has_the_relative_speed(drive):
     nearing = scan.columns["velocity"] / ahead
     np.testing.assert_allclose(nearing[own], 8.0 - SPEED, atol=0.02)
     np.testing.assert_allclose(nearing[~own], -SPEED, atol=0.05)
+
+
+def test_the_recorded_sweep_has_the_brightness_that_the_loop_shows(drive):
+    """Both know that these surfaces send less light back where they are met aslant."""
+    world = drive(0)
+    cloud = wall(10.0, half=10.0)  # met at up to 45 degrees
+    mirror = Reflector(cloud, torch.tensor([[0.8, 0.0]]).repeat(len(cloud), 1))
+    scene = replace(world.scene, lidar=LidarSurfaces(mirror, incidence=0.0), objects={})
+    state = ScenarioState.of(scene)
+    moving = World(scene, state, world.spec)
+    (mounted,) = moving.ranging.all
+    caster = select_caster()
+    shown = recorded_cloud(scene, state, mounted, moving.t_us, caster).columns["intensity"]
+    assert shown.min() < 0.8 * shown.max()
+    assert np.allclose(shown, clouds_of(moving, [mounted], caster)[0].columns["intensity"])
 
 
 def test_periods_that_no_sweep_fits_into_are_refused(drive):

@@ -12,7 +12,6 @@ from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...render.cast import CastBackend, CastRequest, Echo, Sweep, detect
-from ...render.cast.call import checked_request
 from ...render.ground_class import TOLERANCE
 from ...scene import Ground, Lidar
 from ..drive import Drive, Moment
@@ -44,14 +43,7 @@ def lidar_points(
         caster: follows the rays.
     """
     met = drive.sweep_at(lidar, moment.t_us)
-    request = checked_request(
-        met.things.instances,
-        lidar,
-        met.T_world_lidar,
-        object_poses=met.things.poses,
-        attributes=met.things.attributes,
-        incidence=met.things.incidence,
-    )
+    request = met.things.request(lidar, met.T_world_lidar)
     echo = caster.cast(request)
     sweep = detect(echo, lidar, seed=seed)
     ray, ranges, number = _returns(sweep)

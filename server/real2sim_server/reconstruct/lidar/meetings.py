@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...logs import DrivingLog
-from ...render.cast.call import checked_request
 from ...render.cast.cpu.backend import CpuCaster
 from ...render.cast.recorded import recorded_scene, sensor_poses
 from ...render.cast.types import CastRequest, Meetings
@@ -49,13 +48,7 @@ def meet(
     """
     t_us = int(log.frame_times_us[frame])
     met = recorded_scene(scene, lidar, t_us)
-    request = checked_request(
-        met.instances,
-        lidar,
-        sensor_poses(log.ego, lidar, t_us),
-        object_poses=met.poses,
-        attributes=met.attributes,
-    )
+    request = met.request(lidar, sensor_poses(log.ego, lidar, t_us))
     found = CpuCaster().meetings(request, reach)
     # Ids count from 1 over the scene's objects; the background has 0.
     bodies = np.array([instance.instance_id for instance in met.instances])

@@ -5,26 +5,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...geometry.rotation import Float, slerp
 from ...geometry.transform import transform_from
 from ...scene import GaussianCloud, Lidar, Scene, Trajectory
 from ..types import Instance
-from .call import cast
-from .types import Echo
+from .call import checked_request, select_caster
+from .types import CastRequest, Echo
 
 Attributes = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class SweepScene:
-    """What cast() takes, one entry for each instance, and their ``incidence``."""
+    """What rays may meet: one entry for each instance, as :func:`~.call.cast` takes them, and the
+    ``incidence`` of all."""
 
     instances: tuple[Instance, ...]
     poses: tuple[Float | None, ...]
     attributes: tuple[Attributes | None, ...]
     incidence: float = 1.0
+
+    def request(self, lidar: Lidar, T_world_lidar: ArrayLike) -> CastRequest:
+        """A sweep through it. Raises RenderError as :func:`~.call.cast` does."""
+        return checked_request(
+            self.instances,
+            lidar,
+            T_world_lidar,
+            object_poses=self.poses,
+            attributes=self.attributes,
+            incidence=self.incidence,
+        )
 
 
 def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "auto") -> Echo:
@@ -33,15 +45,8 @@ def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "aut
     A scene's own set for LiDARs (``scene.lidar``) is met where there is one.
     """
     met = recorded_scene(scene, lidar, t_us)
-    return cast(
-        met.instances,
-        lidar,
-        sensor_poses(scene.ego, lidar, t_us),
-        object_poses=met.poses,
-        attributes=met.attributes,
-        incidence=met.incidence,
-        backend=backend,
-    )
+    request = met.request(lidar, sensor_poses(scene.ego, lidar, t_us))
+    return select_caster(backend).cast(request)
 
 
 def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:

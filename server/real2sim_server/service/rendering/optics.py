@@ -10,17 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.cameras import (
-    CameraEffects,
-    LensSpec,
-    MotionBlurSpec,
-    Optics,
-)
+from real2sim_proto.cameras import LensSpec, MotionBlurSpec, Optics
 from real2sim_proto.episode import SensorSpec
 
 from ...geometry.rotation import Float
 from ...render import Instance, RigView
-from ...render.effects import Light, to_display, to_light, with_effects
+from ...render.effects import Light, to_display, to_light
 from ...scene import Camera, Lens, Shutter
 from ...scene.camera_motion import moved
 from ...scene.lens import lens_from
@@ -59,61 +54,36 @@ def frame_names(sensor: SensorSpec, camera: Camera | None, modality: str) -> dic
     return said
 
 
-class EffectImage:
-    """A colour image that gets its effects when somebody waits for it, on whatever thread.
+class FollowingImage:
+    """An image that follows from a drawn one when somebody waits for it, on whatever thread.
+
+    Args:
+        drawn: [H, W] or [H, W, 3] uint8; whole once ``wait`` has returned.
+        wait: for the drawn image.
+        follow: the image that follows, of the same shape; called once, after ``wait``.
 
     Attributes:
-        pixels: [H, W, 3] uint8; whole once :meth:`ready` has returned.
+        pixels: like ``drawn``; whole once :meth:`ready` has returned.
     """
 
     def __init__(
         self,
         drawn: NDArray[np.uint8],
         wait: Callable[[], object],
-        effects: CameraEffects,
-        of: tuple[str, int],
+        follow: Callable[[], NDArray[np.uint8]],
     ) -> None:
         self.pixels = np.empty_like(drawn)
-        self._drawn: NDArray[np.uint8] | None = drawn
-        self._wait, self._effects, self._of = wait, effects, of
+        self._wait = wait
+        self._follow: Callable[[], NDArray[np.uint8]] | None = follow
         self._lock = threading.Lock()
 
     def ready(self) -> None:
         """Return when the pixels are there; any number of times."""
         with self._lock:
-            if self._drawn is None:
-                return
-            self._wait()
-            self.pixels[:] = with_effects(self._drawn, self._effects, *self._of)
-            self._drawn = None
-
-
-class GroundImage:
-    """A semantic image in which the ground gets its class when somebody waits for it, on whatever
-    thread.
-
-    Attributes:
-        pixels: [H, W] uint8; whole once :meth:`ready` has returned.
-    """
-
-    def __init__(
-        self,
-        drawn: NDArray[np.uint8],
-        wait: Callable[[], object],
-        find: Callable[[], NDArray[np.uint8]],
-    ) -> None:
-        self.pixels = np.empty_like(drawn)
-        self._wait, self._find = wait, find
-        self._lock = threading.Lock()
-        self._done = False
-
-    def ready(self) -> None:
-        """Return when the pixels are there; any number of times."""
-        with self._lock:
-            if not self._done:
+            if self._follow is not None:
                 self._wait()
-                self.pixels[:] = self._find()
-                self._done = True
+                self.pixels[:] = self._follow()
+                self._follow = None  # and the drawn image with it
 
 
 def blurred(

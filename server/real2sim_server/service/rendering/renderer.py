@@ -32,6 +32,7 @@ from ...render import (
     warm_up,
 )
 from ...render.backends import device_of
+from ...render.effects import with_effects
 from ...render.frame import at_once
 from ...render.ground_class import with_ground_seen
 from ...render.jpeg import JpegEncoder, jpeg_encoder_for, turbo_jpeg
@@ -46,7 +47,7 @@ from ..library.memory import MemoryBudget
 from .frames import EncodedFrame, RenderedImage, encode_frame
 from .lens_kernels import LensKernels
 from .levels import DetailLevels
-from .optics import EffectImage, GroundImage, blurred, camera_with
+from .optics import FollowingImage, blurred, camera_with
 
 log = structlog.get_logger(__name__)
 
@@ -306,7 +307,8 @@ class Renderer:
         drawn, ready = frame.rgb, frame.ready
         if effects.motion_blur is not None:
             drawn, ready = self._blurred(request, camera, effects.motion_blur), at_once
-        made = EffectImage(drawn, ready, effects, (sensor.camera, request.t_us))
+        of = sensor.camera, request.t_us
+        made = FollowingImage(drawn, ready, partial(with_effects, drawn, effects, *of))
         return replace(image, pixels=made.pixels, ready=made.ready)
 
     def _blurred(
@@ -369,7 +371,7 @@ def _with_ground(image: RenderedImage, scene: Scene, frame: Frame, camera: Camer
         depth = frame.images["median_depth"]
         return with_ground_seen(image.pixels, depth, camera, frame.T_world_camera, scene.ground)
 
-    made = GroundImage(image.pixels, image.ready, found)
+    made = FollowingImage(image.pixels, image.ready, found)
     return replace(image, pixels=made.pixels, ready=made.ready)
 
 

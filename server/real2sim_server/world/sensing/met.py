@@ -10,8 +10,7 @@ import numpy as np
 from ...edit.compose import compose
 from ...edit.sweep import met_background, met_object
 from ...geometry.rotation import Float
-from ...render.cast.call import checked_request
-from ...render.cast.recorded import Attributes, incidence_of
+from ...render.cast.recorded import Attributes, SweepScene, incidence_of
 from ...render.cast.types import CastRequest
 from ...render.types import Instance
 from ...scene import Lidar
@@ -28,8 +27,8 @@ class MetThings:
         object_ids: of the objects.
     """
 
-    instances: Sequence[Instance]
-    attributes: Sequence[Attributes | None]
+    instances: tuple[Instance, ...]
+    attributes: tuple[Attributes | None, ...]
     object_ids: Sequence[str]
 
 
@@ -75,11 +74,5 @@ def sweep_request(world: World, lidar: Lidar, things: MetThings) -> CastRequest:
     for k, object_id in enumerate(things.object_ids, start=1):
         if not still:
             moved[k] = wake.object_poses(object_id, times, t_us=world.t_us, now=agents)
-    return checked_request(
-        things.instances,
-        lidar,
-        ego @ lidar.T_vehicle_lidar,
-        object_poses=moved,
-        attributes=things.attributes,
-        incidence=incidence_of(world.scene),
-    )
+    met = SweepScene(things.instances, tuple(moved), things.attributes, incidence_of(world.scene))
+    return met.request(lidar, ego @ lidar.T_vehicle_lidar)

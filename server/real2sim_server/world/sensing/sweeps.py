@@ -13,7 +13,6 @@ from ...edit import ScenarioState
 from ...edit.sweep import sweep_of
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
-from ...render.cast.call import checked_request
 from ...render.cast.detect import Sweep, detect
 from ...render.cast.recorded import sensor_poses
 from ...render.cast.types import CastBackend, CastRequest, Echo
@@ -52,12 +51,8 @@ def recorded_cloud(
     lidar = mounted.lidar
     T_world_vehicle = scene.ego.transform(t_us)
     met = sweep_of(scene, state, lidar, t_us)
-    poses = sensor_poses(scene.ego, lidar, t_us)
-    request = checked_request(
-        met.instances, lidar, poses, object_poses=met.poses, attributes=met.attributes
-    )
     return measured_sweep(
-        request,
+        met.request(lidar, sensor_poses(scene.ego, lidar, t_us)),
         mounted,
         caster,
         t_us=t_us,
