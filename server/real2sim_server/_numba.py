@@ -43,6 +43,7 @@ import contextlib
 import fcntl
 import functools
 import hashlib
+import os
 import re
 import sys
 import time
@@ -68,6 +69,9 @@ from numba.core.extending import _Intrinsic
 
 LONGEST_WAIT_S = 120.0
 """For another process that compiles the same kernel; the longest take half a minute."""
+
+LOW_PRIORITY = 10
+"""Niceness from which on a thread holds nobody up: on a busy machine it compiles for minutes."""
 
 PARALLEL_LOOPS = ParallelOptions(
     {"comprehension": False, "reduction": False, "numpy": False, "setitem": False}
@@ -233,6 +237,8 @@ def _locked(path: str) -> Iterator[None]:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(open(path, "a"))
             _wait_for(file)
+            if os.nice(0) >= LOW_PRIORITY:
+                fcntl.flock(file, fcntl.LOCK_UN)
             stack.callback(fcntl.flock, file, fcntl.LOCK_UN)
         _LOCKED.add(path)
         stack.callback(_LOCKED.discard, path)

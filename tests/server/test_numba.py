@@ -96,6 +96,21 @@ def package(compiled, tmp_path):
     return tmp_path
 
 
+SLOW = """
+import os, time
+import real2sim_server._numba as n
+def never(*arguments):
+    print("compiled", flush=True)
+    time.sleep(100)
+n._KernelCache.save_overload = never
+os.nice(n.LOW_PRIORITY)
+"""
+IMPATIENT = """
+import real2sim_server._numba as n
+def refuse(seconds):
+    raise SystemExit("it waits")
+n.time.sleep = refuse
+"""
 READ_ONLY = """
 import tempfile
 def refuse(*args, **options):
@@ -179,6 +194,17 @@ def test_processes_that_need_a_kernel_at_once_compile_it_once(package):
     (first, its_misses, _), (second, other_misses, _) = map(finished, both)
     assert first == second == BEFORE + 2.0
     assert its_misses + other_misses == 1
+
+
+def test_a_process_of_low_priority_holds_nobody_up(package):
+    change(package, "FACTOR = 2.0", "FACTOR = 3.0")
+    slow = started(package, before=SLOW)
+    try:
+        assert slow.stdout.readline() == "compiled\n"
+        assert run(package, before=IMPATIENT) == (BEFORE + 2.0, "compiled")
+    finally:
+        slow.kill()
+        slow.communicate()
 
 
 def test_a_lock_that_another_never_gives_back_delays_only(package):
