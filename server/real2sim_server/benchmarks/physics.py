@@ -18,6 +18,7 @@ from ..physics.materials import FixedCorotated, Material, NeoHookean
 from ..physics.particles import box_particles
 from ..physics.solver import Solver, SolverOptions
 from ..simulation.structure import vehicle_structure
+from . import situations
 from .peers.block import PeerBlock
 from .peers.select import PEERS, missing_reason, start_peer
 
@@ -70,7 +71,8 @@ def run(
     """
     report_progress = on_progress or (lambda done, parts: None)
     cases = [(m, n) for m in (*MATERIALS, VEHICLE) for n in SIZES]
-    parts = len(cases) + (3 + peers) * (backend == "cpu")
+    whole = len(situations.SITUATIONS)
+    parts = len(cases) + (3 + whole + peers) * (backend == "cpu")
     report: dict[str, Any] = {
         "threads": numba.get_num_threads(),
         "cores": os.cpu_count(),
@@ -90,10 +92,14 @@ def run(
     report["domain"] = _domain()
     report_progress(len(cases) + 1, parts)
     report["crash"] = _crash()
-    report_progress(len(cases) + 2, parts)
+    report["situations"] = []
+    for done, name in enumerate(situations.SITUATIONS, len(cases) + 2):
+        report_progress(done, parts)
+        report["situations"].append(situations.measure(name))
+    report_progress(len(cases) + 2 + whole, parts)
     report["reference"] = _reference()
     if peers:
-        report_progress(len(cases) + 3, parts)
+        report_progress(len(cases) + 3 + whole, parts)
         report["peers"] = _peers()
     report_progress(parts, parts)
     return report
@@ -115,6 +121,8 @@ def as_rows(figures: dict[str, Any]) -> dict[str, str]:
     crash = figures["crash"]
     name = f"a car against a wall, {crash['particles']:,} particles"
     rows[name] = f"{crash['rate'] / 1e6:.2f} M/s, {crash['substeps']} substeps"
+    for line in figures["situations"]:
+        rows[line["name"]] = situations.as_row(line)
     rows["times as fast as plain torch"] = f"{figures['reference']['ratio']:.0f}"
     for line in figures.get("peers", ()):
         name = f"{line['name']}, {line.get('particles', 0):,} particles"

@@ -16,7 +16,7 @@ from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory
-from .damage import Breakage, DamagedVehicle, fragment_cloud
+from .damage import Breakage, DamagedVehicle, fragment_cloud, with_underside
 from .embedding import Embedding, deform_cloud, stretched
 from .result import ObjectResult, SimulationResult
 from .structure import VEHICLES
@@ -24,6 +24,8 @@ from .structure import VEHICLES
 WHEEL_RADIUS, WHEEL_HALF_WIDTH = 0.36, 0.2
 """What Gaussians of a vehicle are its wheels: so far around the axle and along it [m]."""
 
+TURNED_OVER = 0.3
+"""Cosine between the upright of a vehicle and the world's below which its underside is seen."""
 
 HANGING = 2.0
 """After this time a bumper that came loose no longer moves [s]."""
@@ -183,8 +185,18 @@ class Playback:
         key = subject.object_id
         if key not in self._clouds:
             source = self.scene.object(subject.source_id)
-            self._clouds[key] = stretched(source.cloud_at(self.result.start_us), subject.scale)
+            cloud = stretched(source.cloud_at(self.result.start_us), subject.scale)
+            if self._turns_over(subject):
+                cloud = with_underside(cloud, subject.scaled_size)
+            self._clouds[key] = cloud
         return self._clouds[key]
+
+    def _turns_over(self, subject: PlacedObject) -> bool:
+        """Whether it is a vehicle that is seen from below at any time."""
+        if self.result.breakages is None or subject.category not in VEHICLES:
+            return False
+        x, y = self.result.objects[subject.object_id].quaternions[:, 1:3].T
+        return bool((1 - 2 * (x * x + y * y) < TURNED_OVER).any())
 
     def _embedding(self, subject: PlacedObject) -> Embedding:
         key = subject.object_id

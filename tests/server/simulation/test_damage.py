@@ -13,9 +13,16 @@ from real2sim_server.geometry.rotation import quaternion_to_matrix
 from real2sim_server.physics.particles import box_particles
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.simulation.breakages import find_breakages
-from real2sim_server.simulation.damage import BreakageLog, DamagedVehicle, fragment_cloud
-from real2sim_server.simulation.damage.appearance import CLEARANCE, HANGS_STILL
-from real2sim_server.simulation.damage.parts import parts_of
+from real2sim_server.simulation.damage import (
+    BreakageLog,
+    DamagedVehicle,
+    fragment_cloud,
+    with_underside,
+)
+from real2sim_server.simulation.damage.appearance import CLEARANCE, HANGS_STILL, SH_0
+from real2sim_server.simulation.damage.crumple import HEIGHTS, crumple
+from real2sim_server.simulation.damage.parts import in_wheels, parts_of
+from real2sim_server.simulation.damage.sheet import BRIGHTEST, FLATTER
 from real2sim_server.simulation.embedding import Embedding, deform_cloud
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.result import ObjectResult, SimulationResult
@@ -91,6 +98,70 @@ def test_folds_face_elsewhere_and_are_lit_otherwise(vehicle):
     assert float(light.max() - light.min()) > 0.15
 
 
+def dented_side(depth: float = 0.2) -> np.ndarray:
+    """[N, 3] displacements of a trough in the left side, as a bumper leaves it."""
+    moved = np.zeros_like(PARTICLES)
+    left = PARTICLES[:, 1] > 0.3
+    moved[left, 1] = -depth * np.exp(-((PARTICLES[left, 0] / 0.7) ** 2))
+    return moved
+
+
+def lights(rest, drawn):
+    """[40] brightness of the side's Gaussians against what it was."""
+    colour = [0.5 + SH_0 * cloud.sh[:40, 0].mean(dim=1) for cloud in (drawn, rest)]
+    return (colour[0] / colour[1]).numpy()
+
+
+def test_a_dent_in_a_side_is_seen_by_its_light(vehicle):
+    rest, dented = drawn(vehicle, dented_side())
+    pressed = slice(13, 27)
+    light = lights(rest, dented)[pressed]
+    assert light.max() - light.min() > 0.3
+    assert light.min() < 0.85
+
+
+def test_paint_is_scraped_where_sheet_was_pushed_in_and_nowhere_else():
+    x, z = (a.ravel() for a in np.meshgrid(np.linspace(-2.2, 2.2, 89), np.linspace(-0.4, 0.3, 15)))
+    side = np.stack([x, np.full(len(x), 0.9), z], axis=1).astype(np.float32)
+    red = skin(len(x)).select(torch.arange(len(x)))
+    sh = red.sh * torch.tensor([1.0, -2.0, -2.0])
+    red = replace(red, means=torch.from_numpy(side), sh=sh)
+    made = DamagedVehicle(
+        red, PARTICLES, spacing=SPACING, category="car", size=SIZE, object_id="car_1"
+    )
+    moved = dented_side()
+    shown = 0.5 + SH_0 * made.cloud(moved, made.shortening(moved), {}).sh[:, 0].numpy()
+    painted = 0.5 + SH_0 * sh[0, 0].numpy()
+    scraped = shown[:, 1] / shown[:, 0] - painted[1] / painted[0]
+    assert 0.1 < (scraped[np.abs(x) < 0.5] > 0.05).mean() < 0.7
+    assert np.abs(scraped[np.abs(x) > 1.8]).max() < 1e-4
+
+
+@pytest.mark.parametrize("depth", [0.1, 0.2, 0.4])
+def test_light_on_dents_and_their_height_are_bounded(vehicle, depth):
+    rest, dented = drawn(vehicle, dented_side(depth))
+    light = lights(rest, dented)
+    assert light.min() >= 0.3
+    assert light.max() <= BRIGHTEST + 1e-6
+    bare = (0.5 + SH_0 * dented.sh[:, 0]).min()
+    assert 0.0 < float(bare) < 1.0
+    apart = (dented.means - smooth(dented_side(depth)).means)[:40].norm(dim=1)
+    assert float(apart.max()) < FLATTER * sum(HEIGHTS) + 0.1
+
+
+@pytest.mark.parametrize("moved", ["towards", "aside", "turned"])
+def test_rigid_motion_changes_no_light(vehicle, moved):
+    """Of bodies whose particles went along with what pushed them without any dent."""
+    cloud, made = vehicle
+    turn = np.eye(3)
+    if moved == "turned":
+        turn[:2, :2] = [[np.cos(0.02), -np.sin(0.02)], [np.sin(0.02), np.cos(0.02)]]
+    shift = {"towards": (0.0, -0.02, 0.0), "aside": (0.3, 0.0, 0.0)}.get(moved, (0.0, 0.0, 0.0))
+    displaced = PARTICLES @ turn.T + shift - PARTICLES
+    went = made.cloud(displaced, made.shortening(displaced), {})
+    np.testing.assert_array_equal(went.sh.numpy()[:40], cloud.sh.numpy()[:40])
+
+
 def test_what_was_not_crushed_stays_as_it_was(vehicle):
     rest, folded = drawn(vehicle, crushed_front())
     behind = slice(0, 20)
@@ -103,6 +174,33 @@ def test_folds_stay_when_what_is_behind_them_springs_back(vehicle):
     most = made.shortening(crushed_front())
     back = made.cloud(np.zeros_like(PARTICLES), most, {})
     assert float((back.means - cloud.means)[29:40].abs().max()) > 0.01
+
+
+def test_crumpled_sheet_is_flat_between_ridges_and_nowhere_torn():
+    t = np.linspace(0.0, 1.0, 20_001)
+    line = np.stack([t, 0.3 * t, 0.9 + 0.1 * t], axis=1)
+    height, slope = crumple(line, seed=7)
+    along = slope @ (line[1] - line[0])
+    steps = np.diff(height)
+    assert np.abs(steps).max() < 1e-4
+    kinks = np.abs(np.diff(steps)) > 1e-9
+    assert 8 < kinks.sum() < 200
+    flat = ~kinks
+    np.testing.assert_allclose(steps[1:][flat], along[1:-1][flat], atol=1e-9)
+
+
+def test_side_windows_go_dark_up_to_the_roof_where_they_lean_inwards():
+    glass = torch.full((3, 1, 3), -1.0)
+    row = np.array([[0.0, 0.85, 0.3], [0.0, 0.55, 0.5], [0.0, 0.2, 0.5]], dtype=np.float32)
+    cloud = replace(skin(2).select(torch.arange(3)), means=torch.from_numpy(row), sh=glass)
+    cloud = GaussianCloud.concatenate([skin(), cloud])
+    made = DamagedVehicle(
+        cloud, PARTICLES, spacing=SPACING, category="car", size=SIZE, object_id="car_1"
+    )
+    still = np.zeros_like(PARTICLES)
+    dark = made.cloud(still, made.shortening(still), {"left windows": 1.0}).sh != cloud.sh
+    assert dark[-3:].all(dim=(1, 2)).tolist() == [True, True, False]
+    assert not dark[:-3].any()
 
 
 def test_a_bonnet_rises_in_the_middle(vehicle):
@@ -264,6 +362,36 @@ def test_fragments_fly_before_they_lie_and_then_stay(crash):
     assert flying[:, 2].max() > 0.3
     np.testing.assert_array_equal(lying, later)
     assert fragment_cloud(result.breakages, 1.9, flat) is None
+
+
+def test_what_turns_over_shows_a_floor_instead_of_its_shadow():
+    x = np.linspace(-2.2, 2.2, 60)
+    low = np.stack([x, np.zeros(60), np.full(60, 0.05 - SIZE[2] / 2)], axis=1).astype(np.float32)
+    wheel = torch.tensor([[0.3 * SIZE[0], 0.8, 0.1 - SIZE[2] / 2]])
+    shadow = replace(skin(30), means=torch.from_numpy(low))
+    tyre = replace(skin(1).select(torch.arange(1)), means=wheel)
+    shown = with_underside(GaussianCloud.concatenate([skin(), shadow, tyre]), SIZE)
+    shown.check_values("underside")
+    heights = shown.means[:, 2] + SIZE[2] / 2
+    assert int((heights < 0.15).sum()) == 1
+    floor = shown.means[(heights > 0.15) & (heights < 0.3)].numpy()
+    assert (np.abs(floor).max(axis=0)[:2] < np.array(SIZE[:2]) / 2).all()
+    assert (np.ptp(floor[:, :2], axis=0) > 0.85 * np.array(SIZE[:2])).all()
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(shown, name)[:80], getattr(skin(), name))
+    assert in_wheels(shown.means.numpy().astype(float), SIZE).sum() >= 1
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_only_vehicles_that_turn_over_get_a_floor(crash, tiny_scene, over):
+    state, result = crash
+    own = result.objects["car_red"]
+    turned = np.tile((0.0, 1.0, 0.0, 0.0) if over else (0.99, 0.1, 0.0, 0.1), (4, 1))
+    result = replace(result, objects={"car_red": replace(own, quaternions=turned)})
+    [_, red, *_] = Playback(tiny_scene, state, result).instances(0)
+    source = tiny_scene.object("car_red").cloud_at(0)
+    same = len(red.cloud) == len(source) and torch.equal(red.cloud.means, source.means)
+    assert same != over
 
 
 def test_fragments_are_whole_gaussians(crash):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,6 +148,32 @@ def test_how_it_is_filmed_is_kept(experiment, tiny_scene, tmp_path):
     np.testing.assert_array_equal(kept.obstacles[0][0], plan.obstacles[0][0])
     with pytest.raises(PhysicsError, match=r"film\.json"):
         FilmPlan.load(tmp_path / "nowhere")
+
+
+def test_a_t_bone_is_filmed_along_with_what_is_struck(experiment, tiny_scene, tmp_path):
+    made = experiment("t_bone", objects=["car_red", "car_blue"])
+    FilmPlan.of(made, tiny_scene.ground.height).save(tmp_path)
+    plan = FilmPlan.load(tmp_path)
+    assert plan.follows == "car_blue"
+    places = np.array([[10.0, 0.0, 0.5], [10.0, 0.0, 0.6], [14.0, 1.0, 0.5]])
+    result = SimpleNamespace(objects={"car_blue": SimpleNamespace(positions=places)})
+    playback = SimpleNamespace(scene=tiny_scene, result=result)
+    recorded, near = views(playback, plan)
+    went = [near.camera_at(k).T_vehicle_camera - near.camera.T_vehicle_camera for k in range(3)]
+    np.testing.assert_allclose([w[:3, 3] for w in went], [[0, 0, 0], [0, 0, 0], [4, 1, 0]])
+    assert not np.any(went[2][:3, :3])
+    assert recorded.camera_at(2) is recorded.camera
+    kept = json.loads((tmp_path / "film.json").read_text())
+    del kept["follows"]
+    (tmp_path / "film.json").write_text(json.dumps(kept))
+    assert views(playback, FilmPlan.load(tmp_path))[1].moved is None
+
+
+def test_the_side_of_a_roof_that_comes_down_first_is_filmed(experiment):
+    made = experiment("roof", objects=["car_red"])
+    pose = made.options.objects["car_red"].T_world_object
+    lower = pose[:3, 1] * -np.sign(pose[2, 1])
+    assert lower @ made.side > 0.3
 
 
 def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_camera(

@@ -7,5 +7,6 @@ account for simulated rollouts, REST and the closed loop.
 from .appearance import DamagedVehicle
 from .breakage import Breakage, BreakageLog
 from .fragments import fragment_cloud
+from .underside import with_underside
 
-__all__ = ["Breakage", "BreakageLog", "DamagedVehicle", "fragment_cloud"]
+__all__ = ["Breakage", "BreakageLog", "DamagedVehicle", "fragment_cloud", "with_underside"]

@@ -12,13 +12,17 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...scene import GaussianCloud
-from ..embedding import Embedding, deform_cloud, replaced_rows
-from .parts import Part, parts_of
+from ..embedding import Deformed, Embedding, deform_cloud, replaced_rows
+from .parts import Part, in_wheels, parts_of
 from .sheet import Sheet
 
 SH_0 = 0.28209479177387814
 GLASS_DARKER = 0.7
 """Glass is what is darker than so much of the vehicle's paint, within a pane's place."""
+OTHER_HUE = 0.05
+"""Or what differs by so much in a channel's share of the light: glass that shows the sky."""
+LEANING = 0.12
+"""Of the width, by which side windows lean inwards."""
 OF_GLASS = 0.1
 """A windscreen differs from paint by so much."""
 SILLS = 0.3
@@ -27,14 +31,14 @@ OTHER_COLOUR = 0.22
 """A lamp is what differs by so much from the colour of most of the vehicle, within its place."""
 LAMP_DARKER, LAMP_SHARE = 0.6, 0.6
 """And is not darker than so much of it, as grilles are; the most unlike of these, this share."""
-AXLES, WHEEL_RADIUS, TREAD = 0.3, 0.38, 0.28
-"""Of wheels: along the length from the middle, radius [m], width within the sides [m]."""
 LAMP_LEFT, PANE_LEFT = 0.22, 0.35
 """Light that comes from the hole where a lamp or a pane was."""
 CRACKED = np.array([0.62, 0.67, 0.68])
 """What laminated glass shows where it is crazed."""
 CRAZED = 0.55
 """Of a cracked windscreen that is crazed."""
+BARE, SMEAR = np.array([0.55, 0.56, 0.57]), np.array([0.1, 0.1, 0.1])
+"""Metal under scraped paint; rubber, plastic and dirt that scraping leaves."""
 DROOP, DROOP_TIME = 0.16, 0.35
 """Angle by which a loose bumper hangs down at one end [rad], and in what time [s]."""
 HANGS_STILL = 3 * DROOP_TIME
@@ -47,6 +51,9 @@ LEAST_MOVED = 8e-3
 """Particles that have moved less than this leave Gaussians where they are [m]: a body hit hard
 bends elastically by several millimetres all along, and the slowest impact that deforms at all
 dents by more than twice as much."""
+CARRIED_ROUNDS, CARRIED_SCALE = 5, 0.01
+"""How often weights are found anew, and what counts as little [m], where it is found how a vehicle
+has moved as a whole."""
 SPLIT = 1.5
 """Gaussians stretched by more are drawn as two, side by side."""
 
@@ -74,13 +81,15 @@ class DamagedVehicle:
     ) -> None:
         self._cloud, self._size = cloud, size
         points = cloud.means.detach().cpu().numpy().astype(np.float64)
-        self._points = points
+        self._points, self._rest = points, rest
         self._embedding = Embedding(rest, points, spacing=spacing)
         self._parts = {part.name: part for part in parts_of(category, size)}
         colours = np.clip(cloud.sh[:, 0].detach().cpu().numpy() * SH_0 + 0.5, 0.0, 1.0)
         self._brightness = colours.mean(axis=1)
         painted = self._painted()
         self._paint = float(np.median(self._brightness[painted]))
+        hues = colours / np.maximum(3 * self._brightness, 0.05)[:, None]
+        self._other_hue = np.abs(hues - np.median(hues[painted], axis=0)).max(axis=1)
         self._unlike_paint = np.abs(colours - np.median(colours[painted], axis=0)).max(axis=1)
         self._rows = {name: self._rows_of(part) for name, part in self._parts.items()}
         glass = np.zeros(len(points), dtype=bool)
@@ -93,7 +102,7 @@ class DamagedVehicle:
             rest,
             spacing=spacing,
             size=size,
-            smooth=glass | self._in_wheels(),
+            smooth=glass | in_wheels(points, size),
             seed=self._seed,
         )
 
@@ -120,9 +129,11 @@ class DamagedVehicle:
             changed |= self._sheet.bonnet
         rows = np.flatnonzero(changed)
         body = self._embedding.follow(displacements, rows)
-        folded = self._sheet.fold(body, most[rows], rows)
+        # Only what differs from how the vehicle as a whole has moved is seen as damage.
+        turn, shift = _carried(self._rest, displacements)
+        folded = self._sheet.fold(_without(body, turn, shift), most[rows], rows)
         index = torch.from_numpy(rows).to(self._cloud.device)
-        part = deform_cloud(self._cloud.select(index), folded.deformed)
+        part = deform_cloud(self._cloud.select(index), _with(folded.deformed, turn, shift))
         light = np.ones(len(self._points))
         light[rows] = folded.light
         for name in broken:
@@ -130,7 +141,7 @@ class DamagedVehicle:
             if kind in ("lamp", "pane"):
                 light[self._rows[name]] *= LAMP_LEFT if kind == "lamp" else PANE_LEFT
         moved = replaced_rows(self._cloud, index, part)
-        sh = _lit(moved.sh, light)
+        sh = _lit(_scraped(moved.sh, index, folded.scraped), light)
         if "windscreen" in broken:
             sh = self._crazed(sh)
         means = moved.means
@@ -142,11 +153,14 @@ class DamagedVehicle:
     def _rows_of(self, part: Part) -> NDArray[np.int64]:
         """Gaussians that a part consists of: all at its place, without paint around it."""
         inside = part.holds(self._points)
+        if part.kind == "pane" and part.outward[1]:
+            inside |= self._leaning(part)
         if part.kind == "windscreen":
             # It shows the sky, brighter than paint at times; nothing else faces ahead up there.
             inside &= self._unlike_paint > OF_GLASS
         elif part.kind == "pane":
-            inside &= self._brightness < max(GLASS_DARKER * self._paint, 0.12)
+            dark = self._brightness < max(GLASS_DARKER * self._paint, 0.12)
+            inside &= dark | (self._other_hue > OTHER_HUE)
         elif part.kind == "lamp":
             bright = self._brightness > LAMP_DARKER * self._paint
             inside &= bright & (self._unlike_paint > OTHER_COLOUR)
@@ -154,6 +168,16 @@ class DamagedVehicle:
                 least = np.quantile(self._unlike_paint[inside], 1 - LAMP_SHARE)
                 inside &= self._unlike_paint >= least
         return np.flatnonzero(inside)
+
+    def _leaning(self, part: Part) -> NDArray[np.bool_]:
+        """[G] what belongs to side windows, which lean inwards further up, between the screens."""
+        low, high = np.array(part.low), np.array(part.high)
+        inwards = LEANING * self._size[1]
+        low[1], high[1] = (low[1] - inwards, high[1]) if low[1] > 0 else (low[1], high[1] + inwards)
+        high[0] = min(high[0], self._parts["windscreen"].low[0])
+        if "rear window" in self._parts:
+            low[0] = max(low[0], self._parts["rear window"].high[0])
+        return replace(part, low=tuple(low), high=tuple(high)).holds(self._points)
 
     def _painted(self) -> NDArray[np.bool_]:
         """[G] what is neither glass nor below the sills; all where nothing is left."""
@@ -163,14 +187,6 @@ class DamagedVehicle:
             if part.kind in ("pane", "windscreen"):
                 painted = painted & ~part.holds(self._points)
         return painted if painted.any() else np.ones(len(painted), dtype=bool)
-
-    def _in_wheels(self) -> NDArray[np.bool_]:
-        """[G] by where wheels are under a box of this size."""
-        length, width, height = self._size
-        along = np.abs(np.abs(self._points[:, 0]) - AXLES * length)
-        up = self._points[:, 2] + height / 2 - WHEEL_RADIUS
-        inside: NDArray[np.bool_] = np.hypot(along, up) < WHEEL_RADIUS
-        return inside & (np.abs(self._points[:, 1]) > width / 2 - TREAD)
 
     def _drooped(self, name: str, means: torch.Tensor, age: float) -> torch.Tensor:
         """A bumper that hangs by one end; which one differs from vehicle to vehicle."""
@@ -218,12 +234,50 @@ def _moved(displacements: Float) -> NDArray[np.bool_]:
     return moved
 
 
+def _carried(rest: Float, displacements: Float) -> tuple[Float, Float]:
+    """Turn [3, 3] and shift [3] of most of a body's particles [N, 3]; what is crushed has little
+    weight."""
+    places = rest + displacements
+    weights = np.ones(len(rest))
+    for _ in range(CARRIED_ROUNDS):
+        share = (weights / weights.sum())[:, None]
+        before, after = (share * rest).sum(axis=0), (share * places).sum(axis=0)
+        left, _, right = np.linalg.svd((places - after).T @ (share * (rest - before)))
+        left[:, 2] *= np.sign(np.linalg.det(left @ right))
+        turn = left @ right
+        shift = after - turn @ before
+        off = np.linalg.norm(places - rest @ turn.T - shift, axis=1)
+        weights = 1 / (off + CARRIED_SCALE)
+    return turn, shift
+
+
+def _without(body: Deformed, turn: Float, shift: Float) -> Deformed:
+    """A body's points before it was turned and shifted."""
+    return Deformed((body.positions - shift) @ turn, turn.T @ body.F, turn.T @ body.rotations)
+
+
+def _with(body: Deformed, turn: Float, shift: Float) -> Deformed:
+    """A body's points after it was turned and shifted."""
+    return Deformed(body.positions @ turn.T + shift, turn @ body.F, turn @ body.rotations)
+
+
 def _lit(sh: torch.Tensor, light: Float) -> torch.Tensor:
     """Harmonics of Gaussians whose colours are multiplied by ``light`` [G]."""
     factor = torch.from_numpy(light.astype(np.float32)).to(sh.device)
     lit = sh * factor[:, None, None]
     lit[:, 0] += ((factor - 1) * 0.5 / SH_0)[:, None]
     return lit
+
+
+def _scraped(sh: torch.Tensor, rows: torch.Tensor, scraped: Float) -> torch.Tensor:
+    """Harmonics with the paint of ``rows`` [R] scraped and smeared by ``scraped`` [R, 2]."""
+    found = sh.clone()
+    for colour, share in zip((BARE, SMEAR), scraped.T, strict=True):
+        weight = torch.from_numpy(share.astype(np.float32))[:, None, None].to(sh.device)
+        target = torch.zeros_like(found[rows])
+        target[:, 0] = torch.from_numpy(((colour - 0.5) / SH_0).astype(np.float32)).to(sh.device)
+        found[rows] = (1 - weight) * found[rows] + weight * target
+    return found
 
 
 def _split(cloud: GaussianCloud, changed: NDArray[np.int64], F: Float) -> GaussianCloud:

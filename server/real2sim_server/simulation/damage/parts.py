@@ -36,6 +36,9 @@ INSIDE = 0.14
 """What is nearer to the middle plane than half the width less this fraction of the width is no side
 window."""
 
+AXLES, WHEEL_RADIUS, TREAD = 0.3, 0.38, 0.28
+"""Of wheels: along the length from the middle, radius [m], width within the sides [m]."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -72,6 +75,15 @@ def parts_of(category: str, size: Sequence[float]) -> tuple[Part, ...]:
     if category not in VEHICLES:
         return ()
     return (*_end(size, ahead=True), *_end(size, ahead=False), *_glass(size))
+
+
+def in_wheels(points: Float, size: Sequence[float]) -> NDArray[np.bool_]:
+    """[N] whether points [N, 3] of a vehicle are where wheels are under a box of ``size``."""
+    length, width, height = size
+    along = np.abs(np.abs(points[:, 0]) - AXLES * length)
+    up = points[:, 2] + height / 2 - WHEEL_RADIUS
+    inside: NDArray[np.bool_] = np.hypot(along, up) < WHEEL_RADIUS
+    return inside & (np.abs(points[:, 1]) > width / 2 - TREAD)
 
 
 def _end(size: Sequence[float], *, ahead: bool) -> list[Part]:

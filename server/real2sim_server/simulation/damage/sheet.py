@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ..embedding import Deformed
+from .crumple import HIGHEST, crumple, scrapes
 
 WAVELENGTHS = (0.36, 0.17)
 """Of folds and of the creases between them, along the sheet [m]."""
@@ -44,11 +45,22 @@ ACROSS_BONNET = 0.35
 """Of a bonnet's shortening that goes into folds besides."""
 BONNET_MOST = 0.32
 """Height by which a bonnet rises at most [m]."""
-SKY, SUN = 0.5, 0.5
-"""Shares of light from all of the sky and from one side, in the vehicle's frame as it was lit when
-it was seen."""
-SUN_DIRECTION = np.array([0.45, 0.4, 0.8]) / np.linalg.norm([0.45, 0.4, 0.8])
-DARKEST, BRIGHTEST = 0.42, 1.5
+SKY, SIDE = 0.45, 0.55
+"""Shares of light from all of the sky and from one side."""
+GROUND = 0.3
+"""Of the sky's light that reaches what faces down."""
+SLANT, HEIGHT = 0.6, 0.8
+"""Of light from one side: how far beside the normal at rest, and how high it stands."""
+AHEAD = np.array([0.45, 0.4, 0.0])
+"""Where it comes from for what faces up."""
+DARKEST, BRIGHTEST = 0.35, 1.7
+DENT = (0.03, 0.14)
+"""Depths from which on sheet that was pushed in is crumpled, and wholly so [m]."""
+HOLLOW = 0.4
+"""Light that the lowest facets of a deep dent lose to its rim and to the others."""
+FLATTER = 0.4
+"""Of the height of facets by which what is drawn is moved; it is lit by all of their slope, as what
+is drawn is too coarse to show it otherwise."""
 OCCLUDED = 0.4
 """Light that is lost at the bottom of a deep fold."""
 
@@ -60,10 +72,12 @@ class FoldedSheet:
     Attributes:
         deformed: positions, F and rotation of each point.
         light: [G] light on it against what fell on it before.
+        scraped: [G, 2] how much of the paint is gone, and how much is smeared; 0 to 1.
     """
 
     deformed: Deformed
     light: Float
+    scraped: Float
 
 
 class Sheet:
@@ -91,7 +105,10 @@ class Sheet:
         self.normals, depth = _outward(points, rest, spacing)
         skin = np.clip((depth - SKIN[0]) / (SKIN[1] - SKIN[0]), 0.0, 1.0)
         self._foldable = skin * ~smooth
+        self._points = points
         self._along = _phases(points, seed)
+        self._crumple, self._crumple_slope = crumple(points, seed)
+        self._scrapes = scrapes(points, seed)
         place = points / np.asarray(size) + 0.5
         bonnet = (self.normals[:, 2] > BONNET_UP) & (place[:, 2] < BONNET_HEIGHT)
         bonnet &= (place[:, 0] > 1 - BONNET_BEHIND) & ~smooth
@@ -119,7 +136,12 @@ class Sheet:
         normals = _turned(body.rotations, at_rest)
         raised, hump = self._bonnet_rise(shortened, rows)
         shortened[self.bonnet[rows], 0] *= ACROSS_BONNET
-        offset, tilted, deepest = np.zeros(len(normals)), normals.copy(), np.zeros(len(normals))
+        pressed = self._pressed(body, rows) * np.minimum(4 * foldable, 1.0)
+        offset, deepest = FLATTER * pressed * self._crumple[rows], np.zeros(len(normals))
+        tilted = _faces(body.F, at_rest)
+        slope = self._crumple_slope[rows]
+        slope = slope - (slope * at_rest).sum(axis=1)[:, None] * at_rest
+        tilted -= pressed[:, None] * _turned(body.rotations, slope)
         F = body.F.copy()
         for axis in range(3):
             along = F[:, :, axis] / np.maximum(np.linalg.norm(F[:, :, axis], axis=1), 1e-6)[:, None]
@@ -136,10 +158,19 @@ class Sheet:
         positions = body.positions + offset[:, None] * normals + up
         tilt = _between(normals, tilted)
         F = tilt @ _lengthened(F, shortened)
-        light = _light(tilted) / _light(at_rest)
+        towards = _lit_from(at_rest)
+        light = _light(tilted, towards) / _light(at_rest, towards)
         light *= 1 - OCCLUDED * np.clip(deepest, 0.0, 1.0)
+        light *= 1 - HOLLOW * pressed * (1 - self._crumple[rows] / HIGHEST) / 2
+        scraped = self._scrapes[rows] * pressed[:, None]
         light = np.where(foldable > 0, np.clip(light, DARKEST, BRIGHTEST), 1.0)
-        return FoldedSheet(Deformed(positions, F, tilt @ body.rotations), light)
+        return FoldedSheet(Deformed(positions, F, tilt @ body.rotations), light, scraped)
+
+    def _pressed(self, body: Deformed, rows: NDArray[np.int64]) -> Float:
+        """[R] how far points were pushed in, from not at all (0) to as deep as it looks (1)."""
+        depth = -((body.positions - self._points[rows]) * self.normals[rows]).sum(axis=1)
+        pressed: Float = np.clip((depth - DENT[0]) / (DENT[1] - DENT[0]), 0.0, 1.0)
+        return pressed
 
     def _bonnet_rise(self, shortened: Float, rows: NDArray[np.int64]) -> tuple[Float, Float]:
         """[R] height by which the bonnet is raised, [R] and its slope."""
@@ -205,6 +236,13 @@ def _turned(rotations: Float, vectors: Float) -> Float:
     return turned
 
 
+def _faces(F: Float, normals: Float) -> Float:
+    """[G, 3] where surfaces face that faced along unit ``normals``, mapped by F [G, 3, 3]."""
+    faces = np.linalg.solve(F.transpose(0, 2, 1), normals[:, :, None])[:, :, 0]
+    found: Float = faces / np.maximum(np.linalg.norm(faces, axis=1), 1e-9)[:, None]
+    return found
+
+
 def _between(first: Float, second: Float) -> Float:
     """[G, 3, 3] smallest rotations that turn unit vectors ``first`` [G, 3] to ``second``."""
     axis = np.cross(first, second)
@@ -216,8 +254,23 @@ def _between(first: Float, second: Float) -> Float:
     return turned
 
 
-def _light(normals: Float) -> Float:
+def _lit_from(normals: Float) -> Float:
+    """[G, 3] where light comes from that falls on surfaces with unit ``normals`` at rest [G, 3].
+
+    What a surface shows at rest is how it was lit when it was seen, whichever side that was. So
+    light comes from above and beside each surface, never along it: however it is turned, it gets
+    lighter or darker.
+    """
+    x, y = normals[:, 0], normals[:, 1]
+    beside = np.stack([x - y, x + y, np.zeros(len(x))], axis=1) * np.sqrt(0.5)
+    towards = SLANT * beside + (1 - np.hypot(x, y))[:, None] * AHEAD
+    towards[:, 2] = HEIGHT
+    found: Float = towards / np.linalg.norm(towards, axis=1)[:, None]
+    return found
+
+
+def _light(normals: Float, towards: Float) -> Float:
     """[G] light on surfaces that face along unit ``normals`` [G, 3]."""
-    sky = SKY * (0.35 + 0.65 * (1 + normals[:, 2]) / 2)
-    light: Float = sky + SUN * np.maximum(normals @ SUN_DIRECTION, 0.0)
+    sky = SKY * (GROUND + (1 - GROUND) * (1 + normals[:, 2]) / 2)
+    light: Float = sky + SIDE * np.maximum((normals * towards).sum(axis=1), 0.0)
     return light

@@ -6,6 +6,8 @@ moved there as they were lit, and is seen from the side that the recording saw b
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ...geometry.rotation import Float
@@ -16,7 +18,7 @@ from ..playback import PlacedObject
 from ..presets import ObjectPhysics
 from ..rollout import SimulateOptions
 from ..structure import VEHICLES
-from .setup import Experiment, Request, beside, level, others_near, scene_road, viewer
+from .setup import Experiment, Request, beside, level, others_near, scene_road
 from .viewing import visibility_of
 
 AHEAD = 14.0
@@ -29,6 +31,8 @@ POLE, POLE_HEIGHT = 0.25, 2.6
 """Of a lamp post: width and height [m]."""
 OFF_CENTRE = 0.12
 """Of the width: where a pole meets a front, beside its middle."""
+ASIDE = 0.8
+"""Where a T-bone is looked at, from the middle of what is struck towards what strikes it [m]."""
 TURNED_OVER = np.radians(158.0)
 """About its length, of a vehicle that falls on the edge of its roof (SAE J996 has 25 degrees of
 roll)."""
@@ -48,7 +52,10 @@ def frontal(request: Request) -> Experiment:
         "barrier", BARRIER, nose + (GAP + BARRIER[0] / 2) * forward, forward, request
     )
     focus = nose + (GAP - 0.9) * forward
-    return _experiment(request, "frontal", subject, speed * forward, [block], focus=focus)
+    side = beside(request.scene, subject, pose)
+    return _experiment(
+        request, "frontal", subject, speed * forward, [block], focus=focus, side=side
+    )
 
 
 def pole(request: Request) -> Experiment:
@@ -62,7 +69,9 @@ def pole(request: Request) -> Experiment:
     place = nose + (GAP + POLE / 2) * forward
     place = place + seen_side * OFF_CENTRE * subject.scaled_size[1] * left
     post = _standing_box("pole", (POLE, POLE, POLE_HEIGHT), place, forward, request)
-    return _experiment(request, "pole", subject, speed * forward, [post], focus=nose)
+    # From ahead, where what a post leaves of a front is seen on both of its sides.
+    side = beside(request.scene, subject, pose, ahead=1.0, rise=0.65)
+    return _experiment(request, "pole", subject, speed * forward, [post], focus=nose, side=side)
 
 
 def t_bone(request: Request) -> Experiment:
@@ -86,10 +95,12 @@ def t_bone(request: Request) -> Experiment:
         runner.object_id: ObjectPhysics(T_world_object=own, velocity=speed * forward),
         struck.object_id: ObjectPhysics(T_world_object=target, velocity=(0.0, 0.0, 0.0)),
     }
-    # From behind the runner's shoulder, so that the dented side is seen when they have parted.
-    side = ahead - 0.75 * forward + np.array([0.0, 0.0, 0.75])
-    focus = own[:3, 3] + reach * forward
-    return _made(request, "t_bone", objects, [], focus=focus, side=side, distance=9.0)
+    # Along the struck side and past the runner, going along with the struck one: the dent is seen
+    # between them when they have parted.
+    side = ahead - 0.6 * forward + np.array([0.0, 0.0, 0.5])
+    focus = target[:3, 3] - ASIDE * forward
+    plan = _made(request, "t_bone", objects, [], focus=focus, side=side, distance=6.5)
+    return replace(plan, follows=struck.object_id)
 
 
 def roof(request: Request) -> Experiment:
@@ -97,20 +108,23 @@ def roof(request: Request) -> Experiment:
     speed = 5.4 if request.speed is None else request.speed
     subject = _best(request)
     own, forward = _on_the_road(request, subject)
-    side = viewer(request.scene, subject, own, slant=1.5, rise=0.3)
     left = np.cross([0.0, 0.0, 1.0], forward)
-    # It comes down with the edge ahead that the viewer sees.
-    turn = -TURNED_OVER if float(side @ left) > 0 else TURNED_OVER
+    seen = 1.0 if visibility_of(request.scene, subject).direction[1] >= 0 else -1.0
+    # Turned over, the side that was seen is on the other side, and its edge comes down first.
+    turn = -seen * TURNED_OVER
+    side = forward - seen * 1.1 * left + np.array([0.0, 0.0, 0.08])
     c, s = np.cos(turn), np.sin(turn)
     own[:3, :3] = own[:3, :3] @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     half = np.array(subject.scaled_size) / 2
     corners = half * (np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1)
     lowest = float(apply_transform(own, corners)[:, 2].min())
-    own[2, 3] += request.scene.ground.height(own[0, 3], own[1, 3]) + FALL - lowest
+    road = request.scene.ground.height(own[0, 3], own[1, 3])
+    own[2, 3] += road + FALL - lowest
     objects = {
         subject.object_id: ObjectPhysics(T_world_object=own, velocity=(0.0, 0.0, -speed)),
     }
-    return _made(request, "roof", objects, [], focus=own[:3, 3], side=side, distance=7.5)
+    focus = np.array([*own[:2, 3], road + half[2]])
+    return _made(request, "roof", objects, [], focus=focus, side=side, distance=6.3)
 
 
 CRASHES = {"frontal": frontal, "t_bone": t_bone, "pole": pole, "roof": roof}
@@ -183,19 +197,12 @@ def _experiment(
     obstacles: list[Collider],
     *,
     focus: Float,
+    side: Float,
 ) -> Experiment:
     """One vehicle on the road into obstacles."""
     own, _ = _on_the_road(request, subject)
     objects = {subject.object_id: ObjectPhysics(T_world_object=own, velocity=velocity)}
-    return _made(
-        request,
-        name,
-        objects,
-        obstacles,
-        focus=focus,
-        side=beside(request.scene, subject, own),
-        distance=6.0,
-    )
+    return _made(request, name, objects, obstacles, focus=focus, side=side, distance=6.0)
 
 
 def _made(

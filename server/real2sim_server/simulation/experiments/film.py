@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,8 @@ HARD_SHARE = 0.05
 """Of the kinetic energy, lost from one picture of a film to the next: something was hit."""
 AFTERWARDS = 0.25
 """Of the time from there to the end, at which the still between them is."""
+WAY_PLACES = 8
+"""Of a camera that moves, at which it is asked what stands before it."""
 CLEAR = 0.8
 """Of the distance from a near view to its focus."""
 
@@ -38,12 +40,14 @@ class FilmView:
     """A camera of the film.
 
     Attributes:
-        camera: fixed in the world: ``T_vehicle_camera`` is ``T_world_camera``.
+        camera: in the world: ``T_vehicle_camera`` is ``T_world_camera``, at the start.
         background: what of it is drawn.
         clear: what takes no part is left out when it comes this near [m]; nobody ever saw it from
             there, and it would hide what is to be seen.
         without: objects that are left out.
         obstacles: what vehicles run into and no recording shows.
+        moved: [F, 3] by how much the camera has moved in each frame of the result [m]; None where
+            it stands.
     """
 
     camera: Camera
@@ -51,6 +55,15 @@ class FilmView:
     clear: float = 0.0
     without: frozenset[str] = frozenset()
     obstacles: tuple[GaussianCloud, ...] = ()
+    moved: Float | None = None
+
+    def camera_at(self, frame: int) -> Camera:
+        """The camera as it stands in a frame of the result."""
+        if self.moved is None:
+            return self.camera
+        pose = self.camera.T_vehicle_camera.copy()
+        pose[:3, 3] += self.moved[frame]
+        return replace(self.camera, T_vehicle_camera=pose)
 
 
 def views(playback: Playback, plan: FilmPlan, *, width: int | None = None) -> list[FilmView]:
@@ -67,6 +80,7 @@ def views(playback: Playback, plan: FilmPlan, *, width: int | None = None) -> li
     stood = recorded.pose(scene.ego.transform(plan.start_us))
     viewer = plan.focus + plan.distance * plan.side / np.linalg.norm(plan.side)
     near = look_at(viewer, plan.focus)
+    moved = _moved(playback.result, plan)
     obstacles = tuple(obstacle_cloud(o) for o in plan.obstacles)
     K = np.array(recorded.K)
     K[0, 0] = K[1, 1] = 0.9 * recorded.width
@@ -80,18 +94,34 @@ def views(playback: Playback, plan: FilmPlan, *, width: int | None = None) -> li
         ),
         FilmView(
             Camera("near", recorded.width, recorded.height, K, near),
-            _before(scene.background, viewer, plan),
+            _before(scene.background, viewer, moved, plan),
             clear=CLEAR * plan.distance,
             without=plan.without,
             obstacles=obstacles,
+            moved=moved,
         ),
     ]
 
 
-def _before(cloud: GaussianCloud, viewer: Float, plan: FilmPlan) -> GaussianCloud:
-    """The background without trees and posts between a near viewer and the focus."""
+def _moved(result: SimulationResult, plan: FilmPlan) -> Float | None:
+    """[F, 3] how the near camera goes along the road with what it follows, if it does [m]."""
+    if plan.follows is None or plan.follows not in result.objects:
+        return None
+    places = result.objects[plan.follows].positions
+    moved: Float = (places - places[0]) * [1.0, 1.0, 0.0]
+    return moved
+
+
+def _before(
+    cloud: GaussianCloud, viewer: Float, moved: Float | None, plan: FilmPlan
+) -> GaussianCloud:
+    """The background without trees and posts between a near viewer and the focus, wherever the
+    viewer goes."""
     means = cloud.means.detach().cpu().numpy()
-    near = np.linalg.norm(means - viewer, axis=1) < CLEAR * plan.distance
+    way = np.zeros((1, 3)) if moved is None else moved[:: max(len(moved) // WAY_PLACES, 1)]
+    near = np.zeros(len(means), dtype=bool)
+    for step in way:
+        near |= np.linalg.norm(means - (viewer + step), axis=1) < CLEAR * plan.distance
     hides = torch.from_numpy(near & (means[:, 2] > plan.focus[2]))
     return cloud.select(~hides.to(cloud.device))
 
@@ -116,7 +146,7 @@ def draw(playback: Playback, shown: Sequence[FilmView], frame: int, backend: str
         obstacles = [Instance(cloud) for cloud in view.obstacles]
         [drawn] = render_cameras(
             [Instance(view.background), *obstacles, *objects],
-            [view.camera],
+            [view.camera_at(frame)],
             np.eye(4),
             sky=playback.scene.sky,
             options=RGB_ONLY,
@@ -128,7 +158,7 @@ def draw(playback: Playback, shown: Sequence[FilmView], frame: int, backend: str
 
 def _bystanders(playback: Playback, view: FilmView, frame: int) -> set[str]:
     """What takes no part and is too near to the view to be shown."""
-    t_us, eye = playback.time_us(frame), view.camera.T_vehicle_camera[:3, 3]
+    t_us, eye = playback.time_us(frame), view.camera_at(frame).T_vehicle_camera[:3, 3]
     return {
         o.object_id
         for o in playback.state.visible

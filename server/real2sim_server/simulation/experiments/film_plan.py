@@ -48,6 +48,7 @@ class FilmPlan:
         without: objects that are not shown.
         slow: how many times slower it plays than it was.
         obstacles: boxes that vehicles run into, which no recording shows.
+        follows: object that focus and near camera move along with; None: they stay.
     """
 
     focus: Float
@@ -57,6 +58,7 @@ class FilmPlan:
     without: frozenset[str] = frozenset()
     slow: float = 1.0
     obstacles: tuple[Obstacle, ...] = ()
+    follows: str | None = None
 
     @classmethod
     def of(cls, experiment: Experiment, height: Callable[[float, float], float]) -> FilmPlan:
@@ -77,6 +79,7 @@ class FilmPlan:
             experiment.without,
             experiment.slow,
             tuple(solid),
+            experiment.follows,
         )
 
     def save(self, folder: Path) -> None:
@@ -88,6 +91,7 @@ class FilmPlan:
             "start_us": self.start_us,
             "without": sorted(self.without),
             "slow": self.slow,
+            "follows": self.follows,
             "obstacles": [{"pose": p.tolist(), "size": s.tolist()} for p, s in self.obstacles],
         }
         with atomic_file(folder / FILE) as file:
@@ -110,6 +114,7 @@ class FilmPlan:
                 frozenset(record["without"]),
                 float(record["slow"]),
                 tuple((np.array(o["pose"]), np.array(o["size"])) for o in record["obstacles"]),
+                record.get("follows"),
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise PhysicsError(

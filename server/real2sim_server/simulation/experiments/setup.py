@@ -37,6 +37,7 @@ class Experiment:
         distance: of that viewer [m].
         without: objects that are not shown.
         slow: how many times slower films show it than it was.
+        follows: subject that the near-by viewer moves along with; None: he stays.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Experiment:
     distance: float
     without: frozenset[str] = frozenset()
     slow: float = 1.0
+    follows: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +106,25 @@ def viewer(
     return direction
 
 
-def beside(scene: Scene, subject: PlacedObject, pose: Float, *, rise: float = 0.35) -> Float:
-    """Direction [3] to a viewer beside the subject, where what it runs into hides nothing."""
+def beside(
+    scene: Scene,
+    subject: PlacedObject,
+    pose: Float,
+    *,
+    ahead: float = FROM_AHEAD,
+    rise: float = 0.35,
+) -> Float:
+    """Direction [3] to a viewer on the side that was seen.
+
+    Args:
+        ahead: how much ahead, against to the side; little where what it runs into is broad, so that
+            it hides nothing.
+        rise: how much up.
+    """
     forward = level(pose[:3, 0])
     left = np.cross([0.0, 0.0, 1.0], forward)
     seen = 1.0 if visibility_of(scene, subject).direction[1] >= 0 else -1.0
-    direction: Float = seen * left + FROM_AHEAD * forward + np.array([0.0, 0.0, rise])
+    direction: Float = seen * left + ahead * forward + np.array([0.0, 0.0, rise])
     return direction
 
 
