@@ -122,6 +122,49 @@ def edit(
     _report(json, edit.run(edit.EditBenchOptions(operations=operations)))
 
 
+@command("recovery", group=app)
+def recovery(
+    *,
+    scene: Annotated[
+        Path | None, typer.Option(help="Scene bundle; default: the demo's street.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=8, max=1000, help="Of each planner.")] = 64,
+    epochs: Annotated[int, typer.Option(min=1, max=1000, help="Of training.")] = 60,
+    seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
+    json: JsonFile = None,
+) -> None:
+    """What recovery data is worth: the learned planner with and without, from displaced starts."""
+    from ..benchmarks import recovery
+
+    options = recovery.RecoveryBenchOptions(
+        scene=scene, episodes=episodes, epochs=epochs, seed=seed
+    )
+    _report(json, recovery.run(options))
+
+
+@command("detector", group=app)
+def detector(
+    *,
+    scene: Annotated[
+        Path | None,
+        typer.Option(help="Bundle made of a synthetic drive; default: the demo's street."),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=20, max=100_000, help="To train on.")] = 2000,
+    epochs: Annotated[int, typer.Option(min=1, max=1000, help="Of training.")] = 8,
+    drives: Annotated[int, typer.Option(min=1, max=100, help="To test on.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Processes that export.")] = 1,
+    json: JsonFile = None,
+) -> None:
+    """What exported labels are worth: a detector trained on them, beside one trained on truth."""
+    from ..benchmarks import detector
+
+    options = detector.DetectorBenchOptions(
+        scene=scene, frames=frames, epochs=epochs, drives=drives, seed=seed, workers=workers
+    )
+    _report(json, detector.run(options))
+
+
 def _report(path: Path | None, figures: dict[str, Any]) -> None:
     """Say what the figures were measured with, and write both where a path is given."""
     from ..benchmarks.environment import environment

@@ -36,7 +36,8 @@ def export_dataset(
         typer.Option(
             "--format",
             "-f",
-            help="labels, kitti, kitti_raw, coco, nuscenes, argoverse2, webdataset, mcap, pictures",
+            help="labels, kitti, kitti_raw, coco, nuscenes, argoverse2, waymo, webdataset, mcap, "
+            "pictures",
         ),
     ],
     operations: Annotated[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from .options import JsonFile, LogFormat, Sequence
 if TYPE_CHECKING:
     from real2sim.planners.learned import PolicyShape
 
+    from ..policies.cloning import CloningDataset
     from ..policies.posed_images import PosedImage
     from ..scene import CameraRig
 
@@ -23,7 +25,10 @@ if TYPE_CHECKING:
 @command("train-policy")
 def train_policy(
     *,
-    source: Annotated[Path, typer.Argument(help="Scene bundle, or folder of a driving log.")],
+    sources: Annotated[
+        list[Path],
+        typer.Argument(help="Scene bundle, driving log, or data sets of export-dataset."),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="File of weights (.safetensors).")],
     camera: Annotated[
         str | None, typer.Option(help="Default: the one that looks most nearly ahead.")
@@ -38,22 +43,19 @@ def train_policy(
     json: JsonFile = None,
 ) -> None:
     """Teach a small network to drive as the recording vehicle did; for planner learned=FILE."""
-    from ..logs import open_log
-    from ..policies.cloning import build_dataset, save_policy, train_network
-    from ..policies.posed_images import log_images, scene_images
-    from ..scene.io import load_scene
+    from ..policies.cloning import save_policy, train_network
 
     start = time.perf_counter()
     with staged_progress() as report:
-        if (source / "scene.json").is_file():
-            scene = load_scene(source)
-            ego, shape = scene.ego, _policy_shape(scene.rig, camera)
-            images = scene_images(scene, shape, shifted=shifted, seed=seed)
-        else:
-            log = open_log(source, format=log_format, sequence=sequence)
-            ego, shape = log.ego, _policy_shape(log.rig, camera)
-            images = log_images(log, shape)
-        dataset = build_dataset(ego, shape, _with_progress(images, report))
+        shape, dataset = _examples(
+            sources,
+            report,
+            camera=camera,
+            shifted=shifted,
+            seed=seed,
+            log_format=log_format,
+            sequence=sequence,
+        )
         weights, figures = train_network(
             dataset,
             shape,
@@ -65,6 +67,40 @@ def train_policy(
     figures |= {"examples": len(dataset.images), "seconds": time.perf_counter() - start}
     print_figures(f"policy for camera {shape.camera}", figures)
     write_json(json, figures)
+
+
+def _examples(
+    sources: list[Path],
+    report: Callable[[str, int, int], None],
+    *,
+    camera: str | None,
+    shifted: int,
+    seed: int,
+    log_format: str | None,
+    sequence: str | None,
+) -> tuple[PolicyShape, CloningDataset]:
+    from ..logs import open_log
+    from ..policies.cloning import build_dataset
+    from ..policies.exported import exported_examples, exported_shape, is_export
+    from ..policies.posed_images import log_images, scene_images
+    from ..scene.io import load_scene
+
+    if all(is_export(source) for source in sources):
+        shape = exported_shape(sources[0], camera)
+        read = partial(report, "read")
+        return shape, exported_examples(sources, shape, on_progress=read)
+    if len(sources) > 1:
+        raise CommandError("several sources must all be data sets that export-dataset has written")
+    (source,) = sources
+    if (source / "scene.json").is_file():
+        scene = load_scene(source)
+        ego, shape = scene.ego, _policy_shape(scene.rig, camera)
+        images = scene_images(scene, shape, shifted=shifted, seed=seed)
+    else:
+        log = open_log(source, format=log_format, sequence=sequence)
+        ego, shape = log.ego, _policy_shape(log.rig, camera)
+        images = log_images(log, shape)
+    return shape, build_dataset(ego, shape, _with_progress(images, report))
 
 
 def _policy_shape(rig: CameraRig, camera: str | None) -> PolicyShape:

@@ -28,6 +28,7 @@ from ..geometry.transform import invert_transform
 from ..render import Backend, encode_image
 from ..render.cast import CastBackend, select_caster
 from ..scene import Camera
+from ..world.path import LoggedPath
 from .drive import Drive, Moment
 from .labels import (
     CameraImages,
@@ -37,6 +38,7 @@ from .labels import (
     boxes_at,
     draw_moment,
     ego_future,
+    ego_state,
     flow_between,
     futures_at,
     lidar_points,
@@ -175,7 +177,7 @@ def write_clip(
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    frames = []
+    frames, path = [], LoggedPath(drive.scene.ego)
     before: LabelledMoment | None = None
     with _FileWriter(partial) as files:
         for index, t_us in enumerate(clip.times_us):
@@ -184,7 +186,7 @@ def write_clip(
             here = LabelledMoment(moment, boxes_at(moment.placed), images)
             views = [views_of(i, here.boxes, moment.instances, backend=backend) for i in images]
             points = _points_of(drive, plan, here, backend)
-            labels = _frame_labels(drive, here, views, points, index)
+            labels = _frame_labels(drive, here, views, points, index=index, path=path)
             if plan.noise is not None:
                 labels["detections"] = _detections(here, labels, plan, (int(clip.name), index))
             frames.append(labels)
@@ -219,7 +221,9 @@ def _frame_labels(
     here: LabelledMoment,
     views: Sequence[CameraView],
     points: SeenPoints,
+    *,
     index: int,
+    path: LoggedPath,
 ) -> dict[str, Any]:
     moment, boxes = here.moment, here.boxes
     beside = _beside(drive, moment.t_us)
@@ -231,6 +235,7 @@ def _frame_labels(
         "index": index,
         "t_us": moment.t_us,
         "T_world_ego": moment.T_world_ego.tolist(),
+        "ego": ego_state(drive, path, moment.t_us),
         "ego_future": ego_future(drive, moment.t_us),
         **beside,
         "objects": [

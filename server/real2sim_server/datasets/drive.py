@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -79,6 +80,10 @@ class Drive(Protocol):
         """``T_world_ego`` [4, 4] at an instant of the span."""
         ...
 
+    def ego_speed_at(self, t_us: int) -> float:
+        """Speed of the ego at an instant of the span [m/s]."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class ScenarioDrive:
@@ -109,6 +114,10 @@ class ScenarioDrive:
     def ego_at(self, t_us: int) -> Float:
         """See :class:`Drive`."""
         return self.scene.ego.transform(t_us)
+
+    def ego_speed_at(self, t_us: int) -> float:
+        """See :class:`Drive`."""
+        return float(np.linalg.norm(self.scene.ego.velocity(t_us)[:2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +169,10 @@ class EpisodeDrive:
     def ego_at(self, t_us: int) -> Float:
         """See :class:`Drive`."""
         return np.array(self._world(t_us).T_world_body)
+
+    def ego_speed_at(self, t_us: int) -> float:
+        """See :class:`Drive`."""
+        return math.hypot(*self._world(t_us).motion.velocity)
 
     def _world(self, t_us: int) -> World:
         """The one of the last step up to ``t_us``."""

@@ -20,7 +20,8 @@ from .drive import Drive
 from .errors import DatasetError
 from .executors import Executor, InProcess
 from .labels import HOW
-from .plan import ROOF, ExportPlan, PlannedClip, planned_cameras, planned_lidar, planned_shards
+from .labels.points import ROOF
+from .plan import ExportPlan, PlannedClip, planned_cameras, planned_lidar, planned_shards
 from .previews import write_previews
 from .statistics import statistics_of
 from .variants import Variant

@@ -109,6 +109,10 @@ class PerturbedDrive:
         moved: Float = self._moved(self.base.ego_at(t_us)[None], lateral, heading)[0]
         return moved
 
+    def ego_speed_at(self, t_us: int) -> float:
+        """See :class:`Drive`; the slant of the way back makes it longer."""
+        return self.base.ego_speed_at(t_us) / math.cos(self.offset_at(t_us)[1])
+
     def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
         """See :class:`Drive`."""
         met = self.base.sweep_at(lidar, t_us)

@@ -16,13 +16,12 @@ from ..scene.lidar_catalogue import catalogue_lidar, lidar_from_values
 from .drive import Drive
 from .errors import DatasetError
 from .labels.noise import BoxNoise
+from .labels.points import ROOF
 from .perturbed import Perturbation
 from .rig import cameras_of
 from .variants import Variant
 
 MAX_FRAMES = 100_000
-ROOF = (0.9, 0.0, 1.73)
-"""Where a LiDAR stands that is not placed itself, in the ego frame [m]."""
 
 
 @dataclass(frozen=True)

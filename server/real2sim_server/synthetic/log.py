@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,36 @@ class SyntheticLog(DrivingLog):
         source = self.source
         assert isinstance(source, SyntheticSource)
         return source.render(np.asarray(T_world_camera), np.asarray(k), width, height, t_us)
+
+    def render_placed(
+        self,
+        T_world_camera: ArrayLike,
+        k: ArrayLike,
+        size: tuple[int, int],
+        vehicles: Sequence[int],
+        T_world_objects: ArrayLike,
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
+        """The truth of an edited street: with these vehicles at these places, and no others.
+
+        Args:
+            T_world_camera, k: as of :meth:`render`.
+            size: width and height [px].
+            vehicles: [N] indices into ``tracks``, one as often as it shall be there.
+            T_world_objects: [N, 4, 4] poses of their boxes.
+
+        Returns:
+            As :meth:`render`; instances are 1 + index into ``vehicles``.
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        return shoot_image(
+            source.world,
+            source.placed(vehicles, np.asarray(T_world_objects, dtype=np.float64)),
+            np.ascontiguousarray(T_world_camera, dtype=np.float64),
+            np.ascontiguousarray(k, dtype=np.float64),
+            *size,
+            source.config.samples,
+        )
 
     def render_through(
         self, camera: Camera, motion: CameraMotion, t_us: int, *, samples: int = 3
@@ -186,10 +216,14 @@ class SyntheticSource:
         return sweeps._replace(to_object=sweeps.to_object[0], to_world=sweeps.to_world[0])
 
     def _instances_over(self, times_us: Float) -> Instances:
-        shapes = np.array([v.shape for v in self.drive.vehicles], dtype=np.int64)
         to_world = np.zeros((len(times_us), len(self.drive.vehicles), 4, 4))
         for i, vehicle in enumerate(self.drive.vehicles):
             to_world[:, i] = poses_at(vehicle.trajectory, times_us)
+        return self.placed(range(len(self.drive.vehicles)), to_world)
+
+    def placed(self, vehicles: Sequence[int], to_world: Float) -> Instances:
+        """Vehicles [N] at poses [..., N, 4, 4]."""
+        shapes = np.array([self.drive.vehicles[v].shape for v in vehicles], dtype=np.int64)
         half = np.array([SHAPES[s].size for s in shapes]).reshape(-1, 3) / 2
         return Instances(
             to_object=np.ascontiguousarray(invert_transform(to_world)[..., :3, :]),
@@ -197,7 +231,7 @@ class SyntheticSource:
             radius=np.linalg.norm(half, axis=1) + 0.05,
             root=self.roots[shapes],
             shape=shapes,
-            paint=self.body_paints,
+            paint=self.body_paints[list(vehicles)],
             half_size=half,
         )
 

@@ -12,7 +12,8 @@ from real2sim_proto.semantics import GROUND, SEMANTIC_CLASSES
 from real2sim_server.datasets.drive import MetSweep
 from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.labels import points_in_boxes
-from real2sim_server.datasets.plan import ROOF, ExportPlan, planned_lidar
+from real2sim_server.datasets.labels.points import ROOF
+from real2sim_server.datasets.plan import ExportPlan, planned_lidar
 from real2sim_server.demo.street import SHIPPED
 from real2sim_server.scene.io import read_packed
 from real2sim_server.synthetic import SyntheticConfig, generate_log

@@ -338,3 +338,24 @@ def test_values_that_give_no_drive_are_refused_by_name(name: str) -> None:
     make: Callable[..., SyntheticConfig] = SyntheticConfig
     with pytest.raises(ValueError, match=name):
         make(**BAD_VALUES[name])
+
+
+def test_the_truth_of_an_edited_street_has_the_given_vehicles_alone(log):
+    camera, pose = log.rig["front"], log.rig["front"].pose(log.ego.transform(0))
+    places = np.stack([np.eye(4)] * 2)
+    places[:, :3, 3] = [(14.0, 2.0, 0.8), (14.0, -2.0, 0.8)]
+    size = (camera.width, camera.height)
+    _, _, instance = log.render_placed(pose, camera.K, size, [1, 1], places)
+    columns = [np.flatnonzero((instance == number).any(axis=0)) for number in (1, 2)]
+    assert np.unique(instance).tolist() == [0, 1, 2]
+    assert columns[0].mean() < camera.width / 2 < columns[1].mean()
+
+
+def test_the_truth_of_a_street_that_is_not_edited_is_what_was_recorded(log):
+    camera, t_us = log.rig["front"], int(log.frame_times_us[0])
+    pose = camera.pose(log.ego.transform(t_us))
+    places = np.stack([track.trajectory.transform(t_us) for track in log.tracks])
+    every = range(len(log.tracks))
+    size = (camera.width, camera.height)
+    rgb, _, _ = log.render_placed(pose, camera.K, size, every, places)
+    np.testing.assert_array_equal(rgb, log.image("front", 0))

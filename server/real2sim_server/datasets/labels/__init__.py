@@ -6,7 +6,7 @@ drive has; :data:`HOW` says which label from what.
 
 from .boxes import ObjectBox, boxes_at, projected_box
 from .flow import flow_between
-from .futures import ego_future, futures_at
+from .futures import ego_future, ego_state, futures_at
 from .how import HOW
 from .images import CameraImages, draw_moment
 from .lidar import lidar_points
@@ -23,6 +23,7 @@ __all__ = [
     "boxes_at",
     "draw_moment",
     "ego_future",
+    "ego_state",
     "flow_between",
     "futures_at",
     "lidar_points",

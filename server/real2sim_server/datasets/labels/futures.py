@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from ...edit import ObjectState, PlacedObjects
 from ...geometry.rotation import Float, matrix_to_quaternion, quaternion_yaw
 from ...geometry.transform import invert_transform
+from ...world.ego.route import command_ahead, route_ahead
+from ...world.path import LoggedPath
 from ..drive import Drive
 
 STEP_US = 500_000
@@ -52,3 +55,17 @@ def ego_future(drive: Drive, t_us: int) -> list[list[float]]:
         yaw = float(quaternion_yaw(matrix_to_quaternion(pose[:3, :3])))
         rows.append([step * STEP_US * 1e-6, float(pose[0, 3]), float(pose[1, 3]), yaw])
     return rows
+
+
+def ego_state(drive: Drive, path: LoggedPath, t_us: int) -> dict[str, Any]:
+    """What a planner is told at ``t_us``, as in a session: ``speed`` [m/s], ``command``, and
+    ``route``, 20 places 2 m apart in the ego's frame [m] along ``path``, the recorded drive."""
+    pose = drive.ego_at(t_us)
+    x, y = pose[:2, 3].tolist()
+    yaw = float(quaternion_yaw(matrix_to_quaternion(pose[:3, :3])))
+    s = path.nearest(x, y).s
+    return {
+        "speed": drive.ego_speed_at(t_us),
+        "command": command_ahead(path, s),
+        "route": route_ahead(path, s, x, y, yaw).tolist(),
+    }

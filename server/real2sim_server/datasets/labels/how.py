@@ -27,5 +27,6 @@ HOW = {
     "track": "box: poses of the object at the instants before and after",
     "detections": "box: boxes of the drive, moved, missed and made up as a detector might",
     "ego_future": "box: poses of the ego at the instants after, in the ego's frame",
+    "ego": "map: speed of the drive; route and command along the recorded drive",
 }
 """What each label is made from: ``rendered``, ``box`` (poses and sizes of the drive)."""

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...render.ground_class import back_projected
-from ..plan import ROOF
 from .boxes import ObjectBox
 from .images import CameraImages
 
+ROOF = (0.9, 0.0, 1.73)
+"""Where a LiDAR stands that is not placed itself, in the ego frame [m]."""
 BEAMS, COLUMNS = 64, 1024
 ELEVATION = (np.radians(-25.0), np.radians(3.0))
 NEAR, FARTHEST = 1.0, 80.0

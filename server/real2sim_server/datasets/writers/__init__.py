@@ -9,6 +9,7 @@ from .labels import LabelsWriter
 from .mcap import McapWriter
 from .nuscenes import NuScenesWriter
 from .pictures import PicturesWriter
+from .waymo import WaymoWriter
 from .webdataset import WebDatasetWriter
 from .writer import DatasetWriter, LabelledDrive
 
@@ -19,6 +20,7 @@ WRITERS: list[DatasetWriter] = [
     CocoWriter(),
     NuScenesWriter(),
     Argoverse2Writer(),
+    WaymoWriter(),
     WebDatasetWriter(),
     McapWriter(),
     PicturesWriter(),

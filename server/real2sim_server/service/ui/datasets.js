@@ -10,6 +10,7 @@ const FORMATS = [
   "kitti_raw",
   "coco",
   "argoverse2",
+  "waymo",
   "webdataset",
   "mcap",
   "labels",

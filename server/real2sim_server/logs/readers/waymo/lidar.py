@@ -107,7 +107,11 @@ def merge_range_images(
     points, intensities, offsets = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
     origin = np.zeros(3)
     for image in images:
-        row, column, found = _points(image, T_world_vehicle)
+        row, column, found = pixel_points(image)
+        if image.pixel_poses is not None:
+            poses = image.pixel_poses[row, column].astype(np.float64)
+            in_world = np.einsum("nij,nj->ni", rotations(poses[:, :3]), found) + poses[:, 3:]
+            found = apply_transform(invert_transform(T_world_vehicle), in_world)
         points.append(found)
         intensities.append(np.clip(image.values[row, column, 1], 0, 1))
         width = image.values.shape[1]
@@ -123,10 +127,9 @@ def merge_range_images(
     )
 
 
-def _points(
-    image: RangeImage, T_world_vehicle: Float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
-    """Rows [N], columns [N] and points [N, 3] float64 of all pixels with a return."""
+def pixel_points(image: RangeImage) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
+    """Rows [N], columns [N] and points [N, 3] float64 of all pixels with a return, row by row, in
+    the vehicle frame of their own instant."""
     height, width = image.values.shape[:2]
     inclination = image.laser.rows(height, image.where)
     azimuth = image.laser.azimuths(width)
@@ -137,12 +140,7 @@ def _points(
     local = np.stack(
         [level * np.cos(turned), level * np.sin(turned), distance * np.sin(up)], axis=1
     )
-    points = apply_transform(image.laser.T_vehicle_laser, local)
-    if image.pixel_poses is not None:
-        poses = image.pixel_poses[row, column].astype(np.float64)
-        in_world = np.einsum("nij,nj->ni", rotations(poses[:, :3]), points) + poses[:, 3:]
-        points = apply_transform(invert_transform(T_world_vehicle), in_world)
-    return row, column, points
+    return row, column, apply_transform(image.laser.T_vehicle_laser, local)
 
 
 def rotations(angles: Float) -> Float:
