@@ -183,7 +183,7 @@ def warm_up(backend: str | Backend = "auto") -> None:
     render_cameras([], [camera], np.eye(4), backend=chosen)
 
 
-def _classes(instances: Sequence[Instance]) -> NDArray[np.uint8]:
+def classes_of(instances: Sequence[Instance]) -> NDArray[np.uint8]:
     """Classes [65536] by instance id, of the first that has it."""
     classes = np.full(MAX_INSTANCE_ID + 1, UNLABELED, np.uint8)
     for instance in reversed(instances):
@@ -286,7 +286,7 @@ def _drawn_in_colour(
     for request, output in zip(requests, _rasterized(requests, backend), strict=True):
         seen = output
         if "semantic" in modalities:
-            classes, behind = _classes(request.instances), class_behind(request)
+            classes, behind = classes_of(request.instances), class_behind(request)
             seen = replace(output, classes=classes, behind=behind)
         images = {name: modality_of(name).pixels(seen) for name in modalities}
         if request.optics is not None and "semantic" in images:

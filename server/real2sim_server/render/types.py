@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -173,3 +173,33 @@ __all__ = [
     "Sky",
     "WorldViews",
 ]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Pixels [top:bottom, left:right] of an image in which an object is also asked for alone."""
+
+    instance_id: int
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+@dataclass(frozen=True, eq=False)
+class LabelOutput:
+    """One camera's picture and labels.
+
+    Attributes:
+        rgb: [H, W, 3] float32, as of RenderOutput.
+        depth: [H, W] float32 along the camera's z axis, of each pixel's front [m], 0 for none.
+        instance: [H, W] uint16, object of the front; 0 also where there is none.
+        alone: by window, depths [h, w] float32 of the object's own fronts, whatever hides it.
+        timing_ms: by stage.
+    """
+
+    rgb: Tensor
+    depth: NDArray[np.float32]
+    instance: NDArray[np.uint16]
+    alone: Sequence[NDArray[np.float32]]
+    timing_ms: dict[str, float] = field(default_factory=dict)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from real2sim_proto.semantics import GROUND
 from real2sim_server.datasets.clips import flow_png, read_flow
 from real2sim_server.datasets.labels import (
     CameraImages,
@@ -19,6 +20,8 @@ from real2sim_server.datasets.labels import (
     projected_box,
     views_of,
 )
+from real2sim_server.datasets.labels.surface import on_surface
+from real2sim_server.render.ground_class import back_projected
 from real2sim_server.scene import Camera, Trajectory
 
 CAMERA = Camera("c", 96, 64, np.array([[60.0, 0, 48], [0, 60, 32], [0, 0, 1]]), np.eye(4))
@@ -106,6 +109,30 @@ def test_what_stands_behind_another_is_less_visible(tiny_scene, tiny_drive):
     visibility = {v.object_id: v.visibility for v in view.objects}
     assert visibility["car_blue"] > 0.95
     assert 0.0 < visibility[hidden.object_id] < 0.7
+
+
+@pytest.mark.parametrize(
+    ("place", "own"),
+    [
+        ((1.9, 0.0, -0.85), False),  # below the bumper
+        ((0.0, 0.95, -0.85), False),  # below the sill
+        ((1.2, 0.95, -0.85), True),  # a wheel
+        ((1.9, 0.0, -0.7), True),
+        ((1.9, 1.2, 0.0), False),
+    ],
+)
+def test_between_its_wheels_a_vehicle_shows_its_shadow(place, own):
+    points = np.add([place], (0, 0, 10))
+    assert on_surface(points, pose(0, 0, 10), box(0.0)).tolist() == [own]
+
+
+def test_ground_is_as_far_as_its_heights_say(tiny_scene, tiny_drive):
+    moment = tiny_drive.at(0)
+    (images,) = draw_moment(tiny_scene, moment, [tiny_scene.rig["front"]])
+    points = back_projected(images.depth, images.camera.K, images.T_world_camera)
+    shown = points[images.semantic == GROUND]
+    assert len(shown) > 100
+    np.testing.assert_allclose(shown[:, 2], tiny_scene.ground.height_at(shown[:, :2]), atol=5e-3)
 
 
 def test_futures_go_on_as_far_as_the_drive(tiny_drive):

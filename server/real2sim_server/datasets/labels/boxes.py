@@ -70,18 +70,25 @@ def projected_box(
     of it is behind the near plane."""
     T_camera_object = invert_transform(T_world_camera) @ T_world_object
     corners = box_corners(T_camera_object, size)
+    depths = corners[:, 2].tolist()
+    if max(depths) < NEAR:
+        return None
+    seen = corners if min(depths) >= NEAR else _ahead(corners)
+    points = seen @ camera.K.T
+    pixels = points[:, :2] / points[:, 2:]
+    left, top = pixels.min(axis=0).tolist()
+    right, bottom = pixels.max(axis=0).tolist()
+    return (left, top, right, bottom)
+
+
+def _ahead(corners: Float) -> Float:
+    """Corners in front of the near plane, and where edges meet it."""
     seen = [corner for corner in corners if corner[2] >= NEAR]
     for i, j in EDGES:
         a, b = corners[i], corners[j]
         if (a[2] < NEAR) != (b[2] < NEAR):
             seen.append(a + (b - a) * (NEAR - a[2]) / (b[2] - a[2]))
-    if not seen:
-        return None
-    points = np.array(seen) @ camera.K.T
-    pixels = points[:, :2] / points[:, 2:]
-    left, top = pixels.min(axis=0).tolist()
-    right, bottom = pixels.max(axis=0).tolist()
-    return (left, top, right, bottom)
+    return np.array(seen)
 
 
 def cut_at_border(box: Box2D, width: int, height: int) -> Box2D | None:

@@ -12,11 +12,12 @@ HOW = {
     "visibility": "rendered: pixels of the object in the scene over those it fills when it is "
     "drawn alone",
     "truncation": "box: share of the projected 3D box's bounding box outside of the image",
-    "instance": "rendered: object of the Gaussian that takes half of the light of a pixel",
+    "instance": "rendered: object of a pixel's front, the Gaussian that takes its light to a fifth "
+    "(where passes draw labels, to a half); an object's shadow is ground",
     "semantic": "rendered: class of the object by its category; of the background the ground by "
     "geometry, within 0.15 m of the scene's height field, the sky by opacity",
-    "depth": "rendered: depth along the camera's z axis of the Gaussian that takes half of the "
-    "light of a pixel [m]",
+    "depth": "rendered: depth along the camera's z axis where a pixel's ray meets its front most; "
+    "of the ground that of the scene's height field [m]",
     "flow": "rendered depth and poses: where the surface of a pixel is in the other image; "
     "occluded where the other image shows something else there",
     "points": "rendered: points of the cameras' depth images along the beams of a spinning "

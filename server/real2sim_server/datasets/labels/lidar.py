@@ -100,16 +100,16 @@ def _objects(
     met = np.where(median, echo.instance.ravel()[ray], 0)
     found, velocity = np.zeros(len(ray), np.uint16), np.zeros((len(ray), 3))
     times = request.lidar.beams.slots[0]
-    sizes = {box.instance_id: box.size for box in boxes}
+    known = {box.instance_id: box for box in boxes}
     for instance, poses in zip(request.instances, request.object_poses, strict=True):
-        size = sizes.get(instance.instance_id)
-        if size is None or poses is None:
+        box = known.get(instance.instance_id)
+        if box is None or poses is None:
             continue
         centre = poses[len(poses) // 2][:3, 3]
-        near = np.linalg.norm(points - centre, axis=1) < np.linalg.norm(size) + SAME_SURFACE
+        near = np.linalg.norm(points - centre, axis=1) < np.linalg.norm(box.size) + SAME_SURFACE
         asked = np.flatnonzero(near & ((met == instance.instance_id) | ~median))
         local = _each(invert_transform(poses[slots[asked]]), points[asked])
-        own = on_surface(local.astype(np.float32), np.eye(4), size)
+        own = on_surface(local, np.eye(4), box)
         found[asked[own]] = instance.instance_id
         velocity[asked[own]] = _speed(poses, times, slots[asked[own]], local[own])
     return found, velocity

@@ -12,26 +12,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import invert_transform
+from .boxes import ObjectBox
+from .pixels import BODY, on_bodies
 
-MARGIN = 0.2
+MARGIN = 0.1
 """Surface may lie so far outside of the box [m]: boxes are as exact as who drew them."""
 
 CLEARANCE = 0.12
 """What is less above the box's lowest face, below it too, is the ground [m]."""
 
+SILL = 0.11
+"""Below this share of a road vehicle's height are its wheels alone, and between them the shadow."""
+
+WHEELED = frozenset({"car", "truck", "bus", "van", "trailer"})
+TYRE = 0.22
+"""Wheels reach so far inwards from the sides of the box [m]."""
+
+AXLES = 0.18, 0.43
+"""Wheels lie between these shares of the length, ahead of the centre and behind."""
+
+CONTACT = 0.08
+"""Of wheels, what is less above the box's lowest face is the ground [m]."""
+
 
 def on_surface(
-    points: NDArray[np.float32], T_world_object: Float, size: Sequence[float]
+    points: NDArray[np.floating], T_world_object: Float, box: ObjectBox
 ) -> NDArray[np.bool_]:
-    """Which points [N, 3] of the world at an object's pixels are of itself, [N] bool."""
-    local = apply_transform(invert_transform(T_world_object), points)
-    half = np.asarray(size) / 2
-    inside = (np.abs(local[:, :2]) <= half[:2] + MARGIN).all(axis=1)
-    upper: NDArray[np.bool_] = local[:, 2] <= half[2] + MARGIN
-    return inside & upper & (local[:, 2] >= _lowest(half[2]))
+    """Which points [N, 3] of the world are of an object's surface, [N] bool.
+
+    Args:
+        points: at its pixels.
+        T_world_object: [4, 4] of the box, at the instant of the points.
+        box: gives size and category.
+    """
+    found = np.empty(len(points), np.bool_)
+    on_bodies(np.asarray(points, np.float64), body_of(box, T_world_object), found)
+    return found
 
 
-def _lowest(half_height: float) -> float:
-    """Lowest surface of an object in its own frame; flat things are all surface."""
-    return -half_height + min(CLEARANCE, half_height / 4)
+def bodies_of(boxes: Sequence[ObjectBox]) -> Float:
+    """What kernels take of boxes, [K, BODY], see ``is_surface``."""
+    found = np.empty((len(boxes), BODY))
+    for row, box in zip(found, boxes, strict=True):
+        row[:] = body_of(box, box.T_world_object)
+    return found
+
+
+def body_of(box: ObjectBox, T_world_object: Float) -> Float:
+    """One of :func:`bodies_of`, at another pose."""
+    half = np.asarray(box.size) / 2
+    to_object = invert_transform(T_world_object)[:3]
+    lowest = -half[2] + min(CLEARANCE, half[2] / 4)
+    limits = lowest, lowest, 0.0, 0.0, 0.0
+    if box.category in WHEELED:
+        aside, (inner, outer) = half[1] - TYRE, AXLES
+        sill = max(lowest, (2 * SILL - 1) * half[2])
+        limits = -half[2] + CONTACT, sill, aside, inner * box.size[0], outer * box.size[0]
+    return np.concatenate([to_object.ravel(), half, [MARGIN, *limits]])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,16 +11,15 @@ from numpy.typing import NDArray
 
 from ...geometry.transform import invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
-from ...render.ground_class import back_projected
+from ...render.types import Window
 from .boxes import Box2D, ObjectBox, area, cut_at_border, projected_box
-from .images import CameraImages
-from .surface import on_surface
+from .images import CameraImages, rays_of
+from .pixels import surface_mask
+from .surface import body_of
+from .windows import window_about
 
 SMALLEST_BLOB = 8
 """Connected pixels of an object that are fewer do not count [px]."""
-
-MARGIN = 0.1
-"""Gaussians of an object reach beyond its box: by this share of its projection, at least 8 px."""
 
 ALONE = RasterOptions(depth=False, instance=True, median_depth=True)
 
@@ -83,9 +81,10 @@ def views_of(
         seen = None if whole is None else cut_at_border(whole, camera.width, camera.height)
         if whole is None or seen is None:
             continue
-        modal, visible = _modal(images.instance, box.instance_id, whole)
-        own = [i for i in instances if i.instance_id == box.instance_id]
-        alone = _alone_pixels(own, box, whole, images, backend)
+        window = window_about(box.instance_id, whole, camera)
+        modal, visible = _modal(images.instance, window)
+        held = images.alone.get(box.instance_id)
+        depth = _drawn_alone(window, images, instances, backend) if held is None else held[1]
         found.append(
             ObjectView(
                 object_id=box.object_id,
@@ -93,31 +92,17 @@ def views_of(
                 amodal_box=seen,
                 modal_box=modal,
                 visible_pixels=visible,
-                alone_pixels=alone,
+                alone_pixels=_pixels_of(depth, window, box, images),
                 truncation=min(max(1 - area(seen) / area(whole), 0.0), 1.0),
             )
         )
     return CameraView(images, tuple(found))
 
 
-def _window(whole: Box2D, width: int, height: int) -> tuple[int, int, int, int]:
-    """Whole pixels about a projected box in which all of an object shows."""
-    wide = max(8.0, MARGIN * (whole[2] - whole[0]))
-    high = max(8.0, MARGIN * (whole[3] - whole[1]))
-    # Boxes that reach behind the camera have corners at enormous places.
-    left = math.floor(max(whole[0] - wide, 0.0))
-    top = math.floor(max(whole[1] - high, 0.0))
-    right = math.ceil(min(whole[2] + wide, float(width)))
-    bottom = math.ceil(min(whole[3] + high, float(height)))
-    return left, top, right, bottom
-
-
-def _modal(
-    instance: NDArray[np.uint16], instance_id: int, whole: Box2D
-) -> tuple[Box2D | None, int]:
-    height, width = instance.shape
-    left, top, right, bottom = _window(whole, width, height)
-    mask = without_blobs(instance[top:bottom, left:right] == instance_id)
+def _modal(instance: NDArray[np.uint16], window: Window) -> tuple[Box2D | None, int]:
+    left, top = window.left, window.top
+    part = instance[top : window.bottom, left : window.right]
+    mask = without_blobs(part == window.instance_id)
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None, 0
@@ -141,23 +126,19 @@ def without_blobs(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return kept
 
 
-def _alone_pixels(
-    own: Sequence[Instance],
-    box: ObjectBox,
-    whole: Box2D,
-    images: CameraImages,
-    backend: str | Backend,
-) -> int:
-    """Pixels that an object fills in the image when nothing else is drawn."""
-    camera, pose = images.camera, images.T_world_camera
-    left, top, right, bottom = _window(whole, camera.width, camera.height)
+def _drawn_alone(
+    window: Window, images: CameraImages, instances: Sequence[Instance], backend: str | Backend
+) -> NDArray[np.float32]:
+    """Depths [h, w] of an object when nothing else is drawn."""
+    left, top, right, bottom = window.left, window.top, window.right, window.bottom
+    own = [i for i in instances if i.instance_id == window.instance_id]
     if not own or left >= right or top >= bottom:
-        return 0
-    K = camera.K.copy()
+        return np.zeros((max(bottom - top, 0), max(right - left, 0)), np.float32)
+    K = images.camera.K.copy()
     K[:2, 2] -= left, top
     output = rasterize(
         own,
-        invert_transform(pose)[None],
+        invert_transform(images.T_world_camera)[None],
         K[None],
         right - left,
         bottom - top,
@@ -165,7 +146,16 @@ def _alone_pixels(
         backend=backend,
     )
     assert output.median_depth is not None
-    depth = output.median_depth[0].cpu().numpy()
-    mask = depth > 0
-    mask[mask] = on_surface(back_projected(depth, K, pose)[mask], box.T_world_object, box.size)
+    depth: NDArray[np.float32] = output.median_depth[0].cpu().numpy()
+    return depth
+
+
+def _pixels_of(
+    depth: NDArray[np.float32], window: Window, box: ObjectBox, images: CameraImages
+) -> int:
+    """Pixels of the object's surface where it has these depths."""
+    mask = np.empty(depth.shape, np.bool_)
+    rays = rays_of(images.camera.K, images.T_world_camera)
+    body = body_of(box, box.T_world_object)
+    surface_mask(depth, window.left, window.top, rays, body, mask)
     return int(without_blobs(mask).sum())

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...types import RenderError, RenderOutput, WorldViews
+from ...types import LabelOutput, RenderError, RenderOutput, Window, WorldViews
 from ..base import RasterRequest, is_reduced, needs_gradients, place_instances, with_colours
 from ..warm_up import warm_up_requests
 from .cull import seen_chunks
@@ -26,6 +26,7 @@ from .detail.images import SmallImages
 from .drawing import Drawing
 from .gradients import TrainingPasses
 from .inputs import Workspace, timed, view_of
+from .label_drawing import draw_labels
 from .ray_drawing import draw_rays
 from .records import Images
 
@@ -84,6 +85,18 @@ class CpuBackend:
         """Draw small images of many worlds of the same things at once, see SmallImages."""
         with self._lock:
             return self._small.draw_worlds(worlds, like)
+
+    def label(
+        self,
+        request: RasterRequest,
+        windows: Sequence[Sequence[Window]],
+        *,
+        level: float,
+        along_rays: bool = True,
+    ) -> list[LabelOutput]:
+        """Pictures and labels in one walk, see LabelBackend."""
+        with self._work_space() as space, torch.no_grad():
+            return draw_labels(request, windows, space, level=level, along_rays=along_rays)
 
     def warm_up(self) -> None:
         """Compile every kernel, or load it from the disk cache."""

@@ -1,0 +1,208 @@
+"""What is done for each pixel of labels, compiled: what it shows, and where that goes."""
+
+# Kernels take arrays by position.
+# ruff: noqa: PLR0917
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from real2sim_proto.semantics import GROUND, STATIC
+
+from ..._numba import PARALLEL_LOOPS, func, kernel
+
+F32 = np.float32
+BODY = 21
+"""Numbers of a body, see is_surface."""
+
+TOLERANCE = 0.15
+"""What is nearer to the ground's height shows it [m]."""
+
+UNDER_BODY = 0.6
+"""A shadow is drawn as high above the ground as the body's underside may be [m]; what an object
+shows outside of its body farther up is what stands behind it."""
+
+FLATTEST = 0.01
+"""Rays that fall less by metre of depth are not followed to the ground."""
+
+MET = 0.05
+"""From the second step towards the ground the ray may still be so far above or below it [m]."""
+
+BEHIND = F32(1e-3)
+"""What is less far in front of the other camera is behind it [m]."""
+
+SAME_SURFACE, SLACK = F32(0.03), F32(0.05)
+"""A point is seen in the other image where its depth there differs by at most this share and so
+much more [m]."""
+
+
+@func(inline="always")
+def is_surface(body: Any, x: float, y: float, z: float) -> bool:
+    """Whether a place of the world is of a body and not of its shadow, see :mod:`.surface`.
+
+    Args:
+        body: [BODY]: ``T_object_world`` [3, 4]; half length, width and height; margin about the
+            box; lowest place of the surface; sill, below which are wheels alone, and wheels: how
+            far aside they begin, and between which places ahead and behind they are [m].
+        x, y, z: place in the world [m].
+    """
+    a = abs(body[0] * x + body[1] * y + body[2] * z + body[3])
+    b = abs(body[4] * x + body[5] * y + body[6] * z + body[7])
+    c = body[8] * x + body[9] * y + body[10] * z + body[11]
+    if a > body[12] + body[15] or b > body[13] + body[15] or c > body[14] + body[15]:
+        return False
+    if c < body[16]:
+        return False
+    if c < body[17]:
+        return b > body[18] and body[19] < a < body[20]
+    return True
+
+
+@kernel(parallel=PARALLEL_LOOPS)
+def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, heights, frame):
+    """Make depth, instance and semantic image of fronts; shadows of objects become ground.
+
+    Args:
+        depth: [H, W] float32 [m], 0 where nothing is; of the ground that of its heights, changed.
+        instance: [H, W] uint16, changed.
+        semantic: [H, W] uint8, written.
+        rays: [3, 4] float64: a pixel (x, y) of depth d lies at d * rays[:, :3] @ (x, y, 1)
+            + rays[:, 3] of the world.
+        slots: [65536] int16, body of an instance id, -1 for none.
+        bodies: [K, ...] see is_surface.
+        classes: [65536] uint8, by instance id.
+        behind: class where nothing is.
+        heights, frame: of the ground.
+    """
+    x0, y0, per_cell = frame[0], frame[1], 1.0 / frame[2]
+    for row in prange(depth.shape[0]):
+        v = row + 0.5
+        for column in range(depth.shape[1]):
+            d = np.float64(depth[row, column])
+            if d == 0:
+                semantic[row, column] = behind
+                continue
+            u = column + 0.5
+            across = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
+            along = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
+            slope = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+            x, y = d * across + rays[0, 3], d * along + rays[1, 3]
+            z = d * slope + rays[2, 3]
+            number = instance[row, column]
+            found, slot = classes[number], slots[number]
+            shadow = slot >= 0 and not is_surface(bodies[slot], x, y, z)
+            if shadow:
+                instance[row, column], found = 0, STATIC
+            if shadow or found == STATIC:
+                above = z - height_over(heights, x0, y0, per_cell, x, y)
+                if abs(above) < (UNDER_BODY if shadow else TOLERANCE):
+                    found = GROUND
+                if found == GROUND and slope < -FLATTEST:
+                    # Heights are known to a centimetre, what is drawn there to several: along a
+                    # road a centimetre of height is a decimetre of depth.
+                    steepness = 1.0 / slope
+                    met = d - above * steepness
+                    x, y = met * across + rays[0, 3], met * along + rays[1, 3]
+                    height = height_over(heights, x0, y0, per_cell, x, y)
+                    miss = met * slope + rays[2, 3] - height
+                    if abs(miss) < MET and met > 0:
+                        depth[row, column] = met - miss * steepness
+            semantic[row, column] = found
+
+
+@func(inline="always")
+def height_over(heights: Any, x0: float, y0: float, per_cell: float, x: float, y: float) -> float:
+    """As height_under, with one over the edge of a cell."""
+    rows, columns = heights.shape
+    u = min(max((x - x0) * per_cell, 0.0), rows - 1.0)
+    v = min(max((y - y0) * per_cell, 0.0), columns - 1.0)
+    i, j = min(np.uint64(u), np.uint64(rows - 2)), min(np.uint64(v), np.uint64(columns - 2))
+    a, b = u - i, v - j
+    one = np.uint64(1)
+    low = heights[i, j] + (heights[i + one, j] - heights[i, j]) * a
+    high = heights[i, j + one] + (heights[i + one, j + one] - heights[i, j + one]) * a
+    return low + (high - low) * b
+
+
+@kernel
+def surface_mask(depth, left, top, rays, body, mask):
+    """Where a window [h, w] of depths shows the surface of one body; ``mask`` [h, w] uint8."""
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            d = np.float64(depth[row, column])
+            u, v = column + left + 0.5, row + top + 0.5
+            x = d * (rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]) + rays[0, 3]
+            y = d * (rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]) + rays[1, 3]
+            z = d * (rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]) + rays[2, 3]
+            mask[row, column] = d > 0 and is_surface(body, x, y, z)
+
+
+@kernel
+def on_bodies(points, body, found):
+    """Which points [N, 3] of the world are of a body; ``found`` [N] bool is written."""
+    for k in range(points.shape[0]):
+        found[k] = is_surface(body, points[k, 0], points[k, 1], points[k, 2])
+
+
+@kernel(parallel=PARALLEL_LOOPS)
+def carry(depth, instance, slots, motions, there, flow, valid, occluded):
+    """Flow of each pixel, whether it is valid, and whether the other image shows something else.
+
+    Args:
+        depth: [H, W] float32 [m], 0 for what is infinitely far away.
+        instance: [H, W] uint16.
+        slots: [65536] int16, motion of an instance id, 0 for what stands, -1 for what is not there
+            then.
+        motions: [K, 3, 4] float32, K_there times T_there_here, so that a pixel (x, y) of depth d is
+            at d * motion[:, :3] @ (x, y, 1) + motion[:, 3] there, times its depth.
+        there: lowest and highest depth about each pixel of the other image [H, W] float32, and its
+            instances.
+        flow, valid, occluded: [H, W, 2] float32, [H, W] bool twice, written.
+    """
+    low, high, shown = there
+    height, width = low.shape
+    still = motions[0]
+    for row in prange(depth.shape[0]):
+        v = F32(row) + F32(0.5)
+        # Where everything would be that stands still, in a loop without branches.
+        places = np.empty((3, depth.shape[1]), np.float32)
+        xs, ys, zs = places[0], places[1], places[2]
+        first = still[0, 1] * v + still[0, 2]
+        second = still[1, 1] * v + still[1, 2]
+        third = still[2, 1] * v + still[2, 2]
+        for column in range(depth.shape[1]):
+            u, d = F32(column) + F32(0.5), depth[row, column]
+            near = F32(1) if d > 0 else F32(0)
+            d = d if d > 0 else F32(1)
+            z = (still[2, 0] * u + third) * d + still[2, 3] * near
+            one = F32(1) / z
+            xs[column] = ((still[0, 0] * u + first) * d + still[0, 3] * near) * one
+            ys[column] = ((still[1, 0] * u + second) * d + still[1, 3] * near) * one
+            zs[column] = z
+        for column in range(depth.shape[1]):
+            number = instance[row, column]
+            u, d = F32(column) + F32(0.5), depth[row, column]
+            x, y, z = xs[column], ys[column], zs[column]
+            slot = slots[number]
+            if slot > 0:
+                m = motions[slot]
+                z = (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * d + m[2, 3]
+                x = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) * d + m[0, 3]) / z
+                y = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) * d + m[1, 3]) / z
+            good = slot >= 0 and z > BEHIND
+            valid[row, column] = good
+            flow[row, column, 0] = x - u if good else F32(0)
+            flow[row, column, 1] = y - v if good else F32(0)
+            hidden = good
+            if good and x >= 0 and x < width and y >= 0 and y < height:
+                i, j = np.uint64(y), np.uint64(x)
+                slack = SAME_SURFACE * z + SLACK
+                z = z if d > 0 else F32(0)
+                slack = slack if d > 0 else F32(0)
+                same = low[i, j] - slack <= z <= high[i, j] + slack
+                # Sky is met where there is sky about; nothing else has depth 0.
+                hidden = not (same and shown[i, j] == number)
+            occluded[row, column] = hidden
