@@ -5,8 +5,9 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
     .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
 
-NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses; without one, all
-are made. It takes about a quarter of an hour on two cores.
+NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, jam; without
+one, all but jam are made. It takes about a quarter of an hour on two cores. ``jam`` trains for
+another five minutes, on the KITTI drive whose folder ``KITTI_LOG`` names.
 """
 
 from __future__ import annotations
@@ -25,12 +26,13 @@ import cv2
 import numpy as np
 
 import real2sim
+from real2sim_proto.operations import Delete, Duplicate, Operation, Rotate, Translate
 from real2sim_server.demo.run import SCENE
 from real2sim_server.demo.street import DURATION_S, TRAINING_HZ, record_street, unpack_street
 from real2sim_server.demo.worker import worker_process
-from real2sim_server.edit import posed_instances
+from real2sim_server.edit import ScenarioState, apply_operations, instances_at, posed_instances
 from real2sim_server.render import render_cameras
-from real2sim_server.scene import Fisheye, Shutter
+from real2sim_server.scene import Fisheye, Scene, Shutter
 from real2sim_server.scene.io import load_scene
 
 HERE = Path(__file__).parent
@@ -58,6 +60,7 @@ EDITS = [
 """Of docs/rest.md."""
 SHOWN_US = 5_250_000
 LENSES_US = 5_300_000
+CARS_US = 6_600_000
 IN_THE_LANE = {"op": "translate", "object_id": "car_6", "y": 3.0, "frame": "object", "snap": True}
 """Puts a parked car before the van that drives ahead, for the studio's run of physics."""
 
@@ -66,7 +69,8 @@ def main() -> None:
     """Make the pictures that are named."""
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("--work", type=Path, default=Path("out/pictures"))
-    parser.add_argument("names", nargs="*", default=list(PICTURES))
+    everything = [name for name in PICTURES if name != "jam"]
+    parser.add_argument("names", nargs="*", default=everything)
     given = parser.parse_args()
     scenes = given.work / "scenes"
     shutil.rmtree(scenes, ignore_errors=True)
@@ -185,9 +189,64 @@ def lenses(_: Path, scenes: Path) -> None:
     save("lenses.jpg", np.concatenate([pictures[0], gap, pictures[1]], axis=1), width=1286)
 
 
+def cars(_: Path, scenes: Path) -> None:
+    """``cars.jpg``: a parked car of the demo's street in all kinds of edits."""
+    rows = {
+        "as recorded": [],
+        "turned by 35 degrees": [Rotate(object_id="car_6", angle=np.radians(35))],
+        "turned by 90 degrees": [Rotate(object_id="car_6", angle=np.radians(90))],
+        "moved": [Translate(object_id="car_6", x=2, y=3.0, frame="object", snap=True)],
+        "duplicated": [Duplicate(object_id="car_6", x=6.5, frame="object", snap=True)],
+        "the van ahead deleted": [Delete(object_id="van_0")],
+    }
+    edits("cars.jpg", load_scene(scenes / SCENE), CARS_US, rows, rows_shown=slice(180, 480))
+
+
+def jam(work: Path, _: Path) -> None:
+    """``jam.jpg``: the car ahead in a KITTI drive, which was only ever seen from behind."""
+    log, scene = os.environ["KITTI_LOG"], work / "jam"
+    if not scene.exists():
+        command("reconstruct", log, "--out", scene, "--iterations", "1200", "--width", "621")
+    loaded = load_scene(scene)
+    car, times = "car_0", loaded.frame_times_us
+    rows = {
+        "as recorded": [],
+        "turned by 35 degrees": [Rotate(object_id=car, angle=np.radians(35))],
+        "turned by 90 degrees": [Rotate(object_id=car, angle=np.radians(90))],
+        "moved": [Translate(object_id=car, x=4, y=1.2, frame="object", snap=True)],
+        "duplicated": [Duplicate(object_id=car, x=-1.5, y=2.9, frame="object", snap=True)],
+        "deleted": [Delete(object_id=car)],
+    }
+    edits("jam.jpg", loaded, int(times[len(times) // 2]), rows)
+
+
+def edits(
+    name: str,
+    scene: Scene,
+    t_us: int,
+    rows: dict[str, list[Operation]],
+    *,
+    rows_shown: slice = slice(None),
+) -> None:
+    """What the first camera sees after each of some batches of operations, one above the other."""
+    camera, vehicle = scene.rig.cameras[0].resized(960), scene.ego.transform(t_us)
+    recorded, pictures = ScenarioState.of(scene), []
+    for caption, operations in rows.items():
+        state = apply_operations(recorded, operations).state
+        instances = instances_at(scene, state, t_us)
+        [frame] = render_cameras(instances, [camera], vehicle, sky=scene.sky, backend="cpu")
+        shown = np.ascontiguousarray(frame.rgb[rows_shown, :, ::-1])
+        cv2.rectangle(shown, (0, 0), (10 * len(caption) + 24, 30), (44, 36, 32), -1)
+        cv2.putText(
+            shown, caption, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA
+        )
+        pictures += [shown, np.full((6, 960, 3), 255, np.uint8)]
+    save(name, np.concatenate(pictures[:-1]), width=960)
+
+
 PICTURES = {
     make.__name__: make
-    for make in (demo, scenario, studio, wall, pair, drop, crashes, ground, lenses)
+    for make in (demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, jam)
 }
 
 

@@ -30,6 +30,14 @@ def render(
     _report(json, render.run(splat=splat))
 
 
+@command("sensors", group=app)
+def sensors(*, json: JsonFile = None) -> None:
+    """Time of a LiDAR's sweep, and of images through lenses and shutters beside a pinhole's."""
+    from ..benchmarks import sensors
+
+    _report(json, sensors.run())
+
+
 @command("reconstruct", group=app)
 def reconstruct(*, json: JsonFile = None) -> None:
     """Training iterations per second by stage, at 76,000 Gaussians and 621x188."""

@@ -35,7 +35,10 @@ RIM = 1.2
 LOW = 0.25
 """The ground's Gaussians are less than this above or below the box's bottom [m]."""
 
-NEIGHBOURS = 6
+FEWEST = 6
+NEIGHBOURS = 48
+"""Of so many the middle colour counts, so that neither a line nor a shadow beside the box is drawn
+out into what was under it."""
 
 
 def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
@@ -103,9 +106,10 @@ def _away(pose: Float, parked: ObjectState) -> bool:
 
 
 def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
-    """Give those of ``unknown`` [N] bool the mean ``sh`` of the nearest of ``known``, in place."""
-    if int(known.sum()) < NEIGHBOURS or not bool(unknown.any()):
+    """Give those of ``unknown`` [N] bool the median ``sh`` of the nearest ``known``, in place."""
+    count = min(NEIGHBOURS, int(known.sum()))
+    if count < FEWEST or not bool(unknown.any()):
         return
     distances = torch.cdist(places[unknown], places[known])
-    nearest = distances.topk(NEIGHBOURS, largest=False).indices
-    sh[unknown] = sh[known][nearest].mean(dim=1)
+    nearest = distances.topk(count, largest=False).indices
+    sh[unknown] = sh[known][nearest].median(dim=1).values

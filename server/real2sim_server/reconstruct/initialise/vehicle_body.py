@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...logs import DrivingLog, ObjectTrack
+from ...scene import Scene
 from ...synthetic.materials import BODY, WHEEL
 from ...synthetic.vehicles import SHAPES, VehicleShape, build_vehicle, roof_heights
+from .inpainting import MIN_OBSERVED, modal_colour
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
@@ -29,11 +31,14 @@ LONGEST_SCALE = 1.35
 GLASS = (0.2, 0.23, 0.27)
 TRIM = (0.13, 0.13, 0.14)
 TYRE = (0.1, 0.1, 0.1)
-RIM = (0.55, 0.55, 0.56)
-WHITE_LAMP, RED_LAMP = (0.8, 0.8, 0.8), (0.6, 0.13, 0.13)
-PLATE = (0.75, 0.75, 0.73)
+RIM = (0.4, 0.4, 0.41)
+WHITE_LAMP, RED_LAMP = (0.65, 0.65, 0.65), (0.45, 0.1, 0.1)
+PLATE = (0.6, 0.6, 0.58)
 GRAZING = 0.35
 """Cosine to a surface's normal up to which a camera hardly sees it: 20 degrees from edge on."""
+SKY_LIGHT, SHADE = 0.18, 0.4
+"""Of its brightness a surface that faces up gains the first and one that faces down loses the
+second, against an upright one."""
 PAINT_REACH = 0.2
 """Points farther from a body say nothing by its parts [m]."""
 
@@ -94,6 +99,32 @@ def fitted_body(
     few = measured[:: -(-len(measured) // COMPARED)]
     distances = [np.minimum(cKDTree(b.points).query(few)[0], 0.3).mean() for b in bodies]
     return bodies[int(np.argmin(distances))]
+
+
+def scene_bodies(scene: Scene) -> list[VehicleBody | None]:
+    """The bodies of the objects of stage 0, in their order."""
+    return [
+        fitted_body(item.cloud.means.detach().cpu().numpy(), item.size, item.category)
+        for item in scene.objects.values()
+    ]
+
+
+def body_colours(
+    body: VehicleBody, points: NDArray[np.float32], colours: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Colours [B, 3] of the points of a body: its parts' own, and one paint in soft light.
+
+    Args:
+        points: [N, 3] of a vehicle in that box, stage 0's.
+        colours: [N, 3] of these; the commonest where there is paint becomes the paint.
+    """
+    _, is_part = body.part_colours(points)
+    painted = colours[~is_part] if (~is_part).sum() >= MIN_OBSERVED else colours
+    paint = modal_colour(painted) if len(painted) else np.full(3, 0.4, np.float32)
+    up = body.normals[:, 2:]
+    light = 1 + np.where(up > 0, SKY_LIGHT, SHADE) * up
+    mixed = np.where(body.is_paint[:, None], paint, body.colours)
+    return np.clip(mixed * light, 0, 1).astype(np.float32)
 
 
 def faced(

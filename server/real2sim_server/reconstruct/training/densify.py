@@ -59,8 +59,11 @@ class DensifyOptions:
             stage 0 take their places; what stands before these closes up in the rest.
         background_limits: of what counts as hidden in the background.
         object_limits: likewise in objects.
-        last_object_limits: likewise when priors take their places; what a window shows of an
-            object's inside is hardly ever learnt well, and is better drawn as the window's colour.
+        last_background_limits: when priors take their places, besides, of what is no higher than
+            the objects: what lies metres behind all that images show of it was learnt through gaps
+            in them, and shows when one is deleted.
+        last_object_limits: likewise in objects; what a window shows of an object's inside is
+            hardly ever learnt well, and is better drawn as the window's colour.
     """
 
     method: str = "gradient"
@@ -81,6 +84,9 @@ class DensifyOptions:
     background_limits: VisibilityLimits = field(default_factory=VisibilityLimits)
     object_limits: VisibilityLimits = field(
         default_factory=lambda: VisibilityLimits(0.01, occluded_fraction=0.03, occluded_depth=0.3)
+    )
+    last_background_limits: VisibilityLimits = field(
+        default_factory=lambda: VisibilityLimits(0.005, occluded_fraction=0.1, occluded_depth=4.0)
     )
     last_object_limits: VisibilityLimits = field(
         default_factory=lambda: VisibilityLimits(0.03, occluded_fraction=0.3, occluded_depth=0.15)

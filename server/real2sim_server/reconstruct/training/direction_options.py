@@ -16,10 +16,13 @@ class DirectionOptions:
             initialisation from ahead; what images show of them stays.
         sides: whether sides of vehicles that images show only edge on are taken from
             initialisation: right for edits, but recorded views lose by it.
+        close: whether vehicles that images show from one direction alone become closed bodies:
+            what was learnt is laid on the body's surface, the body stands behind it.
         views: that are asked.
     """
 
     lobe_prior: float = 0.03
     paint: bool = True
     sides: bool = False
+    close: bool = True
     views: int = 32

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...scene import GaussianCloud
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import GRAZING, VehicleBody
 from .model import SceneModel
@@ -172,9 +173,13 @@ def _initial_colours(model: SceneModel, rows: Tensor) -> Tensor:
             continue
         tree = cKDTree(item.cloud.means.detach().cpu().numpy())
         _, near = tree.query(model.gaussians.means[rows[mine]].detach().cpu().numpy(), k=1)
-        constant = item.cloud.sh[torch.from_numpy(near), 0]
-        colours[mine] = (0.5 + SH_C0 * constant).to(colours)
+        colours[mine] = constant_colours(item.cloud)[torch.from_numpy(near)].to(colours)
     return colours
+
+
+def constant_colours(cloud: GaussianCloud) -> Tensor:
+    """The part of colours [N, 3] that does not depend on the direction."""
+    return 0.5 + SH_C0 * cloud.sh[:, 0]
 
 
 @torch.no_grad()

@@ -16,10 +16,11 @@ from ...logs import DrivingLog
 from ...render.backends import Backend
 from ...scene import Scene
 from ...scene.spherical_harmonics import SH_C0
-from ..initialise.vehicle_body import VehicleBody, fitted_body
+from ..initialise.vehicle_body import scene_bodies
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from .closed_vehicles import close_followed
 from .data import TrainingView, TrainingViews, held_out_frames, image_time
 from .densify import STRATEGIES, ScreenSums, TrainingStep
 from .directions import (
@@ -82,8 +83,11 @@ class Trainer:
             options.densify,
             options.iterations,
             self.views.sample_viewpoints,
-            unseen=partial(unseen_sides, bodies=_bodies(scene))
+            unseen=partial(unseen_sides, bodies=scene_bodies(scene))
             if options.directions.sides
+            else None,
+            close=partial(close_followed, bodies=scene_bodies(scene))
+            if options.directions.close
             else None,
         )
         self.iteration = 0
@@ -268,7 +272,7 @@ class Trainer:
             seen = viewing_directions(self.model, viewpoints, objects_only=True)
             plain_lobes(self.model, seen, prior=options.lobe_prior)
         if options.paint:
-            paint_unseen_sides(self.model, viewpoints, _bodies(self.model.scene))
+            paint_unseen_sides(self.model, viewpoints, scene_bodies(self.model.scene))
 
     def _report(
         self, terms: dict[str, float], clock: RateMeter, on_progress: OnTraining | None
@@ -346,14 +350,6 @@ class Trainer:
         )
         if self.metrics is not None:
             self.metrics.cut(held.iteration)
-
-
-def _bodies(scene: Scene) -> list[VehicleBody | None]:
-    """What is known of the shape of the objects of stage 0."""
-    return [
-        fitted_body(item.cloud.means.detach().cpu().numpy(), item.size, item.category)
-        for item in scene.objects.values()
-    ]
 
 
 def _on_host(*values: Tensor) -> list[float]:

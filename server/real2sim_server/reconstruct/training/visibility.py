@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ...render import Instance, RasterOptions, rasterize
-from ...scene import Camera, Sky
+from ...scene import Camera, Scene, Sky
 from ...scene.spherical_harmonics import SH_C0
 from .densify import DensifyOptions, VisibilityLimits
 from .gaussians import Gaussians, concatenate
@@ -37,6 +37,12 @@ PRIOR_FRACTION = 0.01
 less leaves holes in sides that only a turned object shows."""
 SKY_FRACTION = 0.1
 """Visible fraction up to which a texel of the sky counts as hidden."""
+ON_GROUND = 0.05
+"""Gaussians of stage 0 this close to the ground's surface make it up [m]."""
+SHOWN_FRACTION = 0.05
+"""Trained Gaussians of which more is visible than this say what the ground is like."""
+BARE_REACH = 2.5
+"""They say so up to so many standard deviations of a Gaussian of the ground from its centre."""
 VISIBILITY_VIEWS = 64
 """Views that decide which Gaussians are hidden."""
 EPS2D = RasterOptions().eps2d
@@ -201,12 +207,45 @@ def prune_hidden(
     *,
     background_limits: VisibilityLimits,
     object_limits: VisibilityLimits,
+    besides: Tensor | None = None,
 ) -> Gaussians:
-    """Without those hardly visible, or little visible and occluded deep behind the rest."""
+    """Without those hardly visible, or little visible and occluded deep behind the rest.
+
+    Args:
+        besides: [N] bool, more that go.
+    """
     hidden = torch.where(
         gaussians.owners > 0, seen.hidden(object_limits), seen.hidden(background_limits)
     )
-    return prune(gaussians, optimizer, hidden)
+    return prune(gaussians, optimizer, hidden if besides is None else hidden | besides)
+
+
+@torch.no_grad()
+def behind_objects(model: SceneModel, seen: GaussianVisibility, limits: VisibilityLimits) -> Tensor:
+    """[N] bool: hidden Gaussians of the background no higher above the ground than the objects."""
+    count, ground = model.gaussians.counts[0], model.scene.stored_ground
+    found = torch.zeros(len(model.gaussians), dtype=torch.bool, device=model.device)
+    if ground is None or not len(model.half_sizes):
+        return found
+    places = model.gaussians.means[:count].cpu().numpy().astype(np.float64)
+    height = places[:, 2] - ground.height_at(places[:, :2])
+    low = ground.covers(places[:, :2]) & (height < 2 * float(model.half_sizes[:, 2].max()))
+    found[:count] = torch.from_numpy(low).to(found.device) & seen.hidden(limits)[:count]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class OfferedPriors:
+    """What may take the places that no image shows.
+
+    Attributes:
+        scene: of stage 0, or with other clouds of its objects.
+        alternatives: [N] int64 by Gaussian of ``scene``: of those of one number only the first
+            that fits is taken; negative for any that fits. None: all are of the latter kind.
+    """
+
+    scene: Scene
+    alternatives: Tensor | None = None
 
 
 def occluded_priors(
@@ -216,12 +255,14 @@ def occluded_priors(
     *,
     limit: float,
     wanted: Tensor | None = None,
+    alternatives: Tensor | None = None,
+    bare: Tensor | None = None,
 ) -> Gaussians:
     """Gaussians of stage 0 that ``model`` occludes; they are drawn and do not learn.
 
     A prior of the background must have been hidden in stage 0 too: where it was visible, training
-    had its reasons to prune it. Objects can be moved, and are given every prior that their trained
-    Gaussians occlude.
+    had its reasons to prune it. Bare ground needs no reasons. Objects can be moved, and are given
+    every prior that their trained Gaussians occlude.
 
     Args:
         model: trained.
@@ -229,8 +270,12 @@ def occluded_priors(
         viewpoints: training views.
         limit: visible fraction up to which a Gaussian of the background was hidden in stage 0.
         wanted: [N] bool, Gaussians of ``first`` that are taken even where they are visible.
+        alternatives: of the Gaussians of ``first``, see OfferedPriors.
+        bare: [N] bool, Gaussians of ``first`` that count as hidden in stage 0.
     """
     hidden = visibility(first, viewpoints).fractions <= limit
+    if bare is not None:
+        hidden |= bare
     offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
     priors, trained = first.gaussians.select(offered), model.gaussians
     # Faint, so that no prior occludes another: several may stand behind one gap of the surface.
@@ -240,7 +285,44 @@ def occluded_priors(
     model.gaussians = trained
     if wanted is not None:
         behind |= wanted[offered]
-    return priors.select(behind.nonzero()[:, 0])
+    taken = behind.nonzero()[:, 0]
+    if alternatives is not None:
+        taken = taken[_first_of_each(alternatives.to(offered)[offered[taken]])]
+    return priors.select(taken)
+
+
+@torch.no_grad()
+def bare_ground(model: SceneModel, first: SceneModel, seen: GaussianVisibility) -> Tensor:
+    """[N] bool, Gaussians of ``first`` on the ground near which images show none of ``model``.
+
+    Args:
+        seen: of ``model``.
+    """
+    from scipy.spatial import cKDTree
+
+    ground, count = model.scene.stored_ground, first.gaussians.counts[0]
+    bare = torch.zeros(len(first.gaussians), dtype=torch.bool, device=model.device)
+    if ground is None:
+        return bare
+    places = first.gaussians.means[:count].cpu().numpy().astype(np.float64)
+    on_ground = np.abs(places[:, 2] - ground.height_at(places[:, :2])) < ON_GROUND
+    on_ground &= ground.covers(places[:, :2])
+    mine = slice(0, model.gaussians.counts[0])
+    shown = model.gaussians.means[mine][seen.fractions[mine] > SHOWN_FRACTION]
+    if len(shown) and on_ground.any():
+        distance, _ = cKDTree(shown.cpu().numpy()).query(places[on_ground])
+        reach = first.gaussians.log_scales[:count].amax(1).exp().cpu().numpy()[on_ground]
+        on_ground[on_ground] = distance > BARE_REACH * reach
+    bare[:count] = torch.from_numpy(on_ground).to(bare.device)
+    return bare
+
+
+def _first_of_each(numbers: Tensor) -> Tensor:
+    """[N] bool: negative, or the first of its number."""
+    _, first = np.unique(numbers.cpu().numpy(), return_index=True)
+    is_first = torch.zeros(len(numbers), dtype=torch.bool, device=numbers.device)
+    is_first[torch.from_numpy(first).to(numbers.device)] = True
+    return is_first | (numbers < 0)
 
 
 class OcclusionPruning:
@@ -252,6 +334,8 @@ class OcclusionPruning:
         sample: draws so many training views.
         unseen: of a model, which Gaussians lie on sides that no view shows, see
             :func:`.directions.unseen_sides`; None knows of no such sides.
+        close: changes a model before its priors are chosen and says which are offered, see
+            :func:`.closed_vehicles.close_followed`; None offers stage 0.
     """
 
     def __init__(
@@ -261,8 +345,10 @@ class OcclusionPruning:
         sample: Callable[[int], list[Viewpoint]],
         *,
         unseen: Callable[[SceneModel, list[Viewpoint]], Tensor] | None = None,
+        close: Callable[[SceneModel, SelectiveAdam, list[Viewpoint]], OfferedPriors] | None = None,
     ) -> None:
-        self._options, self._sample, self._unseen = options, sample, unseen
+        self._options, self._sample = options, sample
+        self._unseen, self._close = unseen, close
         self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
         self._prior_round = round(options.prior_round * iterations)
 
@@ -272,42 +358,60 @@ class OcclusionPruning:
         prior_round = iteration + 1 == self._prior_round
         if hidden_round:
             viewpoints = self._sample(VISIBILITY_VIEWS)
-            self._prune(model, optimizer, viewpoints, self._options.object_limits)
+            if self._close is not None and iteration + 1 == max(self._hidden_rounds):
+                # Early enough that what is pressed is learnt anew, and the next time moves little.
+                self._close(model, optimizer, viewpoints)
+            model.gaussians = prune_hidden(
+                model.gaussians,
+                optimizer,
+                visibility(model, viewpoints),
+                background_limits=self._options.background_limits,
+                object_limits=self._options.object_limits,
+            )
         if prior_round:
             viewpoints = self._sample(VISIBILITY_VIEWS)
             if self._unseen is not None:
                 sides = self._unseen(model, viewpoints)
                 model.gaussians = prune(model.gaussians, optimizer, sides)
+            offered = OfferedPriors(model.scene)
+            if self._close is not None:
+                offered = self._close(model, optimizer, viewpoints)
+            seen = visibility(model, viewpoints)
             # Priors first: they are to stand behind what is pruned then, too.
-            self._insert_priors(model, optimizer, viewpoints)
-            self._prune(model, optimizer, viewpoints, self._options.last_object_limits)
+            self._insert_priors(model, optimizer, viewpoints, offered, seen)
+            model.gaussians = prune_hidden(
+                model.gaussians,
+                optimizer,
+                seen,
+                background_limits=self._options.background_limits,
+                object_limits=self._options.last_object_limits,
+                besides=behind_objects(model, seen, self._options.last_background_limits),
+            )
         return hidden_round or prior_round
 
-    def _prune(
+    def _insert_priors(
         self,
         model: SceneModel,
         optimizer: SelectiveAdam,
         viewpoints: list[Viewpoint],
-        object_limits: VisibilityLimits,
+        offered: OfferedPriors,
+        seen: GaussianVisibility,
     ) -> None:
-        model.gaussians = prune_hidden(
-            model.gaussians,
-            optimizer,
-            visibility(model, viewpoints),
-            background_limits=self._options.background_limits,
-            object_limits=object_limits,
-        )
-
-    def _insert_priors(
-        self, model: SceneModel, optimizer: SelectiveAdam, viewpoints: list[Viewpoint]
-    ) -> None:
-        """Stage 0's, as opaque as they were, for hidden places, and its sky likewise."""
+        """Those offered, as opaque as they were, for hidden places, and stage 0's sky likewise."""
         opaque = replace(model.options, initial_opacity=0.99, refine_poses=False)
         times = np.array([model.scene.start_us, model.scene.end_us])
-        first = SceneModel(model.scene, opaque, times, backend=model.backend)
+        first = SceneModel(offered.scene, opaque, times, backend=model.backend)
         hidden = hidden_sky(model, viewpoints)
         model.sky.data[hidden] = first.sky.data[hidden]
         optimizer.reset_moments("sky")
         limit = self._options.background_limits.fraction
         wanted = None if self._unseen is None else self._unseen(first, viewpoints)
-        model.priors = occluded_priors(model, first, viewpoints, limit=limit, wanted=wanted)
+        model.priors = occluded_priors(
+            model,
+            first,
+            viewpoints,
+            limit=limit,
+            wanted=wanted,
+            alternatives=offered.alternatives,
+            bare=bare_ground(model, first, seen),
+        )

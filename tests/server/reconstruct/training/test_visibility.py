@@ -13,6 +13,8 @@ from real2sim_server.reconstruct.training.gaussians import Gaussians, concatenat
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.reconstruct.training.visibility import (
     GaussianVisibility,
+    bare_ground,
+    behind_objects,
     hidden_sky,
     occluded_priors,
     prune_hidden,
@@ -241,3 +243,43 @@ def test_training_drops_what_is_hidden_at_its_rounds(tiny_log, tiny_scene):
     assert len(trainer.model.gaussians) < before
     trainer.run(until=5)
     trainer.views.close()
+
+
+def test_of_alternatives_the_first_that_is_hidden_is_taken(model, viewpoints):
+    wall = [ahead(model, 4 + 0.01 * k, 1.0, 0.99) for k in range(4)]
+    trained = model_of(model, wall, subject=[ahead(model, 30, 0.02, 0.5)])
+    offered = [ahead(model, depth, 0.1, 0.9) for depth in (3.0, 6.0, 7.0)]
+    first = model_of(model, wall, subject=offered)
+    numbers = torch.tensor([-1] * len(wall) + [9, 9, 9])
+    taken = occluded_priors(trained, first, viewpoints, limit=0.005, alternatives=numbers)
+    assert taken.counts[1] == 1
+    assert torch.equal(taken.means[-1], first.gaussians.means[-2])
+
+
+def test_low_background_that_shows_from_deep_behind_goes_and_high_background_stays(model):
+    count = len(model.gaussians)
+    deep = GaussianVisibility(torch.full((count,), 0.08), torch.full((count,), 9.0))
+    found = behind_objects(model, deep, LIMITS.last_background_limits)
+    heights = model.gaussians.means.detach()[:, 2]
+    background = model.gaussians.owners == 0
+    assert found[background & (heights < 0.5) & (heights > -0.1)].float().mean() > 0.9
+    assert not found[heights > 6].any()
+    assert not found[~background].any()
+    shallow = GaussianVisibility(deep.fractions, torch.ones(count))
+    assert not behind_objects(model, shallow, LIMITS.last_background_limits).any()
+
+
+def test_ground_is_bare_where_images_show_none(model, tiny_scene):
+    kept = model.gaussians.means[:, 0] > 0
+    kept |= model.gaussians.owners > 0
+    first = SceneModel(tiny_scene, model.options, np.zeros(0, np.int64), backend="cpu")
+    model.gaussians = model.gaussians.select(kept.nonzero()[:, 0])
+    ones = torch.ones(len(model.gaussians))
+    bare = bare_ground(model, first, GaussianVisibility(ones, torch.zeros_like(ones)))
+    means = first.gaussians.means.detach()
+    height = tiny_scene.ground.height_at(means[:, :2].double().numpy())
+    on_ground = torch.from_numpy(np.abs(means[:, 2].numpy() - height) < 0.01)
+    on_ground &= first.gaussians.owners == 0
+    assert bare[on_ground & (means[:, 0] < -3)].float().mean() > 0.9
+    assert not bare[on_ground & (means[:, 0] > 0)].any()
+    assert not bare[first.gaussians.owners > 0].any()

@@ -1,0 +1,205 @@
+"""Vehicles that training shows from one direction alone, closed.
+
+Where all images look along one direction, none tells how deep what they show lies: the tail of a
+vehicle that was followed is learnt as a cloud metres deep, and falls apart when the vehicle turns.
+Here that cloud is pressed along the viewing rays onto the body that fits the vehicle's box, which
+hardly changes an image, and the body closes the rest as far as no image shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ...geometry.rotation import matrix_to_quaternion
+from ...scene import GaussianCloud, SceneObject
+from ...scene.spherical_harmonics import SH_C0
+from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
+from .directions import ViewingDirections, constant_colours, viewing_directions
+from .gaussians import FIELDS, OBJECT_FIELDS
+from .model import SceneModel
+from .operations import rotation_matrices
+from .optimizer import SelectiveAdam
+from .visibility import OfferedPriors, Viewpoint
+
+ONE_DIRECTION = float(np.radians(5))
+"""Root mean square angle between viewing directions up to which they count as one."""
+KEPT_DEPTH = 0.05
+"""Of the depth about a surface so much stays, so that what lay in front still does."""
+HIT = 0.07
+"""A ray that passes a point of a surface this close hits it [m]."""
+LAYER = 0.15
+"""Points of a surface at most so much deeper than the first one hit belong to it [m]."""
+EDGE_ON = 0.2
+"""Surfaces are followed up to this cosine between normal and ray, beyond it Gaussians stand up."""
+THINNEST = 2e-3
+"""Least standard deviation of what was pressed [m]."""
+SHADOW = 0.3
+"""The ground plate on which shadows lie reaches so far beyond the box [m]."""
+INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
+"""A body may be this much narrower and lower, where images show it beyond a vehicle's outline."""
+DISC = (0.6 * SPACING, 0.6 * SPACING, 0.15 * SPACING)
+"""Standard deviations of a body's Gaussians [m]."""
+ROWS = 2000
+
+
+@torch.no_grad()
+def close_followed(
+    model: SceneModel,
+    optimizer: SelectiveAdam,
+    viewpoints: Sequence[Viewpoint],
+    bodies: Sequence[VehicleBody | None],
+) -> OfferedPriors:
+    """Press what was followed onto its body, in place, and offer the body as its prior.
+
+    Args:
+        bodies: of the objects; None where there is none.
+    """
+    seen = viewing_directions(model, viewpoints, objects_only=True)
+    objects, alternatives = dict(model.scene.objects), [_no_choice(len(model.scene.background))]
+    for index, (name, item) in enumerate(model.scene.objects.items()):
+        body, rows = bodies[index], _followed_rows(model, seen, index)
+        if body is not None and len(rows):
+            _press(model, optimizer, rows, seen.means[rows], _surface(body, item.size))
+            objects[name] = replace(item, cloud=body_cloud(body, item))
+            alternatives.append(torch.arange(len(body.points)).repeat(len(INSETS)))
+        else:
+            alternatives.append(_no_choice(len(item.cloud)))
+    # Of a body's point one inset is taken; numbers tell the points of all objects apart.
+    numbered = [a + (a >= 0) * (i << 32) for i, a in enumerate(alternatives)]
+    return OfferedPriors(replace(model.scene, objects=objects), torch.cat(numbered))
+
+
+def body_cloud(body: VehicleBody, item: SceneObject) -> GaussianCloud:
+    """The whole of a body once for each of INSETS, in the paint that ``item`` shows.
+
+    Args:
+        item: of stage 0.
+    """
+    shown = constant_colours(item.cloud)
+    colours = body_colours(body, item.cloud.means.cpu().numpy(), shown.cpu().numpy())
+    insets = np.array([(1 - 0.4 * (1 - f), f, f) for f in INSETS])
+    normals = body.normals / np.linalg.norm(body.normals, axis=1, keepdims=True).clip(1e-9)
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]])
+    first = np.cross(helper, normals)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(normals, first), normals], axis=2)
+    count, copies = len(body.points), len(INSETS)
+    means = (insets[:, None] * body.points).reshape(-1, 3)
+    cloud = GaussianCloud(
+        means=torch.from_numpy(means).float(),
+        quats=torch.from_numpy(matrix_to_quaternion(axes)).float().repeat(copies, 1),
+        scales=torch.tensor(DISC).repeat(copies * count, 1),
+        opacities=torch.full((copies * count,), 0.99),
+        sh=torch.from_numpy((colours - 0.5) / SH_C0)[:, None].float().repeat(copies, 1, 1),
+    )
+    return cloud.to(item.cloud.device)
+
+
+def _no_choice(count: int) -> Tensor:
+    return torch.full((count,), -1, dtype=torch.int64)
+
+
+def _followed_rows(model: SceneModel, seen: ViewingDirections, index: int) -> Tensor:
+    """Gaussians [M] of an object that images show, where they show it from one direction."""
+    starts = model.gaussians.starts
+    rows = torch.arange(starts[index + 1], starts[index + 2], device=model.device)
+    rows = rows[seen.views[rows] > 0]
+    means = seen.means[rows]
+    scatter = seen.seconds[rows].diagonal(dim1=-2, dim2=-1).sum(-1) - means.square().sum(-1)
+    one = scatter < ONE_DIRECTION**2
+    return rows[one] if len(rows) and bool(one.float().mean() > 0.5) else rows[:0]
+
+
+def _surface(body: VehicleBody, size: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """Points and normals [P, 3] of a body and of the ground on which it stands."""
+    length, width, height = size
+    x, y = (
+        np.arange(-0.5 * side - SHADOW, 0.5 * side + SHADOW, SPACING) for side in (length, width)
+    )
+    plate = np.stack([*(g.ravel() for g in np.meshgrid(x, y)), np.zeros(len(x) * len(y))], axis=1)
+    plate[:, 2] = 0.02 - height / 2
+    points = np.concatenate([body.points, plate])
+    normals = np.concatenate([body.normals, np.tile([0.0, 0, 1], (len(plate), 1))])
+    return torch.from_numpy(points).float(), torch.from_numpy(normals).float()
+
+
+def _press(
+    model: SceneModel,
+    optimizer: SelectiveAdam,
+    rows: Tensor,
+    directions: Tensor,
+    surface: tuple[Tensor, Tensor],
+) -> None:
+    """Move Gaussians ``rows`` [M] along ``directions`` [M, 3] onto a surface, in place.
+
+    A shear along the rays brings what lies about the surface down to KEPT_DEPTH of its depth: seen
+    along the rays, centres and outlines stay where they are.
+    """
+    gaussians = model.gaussians
+    rays = normalize(directions, dim=-1).cpu()
+    means = gaussians.means[rows].cpu()
+    distance, normal = _hits(means, rays, *surface)
+    cosine = (normal * rays).sum(-1)
+    outer = rays[:, :, None] * normal[:, None] / cosine[:, None, None]
+    shear = torch.eye(3) - (1 - KEPT_DEPTH) * outer
+    axes = rotation_matrices(gaussians.quats[rows]) * gaussians.log_scales[rows].exp()[:, None]
+    axes = (shear @ axes.cpu()).double()
+    squares, turns = torch.linalg.eigh(axes @ axes.transpose(1, 2))
+    turns = turns * torch.linalg.det(turns).sign()[:, None, None]
+    quats = torch.from_numpy(matrix_to_quaternion(turns.numpy()))
+    scales = squares.clamp(min=THINNEST**2).sqrt()
+    changed = {
+        "means": means + rays * (distance * (1 - KEPT_DEPTH))[:, None],
+        "quats": quats,
+        "log_scales": scales.log(),
+    }
+    for name, values in changed.items():
+        parameter = getattr(gaussians, name)
+        parameter[rows] = values.to(parameter)
+    for name in FIELDS:
+        if name not in OBJECT_FIELDS:
+            optimizer.reset_moments(name, rows)
+
+
+def _hits(origins: Tensor, rays: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Where lines through ``origins`` [M, 3] along unit ``rays`` first meet a surface of points.
+
+    Returns:
+        Distances [M] along the rays [m] and normals [M, 3] there, against the rays. Lines that miss
+        get the distance to where they pass closest, and the ray itself as normal.
+    """
+    parts = [
+        _hits_of(o, r, points, normals)
+        for o, r in zip(origins.split(ROWS), rays.split(ROWS), strict=True)
+    ]
+    distances, at = zip(*parts, strict=True)
+    return torch.cat(distances), torch.cat(at)
+
+
+def _hits_of(
+    origins: Tensor, rays: Tensor, points: Tensor, normals: Tensor
+) -> tuple[Tensor, Tensor]:
+    along = rays @ points.T - (rays * origins).sum(-1, keepdim=True)
+    squares = origins.square().sum(-1, keepdim=True) - 2 * origins @ points.T
+    aside = (squares + points.square().sum(-1) - along.square()).clamp(min=0).sqrt()
+    cosines = -rays @ normals.T
+    hit = (aside < HIT) & (cosines > EDGE_ON / 4)
+    first = torch.where(hit, along, torch.inf).amin(1)
+    weight = (hit & (along < first[:, None] + LAYER)) / (aside + 0.01)
+    weight /= weight.sum(1, keepdim=True).clamp(min=1e-9)
+    normal, place = normalize(weight @ normals, dim=-1), weight @ points
+    cosine = (normal * rays).sum(-1)
+    on_plane = ((place - origins) * normal).sum(-1) / cosine.clamp(max=-EDGE_ON / 2)
+    # The plane through the points of a bend may lie far from them along a grazing ray.
+    on_plane = torch.minimum(torch.maximum(on_plane, first - 2 * LAYER), first + 2 * LAYER)
+    closest = torch.where(cosines > -EDGE_ON, aside, torch.inf).argmin(1, keepdim=True)
+    meets = torch.isfinite(first)
+    distance = torch.where(meets, on_plane, along.gather(1, closest)[:, 0])
+    upright = ~meets | (cosine > -EDGE_ON)
+    return distance, torch.where(upright[:, None], -rays, normal)

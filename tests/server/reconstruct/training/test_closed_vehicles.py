@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
+from real2sim_server.reconstruct.training import SceneModel
+from real2sim_server.reconstruct.training.closed_vehicles import INSETS, close_followed
+from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
+from real2sim_server.scene.spherical_harmonics import SH_C0
+
+from .conftest import TINY
+
+SALOON = (4.7, 1.82, 1.46)
+GREEN = torch.tensor([0.1, 0.4, 0.2])
+BODY = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+
+
+@pytest.fixture
+def ahead(tiny_scene):
+    """A scene's camera, time and pose of a car that drives 12 m ahead."""
+    pose = tiny_scene.ego.transform(tiny_scene.start_us)
+    pose = pose @ np.array([[1, 0, 0, 12.0], [0, 1, 0, 0], [0, 0, 1, 0.75], [0, 0, 0, 1]])
+    return tiny_scene.rig.cameras[0], tiny_scene.start_us, pose
+
+
+def model_of(scene, pose, means: torch.Tensor) -> SceneModel:
+    times = np.array([scene.start_us, scene.end_us])
+    count = len(means)
+    cloud = GaussianCloud(
+        means,
+        torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        torch.full((count, 3), 0.04),
+        torch.full((count,), 0.9),
+        ((GREEN - 0.5) / SH_C0).expand(count, 1, 3),
+    )
+    path = Trajectory.from_transforms(times, np.stack([pose, pose]))
+    car = SceneObject("car", "car", SALOON, cloud, path)
+    scene = replace(scene, objects={"car": car}, content_hash="")
+    return SceneModel(scene, replace(TINY, refine_poses=False), times, backend="cpu")
+
+
+def pixels(camera, scene, t_us, pose, means) -> np.ndarray:
+    at = camera.viewmat(scene.ego.transform(t_us)) @ pose
+    seen = means.detach().numpy() @ at[:3, :3].T + at[:3, 3]
+    projected = seen @ camera.K.T
+    return projected[:, :2] / projected[:, 2:]
+
+
+def deep_tail(camera, scene, t_us, pose) -> torch.Tensor:
+    """What a tail may look like after training: right in the image, up to a metre off in depth."""
+    tail = BODY.points[(BODY.points[:, 0] < -2.2) & (BODY.normals[:, 0] < -0.7)][::8]
+    eye = (invert_transform(pose) @ camera.pose(scene.ego.transform(t_us)))[:3, 3]
+    away = (tail - eye) / np.linalg.norm(tail - eye, axis=1, keepdims=True)
+    off = np.random.default_rng(5).uniform(-1, 1, (len(tail), 1))
+    return torch.from_numpy(tail + off * away).float()
+
+
+def test_a_tail_learnt_deep_becomes_a_surface_where_images_have_it(tiny_scene, ahead):
+    camera, t_us, pose = ahead
+    means = deep_tail(camera, tiny_scene, t_us, pose)
+    model = model_of(tiny_scene, pose, means)
+    close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [BODY])
+    count = model.gaussians.counts[0]
+    pressed = model.gaussians.means.detach()[count:]
+    places = BODY.points[BODY.nearest(pressed.numpy().astype(np.float64))]
+    assert np.linalg.norm(places - pressed.numpy(), axis=1).max() < 0.12
+    was, now = (pixels(camera, tiny_scene, t_us, pose, m) for m in (means, pressed))
+    np.testing.assert_allclose(now, was, atol=0.01)
+    thickness = model.gaussians.log_scales.detach()[count:].exp().amin(1)
+    assert float(thickness.max()) < 0.01
+
+
+def test_what_is_seen_from_many_sides_stays(tiny_scene, ahead):
+    camera, t_us, pose = ahead
+    means = deep_tail(camera, tiny_scene, t_us, pose)
+    near = replace(camera, T_vehicle_camera=camera.T_vehicle_camera.copy())
+    near.T_vehicle_camera[:2, 3] += [4.0, 1.5]
+    model = model_of(tiny_scene, pose, means)
+    views = [(camera, t_us), (near, t_us)]
+    offered = close_followed(model, SelectiveAdam(model.parameters()), views, [BODY])
+    assert torch.equal(model.gaussians.means.detach()[model.gaussians.counts[0] :], means)
+    assert offered.scene.objects["car"] is model.scene.objects["car"]
+
+
+def test_the_whole_body_is_offered_in_one_paint_and_once_for_each_inset(tiny_scene, ahead):
+    camera, t_us, pose = ahead
+    means = deep_tail(camera, tiny_scene, t_us, pose)
+    model = model_of(tiny_scene, pose, means)
+    offered = close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [BODY])
+    cloud, count = offered.scene.objects["car"].cloud, len(BODY.points)
+    assert len(cloud) == len(INSETS) * count
+    np.testing.assert_allclose(cloud.means[:count], BODY.points, atol=1e-5)
+    flank = BODY.is_paint & (np.abs(BODY.normals[:, 1]) > 0.95)
+    colours = 0.5 + SH_C0 * cloud.sh[:count, 0].numpy()[flank]
+    np.testing.assert_allclose(colours, np.tile(GREEN, (flank.sum(), 1)), atol=0.06)
+    numbers = offered.alternatives[-len(cloud) :].reshape(len(INSETS), count)
+    assert (numbers == numbers[0]).all()
+    assert len(numbers[0].unique()) == count
+    assert (offered.alternatives[: len(model.scene.background)] < 0).all()
