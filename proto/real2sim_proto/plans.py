@@ -18,11 +18,11 @@ def _as_lists(value: Any) -> Any:
 
 
 PlanTimes = Annotated[
-    list[Microseconds], BeforeValidator(_as_lists), Field(min_length=1, max_length=MAX_PLAN_POSES)
+    list[Microseconds], Field(min_length=1, max_length=MAX_PLAN_POSES), BeforeValidator(_as_lists)
 ]
 PlanPose = tuple[Metres, Metres, Annotated[float, Field(ge=-1e4, le=1e4)]]
 PlanPoses = Annotated[
-    list[PlanPose], BeforeValidator(_as_lists), Field(min_length=1, max_length=MAX_PLAN_POSES)
+    list[PlanPose], Field(min_length=1, max_length=MAX_PLAN_POSES), BeforeValidator(_as_lists)
 ]
 
 

@@ -50,6 +50,7 @@ class LearnBenchOptions:
         repetitions: of a single image; the best counts.
         sessions: that are driven over sockets at once.
         socket_steps: of each.
+        echo: whether they stand beside servers without worlds.
     """
 
     worlds: int = 64
@@ -58,6 +59,7 @@ class LearnBenchOptions:
     repetitions: int = 10
     sessions: int = 16
     socket_steps: int = 300
+    echo: bool = True
 
 
 def run(options: LearnBenchOptions | None = None) -> Figures:
@@ -176,12 +178,14 @@ def _small_image(scene: Scene, seconds: float, repetitions: int) -> dict[str, fl
 
 def sessions_over_sockets(_scene: Scene, options: LearnBenchOptions) -> Figures:
     """Steps a second of sessions without cameras, see :mod:`.socket_sessions`."""
-    return socket_sessions.of_one_worker(options.sessions, options.socket_steps)
+    steps, echo = options.socket_steps, options.echo
+    return socket_sessions.of_one_worker(options.sessions, steps, echo=echo)
 
 
 def sessions_of_two_workers(_scene: Scene, options: LearnBenchOptions) -> Figures:
     """The same sessions, half of them in a second worker on the same machine."""
-    return socket_sessions.of_two_workers(options.sessions, options.socket_steps)
+    steps, echo = options.socket_steps, options.echo
+    return socket_sessions.of_two_workers(options.sessions, steps, echo=echo)
 
 
 PARTS: dict[str, Callable[[Scene, LearnBenchOptions], Figures]] = {

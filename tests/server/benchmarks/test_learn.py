@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from real2sim_server.benchmarks import learn
@@ -9,7 +11,7 @@ from real2sim_server.demo.street import SHIPPED
 from real2sim_server.scene.io import read_packed
 
 OPTIONS = learn.LearnBenchOptions(
-    worlds=2, steps=2, image_steps=1, repetitions=1, sessions=2, socket_steps=2
+    worlds=2, steps=2, image_steps=1, repetitions=1, sessions=2, socket_steps=2, echo=False
 )
 
 
@@ -38,9 +40,13 @@ def test_sessions_are_driven_over_sockets() -> None:
 @pytest.mark.slow
 @pytest.mark.network
 def test_sessions_are_driven_on_two_workers_at_once() -> None:
-    figures = learn.sessions_of_two_workers(read_packed(SHIPPED), OPTIONS)
+    options = replace(OPTIONS, echo=True)
+    figures = learn.sessions_of_two_workers(read_packed(SHIPPED), options)
     assert figures["steps_per_s"] > 0
     assert figures["sessions"] == 2
+    assert figures["of_echoed_messages"] == pytest.approx(
+        figures["steps_per_s"] / figures["echoed_messages_per_s"]
+    )
 
 
 def _values(value: object) -> list[float]:

@@ -15,11 +15,16 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from websockets.frames import Opcode
+from websockets.frames import Frame, Opcode
 from websockets.http11 import Request
 from websockets.protocol import State
 
 from real2sim_proto import ErrorCode
+
+try:
+    from websockets.speedups import apply_mask
+except ImportError:  # Built without its extension in C.
+    from websockets.utils import apply_mask
 
 from .connections import Backlog, Connections, DropReason
 from .hosts import is_loopback
@@ -46,6 +51,8 @@ CLOSED_NO_UTF8 = 1007
 """Code that RFC 6455, 7.4.1, has for text that is none."""
 SHORT, LONG = 126, 127
 """Stand for a length of 2 and of 8 bytes behind the first two of a frame (RFC 6455, 5.2)."""
+MASKED, MASK_BYTES = 0x80, 4
+NO_MASK = bytes(MASK_BYTES)
 
 
 async def send_parts(websocket: WebSocket, parts: Sequence[Part]) -> None:
@@ -115,6 +122,7 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         self._backlog = Backlog(connections.limits.write_s)
         self._has_spoken = False
         self._taker: Taker | None = None
+        self._unparsed = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection on which a handshake has begun."""
@@ -140,6 +148,23 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[EXTENSION] = self._send_parts
             extensions[TAKING] = self._let_take
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes of the client, most often one message that is taken."""
+        if not self.handshake_initiated:
+            # The request, whole and alone: the server has read it before.
+            super().data_received(data)
+            return
+        if self._taker is not None and not self._unparsed and self._is_whole_and_taken(data):
+            return
+        self._unparsed += len(data)
+        super().data_received(data)
+
+    def handle_events(self) -> None:
+        """Frames are whole, and no longer waited for."""
+        # None is longer than it has to be, so what is left is 0 between two frames only.
+        self._unparsed -= sum(_frame_size(e) for e in self.conn.events if isinstance(e, Frame))
+        super().handle_events()
 
     async def send(self, message: Any) -> None:
         """Send one message, unless the connection is ending by what the client did."""
@@ -193,6 +218,18 @@ class ScatterGatherProtocol(WebSocketsSansIOProtocol):
         self.frames = []
         return True
 
+    def _is_whole_and_taken(self, data: bytes) -> bool:
+        """Whether ``data``, which begins with a frame, is one binary message and is taken: then the
+        protocol need not know of it. It would read it in a dozen steps."""
+        assert self._taker is not None
+        payload = _whole_message(data)
+        if payload is None or self.close_sent or self.conn.state is not State.OPEN:
+            return False
+        # Within a message of several frames another one is an error.
+        if self.conn.current_size is not None or not self.queue.empty():
+            return False
+        return self._taker(payload)
+
     def _send_parts(self, parts: Sequence[Part]) -> bool:
         """Write one binary message, if nothing has to be waited for."""
         if self.disconnected or self.conn.state is not State.OPEN or not self.writable.is_set():
@@ -212,6 +249,26 @@ def _is_utf8(parts: Sequence[bytes]) -> bool:
     except UnicodeDecodeError:
         return False
     return True
+
+
+def _whole_message(data: bytes) -> bytes | None:
+    """The binary message that a client has sent as these bytes; None for anything else, and where
+    it is so large that it does not matter."""
+    if len(data) < 2 + MASK_BYTES or data[0] != FIN | Opcode.BINARY or not data[1] & MASKED:
+        return None
+    size, begin = data[1] & ~MASKED, 2
+    if size == SHORT:
+        size, begin = int.from_bytes(data[2:4], "big"), 4
+    if (size >= LONG and begin == 2) or len(data) != begin + MASK_BYTES + size:
+        return None
+    mask, payload = data[begin : begin + MASK_BYTES], data[begin + MASK_BYTES :]
+    return payload if mask == NO_MASK else bytes(apply_mask(payload, mask))
+
+
+def _frame_size(frame: Frame) -> int:
+    """Bytes of a client's frame, its length written in as few as it can be."""
+    size = len(frame.data)
+    return 2 + (0 if size < SHORT else 2 if size < 1 << 16 else 8) + MASK_BYTES + size
 
 
 def _header(size: int) -> bytes:

@@ -51,7 +51,8 @@ def connect(url: str, *, timeout_s: float) -> sa.Engine:
             # Freed pages can be given back in pieces, if this is said before there is any.
             cursor.execute("PRAGMA auto_vacuum=INCREMENTAL")
         keep_write_ahead_journal(cursor, timeout_s)
-        for pragma in ("synchronous=NORMAL", "foreign_keys=ON"):
+        # What is needed to take back one of several rows has no need of a file.
+        for pragma in ("synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             cursor.execute(f"PRAGMA {pragma}")
         cursor.execute(f"PRAGMA busy_timeout={round(timeout_s * 1000)}")
         cursor.close()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -193,8 +194,8 @@ class Database:
         if not self._write_lock.acquire(timeout=self._timeout_s):
             raise self._noted(StoreUnavailableError("the write before this one has not ended"))
         try:
-            with self._timed("write"), self._transaction(durable=durable) as connection:
-                counts = [c.made_by(connection).rowcount for c in changes]
+            with self._timed("write"):
+                counts = self._executed(changes, durable=durable)
         except Exception as error:
             self._reraise(error)
         finally:
@@ -236,9 +237,7 @@ class Database:
     def _shrink(self, pages: int) -> bool:
         try:
             with self._write_lock, self._connected().connect() as connection:
-                raw = connection.connection.dbapi_connection
-                assert raw is not None
-                cursor = raw.cursor()
+                cursor = _driver_of(connection).cursor()
                 (before,) = cursor.execute("PRAGMA freelist_count").fetchone()
                 # A step a page; the driver makes but one of what has no columns, save in scripts.
                 cursor.executescript(f"PRAGMA incremental_vacuum({pages})")
@@ -276,6 +275,25 @@ class Database:
             if self._on_call is not None:
                 self._on_call(kind, time.perf_counter() - started, done)
 
+    def _executed(self, changes: Sequence[Write], *, durable: bool) -> list[int]:
+        """Rows changed by each statement, in one transaction; the caller holds the write lock."""
+        if self._file is not None and len(changes) == 1 and isinstance(changes[0].statement, str):
+            return [self._executed_by_driver(changes[0], durable=durable)]
+        with self._transaction(durable=durable) as connection:
+            return [c.made_by(connection).rowcount for c in changes]
+
+    def _executed_by_driver(self, change: Write, *, durable: bool) -> int:
+        """The same of one statement as text, for a file: SQLAlchemy would take longer to hand it
+        on than SQLite to append what a step leaves."""
+        statement, rows = cast("str", change.statement), change.rows or [()]
+        with self._kept_writer(durable=durable) as writer:
+            connection = _driver_of(writer)
+            # The driver begins a transaction by itself; it is rolled back where one row fails.
+            with connection:
+                if len(rows) == 1:
+                    return connection.execute(statement, cast("Any", rows[0])).rowcount
+                return connection.executemany(statement, cast("Any", rows)).rowcount
+
     @contextlib.contextmanager
     def _transaction(self, *, durable: bool) -> Iterator[sa.Connection]:
         """A transaction of its own, committed at the end; the caller holds the write lock."""
@@ -283,16 +301,23 @@ class Database:
             with self._connected().begin() as connection:
                 yield connection
             return
+        with self._kept_writer(durable=durable) as writer, writer.begin():
+            yield writer
+
+    @contextlib.contextmanager
+    def _kept_writer(self, *, durable: bool) -> Iterator[sa.Connection]:
+        """The connection that writes to a file, kept unless it fails; the caller holds the write
+        lock."""
         if self._writer is None:
             # Fetching a connection from the pool and giving it back takes as long as an append.
             self._writer, self._writer_is_durable = self._connected().connect(), False
         if durable != self._writer_is_durable:
             self._set_durable(self._writer, durable=durable)
         try:
-            with self._writer.begin():
-                yield self._writer
+            yield self._writer
         except Exception as error:
-            if not isinstance(error, sa.exc.IntegrityError) and not self._found_full(error):
+            is_refused = isinstance(error, sa.exc.IntegrityError | sqlite3.IntegrityError)
+            if not is_refused and not self._found_full(error):
                 self._drop_writer()
             raise
 
@@ -308,11 +333,7 @@ class Database:
     def _set_durable(self, writer: sa.Connection, *, durable: bool) -> None:
         # NORMAL loses no committed transaction when the process dies, only when the machine does.
         pragma = f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}"
-        connection = writer.connection.dbapi_connection
-        assert connection is not None
-        cursor = connection.cursor()
-        cursor.execute(pragma)
-        cursor.close()
+        _driver_of(writer).execute(pragma).close()
         self._writer_is_durable = durable
 
     def _drop_writer(self) -> None:
@@ -433,6 +454,13 @@ class Database:
         if self._engine is not None:
             self._engine.dispose()
             self._engine = None
+
+
+def _driver_of(connection: sa.Connection) -> sqlite3.Connection:
+    """SQLite's own connection, for what is no statement of SQLAlchemy's."""
+    found = connection.connection.dbapi_connection
+    assert found is not None
+    return cast("sqlite3.Connection", found)
 
 
 def _looked_at(work: asyncio.Future[Any]) -> None:

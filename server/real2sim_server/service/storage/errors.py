@@ -83,7 +83,8 @@ def sorted_error(error: Exception, *, folder: Path | None) -> StoreError | None:
     if isinstance(error, StoreError):
         return error
     cause = getattr(error, "orig", None) or error
-    if isinstance(error, IntegrityError) or _sqlstate(cause).startswith("23"):
+    refused = isinstance(error, IntegrityError) or isinstance(cause, sqlite3.IntegrityError)
+    if refused or _sqlstate(cause).startswith("23"):
         return ConflictError(f"not stored: {cause}")
     if isinstance(cause, OSError):
         return StoreFullError(_why(cause)) if is_full(cause) else StoreUnavailableError(_why(cause))

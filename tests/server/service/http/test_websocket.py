@@ -16,11 +16,18 @@ from starlette.applications import Starlette
 from starlette.routing import WebSocketRoute
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
 
 from real2sim_server.service.http.connections import ConnectionLimits, Connections
 from real2sim_server.service.http.metrics import Metrics
-from real2sim_server.service.http.websocket import EXTENSION, ScatterGatherProtocol, send_parts
+from real2sim_server.service.http.websocket import (
+    EXTENSION,
+    ScatterGatherProtocol,
+    let_take,
+    send_parts,
+)
 
 pytestmark = pytest.mark.network
 
@@ -141,6 +148,68 @@ def test_a_server_without_the_extension_sends_the_parts_joined():
 
     with TestClient(app(talk)).websocket_connect("/") as connection:
         assert connection.receive_bytes() == b"abcdef"
+
+
+def frame(data: bytes, opcode: Opcode = Opcode.BINARY, *, fin: bool = True) -> bytes:
+    return Frame(opcode, data, fin=fin).serialize(mask=True)
+
+
+def taken(chunks: list[bytes]) -> tuple[list[bytes], list[bytes]]:
+    """Messages in the order in which a server has them that is sent these bytes, a pause after
+    each, and those of them that came by ``receive``."""
+    messages: list[bytes] = []
+    received: list[bytes] = []
+
+    def take(data: bytes) -> bool:
+        if data.startswith(b"later"):
+            return False
+        messages.append(data)
+        return True
+
+    async def talk(websocket: WebSocket) -> None:
+        await websocket.receive_bytes()
+        let_take(
+            websocket, lambda data: not data.startswith(b"later") and not messages.append(data)
+        )
+        await send_parts(websocket, [b"begin"])
+        while (data := await websocket.receive_bytes()) != b"later, the end":
+            messages.append(data)
+            received.append(data)
+
+    with served(talk) as url, client(url) as connection:
+        connection.send(b"hello")
+        connection.recv()
+        for chunk in chunks:
+            connection.socket.sendall(chunk)
+            time.sleep(0.02)
+        connection.send(b"later, the end")
+        with contextlib.suppress(ConnectionClosed):
+            connection.recv(20)
+    return messages, received
+
+
+def test_messages_are_taken_however_their_bytes_arrive():
+    one, two, large = frame(b"one"), frame(b"two"), frame(noise(70_000))
+    cut = [two[:2], two[2:5], two[5:], one + two[:2], two[2:]]
+    ping = frame(b"", Opcode.PING)
+    parts = [frame(b"a", fin=False), ping, frame(b"b", Opcode.CONT)]
+    chunks = [one, frame(noise(300)), *cut, one + two, ping + one, large, two, *parts, one]
+    messages, _ = taken(chunks)
+    texts = [b"one", noise(300), b"two", b"one", b"two", b"one", b"two", b"one", noise(70_000)]
+    assert messages == [*texts, b"two", b"ab", b"one"]
+
+
+def test_what_is_not_taken_is_received():
+    assert taken([frame(b"one"), frame(b"later"), frame(b"two")]) == (
+        [b"one", b"later", b"two"],
+        [b"later"],
+    )
+
+
+def test_a_message_within_another_is_refused():
+    chunks = [frame(b"a", fin=False), frame(b"one")]
+    with pytest.raises(ConnectionClosed, match="1002"):
+        taken(chunks)
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_CONGESTION"), reason="Linux names them")

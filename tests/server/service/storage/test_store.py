@@ -188,6 +188,35 @@ def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
     assert run(sqlite_url, work)
 
 
+def test_entries_of_several_sessions_are_stored_together_or_not_at_all(url):
+    sessions = [replace(SESSION, session_id=name) for name in ("w0.1", "w0.2")]
+
+    def logs(*seqs: int) -> list[tuple[str, list[SessionEntry]]]:
+        entries = [SessionEntry(seq, "action", seq, b"p", 1) for seq in seqs]
+        return [(s.session_id, [e]) for s, e in zip(sessions, entries, strict=True)]
+
+    async def work(store):
+        for session in sessions:
+            await store.create_session(session)
+        store.record_together(logs(0, 0))
+        with pytest.raises(ConflictError):
+            store.record_together(logs(1, 0))
+        store.record_together(logs(1, 1))
+        return [[e.seq for e in await store.session_entries(s.session_id)] for s in sessions]
+
+    assert run(url, work) == [[0, 1], [0, 1]]
+
+
+def test_steps_are_appended_without_a_file_for_each_transaction(sqlite_url):
+    async def work(store):
+        await store.create_session(SESSION)
+        writer = store.database._writer.connection.dbapi_connection
+        return writer.execute("PRAGMA temp_store").fetchone()[0]
+
+    in_memory = 2
+    assert run(sqlite_url, work) == in_memory
+
+
 NORMAL, FULL = 1, 2
 """How SQLite names what it waits for: nothing at a commit, or the disk."""
 
