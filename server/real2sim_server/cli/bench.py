@@ -137,7 +137,7 @@ def recovery(
         Path | None, typer.Option(help="Scene bundle; default: the demo's street.")
     ] = None,
     episodes: Annotated[int, typer.Option(min=8, max=1000, help="Of each planner.")] = 64,
-    epochs: Annotated[int, typer.Option(min=1, max=1000, help="Of training.")] = 60,
+    epochs: Annotated[int, typer.Option(min=1, max=10_000, help="Of training.")] = 300,
     seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
     json: JsonFile = None,
 ) -> None:

@@ -36,8 +36,8 @@ def export_dataset(
         typer.Option(
             "--format",
             "-f",
-            help="labels, kitti, kitti_raw, coco, nuscenes, argoverse2, waymo, webdataset, mcap, "
-            "pictures",
+            help="labels, kitti, kitti_raw, coco, nuscenes, argoverse2, waymo, ncore, webdataset, "
+            "mcap, pictures",
         ),
     ],
     operations: Annotated[

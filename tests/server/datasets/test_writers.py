@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import lzma
 import tarfile
+import zlib
 from itertools import pairwise
 from pathlib import Path
 
@@ -280,3 +282,69 @@ def test_waymo_says_which_object_a_point_is_of(exported):
     for number in np.unique(points["instance"]):
         count = int((points["instance"] == number).sum())
         assert number == 0 or (label[..., 0] == number).sum() == count
+
+
+def ncore_store(exported: Path) -> Path:
+    return next(exported.glob("ncore/*/*_0000.ncore4.zarr"))
+
+
+def test_ncore_holds_metadata_of_everything_once_more(exported):
+    cbor2 = pytest.importorskip("cbor2")
+    root = ncore_store(exported)
+    content = cbor2.loads(lzma.decompress((root / ".zmetadata.cbor.xz").read_bytes()))
+    files = [p for name in (".zgroup", ".zattrs", ".zarray") for p in root.rglob(name)]
+    assert content["zarr_consolidated_format"] == 1
+    assert len(files) == len(content["metadata"])
+    for path in files:
+        kept = content["metadata"][path.relative_to(root).as_posix()]
+        assert kept == json.loads(path.read_text())
+
+
+def test_ncore_stores_hold_arrays_as_zarr_says(exported):
+    frame = labels(exported)["frames"][1]
+    here = ncore_store(exported) / "lidars/lidar_top/frames" / str(frame["t_us"] + 1_000_000)
+    points = np.load(exported / "labels/0000/points/000001.npy")
+
+    def array(path: Path) -> np.ndarray:
+        about = json.loads((path / ".zarray").read_text())
+        data = zlib.decompress((path / ".".join("0" * len(about["shape"]))).read_bytes())
+        return np.frombuffer(data, about["dtype"]).reshape(about["shape"])
+
+    rays = array(here / "ray_bundle/direction")
+    ranges = array(here / "ray_bundle_returns/distance_m")[0]
+    found = rays.astype(np.float64) * ranges[:, None] + [0.9, 0.0, 1.73]
+    np.testing.assert_allclose(found, points["xyz"], atol=1e-4)
+    assert (array(here / "generic_data/instance") == points["instance"]).all()
+
+
+def test_ncores_own_reader_opens_ours(exported, tiny_scene):
+    v4 = pytest.importorskip("ncore.data.v4")
+    reader = v4.SequenceComponentGroupsReader([ncore_store(exported)])
+    frame = labels(exported)["frames"][0]
+    stamp = frame["t_us"] + 1_000_000
+
+    poses = reader.open_component_readers(v4.PosesComponent.Reader)["default"]
+    found, times = poses.get_dynamic_pose("rig", "world")
+    np.testing.assert_allclose(found[0], frame["T_world_ego"])
+    assert times[0] == stamp
+    given = tiny_scene.rig["front"]
+    mount = poses.get_static_pose("front", "rig")
+    np.testing.assert_allclose(mount, given.T_vehicle_camera)
+    lenses = reader.open_component_readers(v4.IntrinsicsComponent.Reader)["default"]
+    lens = lenses.get_camera_model_parameters("front")
+    np.testing.assert_allclose(lens.focal_length, [given.K[0, 0], given.K[1, 1]], rtol=1e-6)
+    camera = reader.open_component_readers(v4.CameraSensorComponent.Reader)["front"]
+    image = np.asarray(camera.get_frame_image(stamp))
+    written = cv2.imread(str(exported / "labels/0000/rgb/front/000000.png"))[..., ::-1]
+    assert np.abs(image.astype(int) - written).mean() < 3
+    shown = cv2.imread(str(exported / "labels/0000/instance/front/000000.png"), -1)
+    assert (camera.get_frame_generic_data(stamp, "instance") == shown).all()
+    lidar = reader.open_component_readers(v4.LidarSensorComponent.Reader)["lidar_top"]
+    points = np.load(exported / "labels/0000/points/000000.npy")
+    assert lidar.get_frame_ray_bundle_count(stamp) == len(points)
+    assert lidar.get_frame_ray_bundle_return_valid_mask(stamp).all()
+    boxes = reader.open_component_readers(v4.CuboidsComponent.Reader)["default"]
+    first = [o for o in boxes.get_observations() if o.timestamp_us == stamp]
+    for box, subject in zip(first, frame["objects"], strict=True):
+        assert (box.track_id, box.source.name) == (subject["object_id"], "GT_SYNTHETIC")
+        np.testing.assert_allclose(box.bbox3.centroid, np.array(subject["T_ego_object"])[:3, 3])

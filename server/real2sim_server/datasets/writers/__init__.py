@@ -7,6 +7,7 @@ from .kitti import KittiWriter
 from .kitti_raw import KittiRawWriter
 from .labels import LabelsWriter
 from .mcap import McapWriter
+from .ncore import NCoreWriter
 from .nuscenes import NuScenesWriter
 from .pictures import PicturesWriter
 from .waymo import WaymoWriter
@@ -21,6 +22,7 @@ WRITERS: list[DatasetWriter] = [
     NuScenesWriter(),
     Argoverse2Writer(),
     WaymoWriter(),
+    NCoreWriter(),
     WebDatasetWriter(),
     McapWriter(),
     PicturesWriter(),

@@ -11,6 +11,7 @@ const FORMATS = [
   "coco",
   "argoverse2",
   "waymo",
+  "ncore",
   "webdataset",
   "mcap",
   "labels",
