@@ -117,6 +117,7 @@ def _table(result: Evaluation) -> dict[str, object]:
         figures[f"psnr from {shift.shift_m:g} m beside [dB]"] = shift.psnr
     for band in result.lane_band:
         figures[f"road from {band.shift_m:g} m beside [dB]"] = band.psnr
+        figures["recorded images by the same, on the path [dB]"] = band.images_psnr
     if result.around is not None:
         figures |= {
             "vehicles' seen sides [dB]": result.around.psnr_seen,

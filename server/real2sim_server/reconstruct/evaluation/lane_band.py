@@ -7,7 +7,7 @@ projected into views from the next lane: what a scene shows there is compared on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from .image_metrics import mean_psnr
 from .lidar_depth import points_in_camera, seen_points
 from .object_regions import moving_mask
 from .rendering import render_view, shifted_pose
+from .shifted import within_an_object
 
 COLOURED_WITHIN = (4.0, 12.0)
 """Road takes its colour from images that show it at such depths [m]."""
@@ -41,12 +42,15 @@ class LaneBandScore:
         shift_m: how far to the left and to the right [m].
         psnr: over the pixels whose road other images show from near by, mean over views [dB]; nan
             where no view shows enough of it.
-        pixels: how many these are, in all views.
-        views: how many views were compared.
+        images_psnr: the same of the recorded images at their own places [dB]: where shadows move or
+            boxes are off, colours from other images are wrong, and scores beyond this say nothing.
+        pixels: how many are compared, in all views.
+        views: how many views were compared; none from within a box or close to one.
     """
 
     shift_m: float
     psnr: float
+    images_psnr: float
     pixels: int
     views: int
 
@@ -78,9 +82,22 @@ def evaluate_lane_band(
         LogError: images or sweeps that cannot be read.
     """
     road = road_colours(log, camera, scene.ground)
-    return tuple(
+    images_psnr = _score_of_images(log, camera, frames, road)
+    scores = (
         _score(scene, log, camera, frames, shift, road=road, backend=backend) for shift in shifts
     )
+    return tuple(replace(score, images_psnr=images_psnr) for score in scores)
+
+
+def _score_of_images(
+    log: DrivingLog, camera: Camera, frames: Sequence[int], road: RoadColours
+) -> float:
+    scores = []
+    for frame in frames:
+        place, colours = projected_road(road, log, camera, image_time(log, camera.name, frame), 0.0)
+        if len(place) >= MIN_PIXELS:
+            scores.append(_psnr(resized(log.image(camera.name, frame), camera), place, colours))
+    return mean_psnr(scores)
 
 
 def _score(
@@ -97,14 +114,21 @@ def _score(
     for frame in frames:
         t_us = image_time(log, camera.name, frame)
         for left in (shift, -shift):
+            vehicle = shifted_pose(log.ego.transform(t_us), left)
+            if within_an_object(log, camera.pose(vehicle)[:3, 3], t_us):
+                continue
             place, colours = projected_road(road, log, camera, t_us, left)
             if len(place) < MIN_PIXELS:
                 continue
             shown = render_view(scene, camera, t_us, left=left, backend=backend).rgb
-            error = shown.reshape(-1, 3)[place].astype(np.float64) - colours
-            scores.append(float(10 * np.log10(255**2 / max(np.square(error).mean(), 1e-6))))
+            scores.append(_psnr(shown, place, colours))
             pixels += len(place)
-    return LaneBandScore(shift, mean_psnr(scores), pixels, len(scores))
+    return LaneBandScore(shift, mean_psnr(scores), float("nan"), pixels, len(scores))
+
+
+def _psnr(image: NDArray[np.uint8], place: NDArray[np.int64], colours: Float) -> float:
+    error = image.reshape(-1, 3)[place].astype(np.float64) - colours
+    return float(10 * np.log10(255**2 / max(np.square(error).mean(), 1e-6)))
 
 
 def road_colours(log: DrivingLog, camera: Camera, ground: Ground) -> RoadColours:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
+from ...logs import DrivingLog
 from ...scene import Camera, Scene
 from ...synthetic import SyntheticLog
 from .image_metrics import mean_psnr, psnr, ssim
@@ -107,7 +108,7 @@ def _compare(
     scene: Scene, truth: SyntheticLog, camera: Camera, *, t_us: int, left: float, backend: str
 ) -> _Compared | None:
     vehicle = shifted_pose(truth.ego.transform(t_us), left)
-    if _within_an_object(truth, camera.pose(vehicle)[:3, 3], t_us):
+    if within_an_object(truth, camera.pose(vehicle)[:3, 3], t_us):
         return None
     image, depth, pose = true_view(truth, camera, t_us, left)
     frame = render_view(scene, camera, t_us, left=left, backend=backend)
@@ -122,8 +123,9 @@ def _compare(
     )
 
 
-def _within_an_object(truth: SyntheticLog, position: Float, t_us: int) -> bool:
-    for track in truth.tracks:
+def within_an_object(log: DrivingLog, position: Float, t_us: int) -> bool:
+    """Whether ``position`` [3] in the world [m] lies in a box at ``t_us``, or within CLEARANCE."""
+    for track in log.tracks:
         pose = track.transform_near(t_us)
         if pose is not None:
             local = apply_transform(invert_transform(pose), position[None])[0]

@@ -127,9 +127,14 @@ class TrainingViews:
         return found
 
     def sample_viewpoints(self, count: int) -> list[tuple[Camera, int]]:
-        """At most ``count`` of :meth:`viewpoints`, drawn at random."""
-        viewpoints = self.viewpoints()
-        return [viewpoints[self.index_at(k)] for k in range(min(count, len(viewpoints)))]
+        """At most ``count`` of :meth:`viewpoints`: of each camera its share, evenly over time.
+
+        What none of them shows counts as hidden, so gaps are kept as short as they can be.
+        """
+        viewpoints, count = self.viewpoints(), min(count, len(self))
+        by_camera = sorted(range(len(self)), key=lambda k: self._keys[k][0])
+        places = (np.arange(count) + 0.5) * (len(self) / max(1, count))
+        return [viewpoints[by_camera[int(place)]] for place in places]
 
     def index_at(self, iteration: int) -> int:
         """Index of the view of ``iteration``: all in random order, then all in another."""

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from real2sim_server.logs import ObjectTrack
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
 from real2sim_server.reconstruct.evaluation.lane_band import (
     evaluate_lane_band,
     projected_road,
     road_colours,
 )
-from real2sim_server.scene import Ground
+from real2sim_server.scene import Ground, Trajectory
 
 from ..conftest import ROAD_COLOUR, painted_log
 
@@ -58,3 +59,15 @@ def test_a_scene_with_the_right_road_scores_high_and_one_with_another_low(log):
     [bad] = evaluate_lane_band(dark, log, log.rig["front"], [1], [1.0])
     assert good.views == 2
     assert good.psnr > 25 > 15 > bad.psnr
+    assert good.images_psnr == bad.images_psnr > 40
+
+
+def test_no_view_is_compared_from_close_beside_a_box(log):
+    scene = initialise_scene(log, options=SMALL)
+    times = log.frame_times_us
+    pose = np.eye(4)
+    pose[:3, 3] = (-3.0, 2.2, 1.0)
+    beside = Trajectory.from_transforms(times, np.broadcast_to(pose, (len(times), 4, 4)))
+    parked = replace(log, tracks=(ObjectTrack("1", "car", (7.0, 2.0, 2.0), beside),))
+    [score] = evaluate_lane_band(scene, parked, log.rig["front"], [1], [1.0])
+    assert score.views == 1

@@ -17,6 +17,7 @@ from real2sim_server.reconstruct.training import (
     held_out_frames,
     score_held_out,
 )
+from real2sim_server.reconstruct.training.data import TrainingViews
 from real2sim_server.reconstruct.training.direction_options import DirectionOptions
 from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
@@ -271,6 +272,17 @@ def test_held_out_frames_lie_between_seen_ones():
     assert held_out_frames(9, 4) == [2, 6]
     assert held_out_frames(7, 4) == [2]
     assert held_out_frames(9, 0) == []
+
+
+def test_sampled_viewpoints_lie_evenly_over_time_of_every_camera(tiny_log):
+    front = tiny_log.rig.cameras[0]
+    rig = replace(tiny_log.rig, cameras=(front, replace(front, name="left")))
+    views = TrainingViews(replace(tiny_log, rig=rig), [0, 1, 3, 4, 5, 6], TINY)
+    sampled = views.sample_viewpoints(6)
+    views.close()
+    for name in rig.names:
+        times = [t_us for camera, t_us in sampled if camera.name == name]
+        assert times == [int(tiny_log.frame_times_us[f]) for f in (1, 4, 6)]
 
 
 def test_a_mirrored_cloud_looks_from_one_side_as_the_cloud_from_the_other(trained):
