@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from real2sim_server.geometry.transform import invert_transform
-from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
+from real2sim_server.reconstruct.initialise.vehicle_body import VehicleBody, fitted_body
 from real2sim_server.reconstruct.training import SceneModel
 from real2sim_server.reconstruct.training.closed_vehicles import INSETS, close_followed
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
@@ -18,7 +18,13 @@ from .conftest import TINY
 
 SALOON = (4.7, 1.82, 1.46)
 GREEN = torch.tensor([0.1, 0.4, 0.2])
-BODY = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+
+
+@pytest.fixture(scope="module")
+def body() -> VehicleBody:
+    found = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    assert found is not None
+    return found
 
 
 @pytest.fixture
@@ -52,23 +58,23 @@ def pixels(camera, scene, t_us, pose, means) -> np.ndarray:
     return projected[:, :2] / projected[:, 2:]
 
 
-def deep_tail(camera, scene, t_us, pose) -> torch.Tensor:
+def deep_tail(body, camera, scene, t_us, pose) -> torch.Tensor:
     """What a tail may look like after training: right in the image, up to a metre off in depth."""
-    tail = BODY.points[(BODY.points[:, 0] < -2.2) & (BODY.normals[:, 0] < -0.7)][::8]
+    tail = body.points[(body.points[:, 0] < -2.2) & (body.normals[:, 0] < -0.7)][::8]
     eye = (invert_transform(pose) @ camera.pose(scene.ego.transform(t_us)))[:3, 3]
     away = (tail - eye) / np.linalg.norm(tail - eye, axis=1, keepdims=True)
     off = np.random.default_rng(5).uniform(-1, 1, (len(tail), 1))
     return torch.from_numpy(tail + off * away).float()
 
 
-def test_a_tail_learnt_deep_becomes_a_surface_where_images_have_it(tiny_scene, ahead):
+def test_a_tail_learnt_deep_becomes_a_surface_where_images_have_it(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
-    means = deep_tail(camera, tiny_scene, t_us, pose)
+    means = deep_tail(body, camera, tiny_scene, t_us, pose)
     model = model_of(tiny_scene, pose, means)
-    close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [BODY])
+    close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [body])
     count = model.gaussians.counts[0]
     pressed = model.gaussians.means.detach()[count:]
-    places = BODY.points[BODY.nearest(pressed.numpy().astype(np.float64))]
+    places = body.points[body.nearest(pressed.numpy().astype(np.float64))]
     assert np.linalg.norm(places - pressed.numpy(), axis=1).max() < 0.12
     was, now = (pixels(camera, tiny_scene, t_us, pose, m) for m in (means, pressed))
     np.testing.assert_allclose(now, was, atol=0.01)
@@ -76,27 +82,27 @@ def test_a_tail_learnt_deep_becomes_a_surface_where_images_have_it(tiny_scene, a
     assert float(thickness.max()) < 0.01
 
 
-def test_what_is_seen_from_many_sides_stays(tiny_scene, ahead):
+def test_what_is_seen_from_many_sides_stays(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
-    means = deep_tail(camera, tiny_scene, t_us, pose)
+    means = deep_tail(body, camera, tiny_scene, t_us, pose)
     near = replace(camera, T_vehicle_camera=camera.T_vehicle_camera.copy())
     near.T_vehicle_camera[:2, 3] += [4.0, 1.5]
     model = model_of(tiny_scene, pose, means)
     views = [(camera, t_us), (near, t_us)]
-    offered = close_followed(model, SelectiveAdam(model.parameters()), views, [BODY])
+    offered = close_followed(model, SelectiveAdam(model.parameters()), views, [body])
     assert torch.equal(model.gaussians.means.detach()[model.gaussians.counts[0] :], means)
     assert offered.scene.objects["car"] is model.scene.objects["car"]
 
 
-def test_the_whole_body_is_offered_in_one_paint_and_once_for_each_inset(tiny_scene, ahead):
+def test_the_whole_body_is_offered_in_one_paint_and_once_for_each_inset(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
-    means = deep_tail(camera, tiny_scene, t_us, pose)
+    means = deep_tail(body, camera, tiny_scene, t_us, pose)
     model = model_of(tiny_scene, pose, means)
-    offered = close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [BODY])
-    cloud, count = offered.scene.objects["car"].cloud, len(BODY.points)
+    offered = close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [body])
+    cloud, count = offered.scene.objects["car"].cloud, len(body.points)
     assert len(cloud) == len(INSETS) * count
-    np.testing.assert_allclose(cloud.means[:count], BODY.points, atol=1e-5)
-    flank = BODY.is_paint & (np.abs(BODY.normals[:, 1]) > 0.95)
+    np.testing.assert_allclose(cloud.means[:count], body.points, atol=1e-5)
+    flank = body.is_paint & (np.abs(body.normals[:, 1]) > 0.95)
     colours = 0.5 + SH_C0 * cloud.sh[:count, 0].numpy()[flank]
     np.testing.assert_allclose(colours, np.tile(GREEN, (flank.sum(), 1)), atol=0.06)
     numbers = offered.alternatives[-len(cloud) :].reshape(len(INSETS), count)
