@@ -63,6 +63,7 @@ def reconstruct(
     """Turn a driving log into a scene of Gaussians."""
     from ..logs import open_log, select_from_log
     from ..reconstruct import ReconstructOptions, reconstruct
+    from ..reconstruct.training.schedule import at_width
     from ..reconstruct.training.schedule import preset as training_preset
 
     refuse_existing(out, overwrite=overwrite)
@@ -71,11 +72,12 @@ def reconstruct(
     training = training_preset(preset)
     if iterations:
         training = replace(training, iterations=iterations)
-    if width is not None:
-        training = replace(training, width=width, max_width=width)
     opened = open_log(log, format=log_format, sequence=sequence)
     if not selection.is_whole:
         opened = select_from_log(opened, selection)
+    if width is not None:
+        logged = max((camera.width for camera in opened.rig), default=width)
+        training = at_width(training, min(width, logged))
     with staged_progress() as report:
         result = reconstruct(
             opened,

@@ -15,6 +15,8 @@ from .losses import LossWeights
 
 COLOUR_BASES = ("cosine", "real_dft")
 HIGHER_HARMONICS_RATE = 1 / 20
+FINE_START = 0.55
+"""Fraction of the iterations from which images wider than a preset's own are shown whole."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ class TrainOptions:
         width: of the training images [px]; None for the logged width. Never above ``max_width``.
         max_width: largest width of training images [px].
         coarse: (fraction of iterations, divisor of the width) stages before full size.
+        scales: divisors of the width that take turns after them; (1, 2) keeps a scene sharp at
+            full size and true at half of it.
         sh_degree: highest degree of the spherical harmonics.
         sh_every: fraction of the iterations after which the degree grows by one.
         harmonics: time-varying colours of objects, number of basis functions; 0 for none.
@@ -89,6 +93,7 @@ class TrainOptions:
     width: int | None = None
     max_width: int = 1600
     coarse: tuple[tuple[float, int], ...] = ()
+    scales: tuple[int, ...] = (1,)
     sh_degree: int = 1
     sh_every: float = 0.05
     harmonics: int = 4
@@ -140,7 +145,7 @@ class TrainOptions:
         for until, divisor in self.coarse:
             if fraction < until:
                 return divisor
-        return 1
+        return self.scales[iteration % len(self.scales)]
 
 
 def _check_range(options: TrainOptions, name: str, low: float, high: float) -> None:
@@ -192,6 +197,20 @@ PRESETS: dict[str, TrainOptions] = {
         densify=DensifyOptions(max_gaussians=6_000_000),
     ),
 }
+
+
+def at_width(options: TrainOptions, width: int) -> TrainOptions:
+    """``options`` for images of ``width`` [px], coarse to fine where these are wider than its own.
+
+    Stages before the last are then at the widths that they had, so that most steps cost what they
+    did; in the last, full size takes turns with a part of it, or what was trained would be too
+    sharp for smaller images.
+    """
+    part = -(-width // options.max_width)
+    if part > 1:
+        stages = tuple((until, divisor * part) for until, divisor in options.coarse)
+        options = replace(options, coarse=(*stages, (FINE_START, part)), scales=(1, part))
+    return replace(options, width=width, max_width=width)
 
 
 def preset(name: str, **changes: Any) -> TrainOptions:

@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+from real2sim_server.reconstruct.training import TrainOptions
+from real2sim_server.reconstruct.training.schedule import at_width, from_values, preset
+
+
+def widths(options: TrainOptions, width: int, *fractions: float) -> list[set[int]]:
+    """Of the images of a pair of steps after each of these fractions of the iterations."""
+    found = []
+    for fraction in fractions:
+        first = round(fraction * options.iterations)
+        found.append({width // options.divisor(i) for i in (first, first + 1)})
+    return found
+
+
+def test_images_wider_than_a_presets_own_come_last_and_take_turns_with_smaller_ones():
+    options = at_width(preset("cpu-small"), 1242)
+    assert widths(options, 1242, 0, 0.3, 0.8) == [{310}, {621}, {621, 1242}]
+
+
+def test_up_to_a_presets_own_width_its_stages_stay():
+    options = at_width(preset("cpu-small"), 621)
+    assert widths(options, 621, 0, 0.3, 0.8) == [{310}, {621}, {621}]
+
+
+def test_options_come_back_from_the_state_of_a_run():
+    options = at_width(preset("cpu-small"), 1242)
+    assert from_values(TrainOptions, json.loads(json.dumps(asdict(options)))) == options
