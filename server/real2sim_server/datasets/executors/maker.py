@@ -37,6 +37,10 @@ class ShardMaker:
         self._cameras = planned_cameras(self._variants[0].drive, plan)
         self._backend = backend
 
+    def is_ready(self) -> bool:
+        """Whether it has been made: an answer at all says so."""
+        return True
+
     def make(self, clip: PlannedClip, folder: Path) -> None:
         """Make a clip as ``folder``, which appears when it is whole."""
         variant = self._variants[clip.variant]

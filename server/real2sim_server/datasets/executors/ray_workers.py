@@ -99,26 +99,27 @@ class RayWorkers:
         folder: Path,
         on_frames: Callable[[int], None],
     ) -> None:
-        """Give each actor one clip at a time, the next when it has made it."""
+        """Give each actor one clip at a time, the next when it has made it. Actors that the cluster
+        has no room for get none, and are not waited for."""
         ray, left = self._ray, list(reversed(clips))
-        at_work = {}
-        for actor in makers:
-            clip = left.pop()
-            at_work[actor.make_archive.remote(clip)] = (actor, clip)
-        while at_work:
+        at_work: dict[Any, tuple[Any, PlannedClip | None]]
+        at_work = {actor.is_ready.remote(): (actor, None) for actor in makers}
+        while left or any(clip is not None for _, clip in at_work.values()):
             [done], _ = ray.wait(list(at_work), num_returns=1)
             actor, clip = at_work.pop(done)
             try:
-                archive = ray.get(done)
+                made = ray.get(done)
             except ray.exceptions.RayActorError as error:
+                what = "a worker" if clip is None else f"clip {clip.name}"
                 raise DatasetError(
-                    f"clip {clip.name}: its actor died {MOST_TRIES} times ({error})"
+                    f"{what}: its actor died {MOST_TRIES} times ({error})"
                 ) from error
             if left:
                 following = left.pop()
                 at_work[actor.make_archive.remote(following)] = (actor, following)
-            _unpack(archive, folder / clip.name)
-            on_frames(len(clip.times_us))
+            if clip is not None:
+                _unpack(made, folder / clip.name)
+                on_frames(len(clip.times_us))
 
 
 def _unpack(archive: bytes, folder: Path) -> None:
