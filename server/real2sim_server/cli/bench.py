@@ -130,6 +130,20 @@ def edit(
     _report(json, edit.run(edit.EditBenchOptions(operations=operations)))
 
 
+@command("dataset", group=app)
+def dataset(
+    *,
+    rounds: Annotated[int, typer.Option(min=1, max=100, help="The least of so many counts.")] = 5,
+    json: JsonFile = None,
+) -> None:
+    """CPU time of a labelled frame by part and as share of its colours; frames written a second."""
+    from ..benchmarks import dataset
+
+    figures = dataset.run(rounds=rounds)
+    print_figures("a labelled frame", figures)
+    _report(json, figures)
+
+
 @command("recovery", group=app)
 def recovery(
     *,

@@ -38,7 +38,7 @@ class LabelBackend(Protocol):
             request: without optics.
             windows: of objects, one each, by camera.
             level: transmittance at which the front of a pixel lies, the Gaussian that brings it
-                there or below.
+                there or below; at most a half, which counts where it is not reached.
             along_rays: whether depth is where a pixel's ray meets its front most, or the depth of
                 the front's centre.
         """

@@ -13,7 +13,7 @@ HOW = {
     "drawn alone",
     "truncation": "box: share of the projected 3D box's bounding box outside of the image",
     "instance": "rendered: object of a pixel's front, the Gaussian that takes its light to a fifth "
-    "(where passes draw labels, to a half); an object's shadow is ground",
+    "(where that is not reached, or passes draw labels, to a half); an object's shadow is ground",
     "semantic": "rendered: class of the object by its category; of the background the ground by "
     "geometry, within 0.15 m of the scene's height field, the sky by opacity",
     "depth": "rendered: depth along the camera's z axis where a pixel's ray meets its front most; "

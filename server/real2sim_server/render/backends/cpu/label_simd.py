@@ -21,7 +21,8 @@ from .simd import exponential
 
 LABEL_PLANES = 5
 """Transmittance (negative once finished), red, green, blue, and the front: one more than the number
-of the record that brings the transmittance to the asked level or below, 0 where none does."""
+of the record that brings the transmittance to the asked level or below; where none does, of the one
+that brings it to a half, 0 where none does that either."""
 OWN_PLANES = 2
 """Transmittance and front of what an object shows by itself."""
 
@@ -65,12 +66,18 @@ def _blend(
     state.store(0, new)
     for plane, value in enumerate(colours, start=1):
         state.store(plane, weight.fused(splat(builder, value), state.load(plane)))
-    crossing = builder.and_(before.compare(">", level), after.compare("<=", level))
+    crossing = builder.or_(_crossed(before, after, 0.5), _crossed(before, after, level))
     crossing = builder.and_(blended, crossing)
     last = 1 + len(colours)
-    state.store(last, state.load(last) + front.where(crossing, 0.0))
+    held = state.load(last)
+    state.store(last, held + (front - held).where(crossing, 0.0))
     mask = builder.bitcast(new.compare(">", 0.0), ir.IntType(LANES))
     return builder.zext(mask, ir.IntType(64))
+
+
+def _crossed(before: Lanes, after: Lanes, level: Lanes | float) -> Any:
+    """Where the transmittance goes from above a level to it or below."""
+    return before.builder.and_(before.compare(">", level), after.compare("<=", level))
 
 
 @intrinsic
