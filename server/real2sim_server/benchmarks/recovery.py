@@ -53,8 +53,6 @@ COPIES = 4
 CLIP_S, RECOVER_S = 1.0, 2.5
 PERIOD_US = 100_000
 """Between frames and between steps."""
-PLAN_US = 3_000_000
-"""Of a policy."""
 AT_ONCE = 16
 """Worlds whose images are drawn in one call."""
 RGB = RasterOptions(depth=False, instance=False)
@@ -77,6 +75,7 @@ class RecoveryBenchOptions:
         scene: bundle; None for the demo's street.
         episodes: of each planner.
         seconds: of each.
+        plan_s: how far plans reach [s].
         lateral, heading: largest distance of starts from the path, and turn [m], [rad].
         epochs: of training.
         seed: of exports, training and starts.
@@ -86,6 +85,7 @@ class RecoveryBenchOptions:
     scene: Path | None = None
     episodes: int = 64
     seconds: float = 4.0
+    plan_s: float = 3.0
     lateral: float = 1.0
     heading: float = math.radians(8)
     epochs: int = 300
@@ -252,12 +252,12 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
 def _world(scene: Scene, seed: int, instant: int, options: RecoveryBenchOptions) -> World:
     steps = round(options.seconds * 1e6 / PERIOD_US)
     # Frames whose plan the drive does not cover teach nothing: nobody has seen the road there.
-    last_us = scene.end_us - PLAN_US - steps * PERIOD_US
+    last_us = scene.end_us - round(options.plan_s * 1e6) - steps * PERIOD_US
     if last_us <= scene.start_us:
         seconds = (scene.end_us - scene.start_us) * 1e-6
         raise CommandError(
             f"scene {scene.name!r} is {seconds:.1f} s long; episodes of {options.seconds:g} s and "
-            f"plans of {PLAN_US * 1e-6:g} s need more"
+            f"plans of {options.plan_s:g} s need more"
         )
     share = instant / (INSTANTS - 1)
     start = StartRandomization(lateral=options.lateral, heading=options.heading)

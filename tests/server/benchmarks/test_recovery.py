@@ -14,7 +14,9 @@ from real2sim_server.datasets.plan import planned_shards
 from real2sim_server.datasets.variants import Variant
 from real2sim_server.edit import ScenarioState
 
-OPTIONS = recovery.RecoveryBenchOptions(episodes=2, seconds=1.0, lateral=0.2, heading=0.02)
+OPTIONS = recovery.RecoveryBenchOptions(
+    episodes=2, seconds=1.0, plan_s=0.0, lateral=0.2, heading=0.02
+)
 
 
 class Straight:
@@ -36,7 +38,9 @@ def test_who_is_told_the_route_comes_back(tiny_scene):
 
 
 def test_who_goes_straight_on_does_not(tiny_scene):
-    options = recovery.RecoveryBenchOptions(seconds=1.0, lateral=2.0, heading=0.01, seed=1)
+    options = recovery.RecoveryBenchOptions(
+        seconds=1.0, plan_s=0.0, lateral=2.0, heading=0.01, seed=1
+    )
     ends = recovery.drive_all(tiny_scene, [Straight() for _ in range(4)], options)
     assert not any(end.success for end in ends)
     assert min(abs(end.offset) for end in ends) > recovery.OFFSET_M
