@@ -12,6 +12,7 @@ import torch
 from real2sim_server.logs import DrivingLog
 from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.reconstruct.options import InitialiseOptions
+from real2sim_server.reconstruct.training.direction_options import DirectionOptions
 from real2sim_server.reconstruct.training.schedule import DensifyOptions, TrainOptions
 from real2sim_server.reconstruct.training.threads import one_torch_thread
 from real2sim_server.reconstruct.training.trainer import Trainer
@@ -29,6 +30,8 @@ OPTIONS = TrainOptions(
     log_every=1000,
     width=32,
     max_width=32,
+    # Whole bodies have more Gaussians than the stand-in draws in a minute.
+    directions=DirectionOptions(close=False),
     initialise=InitialiseOptions(
         voxel=1.0, ground_spacing=2.0, object_voxel=0.5, sky_resolution=8, max_colour_frames=2
     ),
