@@ -14,6 +14,7 @@ from real2sim_server.reconstruct.training import (
     TrainOptions,
     training_log,
 )
+from real2sim_server.reconstruct.training.direction_options import DirectionOptions
 from real2sim_server.scene import Scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
@@ -25,6 +26,8 @@ TINY = TrainOptions(
     log_every=10,
     checkpoint_every=20,
     preview_every=0,
+    # Whole bodies of vehicles take longer to draw than all the rest.
+    directions=DirectionOptions(close=False),
     initialise=InitialiseOptions(
         max_background=6_000,
         max_object=400,

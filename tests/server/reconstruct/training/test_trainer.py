@@ -208,7 +208,7 @@ def losses_of(folder) -> list[tuple[int, float]]:
     return [(line["iteration"], line["loss"]) for line in map(json.loads, lines)]
 
 
-BROKEN_OFF = replace(TINY, iterations=40, mirror=0.5)
+BROKEN_OFF = replace(TINY, iterations=40, mirror=0.5, directions=DirectionOptions())
 
 
 @pytest.fixture(scope="module")
