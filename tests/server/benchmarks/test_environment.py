@@ -1,5 +1,6 @@
 """Every bench says what it was measured with."""
 
+import importlib
 import json
 import platform
 from pathlib import Path
@@ -11,38 +12,24 @@ import torch
 from typer.testing import CliRunner
 
 from real2sim_server import benchmarks
-from real2sim_server.benchmarks import (
-    dataset,
-    detector,
-    edit,
-    environment,
-    learn,
-    physics,
-    reconstruct,
-    recovery,
-    render,
-    sensors,
-    serve,
-    soak,
-    world,
-)
+from real2sim_server.benchmarks import environment, physics
 from real2sim_server.cli import bench
 
-BENCHES = (
-    dataset,
-    detector,
-    edit,
-    learn,
-    physics,
-    reconstruct,
-    recovery,
-    render,
-    sensors,
-    serve,
-    soak,
-    world,
+NAMES = (
+    "dataset",
+    "detector",
+    "edit",
+    "learn",
+    "physics",
+    "reconstruct",
+    "recovery",
+    "render",
+    "sensors",
+    "serve",
+    "soak",
+    "world",
 )
-MODULES = {module.__name__.rpartition(".")[2]: module for module in BENCHES}
+MODULES = {name: importlib.import_module(f"{benchmarks.__name__}.{name}") for name in NAMES}
 FIGURES = {"failures": [], "grows": False, "stage_ms": {}}
 
 
