@@ -130,7 +130,7 @@ class StepsAtOnce:
         if is_written:
             self._end()
         else:
-            self._end_later(self._sent(message_id, observation.answer))
+            self._end_later(self._send(observation.answer, message_id))
 
     def _end_later(self, ending: Awaitable[None]) -> None:
         async def awaited() -> None:
@@ -150,9 +150,7 @@ class StepsAtOnce:
             refusal = service_error(broken.error, log_unexpected=True)
         except Exception as error:
             refusal = service_error(error, log_unexpected=True)
-        await self._sent(message_id, error_message(refusal, step=self._session.lockstep.step))
-
-    async def _sent(self, message_id: int, answer: EncodedMessage) -> None:
+        answer = error_message(refusal, step=self._session.lockstep.step)
         await self._send(answer, message_id)
 
     def _end(self) -> None:
