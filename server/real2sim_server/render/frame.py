@@ -155,7 +155,7 @@ def render_rigs(
     else:
         options = options_for(modalities, options)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
-    groups = [(v, members) for v, view in enumerate(views) for members in _alike(view.cameras)]
+    groups = [(v, members) for v, view in enumerate(views) for members in alike(view.cameras)]
     requests = [_request(views[v], members, options, between) for v, members in groups]
     for request in requests:
         check_optics(chosen, request)
@@ -191,7 +191,7 @@ def classes_of(instances: Sequence[Instance]) -> NDArray[np.uint8]:
     return classes
 
 
-def _alike(cameras: Sequence[Camera]) -> list[list[int]]:
+def alike(cameras: Sequence[Camera]) -> list[list[int]]:
     """Indices of pinholes of one size each, and of every other camera by itself."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for index, camera in enumerate(cameras):

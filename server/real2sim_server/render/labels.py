@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..scene import Camera
 from .backends.base import Backend, RasterRequest
+from .frame import alike
 from .quantize import to_uint8
 from .rasterize import DEFAULT_OPTIONS, checked_request
 from .types import Instance, LabelOutput, Sky, Window
@@ -91,16 +92,14 @@ def label_cameras(
     Raises:
         RenderError: as rasterize().
     """
-    sizes: dict[tuple[int, int], list[int]] = {}
-    for index, camera in enumerate(cameras):
-        sizes.setdefault((camera.width, camera.height), []).append(index)
     frames: dict[int, LabelledFrame] = {}
-    for size, members in sizes.items():
+    for members in alike(cameras):
+        first = cameras[members[0]]
         request = checked_request(
             instances,
             np.stack([cameras[index].viewmat(T_world_vehicle) for index in members]),
             np.stack([cameras[index].K for index in members]),
-            size,
+            (first.width, first.height),
             sky=sky,
             options=DEFAULT_OPTIONS,
         )

@@ -67,17 +67,18 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
         pixels = np.empty(TILE * HALVES * PLANES * LANES, np.float32)
         for tile in range(first_tile + task, last_tile, TASKS):
             x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-            going = open_tile(pixels, x0, y0, alpha.shape)
+            going = open_tile(pixels, PLANES, x0, y0, alpha.shape)
             first, last = starts[tile], starts[tile + 1]
             blend_tile(values, lists, first, last, F32(x0), F32(y0), pixels, going, extras)
             write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median)
 
 
 @inlined()
-def open_tile(pixels, x0, y0, shape):
+def open_tile(pixels, planes, x0, y0, shape):
     """Clear the state and finish pixels outside the image.
 
-    Half rows of eight pixels are numbered down the left half of the tile, then down the right one.
+    Half rows of eight pixels are numbered down the left half of the tile, then down the right one;
+    each has ``planes`` of them, the first is its transmittance.
     Returns a bit for each that has something to draw.
     """
     pixels[:] = 0
@@ -85,7 +86,7 @@ def open_tile(pixels, x0, y0, shape):
     for row in range(min(TILE, shape[0] - y0)):
         for column in range(min(TILE, shape[1] - x0)):
             half = column // LANES * TILE + row
-            pixels[half * PLANES * LANES + column % LANES] = 1
+            pixels[half * planes * LANES + column % LANES] = 1
             alive |= np.int64(1) << half
     return alive
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import prange
 
 from ...._numba import PARALLEL_LOOPS
-from .blend import HALVES, LOOK_AHEAD, TASKS
+from .blend import HALVES, LOOK_AHEAD, TASKS, open_tile
 from .kernel import inlined, kernel
 from .label_simd import LABEL_PLANES, OWN_PLANES, blend_both, blend_label, blend_own
 from .lanes import LANES
@@ -77,7 +77,7 @@ def blend_labels(
         own_alive = np.empty(windows.shape[0], np.int64)
         for tile in range(first_tile + task, last_tile, TASKS):
             x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-            alive = open_label_tile(pixels, x0, y0, alpha.shape)
+            alive = open_tile(pixels, LABEL_PLANES, x0, y0, alpha.shape)
             watched = watch(own_alive, windows, x0, y0)
             label_tile(
                 values, lists, starts[tile], starts[tile + 1], F32(x0), F32(y0), pixels, alive,
@@ -86,19 +86,6 @@ def blend_labels(
             write_colours(pixels, x0, y0, background, rgb, alpha, pixel_fronts, used)
             if watched:
                 write_own(own, own_alive, windows, x0, y0, alpha.shape, alone, used)
-
-
-@inlined()
-def open_label_tile(pixels, x0, y0, shape):
-    """As open_tile."""
-    pixels[:] = 0
-    alive = np.int64(0)
-    for row in range(min(TILE, shape[0] - y0)):
-        for column in range(min(TILE, shape[1] - x0)):
-            half = column // LANES * TILE + row
-            pixels[half * LABEL_PLANES * LANES + column % LANES] = 1
-            alive |= np.int64(1) << half
-    return alive
 
 
 @inlined()

@@ -376,7 +376,7 @@ def blend_image(
     tiles_x = (alpha.shape[1] + TILE - 1) // TILE
     for tile in range(starts.shape[0] - 2):
         x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        going = open_tile(pixels, x0, y0, alpha.shape)
+        going = open_tile(pixels, PLANES, x0, y0, alpha.shape)
         first, last = starts[tile], starts[tile + 1]
         blend_tile(values, lists, first, last, F32(x0), F32(y0), pixels, going, extras)
         write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median)
