@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 Array = NDArray[np.floating[Any]]
+
+WINDOW = np.ones(5) / 5
+"""Over which headings are smoothed, in points of a path."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,8 @@ class Path:
     """The part of a route that lies ahead, as a polyline with arc length.
 
     Attributes:
-        arc: [N] float64, metres from the point of the route nearest to the vehicle; from 0.
+        arc: [N] float64, metres from the point of the route nearest to the vehicle; from 0, evenly
+            spaced.
         points: [N, 2] float64, vehicle frame [m].
         offset: [2] float64, from that nearest point to the vehicle [m].
     """
@@ -137,22 +142,29 @@ class Path:
         if len(route) == 0:
             return cls(np.zeros(1), np.zeros((1, 2)), np.zeros(2))
         route = _from_vehicle_on(route)
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
+        arc = np.zeros(len(route))
+        np.cumsum(_lengths(route[1:] - route[:-1]), out=arc[1:])
         start = _nearest_arc(route, arc)
         count = max(int((arc[-1] - start) / spacing), 0) + 1
         samples = start + np.arange(count) * spacing
-        points = np.stack([np.interp(samples, arc, route[:, k]) for k in (0, 1)], axis=1)
+        points = _interpolated(samples, arc, route)
         return cls(samples - start, points, -points[0])
 
     def curvature(self) -> Array:
         """[N] float64, 1/m, unsigned; over about two metres, to be deaf to noise."""
         if len(self.points) < 3:
             return np.zeros(len(self.points))
-        heading = np.unwrap(np.arctan2(*np.gradient(self.points, self.arc, axis=0).T[::-1]))
-        window = np.ones(5) / 5
-        smooth = np.convolve(np.pad(heading, 2, mode="edge"), window, mode="valid")
-        bend: Array = np.abs(np.gradient(smooth, self.arc))
-        return bend
+        slope = self._slope(self.points)
+        heading = _unwrapped(np.arctan2(slope[:, 1], slope[:, 0]))
+        ends = [heading[:1]] * 2, [heading[-1:]] * 2
+        smooth = np.convolve(np.concatenate([*ends[0], heading, *ends[1]]), WINDOW, mode="valid")
+        return np.abs(self._slope(smooth))
+
+    def direction(self) -> Array:
+        """[N, 2] float64, unit vectors along the path; there have to be two points."""
+        slope = self._slope(self.points)
+        unit: Array = slope / np.maximum(_lengths(slope), 1e-9)[:, None]
+        return unit
 
     def poses(self, travelled: Array, recovery: float) -> Array:
         """[K, 3] x [m], y [m], yaw [rad] after so many metres [K]; the offset from the route fades.
@@ -160,16 +172,17 @@ class Path:
         Yaw is the direction of the path driven, so that it is what a car can do.
         """
         reach = 0.25
-        here, ahead = self._at(travelled, recovery), self._at(travelled + reach, recovery)
+        both = self._at(np.concatenate([travelled, travelled + reach]), recovery)
+        here, ahead = both[: len(travelled)], both[len(travelled) :]
         direction = ahead - here
-        moving = np.linalg.norm(direction, axis=1) > 1e-6
+        moving = _lengths(direction) > 1e-6
         yaw = np.where(moving, np.arctan2(direction[:, 1], direction[:, 0]), 0.0)
         # A vehicle that stands cannot turn; its heading reaches the path's within a metre or two.
-        turned = np.unwrap(yaw) * (1.0 - np.exp(-travelled))
+        turned = _unwrapped(yaw) * (1.0 - np.exp(-travelled))
         return np.concatenate([here, turned[:, None]], axis=1)
 
     def _at(self, travelled: Array, recovery: float) -> Array:
-        inside = np.stack([np.interp(travelled, self.arc, self.points[:, k]) for k in (0, 1)], 1)
+        inside = _interpolated(travelled, self.arc, self.points)
         beyond = np.maximum(travelled - self.arc[-1], 0.0)[:, None] * self._last_direction()
         # Its slope is 0 at the start: the way back begins along the route, not across it.
         fade = ((1.0 + travelled / recovery) * np.exp(-travelled / recovery))[:, None]
@@ -182,6 +195,35 @@ class Path:
         step = self.points[-1] - self.points[-2]
         length = float(np.linalg.norm(step))
         return step / length if length > 1e-9 else np.array([1.0, 0.0])
+
+    def _slope(self, values: Array) -> Array:
+        """Of values [N, ...] along the path: central differences, one-sided at its ends."""
+        spacing = float(self.arc[1] - self.arc[0])
+        slope = np.empty_like(values)
+        slope[1:-1] = (values[2:] - values[:-2]) / (2.0 * spacing)
+        slope[0] = (values[1] - values[0]) / spacing
+        slope[-1] = (values[-1] - values[-2]) / spacing
+        return slope
+
+
+class Profile:
+    """A function along a path, asked for one place after the other: linear between its points."""
+
+    def __init__(self, arc: Array, values: Array) -> None:
+        """The function with ``values`` [N] at increasing ``arc`` [N]; constant beyond both."""
+        self._arc: list[float] = arc.tolist()
+        self._values: list[float] = values.tolist()
+
+    def at(self, where: float) -> float:
+        """Its value there."""
+        arc, values = self._arc, self._values
+        k = bisect_right(arc, where)
+        if k == 0:
+            return values[0]
+        if k == len(arc):
+            return values[-1]
+        slope = (values[k] - values[k - 1]) / (arc[k] - arc[k - 1])
+        return slope * (where - arc[k - 1]) + values[k - 1]
 
 
 @dataclass(frozen=True)
@@ -203,11 +245,13 @@ def speed_limits(path: Path, *, cruise: float, comfort: Comfort) -> Array:
 
 def brake_ahead(arc: Array, limits: Array, *, braking: float) -> Array:
     """Limits lowered so that each can be reached from the one before by braking."""
-    lowered = limits.copy()
+    # Plain numbers: a running minimum of v^2 + 2 b s would lose digits where limits are small.
+    places: list[float] = arc.tolist()
+    lowered: list[float] = limits.tolist()
     for i in range(len(lowered) - 2, -1, -1):
-        reachable = math.sqrt(lowered[i + 1] ** 2 + 2.0 * braking * (arc[i + 1] - arc[i]))
+        reachable = math.sqrt(lowered[i + 1] ** 2 + 2.0 * braking * (places[i + 1] - places[i]))
         lowered[i] = min(lowered[i], reachable)
-    return lowered
+    return np.array(lowered)
 
 
 def obstacles_on(
@@ -215,28 +259,29 @@ def obstacles_on(
 ) -> list[Obstacle]:
     """Agents whose box reaches into the strip that the vehicle sweeps along the path.
 
-    Counted from where the vehicle's origin must stand for its front to touch.
+    Their places are those of the vehicle's origin at which its front touches.
     """
-    found: list[Obstacle] = []
-    direction = np.gradient(path.points, path.arc, axis=0) if len(path.arc) > 1 else None
-    if direction is None:
-        return found
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    if len(path.arc) < 2 or not agents:
+        return []
+    corners, velocities = _in_vehicle_frame(ego, agents)
+    direction = path.direction()
+    dx = corners[..., 0, None] - path.points[:, 0]
+    dy = corners[..., 1, None] - path.points[:, 1]
+    nearest = (dx * dx + dy * dy).argmin(axis=2)
+    along, shift = direction[nearest], corners - path.points[nearest]
+    arcs = path.arc[nearest] + (along * shift).sum(axis=2)
+    aside = along[..., 0] * shift[..., 1] - along[..., 1] * shift[..., 0]
+    reach = 0.5 * ego.size[1] + clearance
+    in_strip = (aside.min(axis=1) < reach) & (aside.max(axis=1) > -reach)
+    first, last = arcs.min(axis=1), arcs.max(axis=1)
     front = 0.75 * ego.size[0]
-    for agent in agents:
-        corners, velocity = _in_vehicle_frame(ego, agent)
-        apart = np.linalg.norm(corners[:, None] - path.points, axis=2)
-        nearest = apart.argmin(axis=1)
-        along = direction[nearest]
-        shift = corners - path.points[nearest]
-        arcs = path.arc[nearest] + (along * shift).sum(axis=1)
-        aside = along[:, 0] * shift[:, 1] - along[:, 1] * shift[:, 0]
-        reach = 0.5 * ego.size[1] + clearance
-        in_strip = aside.min() < reach and aside.max() > -reach
-        if in_strip and arcs.max() > 0.0 and arcs.min() < path.arc[-1]:
-            speed = float(velocity @ direction[nearest[arcs.argmin()]])
-            found.append(Obstacle(float(arcs.min()) - front, speed))
-    return found
+    return [
+        Obstacle(
+            float(first[k]) - front,
+            float((velocities[k] * along[k, arcs[k].argmin()]).sum()),
+        )
+        for k in np.flatnonzero(in_strip & (last > 0.0) & (first < path.arc[-1]))
+    ]
 
 
 def behind(obstacle: Obstacle, arc: Array, comfort: Comfort) -> Array:
@@ -254,19 +299,20 @@ def drive_profile(
 
     Braking may exceed ``comfort.braking`` where somebody is already too near.
     """
-    travelled, now, speed = np.empty(len(delays)), 0.0, max(speed, 0.0)
-    position = 0.0
-    for k, delay in enumerate(delays):
+    travelled: list[float] = []
+    profile, position, now, speed = Profile(arc, limits), 0.0, 0.0, max(speed, 0.0)
+    for delay in delays.tolist():
         steps = max(round((delay - now) / 0.05), 1)
         dt = (delay - now) / steps
         for _ in range(steps):
-            limit = float(np.interp(position + speed * dt, arc, limits))
+            limit = profile.at(position + speed * dt)
             target = min(limit, speed + comfort.acceleration * dt)
             following = max(target, speed - 2.0 * comfort.braking * dt, 0.0)
             position += 0.5 * (speed + following) * dt
             speed = following
-        travelled[k], now = position, delay
-    return travelled
+        travelled.append(position)
+        now = delay
+    return np.array(travelled)
 
 
 def _from_vehicle_on(route: Array) -> Array:
@@ -284,22 +330,48 @@ def _nearest_arc(route: Array, arc: Array) -> float:
     """Arc length of the point of the polyline nearest to the vehicle's origin."""
     if len(route) == 1:
         return 0.0
-    begin, step = route[:-1], np.diff(route, axis=0)
+    begin, step = route[:-1], route[1:] - route[:-1]
     length2 = np.maximum((step**2).sum(axis=1), 1e-12)
     fraction = np.clip(-(begin * step).sum(axis=1) / length2, 0.0, 1.0)
-    distance = np.linalg.norm(begin + fraction[:, None] * step, axis=1)
-    i = int(distance.argmin())
+    i = int(_lengths(begin + fraction[:, None] * step).argmin())
     return float(arc[i] + fraction[i] * math.sqrt(length2[i]))
 
 
-def _in_vehicle_frame(ego: EgoState, agent: AgentState) -> tuple[Array, Array]:
-    """Box corners [4, 2] and velocity [2] of an agent, vehicle frame."""
-    w, x, y, z = agent.quaternion
-    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) - ego.yaw
-    c, s = math.cos(ego.yaw), math.sin(ego.yaw)
-    to_vehicle = np.array([[c, s], [-s, c]])
-    centre = to_vehicle @ np.subtract(agent.position, ego.position)[:2]
-    ahead = np.array([math.cos(yaw), math.sin(yaw)]) * 0.5 * agent.size[0]
-    left = np.array([-math.sin(yaw), math.cos(yaw)]) * 0.5 * agent.size[1]
-    corners = centre + np.array([ahead + left, ahead - left, -ahead - left, -ahead + left])
-    return corners, to_vehicle @ np.array(agent.velocity[:2])
+def _in_vehicle_frame(ego: EgoState, agents: Sequence[AgentState]) -> tuple[Array, Array]:
+    """Box corners [A, 4, 2] and velocities [A, 2] of agents, vehicle frame."""
+    w, x, y, z = np.array([a.quaternion for a in agents]).T
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) - ego.yaw
+    centres = np.array([a.position for a in agents])[:, :2] - np.array(ego.position[:2])
+    centres = _turned_back(centres, ego.yaw)
+    half = 0.5 * np.array([a.size for a in agents])
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    ahead = np.stack([cos, sin], axis=1) * half[:, :1]
+    left = np.stack([-sin, cos], axis=1) * half[:, 1:2]
+    around = np.stack([ahead + left, ahead - left, -ahead - left, -ahead + left], axis=1)
+    velocities = _turned_back(np.array([a.velocity for a in agents])[:, :2], ego.yaw)
+    return centres[:, None] + around, velocities
+
+
+def _turned_back(vectors: Array, yaw: float) -> Array:
+    """Vectors [A, 2] of the world in axes that are turned by ``yaw`` [rad]."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.stack([c * x + s * y, c * y - s * x], axis=1)
+
+
+def _interpolated(where: Array, arc: Array, points: Array) -> Array:
+    """[K, 2] of a polyline with points [N, 2] at arc lengths [N]; its ends beyond them."""
+    return np.stack([np.interp(where, arc, points[:, k]) for k in (0, 1)], axis=1)
+
+
+def _lengths(vectors: Array) -> Array:
+    """[N] of vectors [N, 2]."""
+    x, y = vectors[:, 0], vectors[:, 1]
+    lengths: Array = np.sqrt(x * x + y * y)
+    return lengths
+
+
+def _unwrapped(angles: Array) -> Array:
+    """Angles [N] without jumps of a turn [rad]; most paths have none, and are left as they are."""
+    steps = np.abs(angles[1:] - angles[:-1])
+    return np.unwrap(angles) if len(steps) and steps.max() > math.pi else angles

@@ -15,6 +15,7 @@ from .follow_route import (
     Comfort,
     Obstacle,
     Path,
+    Profile,
     delays_of_poses,
     obstacles_on,
     speed_limits,
@@ -121,23 +122,30 @@ class Idm:
 
     def _drive(self, arc: Array, limits: Array, found: list[Obstacle], *, speed: float) -> Array:
         """[K] float64 metres travelled after each delay."""
-        travelled, position, now = np.empty(len(self._delays)), 0.0, 0.0
-        for k, delay in enumerate(self._delays):
+        leaders = [(one.arc, max(one.speed, 0.0)) for one in found]
+        profile, position, now = Profile(arc, limits), 0.0, 0.0
+        travelled: list[float] = []
+        for delay in self._delays.tolist():
             while now < delay - 1e-9:
-                desired = float(np.interp(position, arc, limits))
-                rate = self._rate(speed, desired, position, now, found)
+                rate = self._rate(speed, profile.at(position), position, now, leaders)
                 following = max(speed + rate * STEP, 0.0)
                 position += 0.5 * (speed + following) * STEP
                 speed, now = following, now + STEP
-            travelled[k] = position
-        return travelled
+            travelled.append(position)
+        return np.array(travelled)
 
     def _rate(
-        self, speed: float, desired: float, position: float, now: float, found: list[Obstacle]
+        self,
+        speed: float,
+        desired: float,
+        position: float,
+        now: float,
+        leaders: list[tuple[float, float]],
     ) -> float:
-        rates = [self.follower.answer(speed, desired, math.inf, 0.0)]
-        for one in found:
-            ahead = max(one.speed, 0.0)
-            gap = one.arc + ahead * now - position
-            rates.append(self.follower.answer(speed, desired, gap, speed - ahead))
-        return min(rates)
+        """The lowest answer to leaders, each with its place at the start and its speed."""
+        answer = self.follower.answer
+        rate = answer(speed, desired, math.inf, 0.0)
+        for place, ahead in leaders:
+            gap = place + ahead * now - position
+            rate = min(rate, answer(speed, desired, gap, speed - ahead))
+        return rate

@@ -91,6 +91,14 @@ def world(*, json: JsonFile = None) -> None:
     _report(json, world.run())
 
 
+@command("planners", group=app)
+def planners(*, json: JsonFile = None) -> None:
+    """Time that the SDK's rule planners take for a plan, beside a step of the world."""
+    from ..benchmarks import planners
+
+    _report(json, planners.run())
+
+
 @command("learn", group=app)
 def learn(*, json: JsonFile = None) -> None:
     """Steps and small images a second, for learning: batches, sessions at once; with ratios."""

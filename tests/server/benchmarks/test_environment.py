@@ -21,6 +21,7 @@ NAMES = (
     "edit",
     "learn",
     "physics",
+    "planners",
     "reconstruct",
     "recovery",
     "render",
