@@ -37,6 +37,7 @@ LAYERS = (
     "simulation",
     "logs",
     "synthetic",
+    "maps",
     "reconstruct",
     "edit",
     "world",

@@ -1,0 +1,317 @@
+"""Roads of an OpenDRIVE file with the lanes of their sections, as the file numbers them."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from ...geometry.rotation import Float
+from ...scene.lane_graph import LaneKind
+from ..errors import MapError
+from ..xml_files import integer, number
+from .plan_view import PlanView, read_plan_view
+from .profiles import Profile, read_profile
+
+STEP_M, BENT_STEP_M = 2.0, 0.5
+MAX_SAMPLES = 4_000_000
+SAME_S = 1e-6
+
+KINDS: dict[str, LaneKind] = {
+    "bidirectional": "driving",
+    "biking": "bicycle",
+    "bus": "bus",
+    "connectingramp": "driving",
+    "driving": "driving",
+    "entry": "driving",
+    "exit": "driving",
+    "hov": "driving",
+    "mwyentry": "driving",
+    "mwyexit": "driving",
+    "offramp": "driving",
+    "onramp": "driving",
+    "parking": "parking",
+    "shared": "driving",
+    "shoulder": "shoulder",
+    "sidewalk": "sidewalk",
+    "slidelane": "driving",
+    "sliplane": "driving",
+    "stop": "shoulder",
+    "taxi": "bus",
+    "walking": "sidewalk",
+}
+"""By the file's name in lower case; what is not here is no part of the carriageway."""
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}
+CHANGES = {"none": (False, False), "increase": (True, False), "decrease": (False, True)}
+"""Of a lane's own mark: whether numbers may be crossed upwards, downwards."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a road goes on as: another road at one of its ends, or a junction."""
+
+    kind: str
+    element: str
+    contact: str
+
+
+@dataclass
+class SectionLane:
+    """One lane of one section.
+
+    Attributes:
+        number: negative to the right of the reference line.
+        kind: of the lane.
+        inner, outer: [M] t of its rims at the section's places [m].
+        links: numbers of the lanes that it goes on as, by "predecessor" and "successor".
+        speed_limit: [m/s] or None.
+        may_increase, may_decrease: whether its outer mark may be crossed.
+    """
+
+    number: int
+    kind: LaneKind
+    inner: Float
+    outer: Float
+    links: dict[str, int]
+    speed_limit: float | None
+    may_increase: bool
+    may_decrease: bool
+    reversed: bool = False
+
+
+@dataclass
+class Section:
+    """A lane section: places along the road and the lanes there, by number."""
+
+    s: Float
+    lanes: dict[int, SectionLane] = field(default_factory=dict)
+
+
+@dataclass
+class OpenDriveRoad:
+    """A <road>.
+
+    Attributes:
+        road_id, junction: as in the file; ``junction`` None outside of junctions.
+        length: [m].
+        plan: reference line seen from above.
+        elevation, roll: along it.
+        drives_right: rule of the road.
+        links: by "predecessor" and "successor".
+        sections: along s.
+        element: for signals and objects.
+        s: [N] places at which everything is sampled [m].
+    """
+
+    road_id: str
+    junction: str | None
+    length: float
+    plan: PlanView
+    elevation: Profile
+    roll: Profile
+    drives_right: bool
+    links: dict[str, Link]
+    sections: list[Section]
+    element: ET.Element
+    s: Float
+
+    @property
+    def where(self) -> str:
+        """Name for messages."""
+        return f"road {self.road_id!r}"
+
+
+def read_road(element: ET.Element, file: str) -> OpenDriveRoad:
+    """A road of a file.
+
+    Raises:
+        MapError: names file, road and what is wrong.
+    """
+    road_id = element.get("id", "")
+    where = f"{file}: road {road_id!r}"
+    plan = read_plan_view(element, where)
+    length = number(element, "length", where)
+    if abs(length - plan.length) > max(0.1, 1e-3 * length):
+        raise MapError(
+            f"{where}: is {length} m long, its geometry {plan.length:.3f} m; they must agree"
+        )
+    length = plan.length
+    junction = element.get("junction", "-1")
+    road = OpenDriveRoad(
+        road_id=road_id,
+        junction=None if junction in ("-1", "") else junction,
+        length=length,
+        plan=plan,
+        elevation=read_profile(element.findall("elevationProfile/elevation"), where),
+        roll=read_profile(element.findall("lateralProfile/superelevation"), where),
+        drives_right=element.get("rule", "RHT").upper() != "LHT",
+        links=_links(element),
+        sections=[],
+        element=element,
+        s=np.zeros(0),
+    )
+    starts = _section_starts(element, length, where)
+    road.s = _sample_places(element, plan, length, [s for s, _ in starts], where)
+    offset = read_profile(element.findall("lanes/laneOffset"), where)
+    ends = [s for s, _ in starts[1:]] + [length]
+    for (start, section), end in zip(starts, ends, strict=True):
+        s = road.s[(road.s >= start - SAME_S) & (road.s <= end + SAME_S)]
+        stretch = _Stretch(road, start, end, s, offset.at(s, until=end), where)
+        road.sections.append(_read_section(section, stretch))
+    return road
+
+
+def _links(element: ET.Element) -> dict[str, Link]:
+    found = {}
+    for end in ("predecessor", "successor"):
+        link = element.find(f"link/{end}")
+        if link is not None:
+            found[end] = Link(
+                link.get("elementType", "road"),
+                link.get("elementId", ""),
+                link.get("contactPoint", "start"),
+            )
+    return found
+
+
+def _section_starts(
+    element: ET.Element, length: float, where: str
+) -> list[tuple[float, ET.Element]]:
+    sections = element.findall("lanes/laneSection")
+    if not sections:
+        raise MapError(f"{where}: has no <laneSection>")
+    starts = sorted(((number(e, "s", where), i) for i, e in enumerate(sections)))
+    found = [(s, sections[i]) for s, i in starts]
+    if found[0][0] > 0.01:
+        raise MapError(f"{where}: its first lane section starts at s = {found[0][0]}, not at 0")
+    found[0] = (0.0, found[0][1])
+    ends = [s for s, _ in found[1:]] + [length]
+    # Sections of no length hold nothing that is driven on; files have them at ends of roads.
+    return [f for f, end in zip(found, ends, strict=True) if end - f[0] > SAME_S]
+
+
+def _sample_places(
+    element: ET.Element, plan: PlanView, length: float, sections: list[float], where: str
+) -> Float:
+    """Places at which all that changes along a road is sampled: every start of a record, and
+    regularly between."""
+    breaks = {0.0, length, *sections}
+    for record in element.iter():
+        if record.tag in ("elevation", "superelevation", "laneOffset", "geometry"):
+            breaks.add(number(record, "s", where))
+    for section in element.findall("lanes/laneSection"):
+        base = number(section, "s", where)
+        for record in section.iter():
+            if record.tag in ("width", "border"):
+                breaks.add(base + number(record, "sOffset", where, 0.0))
+    wide = bool(element.findall("lanes/laneOffset")) or any(
+        any(float(w.get(n, "0") or 0) != 0 for n in "bcd")
+        for tag in ("width", "border")
+        for w in element.iter(tag)
+    )
+    marks = np.array(sorted(s for s in breaks if 0 <= s <= length))
+    marks = marks[np.concatenate([[True], np.diff(marks) > SAME_S])]
+    marks[-1] = length
+    starts = np.array([piece.s for piece in plan.pieces])
+    places = []
+    for a, b in pairwise(marks.tolist()):
+        piece = plan.pieces[max(int(np.searchsorted(starts, a + SAME_S, side="right")) - 1, 0)]
+        step = BENT_STEP_M if piece.bends else (1.0 if wide else STEP_M)
+        places.append(np.linspace(a, b, max(int(np.ceil((b - a) / step)), 1), endpoint=False))
+    found = np.concatenate([*places, [length]])
+    if len(found) > MAX_SAMPLES:
+        raise MapError(f"{where}: needs {len(found)} samples, above {MAX_SAMPLES}")
+    return found
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """Where a lane section lies: its road, the places sampled there, t of its middle line."""
+
+    road: OpenDriveRoad
+    start: float
+    end: float
+    s: Float
+    middle: Float
+    where: str
+
+    def profile(self, elements: list[ET.Element]) -> Float:
+        """Values [M] of records that begin at their ``sOffset``."""
+        records = read_profile(elements, self.where, start="sOffset", base=self.start)
+        return records.at(self.s, until=self.end)
+
+
+def _read_section(element: ET.Element, at: _Stretch) -> Section:
+    section = Section(at.s)
+    by_number: dict[int, ET.Element] = {}
+    for lane in element.iter("lane"):
+        index = integer(lane, "id", at.where)
+        if index in by_number:
+            raise MapError(f"{at.where}: lane {index} is there twice at s = {at.start}")
+        by_number[index] = lane
+    for side in (-1, 1):
+        inner = at.middle
+        for n in sorted((n for n in by_number if n * side > 0), key=abs):
+            outer = _outer(by_number[n], inner, side, at)
+            section.lanes[n] = _section_lane(by_number[n], n, (inner, outer), at)
+            inner = outer
+    return section
+
+
+def _outer(lane: ET.Element, inner: Float, side: int, at: _Stretch) -> Float:
+    """t of the outer rim: the inner one and a width, or a border, which wins where both are."""
+    borders = lane.findall("border")
+    if borders:
+        return at.middle + at.profile(borders)
+    width: Float = np.maximum(at.profile(lane.findall("width")), 0.0)
+    return inner + side * width
+
+
+def _section_lane(lane: ET.Element, n: int, rims: tuple[Float, Float], at: _Stretch) -> SectionLane:
+    links = {}
+    for link in ("predecessor", "successor"):
+        found = lane.find(f"link/{link}")
+        if found is not None:
+            links[link] = integer(found, "id", at.where)
+    mark = lane.find("roadMark")
+    change = "both"
+    if mark is not None:
+        solid = "solid" in mark.get("type", "") and mark.get("type") != "broken solid"
+        change = mark.get("laneChange", "none" if solid else "both")
+    increase, decrease = CHANGES.get(change, (True, True))
+    return SectionLane(
+        number=n,
+        kind=KINDS.get(lane.get("type", "none").lower(), "other"),
+        inner=rims[0],
+        outer=rims[1],
+        links=links,
+        speed_limit=_speed_limit(lane, at),
+        may_increase=increase,
+        may_decrease=decrease,
+        reversed=lane.get("direction", "standard") == "reversed",
+    )
+
+
+def _speed_limit(lane: ET.Element, at: _Stretch) -> float | None:
+    """Of the lane at the middle of its section, else of the road there."""
+    where, middle = at.where, (at.start + at.end) / 2
+    own = [(at.start + number(e, "sOffset", where, 0.0), e) for e in lane.findall("speed")]
+    types = [(number(e, "s", where), e) for e in at.road.element.findall("type")]
+    of_road = [(s, speed) for s, e in types if (speed := e.find("speed")) is not None]
+    for records in (own, of_road):
+        before = [(s, e) for s, e in records if s <= middle]
+        if before:
+            return _speed(max(before, key=lambda record: record[0])[1], where)
+    return None
+
+
+def _speed(element: ET.Element, where: str) -> float | None:
+    if element.get("max") in ("no limit", "undefined", None):
+        return None
+    unit = element.get("unit", "")
+    if unit not in SPEED_UNITS:
+        raise MapError(f"{where}: speed in {unit!r}; allowed: {', '.join(u for u in SPEED_UNITS)}")
+    value = number(element, "max", where) * SPEED_UNITS[unit]
+    return value if value > 0 else None

@@ -1,0 +1,60 @@
+"""The readers of maps, and the one function that finds the right one."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from ..scene.errors import SceneError
+from ..scene.lane_graph import LaneGraph
+from .errors import MapError
+from .opendrive import OpenDriveReader
+from .reader import MapReader
+
+MAP_READERS: list[MapReader] = [OpenDriveReader()]
+"""All registered readers; the first that recognises a file reads it."""
+
+
+def register_map_reader(reader: MapReader) -> None:
+    """Let :func:`read_map` know one more reader, from outside of this package.
+
+    Args:
+        reader: of a format that no other reader recognises.
+
+    Raises:
+        ValueError: a reader of that name is registered.
+    """
+    if any(known.name == reader.name for known in MAP_READERS):
+        raise ValueError(f"a map reader named {reader.name!r} is registered already")
+    MAP_READERS.append(reader)
+
+
+def read_map(path: str | PathLike[str], *, format: str | None = None) -> LaneGraph:
+    """The lanes of a map, in the map's own frame [m].
+
+    Args:
+        path: file, or folder of a data set's map.
+        format: name of a reader; None: the first that recognises it.
+
+    Raises:
+        MapError: nothing there, no reader knows it, or it is damaged: the message names the file.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise MapError(f"{file}: no such file or folder")
+    known = {reader.name: reader for reader in MAP_READERS}
+    if format is not None and format not in known:
+        raise MapError(f"no map format {format!r}; allowed: {', '.join(known)}")
+    reader = known[format] if format else _recognised(file)
+    try:
+        return reader.read(file)
+    except SceneError as error:
+        raise MapError(f"{file}: {error}") from error
+
+
+def _recognised(path: Path) -> MapReader:
+    for reader in MAP_READERS:
+        if reader.recognises(path):
+            return reader
+    expected = "; ".join(f"{reader.name}: {reader.expects}" for reader in MAP_READERS)
+    raise MapError(f"{path}: is no map that can be read. Known are {expected}")
