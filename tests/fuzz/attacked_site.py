@@ -10,6 +10,7 @@ import shutil
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ TOKEN = "a long enough secret"
 DEAD_S = 20.0
 """After which a worker that says nothing hangs, however busy the machine is."""
 PATIENT_S = 600
+ATTEMPTS = 50
 """For what the site asks itself: a request of the attack may be under way."""
 EPISODE_STEPS = 15
 SENSOR = {"camera": "front", "width": 16, "codec": "raw"}
@@ -88,8 +90,17 @@ class Site:
 
     # --- plain requests of somebody who means well -----------------------------------------------
 
-    def ask(self, method: str, path: str, body: Any = None, *, token: str = TOKEN) -> Any:
-        """The JSON of an answer; None where there is nothing at ``path``."""
+    def ask(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        *,
+        token: str = TOKEN,
+        may_conflict: bool = False,
+    ) -> Any:
+        """The JSON of an answer; None where there is nothing at ``path``, or where a request that
+        ``may_conflict`` does."""
         connection = http.client.HTTPConnection(*self.address, timeout=PATIENT_S)
         headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         try:
@@ -98,7 +109,7 @@ class Site:
             text = answer.read()
         finally:
             connection.close()
-        if answer.status in (404, 410):
+        if answer.status in (404, 410) or (may_conflict and answer.status == 409):
             return None
         assert answer.status < 400, f"{method} {path}: {answer.status} {text[:500]!r}"
         return json.loads(text) if text else {}
@@ -114,8 +125,13 @@ class Site:
         if not self._has("sessions", "session_id"):
             made = self.ask("POST", "/v1/sessions?scene=tiny", {"reset": {"sensors": [SENSOR]}})
             known |= {"session_id": made["session_id"], "token": made["token"]}
-        if not self._has("assets", "asset_id"):
-            self.ask("POST", "/v1/assets", {"scene": "tiny", "object_id": "post"})
+        asset = {"scene": "tiny", "object_id": "post"}
+        # An asset whose removal is under way can be neither seen nor made.
+        for _ in range(ATTEMPTS):
+            if self._has("assets", "asset_id"):
+                break
+            if self.ask("POST", "/v1/assets", asset, may_conflict=True) is None:
+                time.sleep(0.1)
         if not self._has("jobs", "job_id"):
             body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 32}
             known["job_id"] = self.ask("POST", "/v1/exports", body)["job_id"]
