@@ -129,10 +129,10 @@ def test_the_same_seed_gives_the_same_weights():
 
 
 def test_boxes_of_an_instance_image_are_those_of_its_objects():
-    instance = np.zeros((40, 60), np.uint16)
-    instance[10:20, 5:25], instance[30:33, 40:43] = 1, 2
+    instance = np.zeros((80, 120), np.uint16)
+    instance[20:40, 10:51], instance[60:66, 80:86] = 1, 2
     found = boxes_in(instance)
-    assert found.boxes.tolist() == [[5, 10, 25, 20], [40, 30, 43, 33]]
+    assert found.boxes.tolist() == [[5, 10, 25.5, 20], [40, 30, 43, 33]]
     assert found.counts.tolist() == [True, False]
 
 

@@ -29,6 +29,7 @@ from ...synthetic import SyntheticConfig
 from .network import Detector, TrainingImages, detect, train_detector
 from .precision import TrueBoxes, average_precision
 from .streets import (
+    FINER,
     EditedStreets,
     cast_pictures,
     export_plan,
@@ -109,7 +110,7 @@ def training_sets(
         maker = InProcess(variants, planned_cameras(variants[0].drive, plan), "auto")
     edits = {"sweeps": [sweep.model_dump(mode="json") for sweep in drives.sweeps]}
     export_dataset(variants, plan, out, made_of=edits, executor=maker, on_progress=report)
-    camera = scene.rig[options.camera].resized(options.width)
+    camera = scene.rig[options.camera].resized(options.width * FINER)
     cast = cast_pictures(log, out, camera, partial(report, "cast rays"))
     found, count = {EXPORTED: exported_pictures(out), CAST: cast}, options.frames
     return {n: TrainingImages(p.images[:count], p.boxes[:count]) for n, p in found.items()}

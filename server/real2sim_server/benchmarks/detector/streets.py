@@ -47,6 +47,9 @@ EGO_CENTRE, EGO_ROOM = np.eye(4), (16.0, 3.5, 4.0)
 LEAST_PIXELS, LEAST_SIDE = 40, 6.0
 """An object counts from so many visible pixels and so large a box on [px]."""
 FORMATS = ("coco", "labels")
+FINER = 2
+"""Pictures are drawn so many times finer, as the streets were recorded, and averaged: what a
+detector sees are pixels that integrate, as a camera's do, and boxes that end between them."""
 
 
 @dataclass(frozen=True)
@@ -151,11 +154,11 @@ def _is_free(
 
 
 def export_plan(camera: str, width: int, seed: int) -> ExportPlan:
-    """About 20 frames of each drive, from beside its path."""
+    """About 20 frames of each drive, from beside its path, for pictures of that width."""
     return ExportPlan(
         formats=FORMATS,
         cameras=(camera,),
-        width=width,
+        width=width * FINER,
         period_us=PERIOD_US,
         clip_s=4 * PERIOD_US * 1e-6,
         seed=seed,
@@ -175,8 +178,8 @@ def exported_pictures(folder: Path) -> TrainingImages:
             row = [left, top, left + width, top + height]
             own.setdefault(note["image_id"], []).append(row)
     for image in content["images"]:
-        images.append(_read(folder / "coco/train" / image["file_name"]))
-        boxes.append(np.array(own.get(image["id"], []), np.float64).reshape(-1, 4))
+        images.append(_averaged(_read(folder / "coco/train" / image["file_name"])))
+        boxes.append(np.array(own.get(image["id"], []), np.float64).reshape(-1, 4) / FINER)
     return TrainingImages(np.stack(images), boxes)
 
 
@@ -186,7 +189,14 @@ def cast_pictures(
     camera: Camera,
     on_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> TrainingImages:
-    """The frames of an export, in the same order, by rays through the street that they show."""
+    """The frames of an export, in the same order, by rays through the street that they show.
+
+    Args:
+        log: of the street.
+        folder: of the export.
+        camera: as fine as the export's.
+        on_progress: called with (frames done, all).
+    """
     numbers = {track.object_id: k for k, track in enumerate(log.tracks)}
     frames = [frame for clip in _clips(folder) for frame in clip.frames]
     images, boxes = [], []
@@ -199,7 +209,7 @@ def cast_pictures(
             [numbers[subject["object_id"].partition(COPY)[0]] for subject in objects],
             np.array([subject["T_world_object"] for subject in objects]).reshape(-1, 4, 4),
         )
-        images.append(rgb)
+        images.append(_averaged(rgb))
         truth = boxes_in(instance)
         boxes.append(truth.boxes[truth.counts])
         on_progress(done, len(frames))
@@ -211,18 +221,18 @@ def withheld_drive(
 ) -> tuple[NDArray[np.uint8], list[TrueBoxes]]:
     """Images [N, H, W, 3] of a synthetic drive as it is, by rays, and the objects in each."""
     log = generate_log(config)
-    lens = log.rig[camera].resized(width)
+    lens = log.rig[camera].resized(width * FINER)
     images, boxes = [], []
     for t_us in range(int(log.frame_times_us[0]), int(log.frame_times_us[-1]) + 1, period_us):
         pose = lens.pose(log.ego.transform(t_us))
         rgb, _, instance = log.render(pose, lens.K, lens.width, lens.height, t_us)
-        images.append(rgb)
+        images.append(_averaged(rgb))
         boxes.append(boxes_in(instance))
     return np.stack(images), boxes
 
 
 def boxes_in(instance: NDArray[np.uint16]) -> TrueBoxes:
-    """Boxes of the objects of an instance image, and which of them count."""
+    """Boxes of the objects of a finer instance image in pixels of the pictures, and which count."""
     boxes, counts = [], []
     for number in np.unique(instance).tolist():
         mask = without_blobs(instance == number)
@@ -231,11 +241,20 @@ def boxes_in(instance: NDArray[np.uint16]) -> TrueBoxes:
             left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
             boxes.append([left, top, right, bottom])
             counts.append(_counts(int(mask.sum()), float(right - left), float(bottom - top)))
-    return TrueBoxes(np.array(boxes, np.float64).reshape(-1, 4), np.array(counts, np.bool_))
+    found = np.array(boxes, np.float64).reshape(-1, 4) / FINER
+    return TrueBoxes(found, np.array(counts, np.bool_))
 
 
 def _counts(pixels: int, width: float, height: float) -> bool:
-    return pixels >= LEAST_PIXELS and min(width, height) >= LEAST_SIDE
+    """By the finer picture."""
+    return pixels >= LEAST_PIXELS * FINER**2 and min(width, height) >= LEAST_SIDE * FINER
+
+
+def _averaged(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = image.shape[:2]
+    size = (width // FINER, height // FINER)
+    smaller: NDArray[np.uint8] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return smaller
 
 
 def _clips(folder: Path) -> list[Clip]:
