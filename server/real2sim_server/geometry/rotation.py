@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -116,11 +118,19 @@ def is_rotation(matrix: ArrayLike, *, tolerance: float = 1e-3) -> bool:
 
 def are_rotations(matrices: ArrayLike, *, tolerance: float = 1e-3) -> NDArray[np.bool_]:
     """Which of [..., 3, 3] matrices are rotations, [...] bool; like :func:`is_rotation`."""
-    given = np.asarray(matrices, dtype=np.float64)
-    finite = np.asarray(np.isfinite(given).all(axis=(-1, -2)))
-    m = np.where(finite[..., None, None], given, 0.0)
+    m = np.asarray(matrices, dtype=np.float64)
+    # By elements: products of many small matrices are calls of a library each.
+    x, y, z = ([m[..., i, j] for j in range(3)] for i in range(3))
     with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(m @ np.swapaxes(m, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    orthonormal = error < tolerance
-    upright = np.where(orthonormal[..., None, None], m, np.eye(3))
-    return np.asarray(finite & orthonormal & (np.linalg.det(upright) > 0))
+        found = np.isfinite(_dot(x, x) + _dot(y, y) + _dot(z, z))
+        for row, other in ((x, y), (y, z), (z, x)):
+            found = found & (np.abs(_dot(row, row) - 1) < tolerance)
+            found = found & (np.abs(_dot(row, other)) < tolerance)
+        cross = [y[i] * z[j] - y[j] * z[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+        return np.asarray(found & (_dot(x, cross) > 0))
+
+
+def _dot(one: Sequence[Float], other: Sequence[Float]) -> Float:
+    """Of vectors given by their three components."""
+    product: Float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    return product

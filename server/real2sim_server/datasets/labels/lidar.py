@@ -16,7 +16,7 @@ from ...render.ground_class import TOLERANCE
 from ...scene import Ground, Lidar
 from ..drive import Drive, Moment
 from .boxes import ObjectBox
-from .points import SeenPoints
+from .points import PointsByX, SeenPoints
 from .surface import on_surface
 
 SAME_SURFACE = 0.3
@@ -101,13 +101,16 @@ def _objects(
     found, velocity = np.zeros(len(ray), np.uint16), np.zeros((len(ray), 3))
     times = request.lidar.beams.slots[0]
     known = {box.instance_id: box for box in boxes}
+    sought = PointsByX(points)
     for instance, poses in zip(request.instances, request.object_poses, strict=True):
         box = known.get(instance.instance_id)
         if box is None or poses is None:
             continue
         centre = poses[len(poses) // 2][:3, 3]
-        near = np.linalg.norm(points - centre, axis=1) < np.linalg.norm(box.size) + SAME_SURFACE
-        asked = np.flatnonzero(near & ((met == instance.instance_id) | ~median))
+        reach = float(np.linalg.norm(box.size)) + SAME_SURFACE
+        asked = sought.near(centre[0], reach)
+        asked = asked[(met[asked] == instance.instance_id) | ~median[asked]]
+        asked = asked[np.linalg.norm(points[asked] - centre, axis=1) < reach]
         local = _each(invert_transform(poses[slots[asked]]), points[asked])
         own = on_surface(local, np.eye(4), box)
         found[asked[own]] = instance.instance_id

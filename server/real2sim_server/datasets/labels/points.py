@@ -32,14 +32,29 @@ def points_in_boxes(points: ArrayLike, transforms: ArrayLike, sizes: ArrayLike) 
         transforms: [K, 4, 4] poses of the boxes in that frame, origin at the centre.
         sizes: [K, 3] (length, width, height) [m].
     """
-    given = np.asarray(points, dtype=np.float64)
+    sought = PointsByX(np.asarray(points, dtype=np.float64))
     counts = []
     for transform, size in zip(np.asarray(transforms), np.asarray(sizes), strict=True):
-        centre = np.asarray(transform)[:3, 3]
-        near = given[(np.abs(given - centre) <= np.linalg.norm(size) / 2 + 1e-6).all(axis=1)]
+        near = sought.points[sought.near(transform[0, 3], float(np.linalg.norm(size)) / 2 + 1e-6)]
         local = apply_transform(invert_transform(transform), near)
-        counts.append(int((np.abs(local) <= np.asarray(size) / 2).all(axis=1).sum()))
+        counts.append(int((np.abs(local) <= size / 2).all(axis=1).sum()))
     return counts
+
+
+class PointsByX:
+    """Points in the order of their x, so that who asks for a place need not look at all of them."""
+
+    def __init__(self, points: Float) -> None:
+        """Sort [N, 3] points."""
+        self.points = points
+        self._order = np.argsort(points[:, 0])
+        self._x = points[self._order, 0]
+
+    def near(self, x: float, reach: float) -> NDArray[np.int64]:
+        """Rows of the points whose x is within ``reach`` of ``x``."""
+        first = np.searchsorted(self._x, x - reach, side="left")
+        last = np.searchsorted(self._x, x + reach, side="right")
+        return self._order[first:last]
 
 
 @dataclass(frozen=True, eq=False)
