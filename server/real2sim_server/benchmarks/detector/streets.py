@@ -253,8 +253,7 @@ def _counts(pixels: int, width: float, height: float) -> bool:
 def _averaged(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = image.shape[:2]
     size = (width // FINER, height // FINER)
-    smaller: NDArray[np.uint8] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return smaller
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 
 def _clips(folder: Path) -> list[Clip]:
