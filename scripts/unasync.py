@@ -26,6 +26,7 @@ SUBSTITUTIONS = (
     (r"\bAsync([A-Z]\w*)", r"\1"),
     (r"\b__aenter__\b", "__enter__"),
     (r"\b__aexit__\b", "__exit__"),
+    (r"\b__aiter__\b", "__iter__"),
     (r"\baclose\b", "close"),
     (r"\benter_async_context\b", "enter_context"),
     (r"\bconnect_async\b", "connect"),

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ._preview import preview_jpeg
 from .errors import ImageDecodeError, MalformedReplyError
 
 if TYPE_CHECKING:
@@ -88,6 +89,12 @@ class Image:
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """For NumPy: ``np.asarray(image)`` is :attr:`array`."""
         return np.array(self.array, dtype=dtype, copy=copy)
+
+    def _repr_jpeg_(self) -> bytes:
+        """For notebooks: the image itself, depth and numbers in grey and colours."""
+        if self.codec == "jpeg":
+            return self.data
+        return preview_jpeg(self.array, self.modality)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the image atomically and return its path.

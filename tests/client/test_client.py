@@ -434,3 +434,20 @@ def test_a_broken_scene_is_not_waited_for(slept):
     script = Script(httpx2.Response(202, json={}), httpx2.Response(200, json=broken))
     with client_of(script) as client, pytest.raises(real2sim.Real2SimError, match="truncated"):
         client.scenes.load("street")
+
+
+def test_a_collection_is_iterated_by_one_request_and_names_its_worker():
+    script = Script(httpx2.Response(200, json=SCENES))
+    with client_of(script) as client:
+        assert [info.scene for info in client.scenes] == ["street"]
+        assert repr(client.scenes) == "Scenes('http://worker:8600', token=None)"
+    assert len(script.requests) == 1
+
+
+def test_a_collection_is_iterated_asynchronously_too():
+    async def names() -> list[str]:
+        transport = httpx2.MockTransport(lambda _: httpx2.Response(200, json=SCENES))
+        async with real2sim.connect_async("http://worker:8600", transport=transport) as client:
+            return [info.scene async for info in client.scenes]
+
+    assert asyncio.run(names()) == ["street"]

@@ -156,3 +156,28 @@ def test_numpy_copies_an_image_when_asked():
     copy = np.array(image, copy=True)
     copy[:] = 0
     np.testing.assert_array_equal(image.array, IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("array", "modality", "dtype"),
+    [
+        (IMAGE, "rgb", "uint8"),
+        (
+            np.linspace(0, 80, IMAGE[..., 0].size, dtype="<f4").reshape(IMAGE.shape[:2]),
+            "depth",
+            "<f4",
+        ),
+        (np.zeros(IMAGE.shape[:2], "<f4"), "depth", "<f4"),
+        (np.arange(IMAGE[..., 0].size, dtype="<u2").reshape(IMAGE.shape[:2]), "instance", "<u2"),
+    ],
+)
+def test_notebooks_show_every_kind_of_image(array, modality, dtype):
+    shown = simplejpeg.decode_jpeg(raw_image(array, modality, dtype)._repr_jpeg_())
+    assert shown.shape == IMAGE.shape
+
+
+def test_a_preview_of_depth_is_brightest_where_it_is_nearest_and_black_where_nothing_was_hit():
+    depth = np.repeat(np.repeat(np.array([[0.0, 5.0, 40.0]], "<f4"), 16, 0), 16, 1)
+    shown = simplejpeg.decode_jpeg(raw_image(depth, "depth", "<f4")._repr_jpeg_())[8, 8::16, 0]
+    assert shown[0] < 8
+    assert shown[1] > shown[2] > shown[0]

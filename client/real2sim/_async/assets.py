@@ -12,19 +12,16 @@ from .. import _requests
 from .._call import checked
 from .._references import SceneRef, scene_name
 from ..images import Image
-from .transport import AsyncTransport
+from .collection import AsyncCollection
 
 
-class AsyncAssets:
+class AsyncAssets(AsyncCollection[AssetInfo]):
     """``client.assets``: objects to insert into scenarios.
 
     Examples:
         >>> client = real2sim.connect_async()
         >>> asset = await client.assets.cut(scene="street", object_id="car_red", asset_id="hatch")
     """
-
-    def __init__(self, transport: AsyncTransport) -> None:
-        self._transport = transport
 
     async def list(self) -> Sequence[AssetInfo]:
         """The whole library.

@@ -31,20 +31,18 @@ from .._references import (
 from .._references import optional_scene_name as name_of
 from .._session_state import SessionBase
 from ..images import write_atomically
+from .collection import AsyncCollection
 from .concurrency import run_blocking, sleep
 from .transport import AsyncTransport
 
 
-class AsyncJobs:
+class AsyncJobs(AsyncCollection[JobInfo]):
     """``client.jobs``.
 
     Examples:
         >>> client = real2sim.connect_async()
         >>> job = await client.jobs.export_video(scene="street", camera="front", end_us=200_000)
     """
-
-    def __init__(self, transport: AsyncTransport) -> None:
-        self._transport = transport
 
     async def get(self, job_id: str) -> AsyncJob:
         """A handle of an existing job.

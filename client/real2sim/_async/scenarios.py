@@ -31,21 +31,19 @@ from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
 from .._scenario_state import Objects, ScenarioState
 from ..clouds import LidarCloud
 from ..images import Image, write_atomically
+from .collection import AsyncCollection
 from .concurrency import run_blocking
 from .jobs import AsyncJob
 from .transport import AsyncTransport
 
 
-class AsyncScenarios:
+class AsyncScenarios(AsyncCollection[ScenarioInfo]):
     """``client.scenarios``.
 
     Examples:
         >>> client = real2sim.connect_async()
         >>> scenario = await client.scenarios.create(scene="street", name="an example")
     """
-
-    def __init__(self, transport: AsyncTransport) -> None:
-        self._transport = transport
 
     async def create(self, *, scene: SceneRef, name: str = "") -> AsyncScenario:
         """A new scenario without edits on a scene.

@@ -18,21 +18,18 @@ from .._references import SceneRef, scene_name
 from ..errors import Real2SimError, ReplyTimeoutError
 from ..images import Image
 from ..observation import View
+from .collection import AsyncCollection
 from .concurrency import sleep
-from .transport import AsyncTransport
 
 POLL_SECONDS = 0.2
 
 
-class AsyncScenes:
+class AsyncScenes(AsyncCollection[SceneInfo]):
     """``client.scenes``. Where a scene is asked for, its name or its ``SceneInfo`` will do.
 
     Examples:
         >>> client = real2sim.connect_async()
     """
-
-    def __init__(self, transport: AsyncTransport) -> None:
-        self._transport = transport
 
     async def list(self) -> Sequence[SceneInfo]:
         """Every available scene, in memory or not.

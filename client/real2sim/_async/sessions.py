@@ -22,10 +22,11 @@ from .._sensors import (
 )
 from .._session_state import SessionTokens
 from ..observation import View
+from .collection import AsyncCollection
 from .transport import AsyncTransport
 
 
-class AsyncSessions:
+class AsyncSessions(AsyncCollection[SessionInfo]):
     """``client.sessions``.
 
     Examples:
@@ -34,7 +35,7 @@ class AsyncSessions:
     """
 
     def __init__(self, transport: AsyncTransport) -> None:
-        self._transport = transport
+        super().__init__(transport)
         self._tokens = SessionTokens(transport.target.token)
 
     async def create(

@@ -13,19 +13,16 @@ from .. import _requests
 from .._call import checked
 from .._references import SceneRef, scene_name
 from ..images import Image
-from .transport import Transport
+from .collection import Collection
 
 
-class Assets:
+class Assets(Collection[AssetInfo]):
     """``client.assets``: objects to insert into scenarios.
 
     Examples:
         >>> client = real2sim.connect()
         >>> asset = client.assets.cut(scene="street", object_id="car_red", asset_id="hatch")
     """
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def list(self) -> Sequence[AssetInfo]:
         """The whole library.

@@ -32,20 +32,18 @@ from .._references import (
 from .._references import optional_scene_name as name_of
 from .._session_state import SessionBase
 from ..images import write_atomically
+from .collection import Collection
 from .concurrency import run_blocking, sleep
 from .transport import Transport
 
 
-class Jobs:
+class Jobs(Collection[JobInfo]):
     """``client.jobs``.
 
     Examples:
         >>> client = real2sim.connect()
         >>> job = client.jobs.export_video(scene="street", camera="front", end_us=200_000)
     """
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def get(self, job_id: str) -> Job:
         """A handle of an existing job.

@@ -32,21 +32,19 @@ from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
 from .._scenario_state import Objects, ScenarioState
 from ..clouds import LidarCloud
 from ..images import Image, write_atomically
+from .collection import Collection
 from .concurrency import run_blocking
 from .jobs import Job
 from .transport import Transport
 
 
-class Scenarios:
+class Scenarios(Collection[ScenarioInfo]):
     """``client.scenarios``.
 
     Examples:
         >>> client = real2sim.connect()
         >>> scenario = client.scenarios.create(scene="street", name="an example")
     """
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def create(self, *, scene: SceneRef, name: str = "") -> Scenario:
         """A new scenario without edits on a scene.

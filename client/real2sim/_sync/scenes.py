@@ -19,21 +19,18 @@ from .._references import SceneRef, scene_name
 from ..errors import Real2SimError, ReplyTimeoutError
 from ..images import Image
 from ..observation import View
+from .collection import Collection
 from .concurrency import sleep
-from .transport import Transport
 
 POLL_SECONDS = 0.2
 
 
-class Scenes:
+class Scenes(Collection[SceneInfo]):
     """``client.scenes``. Where a scene is asked for, its name or its ``SceneInfo`` will do.
 
     Examples:
         >>> client = real2sim.connect()
     """
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def list(self) -> Sequence[SceneInfo]:
         """Every available scene, in memory or not.

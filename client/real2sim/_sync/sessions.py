@@ -23,10 +23,11 @@ from .._sensors import (
 )
 from .._session_state import SessionTokens
 from ..observation import View
+from .collection import Collection
 from .transport import Transport
 
 
-class Sessions:
+class Sessions(Collection[SessionInfo]):
     """``client.sessions``.
 
     Examples:
@@ -35,7 +36,7 @@ class Sessions:
     """
 
     def __init__(self, transport: Transport) -> None:
-        self._transport = transport
+        super().__init__(transport)
         self._tokens = SessionTokens(transport.target.token)
 
     def create(

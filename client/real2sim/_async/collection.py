@@ -1,0 +1,34 @@
+"""What a client has several of: scenes, scenarios, assets, jobs, sessions."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from typing import Generic, TypeVar
+
+from .transport import AsyncTransport
+
+T = TypeVar("T")
+
+
+class AsyncCollection(Generic[T]):
+    """Lists what the worker has; iterating over it asks the worker once.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> [info.scene async for info in client.scenes]
+        ['street']
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    async def list(self) -> Sequence[T]:
+        """All of them."""
+        raise NotImplementedError
+
+    async def __aiter__(self) -> AsyncIterator[T]:
+        for one in await self.list():
+            yield one
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._transport.target})"
