@@ -116,6 +116,7 @@ EventType = Literal[
     "edited",
     "stopped",
     "looped",
+    "storyboard",
 ]
 
 
@@ -127,6 +128,25 @@ class Event(ServerModel):
     object_id: str | None = None
     other_id: str | None = Field(default=None, description="second object, without the ego")
     data: dict[str, float] = Field(default_factory=dict)
+    element: str | None = Field(
+        default=None,
+        description="of 'storyboard': names from the story down to what has changed, joined by "
+        "'::'; t_us is when, within 10 ms",
+    )
+    element_type: str | None = Field(
+        default=None, description="story, act, maneuver_group, maneuver, event or action"
+    )
+    change: str | None = Field(default=None, description="of it: start, end, stop or skip")
+
+
+class SignalShown(ServerModel):
+    """A traffic signal of the storyboard at one instant."""
+
+    signal_id: str
+    state: str = Field(description="in the words of the storyboard, such as 'red' or 'off;off;on'")
+    stop_line: Vector3 | None = Field(
+        default=None, description="x, y [m], heading [rad] where vehicles are to stop, world"
+    )
 
 
 class Score(ServerModel):
@@ -378,6 +398,9 @@ class Obs(ServerEnvelope):
     )
     agents: list[AgentState] = Field(default_factory=list)
     events: list[Event] = Field(default_factory=list)
+    signals: list[SignalShown] = Field(
+        default_factory=list, description="traffic signals of the storyboard"
+    )
     metrics: dict[str, float] = Field(default_factory=dict)
     terminated: bool = False
     truncated: bool = False

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from .base import Codec, Identifier, Microseconds, Modality, Model
 from .cameras import CameraEffects, Optics
 from .ranging import MAX_LIDARS, MAX_RADARS, LidarSpec, RadarSpec
+from .storyboard import Storyboard
 
 MAX_SENSORS = 16
 MAX_DRIVERS = 64
@@ -533,6 +534,10 @@ class ResetSpec(Model):
     ego: EgoSpec = EgoSpec()
     action: Literal["trajectory", "control", "pose"] = "trajectory"
     agents: AgentsSpec = AgentsSpec()
+    storyboard: Storyboard | None = Field(
+        default=None,
+        description="what entities do, and when; they are moved by it and by no driver of `agents`",
+    )
     privileged: bool = Field(default=False, description="fill `agents` of every observation")
     deadline_ms: int | None = Field(
         default=None, ge=1, le=3_600_000, description="wall-clock time for a plan; None: any"

@@ -13,6 +13,7 @@ from .ego.motion import Motion
 from .ego.route import Command
 from .events import Event
 from .path import Float
+from .storyboard.shown_signal import ShownSignal
 
 
 @made_quickly
@@ -36,6 +37,7 @@ class Observation:
         drawn: what the seed has drawn in the step, by name.
         truth: of an ego whose ``motion`` and ``T_world_vehicle`` are an estimate with errors; None
             where they are the truth, or the episode is not privileged.
+        signals: traffic signals of the storyboard.
     """
 
     step: int
@@ -56,6 +58,7 @@ class Observation:
     lap: int = 0
     drawn: Mapping[str, float] = field(default_factory=dict)
     truth: tuple[Motion, Float] | None = None
+    signals: tuple[ShownSignal, ...] = ()
 
     def ego_fields(self) -> dict[str, Any]:
         """The wire's EgoState as a plain map."""
@@ -76,6 +79,8 @@ class Observation:
             extra["drawn"] = dict(self.drawn)
         if self.truth is not None:
             extra["ego_truth"] = self.truth_fields()
+        if self.signals:
+            extra["signals"] = [_signal_fields(signal) for signal in self.signals]
         return {
             "step": self.step,
             "t_us": self.t_us,
@@ -92,6 +97,14 @@ class Observation:
             "warming_up": self.warming_up,
             **extra,
         }
+
+
+def _signal_fields(signal: ShownSignal) -> dict[str, Any]:
+    return {
+        "signal_id": signal.signal_id,
+        "state": signal.state,
+        "stop_line": signal.stop_line,
+    }
 
 
 def ego_fields(

@@ -58,6 +58,8 @@ from .randomization import (
 from .ranging import Mounted, StepWay, Wake, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
 from .seam import Seam
+from .storyboard.begin import begin_storyboard
+from .storyboard.run import StoryboardRun
 from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
 
@@ -130,6 +132,7 @@ class World:
         self._path = self._episode_route.route
         self._tracks = self._tracks_of(state)
         self.ground = scene.ground
+        self._storyboard = self._first_storyboard()
         self.motion, drawn = self._first_motion()
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
@@ -137,6 +140,8 @@ class World:
         self._estimate_error = estimate_error(spec.randomization.estimate, self._draws, 0)
         self._controller = EgoController(spec, scene.ego)
         self.traffic = self._first_traffic()
+        if self._storyboard is not None:
+            drawn |= dict(self._storyboard.drawn)
         self._start_drawn = drawn
         self._step_drawn: Mapping[str, float] = drawn | dict(self.traffic.drawn)
         self._off_route = self._off_road = False
@@ -248,7 +253,8 @@ class World:
         self.wake = self.wake.after(StepWay(since_us, self.t_us, *ways))
         self._step_drawn = _newly_drawn(self.traffic.drawn, drawn_before, jitter_us)
         contacts = self._apply_impacts(moved.impacts, start.agents)
-        events = (*self._edit_events, *loop_events, *late_events, *reaction_events)
+        told = self._storyboard_events()
+        events = (*self._edit_events, *loop_events, *late_events, *reaction_events, *told)
         self._pending = PendingStep(start, trajectory, events, contacts, self._seam)
         self._edit_events = ()
 
@@ -352,6 +358,7 @@ class World:
             lap=self.lap,
             drawn=self._step_drawn,
             truth=truth,
+            signals=() if self.traffic.storyboard is None else self.traffic.storyboard.signals(),
         )
 
     def metrics(self) -> dict[str, float]:
@@ -473,6 +480,9 @@ class World:
         if end_us <= self._warm_up_end_us:
             recorded = logged_motion(self.scene.ego, end_us, self.spec.ego)
             return StepMotion(controller, recorded, traffic, self._contacts, None)
+        if traffic.storyboard is not None and traffic.storyboard.drives_ego:
+            scripted = traffic.storyboard.ego_motion(self.motion)
+            return StepMotion(controller, scripted, traffic, self._contacts, None)
         return self._contacts.advance(
             controller, self.motion, before, traffic, t_us=t_us, height=self.ground.height
         )
@@ -556,7 +566,19 @@ class World:
         self._off_road = self.accumulator.off_road
         return events
 
+    def _storyboard_events(self) -> list[Event]:
+        """Elements of the storyboard that have begun and ended in the step."""
+        run = self.traffic.storyboard
+        return [
+            Event("storyboard", c.t_us, element=c.element, element_type=c.type, change=c.change)
+            for c in (run.changes if run is not None else ())
+        ]
+
     def _horizon_events(self) -> list[Event]:
+        run = self.traffic.storyboard
+        if run is not None and run.over and run.program.board.ends_episode and not self.over:
+            self.truncated, self.reason = True, "storyboard"
+            return [Event("stopped", self.t_us)]
         if self.steps < self._clock.horizon:
             return []
         self.truncated = True
@@ -568,6 +590,8 @@ class World:
     def _first_motion(self) -> tuple[Motion, dict[str, float]]:
         """The ego at the start, and what the seed drew for it by name."""
         recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
+        if self._storyboard is not None and self._storyboard.ego_put:
+            recorded = self._storyboard.ego_motion(recorded)
         others, size = self._tracks.at(self.t_us), self.scene.ego_size
 
         def touched(motion: Motion) -> set[int]:
@@ -582,6 +606,18 @@ class World:
             self._draws,
             is_free=lambda motion: touched(motion) <= touched(recorded),
         )
+
+    def _first_storyboard(self) -> StoryboardRun | None:
+        """The storyboard at the start, the ego where it was recorded."""
+        if self.spec.storyboard is None:
+            return None
+        motion = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
+        ego = ObservedEgo.of(motion, self._path.nearest(motion.x, motion.y), self.scene.ego_size)
+        clock, others = self._clock, self._tracks.at(self.t_us)
+        around = Surroundings(
+            self.t_us, clock.start_us, clock.dt_us, ego, others, self._path, self.ground
+        )
+        return begin_storyboard(self.spec, self.state, around, self.scene, self._draws)
 
     def _first_traffic(self) -> Traffic:
         spec, scene = self.spec, self.scene
@@ -598,6 +634,7 @@ class World:
                 ego=scene.ego,
             ),
             randomized=randomized if randomized.widths else None,
+            storyboard=self._storyboard,
         )
 
     def _tracks_of(self, state: ScenarioState) -> PackedTracks[ObjectState]:

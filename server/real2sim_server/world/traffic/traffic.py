@@ -20,6 +20,8 @@ from ..agents import Agents, rows_of
 from ..errors import WorldError
 from ..evolve import evolved
 from ..path import Float
+from ..storyboard.driver import ScriptedEntity
+from ..storyboard.run import StoryboardRun
 from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import AgentDriver, Surroundings
 from .drivers import begin_driver
@@ -63,6 +65,7 @@ class Traffic:
         randomized: draws parameters of drivers; None where nothing is drawn.
         drawn: all that has been drawn for objects so far, by name.
         edits_drive: whether an edit has said who drives an object.
+        storyboard: moves entities of its own; None where the episode has none.
     """
 
     spec: AgentsSpec
@@ -73,6 +76,7 @@ class Traffic:
     randomized: RandomizedDrivers | None = None
     drawn: Mapping[str, float] = field(default_factory=lambda: NOTHING_DRAWN)
     edits_drive: bool = False
+    storyboard: StoryboardRun | None = None
 
     @classmethod
     def begin(
@@ -83,6 +87,7 @@ class Traffic:
         *,
         spawner: Spawner | None = None,
         randomized: RandomizedDrivers | None = None,
+        storyboard: StoryboardRun | None = None,
     ) -> Traffic:
         """Objects at the start of an episode.
 
@@ -92,6 +97,7 @@ class Traffic:
             surroundings: the start; its ``others`` are where the log has them.
             spawner: lets objects appear and leave.
             randomized: draws parameters of drivers.
+            storyboard: moves entities of its own, from the start on.
 
         Raises:
             WorldError: UNKNOWN_OBJECT for a driver of an object that does not exist.
@@ -103,14 +109,15 @@ class Traffic:
                 f"agents.drivers names {unknown[0]!r}, which is no object of this world",
                 hint="insert or duplicate it first; GET /v1/scenes/{scene} lists the objects",
             )
-        none: Mapping[str, AgentDriver] = MappingProxyType({})
+        scripted: Mapping[str, AgentDriver] = storyboard.drivers if storyboard is not None else {}
         begun = cls(
             spec,
-            none,
+            MappingProxyType(dict(scripted)),
             surroundings.others,
             spawner=spawner,
             randomized=randomized,
             edits_drive=_edits_drive(tracks),
+            storyboard=storyboard,
         )
         begun = begun._with_new_drivers(surroundings.others, surroundings)
         if spawner is None:
@@ -133,11 +140,19 @@ class Traffic:
                 where an object has a driver.
         """
         base = tracks.at(t_us)
-        if not (self.drivers or self.spawner or self._assigns_drivers):
+        if not (self.drivers or self.spawner or self.storyboard or self._assigns_drivers):
             return evolved(self, agents=base)
         before = surroundings()
         drivers = {i: d.advance(before) for i, d in self.drivers.items()}
-        moved = replace(self, drivers=MappingProxyType(drivers))
+        storyboard = self.storyboard and self.storyboard.advance(before)
+        if storyboard is not None:
+            # What an impact has taken over is moved by the physics from then on.
+            drivers |= {
+                i: d
+                for i, d in storyboard.drivers.items()
+                if isinstance(drivers.get(i), ScriptedEntity)
+            }
+        moved = replace(self, drivers=MappingProxyType(drivers), storyboard=storyboard)
         moved = moved._with_new_drivers(base, replace(before, t_us=t_us))
         return moved._with_comers_and_goers(base, before) if self.spawner else moved
 
@@ -148,6 +163,7 @@ class Traffic:
             i: d
             for i, d in self.drivers.items()
             if i.startswith(SPAWNED)
+            or isinstance(d, ScriptedEntity)
             or (
                 (edited := objects.get(i)) is not None
                 and edited.trajectory is d.subject.trajectory

@@ -1,0 +1,428 @@
+"""What happens in an episode: entities, and acts of events that conditions set off.
+
+The model keeps to OpenSCENARIO XML 1.3 (ASAM 2024): what a storyboard holds can be written as such
+a file and read again without loss, save for what OpenSCENARIO has no words for (shape ``quintic``).
+Numbers may be expressions of ``parameters``, so that a sweep sets those alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from .base import Identifier, Model
+from .storyboard_actions import (
+    AnyAction,
+    GlobalAction,
+    PrivateAction,
+    Reference,
+    WorldPosition,
+)
+from .storyboard_conditions import Trigger
+from .storyboard_values import Name, Plain, Value, with_values
+
+MAX_ENTITIES = 64
+MAX_ELEMENTS = 1000
+
+ElementName = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+# --- entities ---------------------------------------------------------------------------------
+
+
+class BoundingBox(Model):
+    """(length, width, height) [m], and where its middle is from the reference point [m]."""
+
+    size: tuple[Value, Value, Value]
+    centre: tuple[Value, Value, Value]
+
+
+class Entity(Model):
+    """Who takes part. An object of the scene, the ego, or somebody new.
+
+    Somebody new looks like `asset_id` of the library or `look` of the scene, by default like the
+    object of the scene that is most alike in category and size, fitted to the box.
+    """
+
+    name: Reference
+    kind: Literal["ego", "object", "new"] = "new"
+    category: str = Field(default="car", max_length=80)
+    object_id: Identifier | None = Field(default=None, description="of the scene, for 'object'")
+    asset_id: Identifier | None = None
+    look: Identifier | None = Field(default=None, description="an object of the scene")
+    box: BoundingBox | None = Field(
+        default=None, description="default: of the object, or by category"
+    )
+    model: str = Field(default="", max_length=200, description="name in the file's catalog")
+    mass: Value | None = Field(default=None, description="[kg]")
+    max_speed: Value = Field(default=70.0, description="[m/s]")
+    max_acceleration: Value = Field(default=10.0, description="[m/s^2]")
+    max_deceleration: Value = Field(default=10.0, description="[m/s^2]")
+
+    @model_validator(mode="after")
+    def _is_someone(self) -> Entity:
+        if (self.kind == "object") != (self.object_id is not None):
+            raise ValueError(f"entity {self.name!r}: object_id goes with kind 'object'")
+        return self
+
+
+# --- road -------------------------------------------------------------------------------------
+
+
+class RouteLanes(Model):
+    """Lanes along the ego's route, where no map says otherwise.
+
+    Lanes on the right of the reference line have ids -1, -2 and so on from there, those on the left
+    1, 2; right-hand traffic: the left ones are oncoming.
+    """
+
+    kind: Literal["route"] = "route"
+    lane_width: Annotated[float, Field(ge=1.5, le=10)] = 3.5
+    ego_lane: int = Field(default=-1, ge=-20, le=-1, description="id of the lane of the route")
+    s: float = Field(default=0.0, description="of the reference line where the route begins [m]")
+    left: int = Field(default=4, ge=0, le=20, description="lanes on the left")
+    right: int = Field(default=4, ge=1, le=20, description="lanes on the right")
+
+
+class MapRoads(Model):
+    """Roads of the scene's map, or of a map that comes with the file."""
+
+    kind: Literal["map"] = "map"
+    file: str = Field(default="", max_length=1000, description="as the file names it")
+
+
+Roads = Annotated[RouteLanes | MapRoads, Field(discriminator="kind")]
+
+
+# --- traffic signals --------------------------------------------------------------------------
+
+
+class SignalHead(Model):
+    """A traffic signal: where vehicles are to stop for it."""
+
+    signal_id: Reference
+    stop_line: WorldPosition | None = Field(default=None, description="None: not known")
+    state: str = Field(default="off", max_length=200, description="until something changes it")
+
+
+class Phase(Model):
+    """What signals show for a while."""
+
+    name: ElementName
+    duration: Value = Field(description="[s]")
+    states: dict[Reference, str] = Field(max_length=200, description="by id of the signal")
+
+
+class SignalController(Model):
+    """Lets signals go through phases, over and over."""
+
+    name: ElementName
+    delay: Value = Field(default=0.0, description="before its first phase, after `reference` [s]")
+    reference: Reference | None = Field(
+        default=None, description="controller whose cycle it follows; None: simulation time"
+    )
+    phases: list[Phase] = Field(min_length=1, max_length=200)
+
+
+# --- story ------------------------------------------------------------------------------------
+
+
+class InitAction(Model):
+    """What holds when the episode begins."""
+
+    entity: Reference
+    action: PrivateAction
+
+
+class Action(Model):
+    """Part of an event."""
+
+    name: ElementName
+    action: AnyAction
+
+
+class Event(Model):
+    """Actions that begin together."""
+
+    name: ElementName
+    priority: Literal["override", "skip", "parallel"] = Field(
+        default="override", description="what becomes of other events of the maneuver that run"
+    )
+    times: int = Field(default=1, ge=1, le=1_000_000, description="that it may happen, at most")
+    actions: list[Action] = Field(min_length=1, max_length=100)
+    start: Trigger | None = Field(default=None, description="None: with its maneuver")
+
+
+class Maneuver(Model):
+    """Events of one purpose."""
+
+    name: ElementName
+    events: list[Event] = Field(min_length=1, max_length=200)
+
+
+class ManeuverGroup(Model):
+    """Maneuvers of the same entities."""
+
+    name: ElementName
+    actors: list[Reference] = Field(default_factory=list, max_length=64)
+    times: int = Field(default=1, ge=1, le=1_000_000)
+    maneuvers: list[Maneuver] = Field(default_factory=list, max_length=100)
+
+
+class Act(Model):
+    """Groups that begin together."""
+
+    name: ElementName
+    groups: list[ManeuverGroup] = Field(min_length=1, max_length=100)
+    start: Trigger | None = Field(default=None, description="None: with its story")
+    stop: Trigger | None = None
+
+
+class Story(Model):
+    """Acts of one topic."""
+
+    name: ElementName
+    acts: list[Act] = Field(min_length=1, max_length=100)
+
+
+# --- distributions ----------------------------------------------------------------------------
+
+
+class ValueSet(Model):
+    """These values, one after the other."""
+
+    kind: Literal["set"] = "set"
+    values: list[Plain] = Field(min_length=1, max_length=100_000)
+
+
+class ValueRange(Model):
+    """From lowest to highest in steps."""
+
+    kind: Literal["range"] = "range"
+    low: float
+    high: float
+    step: Annotated[float, Field(gt=0)]
+
+
+class Uniform(Model):
+    """Drawn from low to high."""
+
+    kind: Literal["uniform"] = "uniform"
+    low: float
+    high: float
+
+
+class Normal(Model):
+    """Drawn normally, again until it is within the range, where there is one."""
+
+    kind: Literal["normal"] = "normal"
+    mean: float
+    variance: Annotated[float, Field(gt=0)]
+    low: float | None = None
+    high: float | None = None
+    log: bool = Field(default=False, description="log-normal: mean and variance of the logarithm")
+
+
+class Poisson(Model):
+    """Drawn as the number of events, `mean` of them expected."""
+
+    kind: Literal["poisson"] = "poisson"
+    mean: Annotated[float, Field(gt=0, le=1e6)]
+    low: float | None = None
+    high: float | None = None
+
+
+class Weighted(Model):
+    """Value and weight."""
+
+    value: Plain
+    weight: Annotated[float, Field(ge=0)]
+
+
+class Choice(Model):
+    """Drawn from these by their weights."""
+
+    kind: Literal["choice"] = "choice"
+    values: list[Weighted] = Field(min_length=1, max_length=100_000)
+
+
+class Bin(Model):
+    """Range and weight."""
+
+    low: float
+    high: float
+    weight: Annotated[float, Field(ge=0)]
+
+
+class Histogram(Model):
+    """Drawn from ranges by their weights, uniform in each."""
+
+    kind: Literal["histogram"] = "histogram"
+    bins: list[Bin] = Field(min_length=1, max_length=100_000)
+
+
+Distribution = Annotated[
+    ValueSet | ValueRange | Uniform | Normal | Poisson | Choice | Histogram,
+    Field(discriminator="kind"),
+]
+DRAWN = (Uniform, Normal, Poisson, Choice, Histogram)
+"""Distributions that the seed of an episode draws from; a sweep goes through the others."""
+
+
+class Storyboard(Model):
+    """What happens in an episode.
+
+    Attributes that hold names are checked: an unknown entity or parameter is a ValueError.
+    """
+
+    name: str = Field(default="", max_length=200)
+    author: str = Field(default="", max_length=200)
+    date: str = Field(default="", max_length=40)
+    parameters: dict[Name, Plain] = Field(default_factory=dict, max_length=1000)
+    variables: dict[Name, Plain] = Field(default_factory=dict, max_length=1000)
+    distributions: dict[Name, Distribution] = Field(
+        default_factory=dict, max_length=200, description="of parameters"
+    )
+    roads: Roads = RouteLanes()
+    origin: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="x, y [m] and heading [rad], in the scene's world, of the frame that positions "
+        "of kind 'world' are in",
+    )
+    entities: list[Entity] = Field(default_factory=list, max_length=MAX_ENTITIES)
+    signals: list[SignalHead] = Field(default_factory=list, max_length=1000)
+    controllers: list[SignalController] = Field(default_factory=list, max_length=200)
+    init: list[InitAction] = Field(default_factory=list, max_length=1000)
+    global_init: list[GlobalAction] = Field(default_factory=list, max_length=1000)
+    stories: list[Story] = Field(default_factory=list, max_length=100)
+    stop: Trigger | None = Field(default=None, description="ends all acts; None: never")
+    drives_ego: bool = Field(
+        default=False, description="moves the ego too, whatever the planner says"
+    )
+    ends_episode: bool = Field(
+        default=False, description="the episode ends with `stop`, or once all stories are complete"
+    )
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Storyboard:
+        _check_names(self)
+        resolved(self)
+        return self
+
+
+def resolved(board: Storyboard) -> Storyboard:
+    """The storyboard with the values of its parameters instead of expressions.
+
+    Raises:
+        ValueError: an expression that has none, or leads to a value that is not allowed.
+    """
+    # What holds no expression is left as it is, so that most are checked once.
+    if not any(_has_expression(getattr(board, name)) for name in _RESOLVED):
+        return board
+    fields = {name: _plain(getattr(board, name)) for name in type(board).model_fields}
+    known = {**board.parameters}
+    found = {k: with_values(v, known) if k in _RESOLVED else v for k, v in fields.items()}
+    return Storyboard.model_validate(found)
+
+
+_RESOLVED = (
+    "entities", "signals", "controllers", "init", "global_init", "stories", "stop",
+)  # fmt: skip
+
+
+def element_names(board: Storyboard) -> Iterator[tuple[str, ...]]:
+    """Names of all stories, acts, groups, maneuvers, events and actions, from the story down."""
+    for story in board.stories:
+        yield (story.name,)
+        for act in story.acts:
+            yield (story.name, act.name)
+            for group in act.groups:
+                at = (story.name, act.name, group.name)
+                yield at
+                for maneuver in group.maneuvers:
+                    yield (*at, maneuver.name)
+                    for event in maneuver.events:
+                        yield (*at, maneuver.name, event.name)
+                        for action in event.actions:
+                            yield (*at, maneuver.name, event.name, action.name)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Model):
+        return value.model_dump()
+    return [_plain(v) for v in value] if isinstance(value, list) else value
+
+
+def _has_expression(value: Any) -> bool:
+    if isinstance(value, str):
+        return value.startswith("$")
+    if isinstance(value, Model):
+        return any(_has_expression(v) for v in value.__dict__.values())
+    if isinstance(value, dict):
+        return any(_has_expression(v) for v in value.values())
+    return isinstance(value, list | tuple) and any(_has_expression(v) for v in value)
+
+
+_ENTITY_MEMBERS = frozenset({"entity", "relative_to", "master"})
+
+
+def _check_names(board: Storyboard) -> None:
+    names = [e.name for e in board.entities]
+    if len(set(names)) != len(names):
+        raise ValueError(f"entities need names of their own; given are {', '.join(names)}")
+    if sum(e.kind == "ego" for e in board.entities) > 1:
+        raise ValueError("one entity at most may be the ego")
+    if unknown := sorted(set(board.distributions) - set(board.parameters)):
+        raise ValueError(f"distribution of {unknown[0]!r}, which is no parameter")
+    for entry in board.init:
+        _check_entity(entry.entity, names)
+    for part in (board.init, board.global_init, board.stories, board.stop):
+        _check_entities(part, frozenset(names))
+    count = sum(1 for _ in element_names(board))
+    if count > MAX_ELEMENTS:
+        raise ValueError(f"{count} elements of stories; {MAX_ELEMENTS} are allowed")
+
+
+def _check_entities(part: Any, names: frozenset[str]) -> None:
+    if isinstance(part, list):
+        for each in part:
+            _check_entities(each, names)
+    if not isinstance(part, Model):
+        return
+    for member, value in part.__dict__.items():
+        if member in _ENTITY_MEMBERS and isinstance(value, str):
+            _check_entity(value, names)
+        elif member in {"entities", "actors"} and value and isinstance(value[0], str):
+            for name in value:
+                _check_entity(name, names)
+        else:
+            _check_entities(value, names)
+
+
+def _check_entity(name: str, names: Any) -> None:
+    if name not in names and not name.startswith("$"):
+        raise ValueError(f"{name!r} is no entity; there are: {', '.join(sorted(names)) or 'none'}")
+
+
+__all__ = [
+    "DRAWN",
+    "Act",
+    "Action",
+    "BoundingBox",
+    "Entity",
+    "Event",
+    "InitAction",
+    "Maneuver",
+    "ManeuverGroup",
+    "MapRoads",
+    "Phase",
+    "RouteLanes",
+    "SignalController",
+    "SignalHead",
+    "Story",
+    "Storyboard",
+    "element_names",
+    "resolved",
+]

@@ -1,0 +1,485 @@
+"""Positions and actions of a storyboard, after OpenSCENARIO XML 1.3 (ASAM 2024).
+
+Positions are of an entity's reference point: of vehicles the middle of the rear axle on the ground,
+as the file's bounding box says. All in metres, seconds, radians.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from .base import Model
+from .storyboard_values import Name, Plain, Value
+
+Reference = Annotated[str, Field(min_length=1, max_length=200)]
+"""Name of an entity, signal or element of the storyboard."""
+
+
+class Orientation(Model):
+    """A heading [rad]; of relative ones against the frame that the position is given in."""
+
+    h: Value = 0.0
+    relative: bool = False
+
+
+DRIVING = Field(
+    default=None, description="None: as traffic goes there; relative: against the road's own way"
+)
+
+
+class WorldPosition(Model):
+    """In the frame of the road network's map; without one, of the scene's world."""
+
+    kind: Literal["world"] = "world"
+    x: Value
+    y: Value
+    z: Value | None = Field(default=None, description="default: on the ground")
+    h: Value = 0.0
+
+
+class RelativeWorldPosition(Model):
+    """Beside an entity, along the axes of the world."""
+
+    kind: Literal["relative_world"] = "relative_world"
+    entity: Reference
+    dx: Value
+    dy: Value
+    orientation: Orientation = Orientation(relative=True)
+
+
+class RelativeObjectPosition(Model):
+    """Beside an entity, along its own axes."""
+
+    kind: Literal["relative_object"] = "relative_object"
+    entity: Reference
+    dx: Value
+    dy: Value
+    orientation: Orientation = Orientation(relative=True)
+
+
+class RoadPosition(Model):
+    """Along a road's reference line and beside it, positive on its left."""
+
+    kind: Literal["road"] = "road"
+    road: str = Field(max_length=80)
+    s: Value
+    t: Value
+    orientation: Orientation | None = DRIVING
+
+
+class RelativeRoadPosition(Model):
+    """Along and beside the road from where an entity is."""
+
+    kind: Literal["relative_road"] = "relative_road"
+    entity: Reference
+    ds: Value
+    dt: Value
+    orientation: Orientation | None = DRIVING
+
+
+class LanePosition(Model):
+    """In a lane; without a map `road` is of no account, and lanes are those along the route."""
+
+    kind: Literal["lane"] = "lane"
+    road: str = Field(max_length=80)
+    lane: int | Value
+    s: Value
+    offset: Value = 0.0
+    orientation: Orientation | None = DRIVING
+
+
+class RelativeLanePosition(Model):
+    """In the lane so many to the left (positive, in the sense of the reference line) of an
+    entity's, so far along it in the direction in which the entity drives."""
+
+    kind: Literal["relative_lane"] = "relative_lane"
+    entity: Reference
+    lanes: int | Value = 0
+    ds: Value
+    along: Literal["lane", "road"] = Field(
+        default="road", description="`ds` along the middle of its lane, or the reference line"
+    )
+    offset: Value = 0.0
+    orientation: Orientation | None = DRIVING
+
+
+PlainPosition = (
+    WorldPosition
+    | RelativeWorldPosition
+    | RelativeObjectPosition
+    | RoadPosition
+    | RelativeRoadPosition
+    | LanePosition
+    | RelativeLanePosition
+)
+PlainPlace = Annotated[PlainPosition, Field(discriminator="kind")]
+
+
+class Route(Model):
+    """The way through places, along lanes between them."""
+
+    name: str = Field(default="route", max_length=200)
+    closed: bool = False
+    waypoints: list[PlainPlace] = Field(min_length=2, max_length=1000)
+
+
+class RoutePosition(Model):
+    """Along a route, in the lane of its way there."""
+
+    kind: Literal["route"] = "route"
+    route: Route
+    s: Value = Field(description="from the route's first place [m]")
+    t: Value = Field(default=0.0, description="positive on the left [m]")
+    orientation: Orientation | None = DRIVING
+
+
+Position = Annotated[PlainPosition | RoutePosition, Field(discriminator="kind")]
+
+
+# --- how values change ------------------------------------------------------------------------
+
+Shape = Literal["step", "linear", "cubic", "sinusoidal", "quintic"]
+
+
+class Dynamics(Model):
+    """How a value goes from what it is to what it is to be, f(0) = 0 to f(1) = 1.
+
+    'linear' f = u; 'cubic' 3 u^2 - 2 u^3; 'sinusoidal' (1 - cos pi u) / 2; 'quintic' 10 u^3 -
+    15 u^4 + 6 u^5, which OpenSCENARIO does not know; 'step' at once.
+    """
+
+    shape: Shape = "linear"
+    dimension: Literal["time", "distance", "rate"] = "time"
+    value: Value = Field(default=0.0, description="[s], [m], or the highest rate of the value")
+
+
+STEP = Dynamics(shape="step")
+
+
+class SpeedLimits(Model):
+    """What an action may use to reach its aim; None: as much as it takes."""
+
+    acceleration: Value | None = Field(default=None, description="[m/s^2]")
+    deceleration: Value | None = Field(default=None, description="[m/s^2], positive")
+    speed: Value | None = Field(default=None, description="[m/s]")
+
+
+class SpeedAction(Model):
+    """To a speed, in a form of time."""
+
+    kind: Literal["speed"] = "speed"
+    speed: Value = Field(description="[m/s]; or difference, or factor")
+    relative_to: Reference | None = None
+    relation: Literal["delta", "factor"] = "delta"
+    continuous: bool = Field(default=False, description="goes on following the other's speed")
+    dynamics: Dynamics = STEP
+
+
+class SpeedPoint(Model):
+    """So long after the one before, this speed."""
+
+    time: Value
+    speed: Value
+
+
+class SpeedProfileAction(Model):
+    """Through speeds, changing linearly between them."""
+
+    kind: Literal["speed_profile"] = "speed_profile"
+    points: list[SpeedPoint] = Field(min_length=1, max_length=10_000)
+    relative_to: Reference | None = None
+
+
+class LaneChangeAction(Model):
+    """Into another lane: the one of an id, or so many to the left of an entity's."""
+
+    kind: Literal["lane_change"] = "lane_change"
+    lane: int | Value = Field(description="id; or number of lanes, positive on the left")
+    relative_to: Reference | None = None
+    offset: Value = Field(default=0.0, description="from the middle of the lane there [m]")
+    dynamics: Dynamics = Dynamics(shape="sinusoidal", value=3.0)
+
+
+class LaneOffsetAction(Model):
+    """Beside the middle of its lane, or so far beside where another is in its."""
+
+    kind: Literal["lane_offset"] = "lane_offset"
+    offset: Value = Field(description="positive on the left [m]")
+    relative_to: Reference | None = None
+    continuous: bool = False
+    shape: Shape = "step"
+    acceleration: Value | None = Field(
+        default=None, description="highest one sideways [m/s^2]; None: at once"
+    )
+
+
+class LateralDistanceAction(Model):
+    """Keeps a distance sideways from an entity."""
+
+    kind: Literal["lateral_distance"] = "lateral_distance"
+    entity: Reference
+    distance: Value
+    side: Literal["any", "left", "right"] = Field(
+        default="any", description="of the entity, on which to be; 'any': where it is"
+    )
+    freespace: bool = False
+    continuous: bool = False
+    limits: SpeedLimits = SpeedLimits()
+
+
+class LongitudinalDistanceAction(Model):
+    """Keeps a distance or a gap in time to an entity, along the road."""
+
+    kind: Literal["longitudinal_distance"] = "longitudinal_distance"
+    entity: Reference
+    distance: Value | None = Field(default=None, description="[m]")
+    time_gap: Value | None = Field(default=None, description="[s] at its own speed")
+    place: Literal["any", "leading", "trailing"] = "any"
+    freespace: bool = False
+    continuous: bool = False
+    limits: SpeedLimits = SpeedLimits()
+
+    @model_validator(mode="after")
+    def _one_aim(self) -> LongitudinalDistanceAction:
+        if (self.distance is None) == (self.time_gap is None):
+            raise ValueError("a longitudinal distance needs either distance or time_gap")
+        return self
+
+
+class SynchronizeAction(Model):
+    """Arrives where it is to be when another arrives at its place.
+
+    Its acceleration is solved anew in every step: a constant one, or where it is to arrive with a
+    speed one that changes linearly.
+    """
+
+    kind: Literal["synchronize"] = "synchronize"
+    master: Reference
+    master_target: Position
+    target: Position
+    final_speed: Value | None = Field(default=None, description="[m/s]")
+    relative: bool = Field(default=False, description="final_speed is the difference to its speed")
+    master_tolerance: Value = 0.0
+    tolerance: Value = 0.0
+    limits: SpeedLimits = Field(
+        default=SpeedLimits(), description="of its own; OpenSCENARIO does not know them here"
+    )
+
+
+class Vertex(Model):
+    """A place on a polyline, and when to be there."""
+
+    time: Value = 0.0
+    position: Position
+
+
+class Polyline(Model):
+    """Straight between places."""
+
+    shape: Literal["polyline"] = "polyline"
+    vertices: list[Vertex] = Field(min_length=2, max_length=20_000)
+
+
+class Clothoid(Model):
+    """Curvature that changes linearly with the way."""
+
+    shape: Literal["clothoid"] = "clothoid"
+    position: Position
+    curvature: Value = Field(description="at its start [1/m]")
+    curvature_rate: Value = Field(default=0.0, description="per way [1/m^2]")
+    length: Value = Field(description="[m]")
+    start_time: Value | None = None
+    stop_time: Value | None = None
+
+
+class ControlPoint(Model):
+    """Of a NURBS."""
+
+    position: Position
+    weight: Value = 1.0
+    time: Value | None = None
+
+
+class Nurbs(Model):
+    """Non-uniform rational B-spline (Piegl & Tiller 1997)."""
+
+    shape: Literal["nurbs"] = "nurbs"
+    order: int = Field(ge=2, le=12)
+    points: list[ControlPoint] = Field(min_length=2, max_length=1000)
+    knots: list[Value] = Field(min_length=4, max_length=1012)
+
+    @model_validator(mode="after")
+    def _knots_fit(self) -> Nurbs:
+        if len(self.knots) != len(self.points) + self.order or len(self.points) < self.order:
+            raise ValueError(
+                f"a NURBS of order {self.order} with {len(self.points)} points needs "
+                f"{len(self.points) + self.order} knots and at least {self.order} points"
+            )
+        return self
+
+
+Curve = Annotated[Polyline | Clothoid | Nurbs, Field(discriminator="shape")]
+
+
+class Timing(Model):
+    """Times of a trajectory: scale x time + offset, from the action's start or the simulation's."""
+
+    domain: Literal["absolute", "relative"] = "relative"
+    scale: Value = 1.0
+    offset: Value = 0.0
+
+
+class FollowTrajectoryAction(Model):
+    """Along a curve, at its own speed or by the curve's times."""
+
+    kind: Literal["follow_trajectory"] = "follow_trajectory"
+    name: str = Field(default="trajectory", max_length=200)
+    curve: Curve
+    closed: bool = False
+    timing: Timing | None = Field(default=None, description="None: at its own speed")
+    offset: Value = Field(default=0.0, description="way from its start where it begins [m]")
+
+
+class AssignRouteAction(Model):
+    """A route that it takes from now on."""
+
+    kind: Literal["assign_route"] = "assign_route"
+    route: Route
+
+
+class AcquirePositionAction(Model):
+    """The way along lanes to a place."""
+
+    kind: Literal["acquire_position"] = "acquire_position"
+    position: Position
+
+
+class TeleportAction(Model):
+    """There at once."""
+
+    kind: Literal["teleport"] = "teleport"
+    position: Position
+
+
+class VisibilityAction(Model):
+    """Whether it is in the world: shown, measured and hit. All three go together here."""
+
+    kind: Literal["visibility"] = "visibility"
+    visible: bool
+
+
+class FollowingParameters(Model):
+    """Of the intelligent driver model (Treiber et al. 2000), as of the driver ``idm``."""
+
+    desired_speed: Annotated[float, Field(ge=0, le=150)] | None = Field(
+        default=None, description="[m/s]; default: its speed when the action begins"
+    )
+    headway: Annotated[float, Field(gt=0, le=3600)] = Field(default=1.5, description="T [s]")
+    gap: Annotated[float, Field(ge=0, le=1e4)] = Field(default=2.0, description="s0 [m]")
+    acceleration: Annotated[float, Field(gt=0, le=10)] = Field(default=1.5, description="[m/s^2]")
+    braking: Annotated[float, Field(gt=0, le=10)] = Field(default=2.0, description="[m/s^2]")
+    lateral: Annotated[float, Field(gt=0, le=10)] = Field(
+        default=2.5, description="acceleration sideways that sets the speed in bends [m/s^2]"
+    )
+
+
+class ControllerAction(Model):
+    """Drives by the intelligent driver model in its lane, until an action moves it otherwise."""
+
+    kind: Literal["controller"] = "controller"
+    active: bool = True
+    idm: FollowingParameters = FollowingParameters()
+
+
+PrivateAction = Annotated[
+    SpeedAction
+    | SpeedProfileAction
+    | LaneChangeAction
+    | LaneOffsetAction
+    | LateralDistanceAction
+    | LongitudinalDistanceAction
+    | SynchronizeAction
+    | FollowTrajectoryAction
+    | AssignRouteAction
+    | AcquirePositionAction
+    | TeleportAction
+    | VisibilityAction
+    | ControllerAction,
+    Field(discriminator="kind"),
+]
+"""Of each entity of a maneuver group."""
+
+
+class AddEntityAction(Model):
+    """Lets an entity appear."""
+
+    kind: Literal["add_entity"] = "add_entity"
+    entity: Reference
+    position: Position
+
+
+class DeleteEntityAction(Model):
+    """Takes an entity out of the world."""
+
+    kind: Literal["delete_entity"] = "delete_entity"
+    entity: Reference
+
+
+class SignalStateAction(Model):
+    """A traffic signal shows a state from now on."""
+
+    kind: Literal["signal_state"] = "signal_state"
+    signal: Reference
+    state: str = Field(max_length=200)
+
+
+class SignalPhaseAction(Model):
+    """A controller of traffic signals goes on from the start of a phase."""
+
+    kind: Literal["signal_phase"] = "signal_phase"
+    controller: Reference
+    phase: str = Field(max_length=200)
+
+
+class SetVariableAction(Model):
+    """A variable holds a value; or what it held plus, or times, a number."""
+
+    kind: Literal["set_variable"] = "set_variable"
+    variable: Name
+    value: Plain
+    rule: Literal["set", "add", "multiply"] = "set"
+
+
+GlobalAction = Annotated[
+    AddEntityAction
+    | DeleteEntityAction
+    | SignalStateAction
+    | SignalPhaseAction
+    | SetVariableAction,
+    Field(discriminator="kind"),
+]
+"""Of nobody."""
+
+AnyAction = Annotated[
+    SpeedAction
+    | SpeedProfileAction
+    | LaneChangeAction
+    | LaneOffsetAction
+    | LateralDistanceAction
+    | LongitudinalDistanceAction
+    | SynchronizeAction
+    | FollowTrajectoryAction
+    | AssignRouteAction
+    | AcquirePositionAction
+    | TeleportAction
+    | VisibilityAction
+    | ControllerAction
+    | AddEntityAction
+    | DeleteEntityAction
+    | SignalStateAction
+    | SignalPhaseAction
+    | SetVariableAction,
+    Field(discriminator="kind"),
+]

@@ -1,0 +1,241 @@
+"""Conditions and triggers of a storyboard, after OpenSCENARIO XML 1.3 (ASAM 2024)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .base import Model
+from .storyboard_actions import Position, Reference
+from .storyboard_values import Name, Plain, Value
+
+Rule = Literal[
+    "greater_than",
+    "less_than",
+    "equal_to",
+    "greater_or_equal",
+    "less_or_equal",
+    "not_equal_to",
+]
+Direction = Literal["longitudinal", "lateral"]
+Measure = Literal["euclidean", "longitudinal", "lateral"]
+Frame = Literal["entity", "lane", "road"]
+
+
+class Entities(Model):
+    """Whose conditions count: of any of them, or of all."""
+
+    entities: list[Reference] = Field(min_length=1, max_length=64)
+    of: Literal["any", "all"] = "any"
+
+
+class Distances(Model):
+    """How a distance is measured: from reference points or between boxes (`freespace`); straight,
+    or along or across the frame of the entity, or the lane or road that it is in."""
+
+    measure: Measure = "euclidean"
+    frame: Frame = "entity"
+    freespace: bool = False
+    rule: Rule
+    value: Value
+
+
+class SimulationTime(Model):
+    """Time since the episode began [s]."""
+
+    kind: Literal["simulation_time"] = "simulation_time"
+    rule: Rule
+    value: Value
+
+
+class TimeToCollision(Entities, Distances):
+    """Distance over the speed at which it shrinks [s], to an entity or a place."""
+
+    kind: Literal["time_to_collision"] = "time_to_collision"
+    entity: Reference | None = None
+    position: Position | None = None
+
+
+class TimeHeadway(Entities, Distances):
+    """Distance to another over one's own speed [s]."""
+
+    kind: Literal["time_headway"] = "time_headway"
+    entity: Reference
+
+
+class RelativeDistance(Entities, Distances):
+    """To another entity [m]."""
+
+    kind: Literal["relative_distance"] = "relative_distance"
+    entity: Reference
+
+
+class Distance(Entities, Distances):
+    """To a place [m]."""
+
+    kind: Literal["distance"] = "distance"
+    position: Position
+
+
+class ReachPosition(Entities):
+    """Within a tolerance [m] of a place."""
+
+    kind: Literal["reach_position"] = "reach_position"
+    position: Position
+    tolerance: Value
+
+
+class Speed(Entities):
+    """[m/s], along its heading, or sideways; `relative_to`: less that of another."""
+
+    kind: Literal["speed"] = "speed"
+    rule: Rule
+    value: Value
+    relative_to: Reference | None = None
+    direction: Direction | None = Field(default=None, description="default: amount, along heading")
+
+
+class Acceleration(Entities):
+    """[m/s^2]."""
+
+    kind: Literal["acceleration"] = "acceleration"
+    rule: Rule
+    value: Value
+    direction: Direction | None = None
+
+
+class Collision(Entities):
+    """With an entity, or with any of a category; None: with anybody."""
+
+    kind: Literal["collision"] = "collision"
+    entity: Reference | None = None
+    category: str | None = Field(default=None, max_length=80)
+
+
+class TraversedDistance(Entities):
+    """At least so far since the condition is looked at [m]."""
+
+    kind: Literal["traversed_distance"] = "traversed_distance"
+    value: Value
+
+
+class StandStill(Entities):
+    """For so long [s]."""
+
+    kind: Literal["stand_still"] = "stand_still"
+    duration: Value
+
+
+class Offroad(Entities):
+    """Beside every lane for so long [s]."""
+
+    kind: Literal["offroad"] = "offroad"
+    duration: Value
+
+
+class EndOfRoad(Entities):
+    """At the end of the road for so long [s]."""
+
+    kind: Literal["end_of_road"] = "end_of_road"
+    duration: Value
+
+
+class RelativeAngle(Entities):
+    """Heading against another entity's, within a tolerance [rad]."""
+
+    kind: Literal["relative_angle"] = "relative_angle"
+    entity: Reference
+    angle: Value
+    tolerance: Value
+
+
+ElementType = Literal["story", "act", "maneuver_group", "maneuver", "event", "action"]
+ElementState = Literal[
+    "standby",
+    "running",
+    "complete",
+    "start_transition",
+    "end_transition",
+    "stop_transition",
+    "skip_transition",
+]
+
+
+class StoryboardElementState(Model):
+    """An element of the storyboard, by its name or by names joined with '::', is in a state."""
+
+    kind: Literal["element_state"] = "element_state"
+    element_type: ElementType
+    element: Reference
+    state: ElementState
+
+
+class VariableValue(Model):
+    """A parameter or variable compares so with a value."""
+
+    kind: Literal["variable"] = "variable"
+    variable: Name
+    rule: Rule
+    value: Plain
+
+
+class SignalState(Model):
+    """A traffic signal shows a state."""
+
+    kind: Literal["signal_state"] = "signal_state"
+    signal: Reference
+    state: str = Field(max_length=200)
+
+
+class SignalPhase(Model):
+    """A controller of traffic signals is in a phase."""
+
+    kind: Literal["signal_phase"] = "signal_phase"
+    controller: Reference
+    phase: str = Field(max_length=200)
+
+
+Test = Annotated[
+    SimulationTime
+    | TimeToCollision
+    | TimeHeadway
+    | RelativeDistance
+    | Distance
+    | ReachPosition
+    | Speed
+    | Acceleration
+    | Collision
+    | TraversedDistance
+    | StandStill
+    | Offroad
+    | EndOfRoad
+    | RelativeAngle
+    | StoryboardElementState
+    | VariableValue
+    | SignalState
+    | SignalPhase,
+    Field(discriminator="kind"),
+]
+
+
+class Condition(Model):
+    """A test, and when its outcome counts: while it holds, or when it begins or ceases to; later
+    by a delay."""
+
+    name: str = Field(default="", max_length=200)
+    edge: Literal["none", "rising", "falling", "rising_or_falling"] = "none"
+    delay: Value = Field(default=0.0, description="[s]")
+    test: Test
+
+
+class ConditionGroup(Model):
+    """All of them at once."""
+
+    conditions: list[Condition] = Field(min_length=1, max_length=100)
+
+
+class Trigger(Model):
+    """Any of the groups; without groups never."""
+
+    groups: list[ConditionGroup] = Field(default_factory=list, max_length=100)

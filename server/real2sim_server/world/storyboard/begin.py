@@ -1,0 +1,61 @@
+"""The storyboard of an episode at its start."""
+
+from __future__ import annotations
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.storyboard import resolved
+
+from ...edit import ScenarioState
+from ...scene import Scene
+from ..draws import Draws
+from ..errors import WorldError
+from ..traffic.driver import Surroundings
+from .entities import subjects_of
+from .run import StoryboardRun
+
+
+def begin_storyboard(
+    spec: ResetSpec, state: ScenarioState, surroundings: Surroundings, scene: Scene, draws: Draws
+) -> StoryboardRun:
+    """The run of the storyboard that a reset has.
+
+    Args:
+        spec: with a storyboard.
+        state: objects of the scenario.
+        surroundings: the start, the ego as it was recorded.
+        scene: that it runs on.
+        draws: of the episode.
+
+    Raises:
+        WorldError: INVALID_REQUEST where it does not go together with other options or cannot be;
+            UNKNOWN_OBJECT, UNKNOWN_ASSET.
+    """
+    board = spec.storyboard
+    assert board is not None
+    if spec.beyond_log == "loop":
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            "a storyboard goes on in one direction, and beyond_log 'loop' puts the ego back",
+            hint="let beyond_log be 'extend' or 'end'",
+        )
+    if spec.warmup_us:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            "a storyboard says where the ego begins, and a warm-up lets it follow the log",
+            hint="leave out warmup_us, or the storyboard",
+        )
+    driven = {e.object_id for e in board.entities if e.kind == "object"} & set(spec.agents.drivers)
+    if driven:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"object {min(map(str, driven))!r} has a driver and is moved by the storyboard",
+            hint="leave it out of agents.drivers",
+        )
+    return StoryboardRun.begin(
+        board,
+        subjects_of(resolved(board).entities, state),
+        surroundings,
+        ego_size=scene.ego_size,
+        draws=draws,
+    )

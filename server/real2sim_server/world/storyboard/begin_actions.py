@@ -1,0 +1,298 @@
+"""How private actions begin: each gives the entity with what moves it from now on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.episode import IdmDriver
+from real2sim_proto.storyboard_actions import (
+    AcquirePositionAction,
+    AssignRouteAction,
+    ControllerAction,
+    Dynamics,
+    FollowTrajectoryAction,
+    LaneChangeAction,
+    LaneOffsetAction,
+    LateralDistanceAction,
+    LongitudinalDistanceAction,
+    SpeedAction,
+    SpeedProfileAction,
+    SynchronizeAction,
+    TeleportAction,
+    VisibilityAction,
+)
+
+from ..errors import WorldError
+from ..evolve import evolved
+from ..path import LoggedPath
+from .actor import Actor
+from .dynamics import duration, gentle_duration
+from .lateral import FollowOffset, HoldOffset, KeepAside, OffsetChange, lane_offset
+from .longitudinal import (
+    FollowIdm,
+    FollowSpeed,
+    KeepDistance,
+    SpeedChange,
+    SpeedCourse,
+    Synchronize,
+)
+from .positions import Places
+from .roads import Place, RoadPoint, Way, path_through
+from .trajectory import Trajectory, course_of
+from .view import View, across, ahead_on_way
+
+SLOWEST_DESIRED = 3.0
+"""Desired speed of an entity that stands when its controller is activated [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """What an action may know when it begins.
+
+    Attributes:
+        view: the instant.
+        places: resolves positions then.
+        token: of the action.
+    """
+
+    view: View
+    places: Places
+    token: int
+
+
+def begun(actor: Actor, action: Any, at: Beginning) -> Actor:
+    """The entity with an action of the storyboard begun; one that takes no time is finished.
+
+    Raises:
+        WorldError: INVALID_REQUEST, a place, lane or form that it cannot go to.
+    """
+    return _BEGIN[type(action)](actor, action, at)
+
+
+def _done(actor: Actor, at: Beginning, **changes: Any) -> Actor:
+    return evolved(actor, finished=actor.finished | {at.token}, **changes)
+
+
+def _freed(actor: Actor) -> Actor:
+    """Off a trajectory whose times ruled its speed, which it goes on along at its own; off one
+    that only rules its place nothing changes."""
+    if actor.trajectory is None or actor.trajectory.timing is None:
+        return actor
+    course = actor.trajectory.course
+    places = [Place(float(x), float(y), 0.0) for x, y in zip(course.x, course.y, strict=True)]
+    way = Way("trajectory", 1, True, path_through(places))
+    return evolved(actor, trajectory=None).on_way(way)
+
+
+def _on_lane(actor: Actor, at: Beginning) -> Actor:
+    """Off its trajectory, on the lane where it is."""
+    if actor.trajectory is None:
+        return actor
+    return evolved(actor, trajectory=None).on_lane(at.view.network)
+
+
+def _speed(actor: Actor, action: SpeedAction, at: Beginning) -> Actor:
+    actor = _freed(actor)
+    value, dynamics = float(action.speed), action.dynamics
+    if action.continuous and action.relative_to is not None:
+        rate = float(dynamics.value) if dynamics.dimension == "rate" else math.inf
+        rate = math.inf if dynamics.shape == "step" else rate
+        follow = FollowSpeed(at.token, action.relative_to, action.relation, value, rate)
+        return evolved(actor, longitudinal=follow)
+    if action.relative_to is not None:
+        other = at.view.actors[action.relative_to].speed
+        value = other + value if action.relation == "delta" else other * value
+    seconds = _speed_duration(dynamics, actor.speed, value)
+    if seconds <= 0.0:
+        return _done(actor, at, speed=value, longitudinal=None)
+    change = SpeedChange(at.token, dynamics.shape, actor.speed, value, seconds)
+    return evolved(actor, longitudinal=change)
+
+
+def _speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
+    """How long it takes [s]. All forms have the mean of both speeds as their mean, which tells
+    the time that a way takes."""
+    if dynamics.dimension != "distance" or dynamics.shape == "step":
+        return duration(dynamics, end - start)
+    mean = (start + end) / 2
+    return float(dynamics.value) / mean if mean > 0 else 0.0
+
+
+def _speed_profile(actor: Actor, action: SpeedProfileAction, at: Beginning) -> Actor:
+    actor = _freed(actor)
+    base = at.view.actors[action.relative_to].speed if action.relative_to is not None else 0.0
+    points, time = [(0.0, actor.speed)], 0.0
+    for point in action.points:
+        time += max(float(point.time), 0.0)
+        points.append((time, base + float(point.speed)))
+    if time <= 0.0:
+        return _done(actor, at, speed=points[-1][1], longitudinal=None)
+    return evolved(actor, longitudinal=SpeedCourse(at.token, tuple(points)))
+
+
+def _longitudinal_distance(
+    actor: Actor, action: LongitudinalDistanceAction, at: Beginning
+) -> Actor:
+    actor = _freed(actor)
+    other = at.view.actors[action.entity]
+    ahead = ahead_on_way(actor, other.x, other.y, at.view.network)
+    leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
+    return evolved(actor, longitudinal=KeepDistance(at.token, action, leading))
+
+
+def _synchronize(actor: Actor, action: SynchronizeAction, at: Beginning) -> Actor:
+    actor = _freed(actor)
+    final = None if action.final_speed is None else float(action.final_speed)
+    tolerances = (float(action.master_tolerance), float(action.tolerance))
+    there, own = at.places.of(action.master_target), at.places.of(action.target)
+    control = Synchronize(
+        at.token, action.master, there, own, final, action.relative, tolerances, action.limits
+    )
+    return evolved(actor, longitudinal=control)
+
+
+def _where(actor: Actor, at: Beginning, what: str) -> RoadPoint:
+    here = at.view.network.locate(actor.x, actor.y, actor.h)
+    if here is None:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"{actor.name!r} is beside all lanes and cannot begin a {what}",
+            hint="let it begin on a lane; storyboard.roads says how many there are",
+        )
+    return here
+
+
+def _lane_change(actor: Actor, action: LaneChangeAction, at: Beginning) -> Actor:
+    actor, network = _on_lane(actor, at), at.view.network
+    here = _where(actor, at, "lane change")
+    along = math.cos(actor.h - here.h) >= 0.0
+    lane = int(action.lane)
+    if action.relative_to is not None:
+        other = at.view.actors[action.relative_to]
+        base = _where(other, at, "lane change relative to it")
+        sense = 1 if math.cos(other.h - base.h) >= 0.0 else -1
+        lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
+    actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
+    end = float(action.offset) * (1.0 if along else -1.0)
+    dynamics, change = action.dynamics, end - actor.offset
+    by_way = dynamics.dimension == "distance" and dynamics.shape != "step"
+    extent = float(dynamics.value) if by_way else duration(dynamics, change)
+    return _shifted(actor, dynamics.shape, end, extent, at, by_way=by_way)
+
+
+def _lane_offset(actor: Actor, action: LaneOffsetAction, at: Beginning) -> Actor:
+    actor = _on_lane(actor, at)
+    value, acceleration = float(action.offset), action.acceleration
+    if action.relative_to is not None:
+        if action.continuous and acceleration is None:
+            return evolved(actor, lateral=FollowOffset(at.token, action.relative_to, value))
+        value += lane_offset(at.view.actors[action.relative_to], at.view)
+    # Who was straight on beside the road or on a route counts from its lane's middle now.
+    actor = actor.on_lane(at.view.network)
+    if action.continuous and acceleration is None:
+        return evolved(actor, lateral=HoldOffset(at.token, value))
+    most = None if acceleration is None else float(acceleration)
+    extent = gentle_duration(action.shape, value - actor.offset, most)
+    return _shifted(actor, action.shape, value, extent, at)
+
+
+def _shifted(
+    actor: Actor, shape: Any, end: float, extent: float, at: Beginning, *, by_way: bool = False
+) -> Actor:
+    if extent <= 0.0:
+        return _done(evolved(actor, lateral=None, offset=end, drift=0.0).placed(), at)
+    change = OffsetChange(at.token, shape, actor.offset, end, extent, by_way)
+    return evolved(actor, lateral=change)
+
+
+def _lateral_distance(actor: Actor, action: LateralDistanceAction, at: Beginning) -> Actor:
+    actor, other = _on_lane(actor, at), at.view.actors[action.entity]
+    side = {"left": 1.0, "right": -1.0}.get(action.side, 0.0)
+    if not side:
+        side = math.copysign(1.0, across(other.h, actor.x - other.x, actor.y - other.y))
+    return evolved(actor, lateral=KeepAside(at.token, action, side))
+
+
+def _follow_trajectory(actor: Actor, action: FollowTrajectoryAction, at: Beginning) -> Actor:
+    course = course_of(action.curve, at.places.of)
+    timing, s = action.timing, float(action.offset)
+    if timing is not None and course.times is None:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"trajectory {action.name!r} is to be followed by its times and has none",
+            hint="give times to its vertices, or leave out `timing`",
+        )
+    elapsed = at.view.elapsed if timing is not None and timing.domain == "absolute" else 0.0
+    following = Trajectory(at.token, course, timing, s, elapsed)
+    longitudinal = actor.longitudinal if timing is None else None
+    actor = evolved(actor, trajectory=following, lateral=None, longitudinal=longitudinal, drift=0.0)
+    if not following.begun():
+        return actor
+    if timing is not None:
+        time = elapsed * float(timing.scale) + float(timing.offset)
+        following = Trajectory(at.token, course, timing, course.way_at(time), elapsed)
+        actor = evolved(actor, trajectory=following)
+    place = following.place(actor)
+    return evolved(actor, x=place.x, y=place.y, h=place.h)
+
+
+def _assign_route(actor: Actor, action: AssignRouteAction, at: Beginning) -> Actor:
+    places = [at.places.of(w) for w in action.route.waypoints]
+    return _done(_on_route(actor, at.view.network.route(places)), at)
+
+
+def _acquire_position(actor: Actor, action: AcquirePositionAction, at: Beginning) -> Actor:
+    here = Place(actor.x, actor.y, actor.h)
+    path = at.view.network.route([here, at.places.of(action.position)])
+    moved = _on_route(actor, path)
+    return evolved(moved, lateral=OffsetChange(
+        at.token, "linear", moved.offset, moved.offset, max(path.length - moved.s, 1e-6), True
+    ))  # fmt: skip
+
+
+def _on_route(actor: Actor, path: LoggedPath) -> Actor:
+    way = Way("route", 1, True, path)
+    return evolved(actor, trajectory=None, lateral=None).on_way(way)
+
+
+def _teleport(actor: Actor, action: TeleportAction, at: Beginning) -> Actor:
+    put = actor.put(at.places.of(action.position), at.view.network)
+    return _done(put, at, lateral=None)
+
+
+def _visibility(actor: Actor, action: VisibilityAction, at: Beginning) -> Actor:
+    return _done(actor, at, visible=action.visible)
+
+
+def _controller(actor: Actor, action: ControllerAction, at: Beginning) -> Actor:
+    actor = _freed(actor)
+    if not action.active:
+        return _done(actor, at, longitudinal=None)
+    desired = action.idm.desired_speed
+    desired = max(actor.speed, SLOWEST_DESIRED) if desired is None else desired
+    return _done(actor, at, longitudinal=FollowIdm(at.token, _idm(action), desired))
+
+
+def _idm(action: ControllerAction) -> IdmDriver:
+    return IdmDriver(path="route", **action.idm.model_dump())
+
+
+_BEGIN: Mapping[type[Any], Callable[[Actor, Any, Beginning], Actor]] = {
+    SpeedAction: _speed,
+    SpeedProfileAction: _speed_profile,
+    LaneChangeAction: _lane_change,
+    LaneOffsetAction: _lane_offset,
+    LateralDistanceAction: _lateral_distance,
+    LongitudinalDistanceAction: _longitudinal_distance,
+    SynchronizeAction: _synchronize,
+    FollowTrajectoryAction: _follow_trajectory,
+    AssignRouteAction: _assign_route,
+    AcquirePositionAction: _acquire_position,
+    TeleportAction: _teleport,
+    VisibilityAction: _visibility,
+    ControllerAction: _controller,
+}

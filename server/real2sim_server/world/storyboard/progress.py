@@ -1,0 +1,368 @@
+"""A storyboard within one step of the clock: elements begin and end, entities move on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.storyboard_actions import (
+    AddEntityAction,
+    DeleteEntityAction,
+    SetVariableAction,
+    SignalPhaseAction,
+    SignalStateAction,
+)
+
+from ..errors import WorldError
+from ..evolve import evolved
+from ..traffic.driver import Surroundings
+from .actor import Actor
+from .begin_actions import Beginning, begun
+from .conditions import Facts, Memory, fires
+from .motion import advanced
+from .positions import Places
+from .program import Element, Program, Start
+from .roads import RoadNetwork
+from .signals import phase_start, shown_at
+from .view import View
+
+STANDBY, RUNNING, COMPLETE = 0, 1, 2
+STATES = {"standby": STANDBY, "running": RUNNING, "complete": COMPLETE}
+
+GLOBAL = (
+    AddEntityAction,
+    DeleteEntityAction,
+    SetVariableAction,
+    SignalPhaseAction,
+    SignalStateAction,
+)
+
+
+class ElementChange(NamedTuple):
+    """An element has begun, ended, been stopped or been skipped.
+
+    Attributes:
+        t_us: when [us].
+        element: names from the story down, joined by '::'.
+        type: of the element.
+        change: 'start', 'end', 'stop' or 'skip'.
+    """
+
+    t_us: int
+    element: str
+    type: str
+    change: str
+
+
+class Memories(NamedTuple):
+    """What a storyboard keeps between steps, apart from entities.
+
+    Attributes:
+        status: of each element.
+        times: that each event has begun.
+        running: tokens of the actions that run: by number of the element, of each entity.
+        conditions: memory of each.
+        variables: parameters and variables.
+        signal_starts, signal_states: what actions have set of traffic signals.
+        token: of the next action.
+        over: whether the whole has been stopped.
+        fresh: changes of elements that conditions have not been asked about yet.
+    """
+
+    status: tuple[int, ...]
+    times: tuple[int, ...]
+    running: Mapping[int, Mapping[str, int]]
+    conditions: Mapping[int, Memory]
+    variables: Mapping[str, Any]
+    signal_starts: Mapping[str, float]
+    signal_states: Mapping[str, str]
+    token: int
+    over: bool
+    fresh: frozenset[tuple[int, str]]
+
+
+class Progress:
+    """What becomes of a storyboard in a step. It is made for the step, and read out at its end.
+
+    Args:
+        program: what runs.
+        actors, memories: before the step.
+        network: roads.
+        surroundings: of the step.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        actors: Mapping[str, Actor],
+        memories: Memories,
+        network: RoadNetwork,
+        surroundings: Surroundings,
+    ) -> None:
+        self._program, self._network, self._surroundings = program, network, surroundings
+        self.actors = dict(actors)
+        self._status, self._times = list(memories.status), list(memories.times)
+        self._running = {k: dict(v) for k, v in memories.running.items()}
+        self._conditions = dict(memories.conditions)
+        self._variables = dict(memories.variables)
+        self._starts, self._states = dict(memories.signal_starts), dict(memories.signal_states)
+        self._token, self._over = memories.token, memories.over
+        self._before, self._fresh = memories.fresh, set[tuple[int, str]]()
+        self.changes: list[ElementChange] = []
+
+    @property
+    def memories(self) -> Memories:
+        """As they are now."""
+        return Memories(
+            tuple(self._status),
+            tuple(self._times),
+            self._running,
+            self._conditions,
+            self._variables,
+            self._starts,
+            self._states,
+            self._token,
+            self._over,
+            self._before,
+        )
+
+    def initialise(self, t_us: int, elapsed: float) -> None:
+        """Do what the storyboard says of the beginning."""
+        board = self._program.board
+        for action in board.global_init:
+            self._global(action, t_us, elapsed)
+        for entry in board.init:
+            self._begin_private(entry.entity, entry.action, elapsed, first=True)
+
+    def pass_instant(self, t_us: int, elapsed: float, *, first: bool) -> None:
+        """Let elements begin and end at an instant."""
+        self._fresh, self._now = set(), t_us
+        self._end_actions()
+        if not self._over:
+            facts = self._facts(elapsed, first=first)
+            self._facts_now, self._elapsed = facts, elapsed
+            self._pass_whole()
+        self._before = frozenset(self._fresh)
+
+    def move(self, elapsed: float, h: float, *, first: bool) -> None:
+        """Move all entities on by ``h`` seconds, each by where the others are now."""
+        view = self._view(elapsed, first=first)
+        self.actors = {name: advanced(a, view, h) for name, a in self.actors.items()}
+
+    # --- elements -------------------------------------------------------------------------------
+
+    def _pass_whole(self) -> None:
+        if self._program.stop is not None and self._fires(self._program.stop):
+            for story in self._program.stories:
+                self._stop(story)
+            self._over = True
+            return
+        for story in self._program.stories:
+            if self._status[story.number] == STANDBY:
+                self._change(story, RUNNING, "start")
+            for act in story.children:
+                self._pass_act(act)
+            self._complete_with_children(story)
+
+    def _pass_act(self, act: Element) -> None:
+        if self._status[act.number] == STANDBY and (act.start is None or self._fires(act.start)):
+            for element in act.within():
+                if element.type in {"act", "maneuver_group", "maneuver"}:
+                    self._change(element, RUNNING, "start")
+        if self._status[act.number] != RUNNING:
+            return
+        if act.stop is not None and self._fires(act.stop):
+            self._stop(act)
+            return
+        for group in act.children:
+            for maneuver in group.children:
+                if self._status[maneuver.number] == RUNNING:
+                    for event in maneuver.children:
+                        self._pass_event(event, maneuver)
+                    self._complete_with_children(maneuver)
+            self._complete_group(group)
+        self._complete_with_children(act)
+
+    def _pass_event(self, event: Element, maneuver: Element) -> None:
+        if self._status[event.number] == STANDBY and (
+            event.start is None or self._fires(event.start)
+        ):
+            self._begin_event(event, maneuver)
+        if self._status[event.number] == RUNNING:
+            self._end_actions(event)
+
+    def _begin_event(self, event: Element, maneuver: Element) -> None:
+        others = [
+            e for e in maneuver.children if e is not event and self._status[e.number] == RUNNING
+        ]
+        self._times[event.number] += 1
+        if event.spec.priority == "skip" and others:
+            self._fresh.add((event.number, "skip_transition"))
+            self._note(event, "skip")
+            if self._times[event.number] >= event.spec.times:
+                self._status[event.number] = COMPLETE
+            return
+        if event.spec.priority == "override":
+            for other in others:
+                self._stop(other, again=self._times[other.number] < other.spec.times)
+        self._change(event, RUNNING, "start")
+        for action in event.children:
+            self._begin_action(action)
+
+    def _begin_action(self, action: Element) -> None:
+        self._change(action, RUNNING, "start")
+        tokens = self._running[action.number] = {}
+        if isinstance(action.spec, GLOBAL):
+            self._global(action.spec, self._now, self._elapsed)
+            return
+        for name in action.actors:
+            tokens[name] = self._token
+            self._begin_private(name, action.spec, self._elapsed, where=action.label)
+
+    def _end_actions(self, event: Element | None = None) -> None:
+        """Actions whose entities are moved by them no more are over; so are events of theirs."""
+        events = [event] if event is not None else [
+            e for e in self._program.elements if e.type == "event"
+        ]  # fmt: skip
+        for each in events:
+            if self._status[each.number] != RUNNING:
+                continue
+            for action in each.children:
+                if self._status[action.number] == RUNNING and not self._moves(action):
+                    ended = all(
+                        token in self.actors[name].finished
+                        for name, token in self._running[action.number].items()
+                    )
+                    self._change(action, COMPLETE, "end" if ended else "stop")
+            if all(self._status[a.number] == COMPLETE for a in each.children):
+                again = self._times[each.number] < each.spec.times
+                self._change(each, STANDBY if again else COMPLETE, "end")
+
+    def _moves(self, action: Element) -> bool:
+        tokens = self._running.get(action.number, {})
+        return any(token in self.actors[name].tokens() for name, token in tokens.items())
+
+    def _complete_group(self, group: Element) -> None:
+        if self._status[group.number] != RUNNING or any(
+            self._status[m.number] != COMPLETE for m in group.children
+        ):
+            return
+        self._times[group.number] += 1
+        if self._times[group.number] >= group.spec.times:
+            self._change(group, COMPLETE, "end")
+            return
+        for element in group.within():
+            if element is not group:
+                self._status[element.number] = RUNNING if element.type == "maneuver" else STANDBY
+                self._times[element.number] = 0
+
+    def _complete_with_children(self, element: Element) -> None:
+        if self._status[element.number] == RUNNING and all(
+            self._status[c.number] == COMPLETE for c in element.children
+        ):
+            self._change(element, COMPLETE, "end")
+
+    def _stop(self, element: Element, *, again: bool = False) -> None:
+        """Stop an element and all that it is made of."""
+        for each in element.within():
+            tokens = set(self._running.pop(each.number, {}).values())
+            if tokens:
+                self.actors = {k: _without(a, tokens) for k, a in self.actors.items()}
+            if self._status[each.number] != COMPLETE:
+                if self._status[each.number] == RUNNING:
+                    self._fresh.add((each.number, "stop_transition"))
+                    self._note(each, "stop")
+                self._status[each.number] = COMPLETE
+        if again:
+            self._status[element.number] = STANDBY
+
+    def _change(self, element: Element, status: int, change: str) -> None:
+        self._status[element.number] = status
+        self._fresh.add((element.number, f"{change}_transition"))
+        self._note(element, change)
+
+    def _note(self, element: Element, change: str) -> None:
+        self.changes.append(ElementChange(self._now, element.label, element.type, change))
+
+    # --- actions --------------------------------------------------------------------------------
+
+    def _begin_private(
+        self, name: str, action: Any, elapsed: float, *, first: bool = False, where: str = "init"
+    ) -> None:
+        actor = self.actors[name]
+        if not actor.scripted and not first:
+            raise WorldError(
+                ErrorCode.INVALID_REQUEST,
+                f"action {where!r} is of {name!r}, the ego, which the planner drives",
+                hint="let the storyboard drive the ego (drives_ego), or leave the action out",
+            )
+        view = self._view(elapsed, first=True)
+        at = Beginning(view, self._places(), self._token)
+        self._token += 1
+        self.actors[name] = begun(actor, action, at)
+
+    def _global(self, action: Any, t_us: int, elapsed: float) -> None:
+        if isinstance(action, AddEntityAction):
+            actor = self.actors[action.entity].put(
+                self._places().of(action.position), self._network
+            )
+            self.actors[action.entity] = evolved(actor, visible=True)
+        elif isinstance(action, DeleteEntityAction):
+            self.actors[action.entity] = evolved(self.actors[action.entity], visible=False)
+        elif isinstance(action, SignalStateAction):
+            self._states[action.signal] = action.state
+        elif isinstance(action, SignalPhaseAction):
+            known = {c.name: c for c in self._program.board.controllers}
+            controller = known[action.controller]
+            self._starts[action.controller] = phase_start(controller, action.phase, elapsed)
+        elif isinstance(action, SetVariableAction):
+            self._set_variable(action)
+
+    def _set_variable(self, action: SetVariableAction) -> None:
+        now, value = self._variables.get(action.variable), action.value
+        if action.rule == "set":
+            self._variables[action.variable] = value
+        elif isinstance(now, int | float) and isinstance(value, int | float):
+            self._variables[action.variable] = now + value if action.rule == "add" else now * value
+
+    # --- facts ----------------------------------------------------------------------------------
+
+    def _fires(self, start: Start) -> bool:
+        return fires(start.trigger, start.numbers, self._facts_now)
+
+    def _facts(self, elapsed: float, *, first: bool) -> Facts:
+        signals, phases = shown_at(self._program.board, elapsed, self._starts, self._states)
+        return Facts(
+            view=self._view(elapsed, first=first),
+            places=self._places(),
+            states=self._is_in,
+            variables=self._variables,
+            signals=signals,
+            phases=phases,
+            memories=self._conditions,
+        )
+
+    def _is_in(self, type_: str, name: str, state: str) -> bool:
+        elements = self._program.named(type_, name)
+        if state in STATES:
+            return any(self._status[e.number] == STATES[state] for e in elements)
+        return any((e.number, state) in self._before for e in elements)
+
+    def _view(self, elapsed: float, *, first: bool) -> View:
+        return View(elapsed, first, self.actors, self._network, self._surroundings)
+
+    def _places(self) -> Places:
+        return Places(self.actors, self._network, self._program.board.origin)
+
+
+def _without(actor: Actor, tokens: set[int]) -> Actor:
+    """An entity that actions move no more; it keeps its speed."""
+    changes: dict[str, Any] = {}
+    if actor.longitudinal is not None and actor.longitudinal.token in tokens:
+        changes["longitudinal"] = None
+    if actor.lateral is not None and actor.lateral.token in tokens:
+        changes |= {"lateral": None, "drift": 0.0}
+    if actor.trajectory is not None and actor.trajectory.token in tokens:
+        changes["trajectory"] = None
+    return evolved(actor, **changes) if changes else actor

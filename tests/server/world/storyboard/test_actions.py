@@ -1,0 +1,218 @@
+"""What actions of a storyboard do, against their formulas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from .boards import action_at, board, drive, places, speeds
+
+NEAR = 0.05
+"""Trajectories meet their formulas within this [m]."""
+
+
+@pytest.fixture
+def run(make_world, moving):
+    """Steps of an episode of actions of the car: the first at 1 s, the ego at 10 m/s."""
+
+    def made(*events, steps=80, init=(), **options):
+        world = make_world(
+            moving(0, 0, speed=10.0),
+            look=moving(500, 50),
+            spec={"storyboard": board(*events, init=init, **options)},
+        )
+        return drive(world, steps)
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("shape", "mean"),
+    [("linear", 0.5), ("cubic", 0.5), ("sinusoidal", 0.5)],
+)
+def test_a_speed_changes_by_its_form_in_its_time(run, shape, mean):
+    dynamics = {"shape": shape, "dimension": "time", "value": 2.0}
+    worlds = run(action_at(1.0, {"kind": "speed", "speed": 4.0, "dynamics": dynamics}))
+
+    v, x = speeds(worlds), places(worlds)[:, 0]
+    assert v[10] == pytest.approx(10.0)
+    assert v[20] == pytest.approx(7.0, abs=0.02)
+    assert v[30] == pytest.approx(4.0)
+    # All three forms have the mean of both speeds as theirs.
+    assert x[30] - x[10] == pytest.approx(2.0 * (10 + (4.0 - 10) * mean), abs=NEAR)
+    assert x[80] - x[30] == pytest.approx(4.0 * 5.0, abs=1e-6)
+
+
+def test_a_rate_is_the_highest_acceleration_of_every_form(run):
+    for shape in ("linear", "cubic", "sinusoidal"):
+        dynamics = {"shape": shape, "dimension": "rate", "value": 3.0}
+        worlds = run(action_at(1.0, {"kind": "speed", "speed": 4.0, "dynamics": dynamics}))
+        rates = np.diff(speeds(worlds)) / 0.1
+        assert -rates.min() == pytest.approx(3.0, abs=0.02)
+
+
+def test_a_speed_by_distance_is_reached_after_it(run):
+    dynamics = {"shape": "linear", "dimension": "distance", "value": 21.0}
+    worlds = run(action_at(1.0, {"kind": "speed", "speed": 4.0, "dynamics": dynamics}))
+
+    v, x = speeds(worlds), places(worlds)[:, 0]
+    there = int(np.argmax(v <= 4.0 + 1e-9))
+    assert x[there] - x[10] == pytest.approx(21.0, abs=NEAR)
+
+
+@pytest.mark.parametrize(
+    ("shape", "form"),
+    [
+        ("linear", lambda u: u),
+        ("cubic", lambda u: 3 * u**2 - 2 * u**3),
+        ("sinusoidal", lambda u: (1 - math.cos(math.pi * u)) / 2),
+        ("quintic", lambda u: 10 * u**3 - 15 * u**4 + 6 * u**5),
+    ],
+)
+def test_a_lane_change_follows_its_form(run, shape, form):
+    dynamics = {"shape": shape, "dimension": "time", "value": 2.5}
+    change = {"kind": "lane_change", "lane": 1, "relative_to": "car", "dynamics": dynamics}
+    worlds = run(action_at(1.0, change))
+
+    y = places(worlds)[:, 1]
+    for k in range(10, 36):
+        assert y[k] == pytest.approx(3.5 * form((k - 10) / 25), abs=NEAR)
+    assert y[60] == pytest.approx(3.5)
+
+
+def test_a_lane_offset_keeps_its_highest_acceleration(run):
+    aside = {"kind": "lane_offset", "offset": -1.2, "shape": "sinusoidal", "acceleration": 1.5}
+    worlds = run(action_at(1.0, aside))
+
+    y = places(worlds)[:, 1]
+    duration = math.pi * math.sqrt(1.2 / (2 * 1.5))
+    assert y[80] == pytest.approx(-1.2)
+    half = 10 + duration / 2 * 10
+    assert np.interp(half, np.arange(81), y) == pytest.approx(-0.6, abs=NEAR)
+
+
+def test_synchronised_entities_arrive_together(run):
+    ego_place = {"kind": "world", "x": 40.0, "y": 0.0}
+    place = {"kind": "world", "x": 130.0, "y": 0.0}
+    sync = {"kind": "synchronize", "master": "Ego", "master_target": ego_place, "target": place}
+    worlds = run(action_at(0.5, sync), steps=40)
+
+    # The ego is there at 4 s, by a constant acceleration of the car.
+    assert places(worlds)[40, 0] == pytest.approx(130.0, abs=NEAR)
+    rates = np.diff(speeds(worlds))[6:39] / 0.1
+    assert np.ptp(rates) < 0.05
+
+
+def test_a_final_speed_is_that_of_the_arrival(run):
+    sync = {
+        "kind": "synchronize",
+        "master": "Ego",
+        "master_target": {"kind": "world", "x": 50.0, "y": 0.0},
+        "target": {"kind": "world", "x": 140.0, "y": 0.0},
+        "final_speed": 6.0,
+    }
+    worlds = run(action_at(0.5, sync), steps=50)
+
+    assert places(worlds)[50, 0] == pytest.approx(140.0, abs=NEAR)
+    assert speeds(worlds)[50] == pytest.approx(6.0, abs=0.05)
+
+
+def test_a_timed_polyline_is_met_at_its_times(run):
+    vertices = [
+        {"time": t, "position": {"kind": "world", "x": x, "y": y}}
+        for t, x, y in ((0.0, 30.0, 0.0), (1.0, 40.0, 2.0), (3.0, 50.0, 2.0))
+    ]
+    follow = {
+        "kind": "follow_trajectory",
+        "curve": {"shape": "polyline", "vertices": vertices},
+        "timing": {"domain": "relative"},
+    }
+    worlds = run(action_at(1.0, follow), steps=45)
+
+    found = places(worlds)
+    assert found[20, :2] == pytest.approx((40.0, 2.0), abs=NEAR)
+    assert found[30, :2] == pytest.approx((45.0, 2.0), abs=NEAR)
+    # At its end it goes on as it went.
+    assert found[45, 0] == pytest.approx(50.0 + 5.0 * 0.5, abs=2 * NEAR)
+
+
+def test_a_clothoid_leads_where_its_integral_says(run):
+    from scipy.integrate import quad
+
+    curvature, rate, length = 0.02, 0.002, 30.0
+    start = {"kind": "world", "x": 40.0, "y": 0.0, "h": 0.0}
+    curve = {
+        "shape": "clothoid",
+        "position": start,
+        "curvature": curvature,
+        "curvature_rate": rate,
+        "length": length,
+    }
+    worlds = run(action_at(1.0, {"kind": "follow_trajectory", "curve": curve}), steps=40)
+
+    def psi(s):
+        return curvature * s + rate * s * s / 2
+
+    x = 40.0 + quad(lambda s: math.cos(psi(s)), 0, length)[0]
+    y = quad(lambda s: math.sin(psi(s)), 0, length)[0]
+    assert places(worlds)[40, :2] == pytest.approx((x, y), abs=NEAR)
+
+
+def test_a_nurbs_of_a_quarter_circle_is_one(run):
+    w = math.sqrt(0.5)
+    points = [((40, 0), 1.0), ((60, 0), w), ((60, 20), 1.0)]
+    curve = {
+        "shape": "nurbs", "order": 3, "knots": [0, 0, 0, 1, 1, 1],
+        "points": [
+            {"position": {"kind": "world", "x": x, "y": y}, "weight": w} for (x, y), w in points
+        ],
+    }  # fmt: skip
+    worlds = run(action_at(1.0, {"kind": "follow_trajectory", "curve": curve}), steps=40)
+
+    for x, y, *_ in places(worlds)[12:40]:
+        assert math.hypot(x - 40, y - 20) == pytest.approx(20.0, abs=0.01)
+
+
+def test_a_distance_to_the_ego_is_kept(run):
+    keep = {
+        "kind": "longitudinal_distance", "entity": "Ego", "distance": 60.0, "continuous": True,
+        "freespace": True, "place": "leading", "limits": {"acceleration": 3.0, "deceleration": 4.0},
+    }  # fmt: skip
+    worlds = run(action_at(1.0, keep), steps=100)
+
+    world = worlds[-1]
+    ego = world.motion.x + world.scene.ego_size[0] - 1.0
+    rear = places(worlds)[-1, 0] - 2.3
+    assert speeds(worlds)[-1] == pytest.approx(10.0, abs=0.1)
+    assert rear - ego == pytest.approx(60.0, abs=0.2)
+
+
+def test_an_entity_appears_where_it_is_put_and_leaves(run):
+    hide = {"kind": "visibility", "visible": False}
+    worlds = run(action_at(1.0, hide), steps=20)
+
+    assert "car" in {o.object_id for o in worlds[5].agents.objects}
+    assert "car" not in {o.object_id for o in worlds[15].agents.objects}
+
+
+def test_a_controller_brakes_behind_the_ego(run):
+    """The car is put 15 m behind the ego and drives up to it."""
+    behind = {"kind": "teleport", "position": {"kind": "relative_lane", "entity": "Ego", "ds": -30}}
+    speed = {"kind": "speed", "speed": 14.0}
+    worlds = run(
+        action_at(0.0, {"kind": "controller", "idm": {"desired_speed": 14.0}}),
+        init=[("car", behind), ("car", speed)],
+        steps=100,
+    )
+    gaps = [w.motion.x - places([w])[0, 0] for w in worlds]
+    assert min(gaps) > 4.6
+    assert speeds(worlds)[-1] == pytest.approx(10.0, abs=1.0)
+
+
+def test_a_speed_goes_on_following_that_of_the_ego(run):
+    follow = {"kind": "speed", "speed": 1.5, "relative_to": "Ego", "continuous": True}
+    worlds = run(action_at(1.0, follow), steps=30)
+
+    assert speeds(worlds)[30] == pytest.approx(worlds[30].motion.speed + 1.5)
