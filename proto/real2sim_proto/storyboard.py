@@ -166,7 +166,7 @@ class ManeuverGroup(Model):
     """Maneuvers of the same entities."""
 
     name: ElementName
-    actors: list[Reference] = Field(default_factory=list, max_length=64)
+    entities: list[Reference] = Field(default_factory=list, max_length=64)
     times: int = Field(default=1, ge=1, le=1_000_000)
     maneuvers: list[Maneuver] = Field(default_factory=list, max_length=100)
 
@@ -394,7 +394,7 @@ def _check_entities(part: Any, names: frozenset[str]) -> None:
     for member, value in part.__dict__.items():
         if member in _ENTITY_MEMBERS and isinstance(value, str):
             _check_entity(value, names)
-        elif member in {"entities", "actors"} and value and isinstance(value[0], str):
+        elif member in {"entities"} and value and isinstance(value[0], str):
             for name in value:
                 _check_entity(name, names)
         else:

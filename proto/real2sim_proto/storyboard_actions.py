@@ -132,10 +132,25 @@ class RoutePosition(Model):
     route: Route
     s: Value = Field(description="from the route's first place [m]")
     t: Value = Field(default=0.0, description="positive on the left [m]")
+    lane: int | Value | None = Field(
+        default=None, description="id there, from whose middle `t` counts; None: from the route"
+    )
     orientation: Orientation | None = DRIVING
 
 
-Position = Annotated[PlainPosition | RoutePosition, Field(discriminator="kind")]
+class TrajectoryPosition(Model):
+    """Along a curve, and beside it."""
+
+    kind: Literal["trajectory"] = "trajectory"
+    curve: Curve
+    s: Value
+    t: Value = Field(default=0.0, description="positive on the left [m]")
+    orientation: Orientation | None = DRIVING
+
+
+Position = Annotated[
+    PlainPosition | RoutePosition | TrajectoryPosition, Field(discriminator="kind")
+]
 
 
 # --- how values change ------------------------------------------------------------------------
@@ -261,6 +276,10 @@ class SynchronizeAction(Model):
     target: Position
     final_speed: Value | None = Field(default=None, description="[m/s]")
     relative: bool = Field(default=False, description="final_speed is the difference to its speed")
+    steady_distance: Value | None = Field(
+        default=None, description="of its way before the arrival, with the final speed [m]"
+    )
+    steady_time: Value | None = Field(default=None, description="the same as a time [s]")
     master_tolerance: Value = 0.0
     tolerance: Value = 0.0
     limits: SpeedLimits = Field(
@@ -320,7 +339,25 @@ class Nurbs(Model):
         return self
 
 
-Curve = Annotated[Polyline | Clothoid | Nurbs, Field(discriminator="shape")]
+class ClothoidPiece(Model):
+    """Of a spline: curvature [1/m] that changes linearly over its length [m]."""
+
+    start: Value
+    end: Value
+    length: Value
+    end_time: Value | None = None
+
+
+class ClothoidSpline(Model):
+    """Clothoids, each from where the one before ends, as it heads there."""
+
+    shape: Literal["clothoid_spline"] = "clothoid_spline"
+    position: Position
+    pieces: list[ClothoidPiece] = Field(min_length=1, max_length=1000)
+
+
+Curve = Annotated[Polyline | Clothoid | ClothoidSpline | Nurbs, Field(discriminator="shape")]
+TrajectoryPosition.model_rebuild()
 
 
 class Timing(Model):

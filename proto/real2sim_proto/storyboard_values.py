@@ -21,7 +21,7 @@ NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_\-]{0,79}$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 """Of a parameter or variable."""
 
-Expression = Annotated[str, Field(pattern=r"^\$", max_length=1000)]
+Expression = Annotated[str, Field(pattern=r"^\$", max_length=8000)]
 
 Value = Annotated[float, Field(ge=-1e9, le=1e9)] | Expression
 """A number, or an expression of parameters such as ``$gap`` or ``${2 * $gap}``."""

@@ -132,16 +132,16 @@ class World:
         self._path = self._episode_route.route
         self._tracks = self._tracks_of(state)
         self.ground = scene.ground
-        self._storyboard = self._first_storyboard()
-        self.motion, drawn = self._first_motion()
+        first = self._first_storyboard()
+        self.motion, drawn = self._first_motion(first)
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
         self._attitude, self.T_world_body = LEVEL, self.T_world_vehicle
         self._estimate_error = estimate_error(spec.randomization.estimate, self._draws, 0)
         self._controller = EgoController(spec, scene.ego)
-        self.traffic = self._first_traffic()
-        if self._storyboard is not None:
-            drawn |= dict(self._storyboard.drawn)
+        self.traffic = self._first_traffic(first)
+        if first is not None:
+            drawn |= dict(first.drawn)
         self._start_drawn = drawn
         self._step_drawn: Mapping[str, float] = drawn | dict(self.traffic.drawn)
         self._off_route = self._off_road = False
@@ -171,6 +171,12 @@ class World:
     def agents(self) -> Agents:
         """Poses of all objects now."""
         return self.traffic.agents
+
+    @property
+    def storyboard(self) -> StoryboardRun | None:
+        """The storyboard of the episode as it is now; None where it has none."""
+        found = self.traffic.storyboard
+        return found if isinstance(found, StoryboardRun) else None
 
     @property
     def route(self) -> LoggedPath:
@@ -358,7 +364,7 @@ class World:
             lap=self.lap,
             drawn=self._step_drawn,
             truth=truth,
-            signals=() if self.traffic.storyboard is None else self.traffic.storyboard.signals(),
+            signals=() if self.storyboard is None else self.storyboard.signals(),
         )
 
     def metrics(self) -> dict[str, float]:
@@ -480,8 +486,9 @@ class World:
         if end_us <= self._warm_up_end_us:
             recorded = logged_motion(self.scene.ego, end_us, self.spec.ego)
             return StepMotion(controller, recorded, traffic, self._contacts, None)
-        if traffic.storyboard is not None and traffic.storyboard.drives_ego:
-            scripted = traffic.storyboard.ego_motion(self.motion)
+        run = traffic.storyboard
+        if isinstance(run, StoryboardRun) and run.drives_ego:
+            scripted = run.ego_motion(self.motion)
             return StepMotion(controller, scripted, traffic, self._contacts, None)
         return self._contacts.advance(
             controller, self.motion, before, traffic, t_us=t_us, height=self.ground.height
@@ -568,14 +575,14 @@ class World:
 
     def _storyboard_events(self) -> list[Event]:
         """Elements of the storyboard that have begun and ended in the step."""
-        run = self.traffic.storyboard
+        run = self.storyboard
         return [
             Event("storyboard", c.t_us, element=c.element, element_type=c.type, change=c.change)
             for c in (run.changes if run is not None else ())
         ]
 
     def _horizon_events(self) -> list[Event]:
-        run = self.traffic.storyboard
+        run = self.storyboard
         if run is not None and run.over and run.program.board.ends_episode and not self.over:
             self.truncated, self.reason = True, "storyboard"
             return [Event("stopped", self.t_us)]
@@ -587,11 +594,11 @@ class World:
 
     # --- views of the instant ---------------------------------------------------------------
 
-    def _first_motion(self) -> tuple[Motion, dict[str, float]]:
+    def _first_motion(self, storyboard: StoryboardRun | None) -> tuple[Motion, dict[str, float]]:
         """The ego at the start, and what the seed drew for it by name."""
         recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
-        if self._storyboard is not None and self._storyboard.ego_put:
-            recorded = self._storyboard.ego_motion(recorded)
+        if storyboard is not None and storyboard.ego_put:
+            recorded = storyboard.ego_motion(recorded)
         others, size = self._tracks.at(self.t_us), self.scene.ego_size
 
         def touched(motion: Motion) -> set[int]:
@@ -619,7 +626,7 @@ class World:
         )
         return begin_storyboard(self.spec, self.state, around, self.scene, self._draws)
 
-    def _first_traffic(self) -> Traffic:
+    def _first_traffic(self, storyboard: StoryboardRun | None) -> Traffic:
         spec, scene = self.spec, self.scene
         randomized = RandomizedIdm(spec.randomization.traffic, self._draws)
         return Traffic.begin(
@@ -634,7 +641,7 @@ class World:
                 ego=scene.ego,
             ),
             randomized=randomized if randomized.widths else None,
-            storyboard=self._storyboard,
+            storyboard=storyboard,
         )
 
     def _tracks_of(self, state: ScenarioState) -> PackedTracks[ObjectState]:

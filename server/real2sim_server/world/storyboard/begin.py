@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec
-from real2sim_proto.storyboard import resolved
+from real2sim_proto.storyboard import MapRoads, Storyboard, resolved
 
 from ...edit import ScenarioState
 from ...scene import Scene
+from ...scene.lane_graph import LaneGraph
 from ..draws import Draws
 from ..errors import WorldError
 from ..traffic.driver import Surroundings
 from .entities import subjects_of
+from .graph_roads import GraphNetwork
+from .roads import RoadNetwork
 from .run import StoryboardRun
 
 
@@ -57,5 +60,22 @@ def begin_storyboard(
         subjects_of(resolved(board).entities, state),
         surroundings,
         ego_size=scene.ego_size,
+        network=_network(board, scene),
         draws=draws,
     )
+
+
+def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
+    """Roads of the scene's map where the storyboard is for a map; None: lanes along the route."""
+    if not isinstance(board.roads, MapRoads):
+        return None
+    graph: LaneGraph | None = getattr(scene, "lane_graph", None)
+    if graph is None or not graph.roads:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"the storyboard is for a road network ({board.roads.file or 'unnamed'}), and scene "
+            f"{scene.name!r} has no map with roads",
+            hint="run it on a scene made from that network, or with storyboard.roads of kind "
+            "'route', lanes along the ego's route",
+        )
+    return GraphNetwork(graph)

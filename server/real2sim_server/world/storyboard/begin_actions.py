@@ -29,8 +29,8 @@ from real2sim_proto.storyboard_actions import (
 from ..errors import WorldError
 from ..evolve import evolved
 from ..path import LoggedPath
-from .actor import Actor
 from .dynamics import duration, gentle_duration
+from .entity_state import EntityState
 from .lateral import FollowOffset, HoldOffset, KeepAside, OffsetChange, lane_offset
 from .longitudinal import (
     FollowIdm,
@@ -64,7 +64,7 @@ class Beginning:
     token: int
 
 
-def begun(actor: Actor, action: Any, at: Beginning) -> Actor:
+def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
     """The entity with an action of the storyboard begun; one that takes no time is finished.
 
     Raises:
@@ -73,11 +73,11 @@ def begun(actor: Actor, action: Any, at: Beginning) -> Actor:
     return _BEGIN[type(action)](actor, action, at)
 
 
-def _done(actor: Actor, at: Beginning, **changes: Any) -> Actor:
+def _done(actor: EntityState, at: Beginning, **changes: Any) -> EntityState:
     return evolved(actor, finished=actor.finished | {at.token}, **changes)
 
 
-def _freed(actor: Actor) -> Actor:
+def _freed(actor: EntityState) -> EntityState:
     """Off a trajectory whose times ruled its speed, which it goes on along at its own; off one
     that only rules its place nothing changes."""
     if actor.trajectory is None or actor.trajectory.timing is None:
@@ -88,14 +88,14 @@ def _freed(actor: Actor) -> Actor:
     return evolved(actor, trajectory=None).on_way(way)
 
 
-def _on_lane(actor: Actor, at: Beginning) -> Actor:
+def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
     """Off its trajectory, on the lane where it is."""
     if actor.trajectory is None:
         return actor
     return evolved(actor, trajectory=None).on_lane(at.view.network)
 
 
-def _speed(actor: Actor, action: SpeedAction, at: Beginning) -> Actor:
+def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
     value, dynamics = float(action.speed), action.dynamics
     if action.continuous and action.relative_to is not None:
@@ -104,7 +104,7 @@ def _speed(actor: Actor, action: SpeedAction, at: Beginning) -> Actor:
         follow = FollowSpeed(at.token, action.relative_to, action.relation, value, rate)
         return evolved(actor, longitudinal=follow)
     if action.relative_to is not None:
-        other = at.view.actors[action.relative_to].speed
+        other = at.view.entities[action.relative_to].speed
         value = other + value if action.relation == "delta" else other * value
     seconds = _speed_duration(dynamics, actor.speed, value)
     if seconds <= 0.0:
@@ -122,9 +122,9 @@ def _speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
     return float(dynamics.value) / mean if mean > 0 else 0.0
 
 
-def _speed_profile(actor: Actor, action: SpeedProfileAction, at: Beginning) -> Actor:
+def _speed_profile(actor: EntityState, action: SpeedProfileAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
-    base = at.view.actors[action.relative_to].speed if action.relative_to is not None else 0.0
+    base = at.view.entities[action.relative_to].speed if action.relative_to is not None else 0.0
     points, time = [(0.0, actor.speed)], 0.0
     for point in action.points:
         time += max(float(point.time), 0.0)
@@ -135,27 +135,36 @@ def _speed_profile(actor: Actor, action: SpeedProfileAction, at: Beginning) -> A
 
 
 def _longitudinal_distance(
-    actor: Actor, action: LongitudinalDistanceAction, at: Beginning
-) -> Actor:
+    actor: EntityState, action: LongitudinalDistanceAction, at: Beginning
+) -> EntityState:
     actor = _freed(actor)
-    other = at.view.actors[action.entity]
+    other = at.view.entities[action.entity]
     ahead = ahead_on_way(actor, other.x, other.y, at.view.network)
     leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
     return evolved(actor, longitudinal=KeepDistance(at.token, action, leading))
 
 
-def _synchronize(actor: Actor, action: SynchronizeAction, at: Beginning) -> Actor:
+def _synchronize(actor: EntityState, action: SynchronizeAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
     final = None if action.final_speed is None else float(action.final_speed)
     tolerances = (float(action.master_tolerance), float(action.tolerance))
+    steady = float(action.steady_distance or 0.0), float(action.steady_time or 0.0)
     there, own = at.places.of(action.master_target), at.places.of(action.target)
     control = Synchronize(
-        at.token, action.master, there, own, final, action.relative, tolerances, action.limits
+        at.token,
+        action.master,
+        there,
+        own,
+        final,
+        action.relative,
+        tolerances,
+        steady,
+        action.limits,
     )
     return evolved(actor, longitudinal=control)
 
 
-def _where(actor: Actor, at: Beginning, what: str) -> RoadPoint:
+def _where(actor: EntityState, at: Beginning, what: str) -> RoadPoint:
     here = at.view.network.locate(actor.x, actor.y, actor.h)
     if here is None:
         raise WorldError(
@@ -166,13 +175,13 @@ def _where(actor: Actor, at: Beginning, what: str) -> RoadPoint:
     return here
 
 
-def _lane_change(actor: Actor, action: LaneChangeAction, at: Beginning) -> Actor:
+def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) -> EntityState:
     actor, network = _on_lane(actor, at), at.view.network
     here = _where(actor, at, "lane change")
     along = math.cos(actor.h - here.h) >= 0.0
     lane = int(action.lane)
     if action.relative_to is not None:
-        other = at.view.actors[action.relative_to]
+        other = at.view.entities[action.relative_to]
         base = _where(other, at, "lane change relative to it")
         sense = 1 if math.cos(other.h - base.h) >= 0.0 else -1
         lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
@@ -184,13 +193,13 @@ def _lane_change(actor: Actor, action: LaneChangeAction, at: Beginning) -> Actor
     return _shifted(actor, dynamics.shape, end, extent, at, by_way=by_way)
 
 
-def _lane_offset(actor: Actor, action: LaneOffsetAction, at: Beginning) -> Actor:
+def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) -> EntityState:
     actor = _on_lane(actor, at)
     value, acceleration = float(action.offset), action.acceleration
     if action.relative_to is not None:
         if action.continuous and acceleration is None:
             return evolved(actor, lateral=FollowOffset(at.token, action.relative_to, value))
-        value += lane_offset(at.view.actors[action.relative_to], at.view)
+        value += lane_offset(at.view.entities[action.relative_to], at.view)
     # Who was straight on beside the road or on a route counts from its lane's middle now.
     actor = actor.on_lane(at.view.network)
     if action.continuous and acceleration is None:
@@ -201,23 +210,33 @@ def _lane_offset(actor: Actor, action: LaneOffsetAction, at: Beginning) -> Actor
 
 
 def _shifted(
-    actor: Actor, shape: Any, end: float, extent: float, at: Beginning, *, by_way: bool = False
-) -> Actor:
+    actor: EntityState,
+    shape: Any,
+    end: float,
+    extent: float,
+    at: Beginning,
+    *,
+    by_way: bool = False,
+) -> EntityState:
     if extent <= 0.0:
         return _done(evolved(actor, lateral=None, offset=end, drift=0.0).placed(), at)
     change = OffsetChange(at.token, shape, actor.offset, end, extent, by_way)
     return evolved(actor, lateral=change)
 
 
-def _lateral_distance(actor: Actor, action: LateralDistanceAction, at: Beginning) -> Actor:
-    actor, other = _on_lane(actor, at), at.view.actors[action.entity]
+def _lateral_distance(
+    actor: EntityState, action: LateralDistanceAction, at: Beginning
+) -> EntityState:
+    actor, other = _on_lane(actor, at), at.view.entities[action.entity]
     side = {"left": 1.0, "right": -1.0}.get(action.side, 0.0)
     if not side:
         side = math.copysign(1.0, across(other.h, actor.x - other.x, actor.y - other.y))
     return evolved(actor, lateral=KeepAside(at.token, action, side))
 
 
-def _follow_trajectory(actor: Actor, action: FollowTrajectoryAction, at: Beginning) -> Actor:
+def _follow_trajectory(
+    actor: EntityState, action: FollowTrajectoryAction, at: Beginning
+) -> EntityState:
     course = course_of(action.curve, at.places.of)
     timing, s = action.timing, float(action.offset)
     if timing is not None and course.times is None:
@@ -236,16 +255,18 @@ def _follow_trajectory(actor: Actor, action: FollowTrajectoryAction, at: Beginni
         time = elapsed * float(timing.scale) + float(timing.offset)
         following = Trajectory(at.token, course, timing, course.way_at(time), elapsed)
         actor = evolved(actor, trajectory=following)
-    place = following.place(actor)
+    place = following.place()
     return evolved(actor, x=place.x, y=place.y, h=place.h)
 
 
-def _assign_route(actor: Actor, action: AssignRouteAction, at: Beginning) -> Actor:
+def _assign_route(actor: EntityState, action: AssignRouteAction, at: Beginning) -> EntityState:
     places = [at.places.of(w) for w in action.route.waypoints]
     return _done(_on_route(actor, at.view.network.route(places)), at)
 
 
-def _acquire_position(actor: Actor, action: AcquirePositionAction, at: Beginning) -> Actor:
+def _acquire_position(
+    actor: EntityState, action: AcquirePositionAction, at: Beginning
+) -> EntityState:
     here = Place(actor.x, actor.y, actor.h)
     path = at.view.network.route([here, at.places.of(action.position)])
     moved = _on_route(actor, path)
@@ -254,21 +275,21 @@ def _acquire_position(actor: Actor, action: AcquirePositionAction, at: Beginning
     ))  # fmt: skip
 
 
-def _on_route(actor: Actor, path: LoggedPath) -> Actor:
+def _on_route(actor: EntityState, path: LoggedPath) -> EntityState:
     way = Way("route", 1, True, path)
     return evolved(actor, trajectory=None, lateral=None).on_way(way)
 
 
-def _teleport(actor: Actor, action: TeleportAction, at: Beginning) -> Actor:
+def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> EntityState:
     put = actor.put(at.places.of(action.position), at.view.network)
     return _done(put, at, lateral=None)
 
 
-def _visibility(actor: Actor, action: VisibilityAction, at: Beginning) -> Actor:
+def _visibility(actor: EntityState, action: VisibilityAction, at: Beginning) -> EntityState:
     return _done(actor, at, visible=action.visible)
 
 
-def _controller(actor: Actor, action: ControllerAction, at: Beginning) -> Actor:
+def _controller(actor: EntityState, action: ControllerAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
     if not action.active:
         return _done(actor, at, longitudinal=None)
@@ -281,7 +302,7 @@ def _idm(action: ControllerAction) -> IdmDriver:
     return IdmDriver(path="route", **action.idm.model_dump())
 
 
-_BEGIN: Mapping[type[Any], Callable[[Actor, Any, Beginning], Actor]] = {
+_BEGIN: Mapping[type[Any], Callable[[EntityState, Any, Beginning], EntityState]] = {
     SpeedAction: _speed,
     SpeedProfileAction: _speed_profile,
     LaneChangeAction: _lane_change,

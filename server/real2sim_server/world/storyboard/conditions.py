@@ -31,7 +31,7 @@ from real2sim_proto.storyboard_conditions import (
     VariableValue,
 )
 
-from .actor import Actor
+from .entity_state import EntityState
 from .positions import Places
 from .view import (
     View,
@@ -145,19 +145,19 @@ Outcome = tuple[bool, Mapping[str, float]]
 
 
 def _of_entities(
-    test: Any, facts: Facts, since: Mapping[str, float], holds: Callable[[Actor], bool]
+    test: Any, facts: Facts, since: Mapping[str, float], holds: Callable[[EntityState], bool]
 ) -> Outcome:
-    outcomes = [holds(facts.view.actors[name]) for name in test.entities]
+    outcomes = [holds(facts.view.entities[name]) for name in test.entities]
     return (any(outcomes) if test.of == "any" else all(outcomes)), since
 
 
 def _lasting(
-    test: Any, facts: Facts, since: Mapping[str, float], holds: Callable[[Actor], bool]
+    test: Any, facts: Facts, since: Mapping[str, float], holds: Callable[[EntityState], bool]
 ) -> Outcome:
     """What has held for `duration`; ``since`` is when it began for each entity."""
     now, began, outcomes = facts.view.elapsed, dict(since), []
     for name in test.entities:
-        if not holds(facts.view.actors[name]):
+        if not holds(facts.view.entities[name]):
             began.pop(name, None)
             outcomes.append(False)
             continue
@@ -171,9 +171,9 @@ def _simulation_time(test: SimulationTime, facts: Facts, since: Mapping[str, flo
 
 
 def _time_to_collision(test: TimeToCollision, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def holds(actor: Actor) -> bool:
+    def holds(actor: EntityState) -> bool:
         if test.entity is not None:
-            other: Any = facts.view.actors[test.entity]
+            other: Any = facts.view.entities[test.entity]
         else:
             assert test.position is not None
             other = facts.places.of(test.position)
@@ -186,8 +186,8 @@ def _time_to_collision(test: TimeToCollision, facts: Facts, since: Mapping[str, 
 
 
 def _time_headway(test: TimeHeadway, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def holds(actor: Actor) -> bool:
-        distance = _distance(actor, facts.view.actors[test.entity], test, facts)
+    def holds(actor: EntityState) -> bool:
+        distance = _distance(actor, facts.view.entities[test.entity], test, facts)
         time = distance / abs(actor.speed) if abs(actor.speed) > INSTANT else math.inf
         return _compared(time, test.rule, float(test.value))
 
@@ -195,8 +195,8 @@ def _time_headway(test: TimeHeadway, facts: Facts, since: Mapping[str, float]) -
 
 
 def _relative_distance(test: RelativeDistance, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def holds(actor: Actor) -> bool:
-        distance = _distance(actor, facts.view.actors[test.entity], test, facts)
+    def holds(actor: EntityState) -> bool:
+        distance = _distance(actor, facts.view.entities[test.entity], test, facts)
         return _compared(distance, test.rule, float(test.value))
 
     return _of_entities(test, facts, since, holds)
@@ -212,7 +212,7 @@ def _to_place(test: Distance, facts: Facts, since: Mapping[str, float]) -> Outco
     )
 
 
-def _distance(actor: Actor, other: Any, test: Any, facts: Facts) -> float:
+def _distance(actor: EntityState, other: Any, test: Any, facts: Facts) -> float:
     return distance_to(
         actor,
         other,
@@ -234,20 +234,20 @@ def _reach_position(test: ReachPosition, facts: Facts, since: Mapping[str, float
 
 
 def _speed(test: Speed, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def part(actor: Actor) -> float:
+    def part(actor: EntityState) -> float:
         return actor.drift if test.direction == "lateral" else actor.speed
 
-    def holds(actor: Actor) -> bool:
+    def holds(actor: EntityState) -> bool:
         value = part(actor)
         if test.relative_to is not None:
-            value -= part(facts.view.actors[test.relative_to])
+            value -= part(facts.view.entities[test.relative_to])
         return _compared(value, test.rule, float(test.value))
 
     return _of_entities(test, facts, since, holds)
 
 
 def _acceleration(test: Acceleration, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def holds(actor: Actor) -> bool:
+    def holds(actor: EntityState) -> bool:
         value = actor.acceleration if test.direction is not None else abs(actor.acceleration)
         return _compared(value, test.rule, float(test.value))
 
@@ -255,48 +255,50 @@ def _acceleration(test: Acceleration, facts: Facts, since: Mapping[str, float]) 
 
 
 def _collision(test: Collision, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def holds(actor: Actor) -> bool:
+    def holds(actor: EntityState) -> bool:
         if not actor.visible:
             return False
         own = corners(actor)
         if test.entity is not None:
-            other = facts.view.actors[test.entity]
+            other = facts.view.entities[test.entity]
             return other.visible and overlapping(own, corners(other))
         return any(overlapping(own, box) for box in _others(actor, test.category, facts))
 
     return _of_entities(test, facts, since, holds)
 
 
-def _others(actor: Actor, category: str | None, facts: Facts) -> list[list[tuple[float, float]]]:
+def _others(
+    actor: EntityState, category: str | None, facts: Facts
+) -> list[list[tuple[float, float]]]:
     """Outlines of entities as they are now, and of all other objects at the start of the step."""
-    actors = facts.view.actors
+    entities = facts.view.entities
     found = [
         corners(other)
-        for other in actors.values()
+        for other in entities.values()
         if other is not actor
         and other.visible
         and (category is None or other.category == category)
         and _near(actor, other.x, other.y, other.size[0])
     ]
-    entities = {a.subject.object_id for a in actors.values() if a.subject is not None}
+    known = {a.subject.object_id for a in entities.values() if a.subject is not None}
     around = facts.view.surroundings
     for row, subject in zip(around.bodies.tolist(), around.others.objects, strict=False):
         x, y, yaw, length, width, _, _ = row
-        if subject.object_id in entities or not _near(actor, x, y, length):
+        if subject.object_id in known or not _near(actor, x, y, length):
             continue
         if category is None or subject.category == category:
             found.append(box_corners_of(x, y, yaw, length, width))
     return found
 
 
-def _near(actor: Actor, x: float, y: float, length: float) -> bool:
+def _near(actor: EntityState, x: float, y: float, length: float) -> bool:
     return math.hypot(x - actor.x, y - actor.y) < 2.0 * (actor.size[0] + length)
 
 
 def _traversed(test: TraversedDistance, facts: Facts, since: Mapping[str, float]) -> Outcome:
     began, outcomes = dict(since), []
     for name in test.entities:
-        travelled = facts.view.actors[name].travelled
+        travelled = facts.view.entities[name].travelled
         outcomes.append(travelled - began.setdefault(name, travelled) >= float(test.value))
     return (any(outcomes) if test.of == "any" else all(outcomes)), began
 
@@ -311,7 +313,7 @@ def _offroad(test: Offroad, facts: Facts, since: Mapping[str, float]) -> Outcome
 
 
 def _end_of_road(test: EndOfRoad, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    def at_end(actor: Actor) -> bool:
+    def at_end(actor: EntityState) -> bool:
         way = actor.way if actor.way is not None else actor.on_lane(facts.view.network).way
         assert way is not None
         near = way.path.nearest(actor.x, actor.y).s
@@ -321,7 +323,7 @@ def _end_of_road(test: EndOfRoad, facts: Facts, since: Mapping[str, float]) -> O
 
 
 def _relative_angle(test: RelativeAngle, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    other = facts.view.actors[test.entity]
+    other = facts.view.entities[test.entity]
     return _of_entities(
         test,
         facts,

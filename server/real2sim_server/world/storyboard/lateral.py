@@ -4,35 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
 
 from real2sim_proto.storyboard_actions import LateralDistanceAction, Shape
 
-from .actor import Actor
 from .dynamics import progress
+from .entity_state import EntityState, Shifted
 from .view import View, across
 
 DONE = 1e-9
 
 AT_PLACE = 0.01
 """A distance sideways is reached within this [m]."""
-
-
-class Shifted(NamedTuple):
-    """Offset from the way [m], and what goes on changing it; None: done."""
-
-    offset: float
-    then: Lateral | None
-
-
-class Lateral(Protocol):
-    """Changes an offset. Immutable; ``token`` is of the action that it belongs to."""
-
-    @property
-    def token(self) -> int: ...  # noqa: D102
-
-    def step(self, actor: Actor, view: View, way: float, h: float) -> Shifted:
-        """``h`` seconds and ``way`` metres on."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +29,7 @@ class OffsetChange:
     by_way: bool = False
     done: float = 0.0
 
-    def step(self, actor: Actor, view: View, way: float, h: float) -> Shifted:
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
         """``h`` seconds and ``way`` metres on."""
         done = self.done + (abs(way) if self.by_way else h)
         u = done / self.extent
@@ -63,9 +45,9 @@ class FollowOffset:
     other: str
     value: float
 
-    def step(self, actor: Actor, view: View, way: float, h: float) -> Shifted:
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
         """``h`` seconds and ``way`` metres on."""
-        return Shifted(self.value + lane_offset(view.actors[self.other], view), self)
+        return Shifted(self.value + lane_offset(view.entities[self.other], view), self)
 
 
 @dataclass(frozen=True)
@@ -75,7 +57,7 @@ class HoldOffset:
     token: int
     value: float
 
-    def step(self, actor: Actor, view: View, way: float, h: float) -> Shifted:
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
         """``h`` seconds and ``way`` metres on."""
         return Shifted(self.value, self)
 
@@ -88,9 +70,9 @@ class KeepAside:
     action: LateralDistanceAction
     side: float
 
-    def step(self, actor: Actor, view: View, way: float, h: float) -> Shifted:
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
         """``h`` seconds and ``way`` metres on."""
-        other, limits = view.actors[self.action.entity], self.action.limits
+        other, limits = view.entities[self.action.entity], self.action.limits
         distance = float(self.action.distance)
         if self.action.freespace:
             distance += (actor.size[1] + other.size[1]) / 2
@@ -107,7 +89,7 @@ class KeepAside:
         return Shifted(actor.offset + step, None if there and not self.action.continuous else self)
 
 
-def lane_offset(actor: Actor, view: View) -> float:
+def lane_offset(actor: EntityState, view: View) -> float:
     """How far an entity is to the left of the middle of its lane, as it drives [m]."""
     if actor.way is not None and actor.way.lane:
         return actor.offset

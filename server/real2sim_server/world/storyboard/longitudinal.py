@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
 
 from real2sim_proto.episode import IdmDriver
 from real2sim_proto.storyboard_actions import LongitudinalDistanceAction, Shape, SpeedLimits
@@ -12,8 +11,8 @@ from real2sim_proto.storyboard_actions import LongitudinalDistanceAction, Shape,
 from ..traffic.idm import acceleration as idm_acceleration
 from ..traffic.idm import advance_along
 from ..traffic.leader import leading_agent
-from .actor import Actor
 from .dynamics import integral, progress
+from .entity_state import EntityState, Moved
 from .roads import Place
 from .view import View, ahead_on_way
 
@@ -27,24 +26,6 @@ SLOWEST_MASTER = 0.05
 """Of whom it is not known when they arrive [m/s]."""
 
 
-class Moved(NamedTuple):
-    """Way made [m], speed at the end [m/s], and what goes on changing it; None: done."""
-
-    way: float
-    speed: float
-    then: Longitudinal | None
-
-
-class Longitudinal(Protocol):
-    """Changes a speed. Immutable; ``token`` is of the action that it belongs to."""
-
-    @property
-    def token(self) -> int: ...  # noqa: D102
-
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
-        """``h`` seconds on."""
-
-
 @dataclass(frozen=True)
 class SpeedChange:
     """From one speed to another in a form of time."""
@@ -56,7 +37,7 @@ class SpeedChange:
     duration: float
     elapsed: float = 0.0
 
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """``h`` seconds on; the way is the integral of the speed."""
         before, after = self.elapsed / self.duration, (self.elapsed + h) / self.duration
         change = self.end - self.start
@@ -75,7 +56,7 @@ class SpeedCourse:
     points: tuple[tuple[float, float], ...]
     elapsed: float = 0.0
 
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """``h`` seconds on."""
         t0, t1 = self.elapsed, self.elapsed + h
         inner = [t for t, _ in self.points if t0 < t < t1]
@@ -105,9 +86,9 @@ class FollowSpeed:
     value: float
     rate: float
 
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """``h`` seconds on."""
-        speed = view.actors[self.other].speed
+        speed = view.entities[self.other].speed
         wanted = speed + self.value if self.relation == "delta" else speed * self.value
         change = min(max(wanted - actor.speed, -self.rate * h), self.rate * h)
         return Moved((actor.speed + change / 2) * h, actor.speed + change, self)
@@ -121,9 +102,9 @@ class KeepDistance:
     action: LongitudinalDistanceAction
     leading: bool
 
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """``h`` seconds on, as fast as the limits let it be there and stay."""
-        other = view.actors[self.action.entity]
+        other = view.entities[self.action.entity]
         ahead = ahead_on_way(actor, other.x, other.y, view.network)
         error = ahead - self._wanted(actor, other)
         closing = error + other.speed * h
@@ -139,7 +120,7 @@ class KeepDistance:
         way = (actor.speed + speed) / 2 * h
         return Moved(way, speed, self._then(left, speed - other.speed))
 
-    def _wanted(self, actor: Actor, other: Actor) -> float:
+    def _wanted(self, actor: EntityState, other: EntityState) -> float:
         """How far ahead of it the other is to be: negative for who leads."""
         aim = self.action
         if aim.distance is not None:
@@ -175,7 +156,8 @@ class Synchronize:
     """Arrives at its place when another arrives at its own, solved anew in every step.
 
     Without a final speed by a constant acceleration a = 2 (d - v T) / T^2, with one by a linear
-    one: a(0) = 6 d / T^2 - (4 v + 2 v_f) / T.
+    one: a(0) = 6 d / T^2 - (4 v + 2 v_f) / T, over the way and time that are left before the steady
+    part; who stands waits until a constant one does.
     """
 
     token: int
@@ -185,11 +167,12 @@ class Synchronize:
     final_speed: float | None
     relative: bool
     tolerances: tuple[float, float]
+    steady: tuple[float, float]
     limits: SpeedLimits
 
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """``h`` seconds on."""
-        master = view.actors[self.master]
+        master = view.entities[self.master]
         to_go = _left(master, self.master_target, view)
         left = _left(actor, self.target, view)
         v = actor.speed
@@ -198,29 +181,54 @@ class Synchronize:
         if master.speed <= SLOWEST_MASTER:
             return Moved(v * h, v, self)
         time = to_go / master.speed
-        rate, jerk = self._solved(left, v, time, self._final(master, v))
+        rate = self._solved(left, v, time)
         if self.limits != SpeedLimits():
             way, speed = advance_along(0.0, v, self._limited(v, rate, h), h)
             return Moved(way, speed, self if time > h else None)
+        if self.final_speed is not None:
+            return self._towards_final(actor, left, time, self._final(master, v), h)
         if time <= h:
-            end = max(v + rate * time + jerk * time * time / 2, 0.0)
+            end = max(v + rate * time, 0.0)
             return Moved(left + end * (h - time), end, None)
+        way, speed = advance_along(0.0, v, rate, h)
+        return Moved(way, speed, self)
+
+    def _towards_final(
+        self, actor: EntityState, left: float, time: float, final: float, h: float
+    ) -> Moved:
+        """With a final speed: a linear acceleration to it, then steadily on."""
+        v, (distance, seconds) = actor.speed, self.steady
+        if seconds > 0.0:
+            distance = seconds * final
+        elif final > DONE:
+            seconds = distance / final
+        d, t = left - distance, time - seconds
+        then = self if time > h else None
+        if t <= DONE or d <= DONE:
+            return Moved(final * h, final, then)
+        if v <= DONE and final > DONE and t > 2.0 * d / final:
+            wait = min(t - 2.0 * d / final, h)
+            if wait >= h:
+                return Moved(0.0, 0.0, self)
+            rate, left_h = final * final / (2.0 * d), h - wait
+            return Moved(rate * left_h * left_h / 2, rate * left_h, self)
+        rate = 6 * d / t**2 - (4 * v + 2 * final) / t
+        jerk = 2 * (final - v - rate * t) / t**2
+        if t <= h:
+            return Moved(d + final * (h - t), final, then)
         speed = v + rate * h + jerk * h * h / 2
         if speed < 0.0:
             way, _ = advance_along(0.0, v, -v / h, h)
             return Moved(way, 0.0, self)
         return Moved(v * h + rate * h * h / 2 + jerk * h**3 / 6, speed, self)
 
-    def _solved(self, d: float, v: float, time: float, final: float) -> tuple[float, float]:
-        """Acceleration and its rate."""
-        if self.final_speed is not None:
-            rate = 6 * d / time**2 - (4 * v + 2 * final) / time
-            return rate, 2 * (final - v - rate * time) / time**2
+    def _solved(self, d: float, v: float, time: float) -> float:
+        """Constant acceleration to arrive in time."""
         rate = 2 * (d - v * time) / time**2
         if v + rate * time < 0.0:
             # It would have to come back: it stops at its place and waits.
-            return -v * v / (2 * max(d, DONE)), 0.0
-        return rate, 0.0
+            return -v * v / (2 * max(d, DONE))
+        return rate
 
     def _limited(self, speed: float, rate: float, h: float) -> float:
         """An acceleration within the limits."""
@@ -229,13 +237,13 @@ class Synchronize:
         rate = rate if least is None else max(rate, -float(least))
         return rate if fastest is None else min(rate, max(float(fastest) - speed, 0.0) / h)
 
-    def _final(self, master: Actor, speed: float) -> float:
+    def _final(self, master: EntityState, speed: float) -> float:
         if self.final_speed is None:
             return speed
         return self.final_speed + (master.speed if self.relative else 0.0)
 
 
-def _left(actor: Actor, target: Place, view: View) -> float:
+def _left(actor: EntityState, target: Place, view: View) -> float:
     """Way that is left to a place [m]."""
     if actor.trajectory is not None:
         return actor.trajectory.ahead(target.x, target.y)
@@ -251,13 +259,13 @@ class FollowIdm:
     desired: float
     rate: float = 0.0
 
-    def step(self, actor: Actor, view: View, h: float) -> Moved:
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """``h`` seconds on; the leader is looked for once in a step of the clock."""
         rate = self._rate(actor, view) if view.first else self.rate
         way, speed = advance_along(0.0, actor.speed, rate, h)
         return Moved(way, speed, replace(self, rate=rate))
 
-    def _rate(self, actor: Actor, view: View) -> float:
+    def _rate(self, actor: EntityState, view: View) -> float:
         if actor.way is None or actor.subject is None:
             return 0.0
         length, width, _ = actor.size

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from ..evolve import evolved
-from .actor import Actor, coasting
-from .longitudinal import Moved
+from .entity_state import EntityState, Moved, coasting
 from .view import View
 
 
-def advanced(actor: Actor, view: View, h: float) -> Actor:
+def advanced(actor: EntityState, view: View, h: float) -> EntityState:
     """An entity ``h`` seconds on, moved by what its actions say; the planner's ego as it goes."""
     if not actor.scripted:
         return coasting(actor, h)
@@ -27,7 +26,7 @@ def advanced(actor: Actor, view: View, h: float) -> Actor:
     return _on_way(actor, view, moved.way, h)
 
 
-def _on_way(actor: Actor, view: View, way: float, h: float) -> Actor:
+def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState:
     control, offset, then, finished = actor.lateral, actor.offset, None, actor.finished
     if control is not None:
         offset, then = control.step(actor, view, way, h)
@@ -44,7 +43,7 @@ def _on_way(actor: Actor, view: View, way: float, h: float) -> Actor:
     ).placed()
 
 
-def _on_trajectory(actor: Actor, view: View, way: float, h: float) -> Actor:
+def _on_trajectory(actor: EntityState, view: View, way: float, h: float) -> EntityState:
     before = actor.trajectory
     assert before is not None
     way, then = before.step(way, h)
@@ -53,7 +52,7 @@ def _on_trajectory(actor: Actor, view: View, way: float, h: float) -> Actor:
         speed = way / h
         actor = evolved(actor, speed=speed, acceleration=(speed - actor.speed) / h)
     if then is not None:
-        place = then.place(actor) if then.begun() else None
+        place = then.place() if then.begun() else None
         if place is None:
             return evolved(actor, trajectory=then)
         return evolved(

@@ -17,30 +17,32 @@ from real2sim_proto.storyboard_actions import (
     RelativeWorldPosition,
     RoadPosition,
     RoutePosition,
+    TrajectoryPosition,
     WorldPosition,
 )
 
 from ..errors import WorldError
-from .actor import Actor
-from .roads import Place, RoadNetwork, RoadPoint, path_through
+from .entity_state import EntityState
+from .roads import Place, RoadNetwork, RoadPoint
+from .trajectory import course_of
 
 
 class Places:
     """Turns positions into places at one instant.
 
     Attributes:
-        actors: entities by name, as they are now.
+        entities: entities by name, as they are now.
         network: roads.
         origin: x, y [m] and heading [rad] of the map's frame in the world.
     """
 
     def __init__(
         self,
-        actors: Mapping[str, Actor],
+        entities: Mapping[str, EntityState],
         network: RoadNetwork,
         origin: tuple[float, float, float],
     ) -> None:
-        self.actors, self.network, self.origin = actors, network, origin
+        self.entities, self.network, self.origin = entities, network, origin
 
     def of(self, position: Position) -> Place:
         """The place of a position.
@@ -60,11 +62,11 @@ class Places:
         return Place(x0 + x * cos - y * sin, y0 + x * sin + y * cos, h0 + float(p.h), z)
 
     def _relative_world(self, p: RelativeWorldPosition) -> Place:
-        entity, h0 = self.actors[p.entity], self.origin[2]
+        entity, h0 = self.entities[p.entity], self.origin[2]
         return _beside(entity, h0, float(p.dx), float(p.dy), self._turned(p.orientation, entity.h))
 
     def _relative_object(self, p: RelativeObjectPosition) -> Place:
-        entity = self.actors[p.entity]
+        entity = self.entities[p.entity]
         h = self._turned(p.orientation, entity.h)
         return _beside(entity, entity.h, float(p.dx), float(p.dy), h)
 
@@ -91,8 +93,17 @@ class Places:
         return self._in_lane(here.road, lane, s, float(p.offset), p.orientation)
 
     def _route(self, p: RoutePosition) -> Place:
-        path = path_through([self.of(w) for w in p.route.waypoints])
+        path = self.network.route([self.of(w) for w in p.route.waypoints])
         x, y, _, h = path.at(float(p.s))
+        t = float(p.t)
+        here = self.network.locate(x, y, h) if p.lane is not None else None
+        if here is not None and p.lane is not None:
+            return self._in_lane(here.road, int(p.lane), here.s, t, p.orientation)
+        place = Place(x - t * math.sin(h), y + t * math.cos(h), h)
+        return place._replace(h=self._heading(p.orientation, h, h))
+
+    def _trajectory(self, p: TrajectoryPosition) -> Place:
+        x, y, h, _ = course_of(p.curve, self.of).at(float(p.s))
         t = float(p.t)
         place = Place(x - t * math.sin(h), y + t * math.cos(h), h)
         return place._replace(h=self._heading(p.orientation, h, h))
@@ -107,7 +118,7 @@ class Places:
 
     def _where(self, entity: str) -> tuple[RoadPoint, float]:
         """Where an entity is on the road; 1 where it drives in its direction, else -1."""
-        actor = self.actors[entity]
+        actor = self.entities[entity]
         here = self.network.locate(actor.x, actor.y, actor.h)
         if here is None:
             raise WorldError(
@@ -125,7 +136,7 @@ class Places:
         return base + h if orientation.relative else self.origin[2] + h
 
 
-def _beside(entity: Actor, axes: float, dx: float, dy: float, h: float) -> Place:
+def _beside(entity: EntityState, axes: float, dx: float, dy: float, h: float) -> Place:
     cos, sin = math.cos(axes), math.sin(axes)
     return Place(entity.x + dx * cos - dy * sin, entity.y + dx * sin + dy * cos, h)
 
@@ -139,4 +150,5 @@ _RESOLVE: Mapping[type[Any], Any] = {
     RelativeRoadPosition: Places._relative_road,
     RelativeLanePosition: Places._relative_lane,
     RoutePosition: Places._route,
+    TrajectoryPosition: Places._trajectory,
 }

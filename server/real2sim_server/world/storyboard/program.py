@@ -28,7 +28,7 @@ class Element:
         path: names from the story down to its own.
         spec: its model.
         children: what it is made of.
-        actors: whom its actions are of.
+        entities: whom its actions are of.
         start, stop: triggers; None: it has none.
     """
 
@@ -37,7 +37,7 @@ class Element:
     path: tuple[str, ...]
     spec: Any
     children: tuple[Element, ...]
-    actors: tuple[str, ...]
+    entities: tuple[str, ...]
     start: Start | None = None
     stop: Start | None = None
 
@@ -107,21 +107,23 @@ class _Maker:
         return self._made("act", path, act, groups, start=act.start, stop=act.stop)
 
     def _group(self, group: Any, above: tuple[str, ...]) -> Element:
-        path, actors = (*above, group.name), tuple(group.actors)
-        made = [self._maneuver(m, path, actors) for m in group.maneuvers]
-        return self._made("maneuver_group", path, group, made, actors)
+        path, entities = (*above, group.name), tuple(group.entities)
+        made = [self._maneuver(m, path, entities) for m in group.maneuvers]
+        return self._made("maneuver_group", path, group, made, entities)
 
-    def _maneuver(self, maneuver: Any, above: tuple[str, ...], actors: tuple[str, ...]) -> Element:
+    def _maneuver(
+        self, maneuver: Any, above: tuple[str, ...], entities: tuple[str, ...]
+    ) -> Element:
         path = (*above, maneuver.name)
-        events = [self._event(e, path, actors) for e in maneuver.events]
-        return self._made("maneuver", path, maneuver, events, actors)
+        events = [self._event(e, path, entities) for e in maneuver.events]
+        return self._made("maneuver", path, maneuver, events, entities)
 
-    def _event(self, event: Event, above: tuple[str, ...], actors: tuple[str, ...]) -> Element:
+    def _event(self, event: Event, above: tuple[str, ...], entities: tuple[str, ...]) -> Element:
         path = (*above, event.name)
         actions = [
-            self._made("action", (*path, a.name), a.action, (), actors) for a in event.actions
+            self._made("action", (*path, a.name), a.action, (), entities) for a in event.actions
         ]
-        return self._made("event", path, event, actions, actors, start=event.start)
+        return self._made("event", path, event, actions, entities, start=event.start)
 
     def _made(
         self,
@@ -129,13 +131,13 @@ class _Maker:
         path: tuple[str, ...],
         spec: Any,
         children: Sequence[Element],
-        actors: tuple[str, ...] = (),
+        entities: tuple[str, ...] = (),
         *,
         start: Trigger | None = None,
         stop: Trigger | None = None,
     ) -> Element:
         self._elements += 1
         return Element(
-            self._elements - 1, type_, path, spec, tuple(children), actors,
+            self._elements - 1, type_, path, spec, tuple(children), entities,
             self.start(start), self.start(stop),
         )  # fmt: skip

@@ -17,9 +17,9 @@ from real2sim_proto.storyboard_actions import (
 from ..errors import WorldError
 from ..evolve import evolved
 from ..traffic.driver import Surroundings
-from .actor import Actor
 from .begin_actions import Beginning, begun
 from .conditions import Facts, Memory, fires
+from .entity_state import EntityState
 from .motion import advanced
 from .positions import Places
 from .program import Element, Program, Start
@@ -87,7 +87,7 @@ class Progress:
 
     Args:
         program: what runs.
-        actors, memories: before the step.
+        entities, memories: before the step.
         network: roads.
         surroundings: of the step.
     """
@@ -95,13 +95,13 @@ class Progress:
     def __init__(
         self,
         program: Program,
-        actors: Mapping[str, Actor],
+        entities: Mapping[str, EntityState],
         memories: Memories,
         network: RoadNetwork,
         surroundings: Surroundings,
     ) -> None:
         self._program, self._network, self._surroundings = program, network, surroundings
-        self.actors = dict(actors)
+        self.entities = dict(entities)
         self._status, self._times = list(memories.status), list(memories.times)
         self._running = {k: dict(v) for k, v in memories.running.items()}
         self._conditions = dict(memories.conditions)
@@ -148,7 +148,7 @@ class Progress:
     def move(self, elapsed: float, h: float, *, first: bool) -> None:
         """Move all entities on by ``h`` seconds, each by where the others are now."""
         view = self._view(elapsed, first=first)
-        self.actors = {name: advanced(a, view, h) for name, a in self.actors.items()}
+        self.entities = {name: advanced(a, view, h) for name, a in self.entities.items()}
 
     # --- elements -------------------------------------------------------------------------------
 
@@ -216,7 +216,7 @@ class Progress:
         if isinstance(action.spec, GLOBAL):
             self._global(action.spec, self._now, self._elapsed)
             return
-        for name in action.actors:
+        for name in action.entities:
             tokens[name] = self._token
             self._begin_private(name, action.spec, self._elapsed, where=action.label)
 
@@ -231,7 +231,7 @@ class Progress:
             for action in each.children:
                 if self._status[action.number] == RUNNING and not self._moves(action):
                     ended = all(
-                        token in self.actors[name].finished
+                        token in self.entities[name].finished
                         for name, token in self._running[action.number].items()
                     )
                     self._change(action, COMPLETE, "end" if ended else "stop")
@@ -241,7 +241,7 @@ class Progress:
 
     def _moves(self, action: Element) -> bool:
         tokens = self._running.get(action.number, {})
-        return any(token in self.actors[name].tokens() for name, token in tokens.items())
+        return any(token in self.entities[name].tokens() for name, token in tokens.items())
 
     def _complete_group(self, group: Element) -> None:
         if self._status[group.number] != RUNNING or any(
@@ -268,7 +268,7 @@ class Progress:
         for each in element.within():
             tokens = set(self._running.pop(each.number, {}).values())
             if tokens:
-                self.actors = {k: _without(a, tokens) for k, a in self.actors.items()}
+                self.entities = {k: _without(a, tokens) for k, a in self.entities.items()}
             if self._status[each.number] != COMPLETE:
                 if self._status[each.number] == RUNNING:
                     self._fresh.add((each.number, "stop_transition"))
@@ -290,7 +290,7 @@ class Progress:
     def _begin_private(
         self, name: str, action: Any, elapsed: float, *, first: bool = False, where: str = "init"
     ) -> None:
-        actor = self.actors[name]
+        actor = self.entities[name]
         if not actor.scripted and not first:
             raise WorldError(
                 ErrorCode.INVALID_REQUEST,
@@ -300,16 +300,16 @@ class Progress:
         view = self._view(elapsed, first=True)
         at = Beginning(view, self._places(), self._token)
         self._token += 1
-        self.actors[name] = begun(actor, action, at)
+        self.entities[name] = begun(actor, action, at)
 
     def _global(self, action: Any, t_us: int, elapsed: float) -> None:
         if isinstance(action, AddEntityAction):
-            actor = self.actors[action.entity].put(
+            actor = self.entities[action.entity].put(
                 self._places().of(action.position), self._network
             )
-            self.actors[action.entity] = evolved(actor, visible=True)
+            self.entities[action.entity] = evolved(actor, visible=True)
         elif isinstance(action, DeleteEntityAction):
-            self.actors[action.entity] = evolved(self.actors[action.entity], visible=False)
+            self.entities[action.entity] = evolved(self.entities[action.entity], visible=False)
         elif isinstance(action, SignalStateAction):
             self._states[action.signal] = action.state
         elif isinstance(action, SignalPhaseAction):
@@ -350,13 +350,13 @@ class Progress:
         return any((e.number, state) in self._before for e in elements)
 
     def _view(self, elapsed: float, *, first: bool) -> View:
-        return View(elapsed, first, self.actors, self._network, self._surroundings)
+        return View(elapsed, first, self.entities, self._network, self._surroundings)
 
     def _places(self) -> Places:
-        return Places(self.actors, self._network, self._program.board.origin)
+        return Places(self.entities, self._network, self._program.board.origin)
 
 
-def _without(actor: Actor, tokens: set[int]) -> Actor:
+def _without(actor: EntityState, tokens: set[int]) -> EntityState:
     """An entity that actions move no more; it keeps its speed."""
     changes: dict[str, Any] = {}
     if actor.longitudinal is not None and actor.longitudinal.token in tokens:

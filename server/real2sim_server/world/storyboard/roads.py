@@ -146,7 +146,7 @@ class RouteNetwork:
         return known
 
     def neighbour(self, road: str, lane: int, s: float, lanes: int) -> int:  # noqa: D102
-        found = _skipping_zero(lane, lanes)
+        found = skipping_zero(lane, lanes)
         self.middle(road, found, s)
         return found
 
@@ -154,8 +154,8 @@ class RouteNetwork:
         return path_through(places)
 
 
-def _skipping_zero(lane: int, lanes: int) -> int:
-    """There is no lane 0."""
+def skipping_zero(lane: int, lanes: int) -> int:
+    """Id of the lane so many in the direction of +t; there is no lane 0."""
     found = lane + lanes
     crossed = (lane < 0) != (found < 0) or found == 0
     return found + (1 if lanes > 0 else -1) if crossed and lanes else found

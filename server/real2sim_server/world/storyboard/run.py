@@ -17,10 +17,10 @@ from ..errors import WorldError
 from ..evolve import evolved
 from ..traffic.driver import Surroundings
 from ..traffic.replay import recorded_pose
-from .actor import Actor, observed
+from ..traffic.scripted import ScriptedEntity
 from .draw import drawn_values
-from .driver import ScriptedEntity
 from .entities import box_of
+from .entity_state import EntityState, observed
 from .positions import Places
 from .program import Program, program_of
 from .progress import COMPLETE, ElementChange, Memories, Progress
@@ -39,7 +39,7 @@ class StoryboardRun:
     Attributes:
         program: what runs.
         network: roads.
-        actors: entities by name.
+        entities: entities by name.
         memories: elements, conditions, variables.
         drivers: of the objects that it moves, by object id.
         changes: of elements, in the step that led here.
@@ -51,7 +51,7 @@ class StoryboardRun:
 
     program: Program
     network: RoadNetwork
-    actors: Mapping[str, Actor]
+    entities: Mapping[str, EntityState]
     memories: Memories
     drivers: Mapping[str, ScriptedEntity]
     changes: tuple[ElementChange, ...]
@@ -90,7 +90,7 @@ class StoryboardRun:
             lanes = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
             network = RouteNetwork.of(lanes, surroundings.route)
         program = program_of(board)
-        actors = {
+        entities = {
             e.name: _first(
                 e,
                 subjects.get(e.name),
@@ -101,7 +101,7 @@ class StoryboardRun:
             )
             for e in board.entities
         }
-        progress = Progress(program, actors, _nothing_yet(program), network, surroundings)
+        progress = Progress(program, entities, _nothing_yet(program), network, surroundings)
         progress.initialise(surroundings.t_us, 0.0)
         ego = next((e.name for e in board.entities if e.kind == "ego"), None)
         put = any(
@@ -109,7 +109,7 @@ class StoryboardRun:
             for entry in board.init
         )
         run = cls(
-            program, network, MappingProxyType(progress.actors), progress.memories,
+            program, network, MappingProxyType(progress.entities), progress.memories,
             MappingProxyType({}), (), put, ego, 0.0, drawn,
         )  # fmt: skip
         return run._with_drivers(surroundings)
@@ -117,11 +117,11 @@ class StoryboardRun:
     def advance(self, surroundings: Surroundings) -> StoryboardRun:
         """One step later. Elements begin and end every 10 ms, at which the planner's ego is taken
         to go straight on as it does at the start of the step."""
-        actors = dict(self.actors)
-        if self.ego is not None and not actors[self.ego].scripted:
+        entities = dict(self.entities)
+        if self.ego is not None and not entities[self.ego].scripted:
             dt = surroundings.dt if self.elapsed > 0.0 else 0.0
-            actors[self.ego] = observed(actors[self.ego], surroundings.ego, dt)
-        progress = Progress(self.program, actors, self.memories, self.network, surroundings)
+            entities[self.ego] = observed(entities[self.ego], surroundings.ego, dt)
+        progress = Progress(self.program, entities, self.memories, self.network, surroundings)
         count = math.ceil(surroundings.dt_us / TICK_US)
         start_us, now_us = surroundings.start_us, surroundings.t_us
         for k in range(count):
@@ -132,7 +132,7 @@ class StoryboardRun:
             progress.move(elapsed, (next_us - t_us) * 1e-6, first=k == 0)
         moved = evolved(
             self,
-            actors=MappingProxyType(progress.actors),
+            entities=MappingProxyType(progress.entities),
             memories=progress.memories,
             changes=tuple(progress.changes),
             elapsed=(now_us + surroundings.dt_us - start_us) * 1e-6,
@@ -156,7 +156,7 @@ class StoryboardRun:
     def ego_motion(self, before: Motion) -> Motion:
         """The ego as the storyboard has it; ``before``: a step ago."""
         assert self.ego is not None
-        actor = self.actors[self.ego]
+        actor = self.entities[self.ego]
         turned = math.remainder(actor.h - before.yaw, math.tau)
         return Motion(actor.x, actor.y, before.yaw + turned, actor.speed, actor.acceleration)
 
@@ -168,7 +168,7 @@ class StoryboardRun:
         states, _ = shown_at(
             board, self.elapsed, self.memories.signal_starts, self.memories.signal_states
         )
-        places = Places(self.actors, self.network, board.origin)
+        places = Places(self.entities, self.network, board.origin)
         lines = {h.signal_id: h.stop_line for h in board.signals}
         return tuple(
             ShownSignal(name, state, places.of(line)[:3] if (line := lines.get(name)) else None)
@@ -178,7 +178,7 @@ class StoryboardRun:
     def _with_drivers(self, surroundings: Surroundings) -> StoryboardRun:
         drivers = {
             a.subject.object_id: ScriptedEntity(a.subject, a.pose(surroundings.ground), a.visible)
-            for a in self.actors.values()
+            for a in self.entities.values()
             if a.subject is not None
         }
         return evolved(self, drivers=MappingProxyType(drivers))
@@ -203,12 +203,12 @@ def _first(
     network: RoadNetwork,
     board: Storyboard,
     ego_size: tuple[float, float, float],
-) -> Actor:
+) -> EntityState:
     """An entity before the storyboard has put it anywhere: the ego and objects of the scene where
     they were recorded, others not in the world."""
     size, centre = box_of(entity, subject, ego_size)
     scripted = entity.kind != "ego" or board.drives_ego
-    actor = Actor(
+    actor = EntityState(
         entity.name, entity.category, subject, size, centre, 0.0, 0.0, 0.0,
         scripted=scripted, visible=entity.kind == "ego",
     )  # fmt: skip
@@ -216,7 +216,7 @@ def _first(
         return observed(actor, surroundings.ego, 0.0).on_lane(network)
     if entity.kind == "new":
         placed = any(e.entity == entity.name and e.action.kind in _PLACING for e in board.init)
-        there = Actor.put(actor, Place(0.0, 0.0, 0.0), network)
+        there = EntityState.put(actor, Place(0.0, 0.0, 0.0), network)
         return evolved(there, visible=placed)
     assert subject is not None
     track = subject.trajectory

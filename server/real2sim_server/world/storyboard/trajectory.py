@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.storyboard_actions import Clothoid, Curve, Nurbs, Polyline, Timing
+from real2sim_proto.storyboard_actions import (
+    Clothoid,
+    ClothoidPiece,
+    ClothoidSpline,
+    Curve,
+    Nurbs,
+    Polyline,
+    Timing,
+    WorldPosition,
+)
 
 from ..errors import WorldError
 from ..path import Float
 from .roads import Place
-
-if TYPE_CHECKING:
-    from .actor import Actor
 
 SAMPLE = 0.1
 """Way between samples of clothoids and NURBS [m]; chords of theirs are off by 0.1 mm at curvatures
@@ -27,7 +33,7 @@ MAX_SAMPLES = 100_000
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class SampledCurve:
     """A curve as places along it.
 
     Attributes:
@@ -86,7 +92,7 @@ class Trajectory:
     """
 
     token: int
-    course: Course
+    course: SampledCurve
     timing: Timing | None
     s: float
     elapsed: float
@@ -116,13 +122,12 @@ class Trajectory:
         time = self.elapsed * float(self.timing.scale) + float(self.timing.offset)
         return bool(time >= self.course.times[0] - 1e-9)
 
-    def place(self, actor: Actor) -> Place:
-        """Where the entity is; before its first time where it was."""
-        del actor
+    def place(self) -> Place:
+        """Where the entity is."""
         return self.course.at(self.s)
 
 
-def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> Course:
+def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> SampledCurve:
     """The course of a curve, whose positions ``resolve`` turns into places.
 
     Raises:
@@ -132,6 +137,8 @@ def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> Course:
         course = _polyline(curve, resolve)
     elif isinstance(curve, Clothoid):
         course = _clothoid(curve, resolve(curve.position))
+    elif isinstance(curve, ClothoidSpline):
+        course = _spline(curve.pieces, resolve(curve.position))
     else:
         course = _nurbs(curve, [resolve(p.position) for p in curve.points])
     if course.length <= 0.0 and course.times is None:
@@ -143,7 +150,7 @@ def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> Course:
     return course
 
 
-def _polyline(curve: Polyline, resolve: Callable[[Any], Place]) -> Course:
+def _polyline(curve: Polyline, resolve: Callable[[Any], Place]) -> SampledCurve:
     places = [resolve(v.position) for v in curve.vertices]
     x, y = np.array([p.x for p in places]), np.array([p.y for p in places])
     times = np.array([float(v.time) for v in curve.vertices])
@@ -164,10 +171,10 @@ def _polyline(curve: Polyline, resolve: Callable[[Any], Place]) -> Course:
             heading = math.atan2(y[k + 1] - y[k], x[k + 1] - x[k])
         h[k] = heading
     h[-1] = heading
-    return Course(np.concatenate([[0.0], np.cumsum(steps)]), x, y, h, times, turns=False)
+    return SampledCurve(np.concatenate([[0.0], np.cumsum(steps)]), x, y, h, times, turns=False)
 
 
-def _clothoid(curve: Clothoid, start: Place) -> Course:
+def _clothoid(curve: Clothoid, start: Place) -> SampledCurve:
     length = float(curve.length)
     count = min(max(math.ceil(length / SAMPLE), 1), MAX_SAMPLES)
     s = np.linspace(0.0, length, count + 1)
@@ -187,10 +194,41 @@ def _clothoid(curve: Clothoid, start: Place) -> Course:
     times = None
     if curve.start_time is not None and curve.stop_time is not None:
         times = np.linspace(float(curve.start_time), float(curve.stop_time), count + 1)
-    return Course(s, x, y, heading(s), times, turns=True)
+    return SampledCurve(s, x, y, heading(s), times, turns=True)
 
 
-def _nurbs(curve: Nurbs, places: list[Place]) -> Course:
+def _spline(pieces: Sequence[ClothoidPiece], start: Place) -> SampledCurve:
+    parts, time = list[SampledCurve](), 0.0
+    timed = all(piece.end_time is not None for piece in pieces)
+    for piece in pieces:
+        length = float(piece.length)
+        rate = (float(piece.end) - float(piece.start)) / length
+        end = float(piece.end_time) if timed and piece.end_time is not None else 0.0
+        made = Clothoid(
+            position=WorldPosition(x=0.0, y=0.0),
+            curvature=piece.start,
+            curvature_rate=rate,
+            length=length,
+            start_time=time if timed else None,
+            stop_time=end if timed else None,
+        )
+        parts.append(_clothoid(made, start))
+        start, time = parts[-1].at(length), end
+    shifts = np.concatenate([[0.0], np.cumsum([part.length for part in parts])])
+    first, rest = parts[0], parts[1:]
+
+    def joined(name: str) -> Float:
+        found: Float = np.concatenate([getattr(first, name), *(getattr(r, name)[1:] for r in rest)])
+        return found
+
+    s = np.concatenate(
+        [first.s, *(r.s[1:] + shift for r, shift in zip(rest, shifts[1:], strict=False))]
+    )
+    times = joined("times") if timed else None
+    return SampledCurve(s, joined("x"), joined("y"), joined("h"), times, turns=True)
+
+
+def _nurbs(curve: Nurbs, places: list[Place]) -> SampledCurve:
     degree = curve.order - 1
     knots = np.array([float(k) for k in curve.knots])
     if (np.diff(knots) < 0).any():
@@ -210,7 +248,7 @@ def _nurbs(curve: Nurbs, places: list[Place]) -> Course:
     s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     h = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
     times = np.maximum.accumulate(found[:, 3] / found[:, 2]) if timed else None
-    return Course(s, x, y, h, times, turns=True)
+    return SampledCurve(s, x, y, h, times, turns=True)
 
 
 def _de_boor(knots: Float, points: Float, degree: int, u: float) -> Float:

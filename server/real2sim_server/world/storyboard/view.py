@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from real2sim_proto.storyboard_conditions import Frame, Measure
 
 from ..traffic.driver import Surroundings
-from .actor import Actor
+from .entity_state import EntityState
 from .roads import Place, RoadNetwork
 
 BESIDE = 8.0
@@ -25,19 +25,19 @@ class View:
     Attributes:
         elapsed: time since the episode began [s].
         first: whether it is the first of its step, whose surroundings are exact.
-        actors: entities by name.
+        entities: entities by name.
         network: roads.
         surroundings: of the step.
     """
 
     elapsed: float
     first: bool
-    actors: Mapping[str, Actor]
+    entities: Mapping[str, EntityState]
     network: RoadNetwork
     surroundings: Surroundings
 
 
-def ahead_on_way(actor: Actor, x: float, y: float, network: RoadNetwork) -> float:
+def ahead_on_way(actor: EntityState, x: float, y: float, network: RoadNetwork) -> float:
     """How far ahead a place is along the way of an entity; straight on where it is not beside it
     [m]."""
     way = actor.way if actor.trajectory is None else None
@@ -64,7 +64,9 @@ def across(h: float, dx: float, dy: float) -> float:
     return dy * math.cos(h) - dx * math.sin(h)
 
 
-def offsets(actor: Actor, place: Place, frame: Frame, network: RoadNetwork) -> tuple[float, float]:
+def offsets(
+    actor: EntityState, place: Place, frame: Frame, network: RoadNetwork
+) -> tuple[float, float]:
     """A place from an entity: ahead and to the left [m], in its own frame, or in its lane's."""
     dx, dy = place.x - actor.x, place.y - actor.y
     if frame == "entity":
@@ -78,8 +80,8 @@ def offsets(actor: Actor, place: Place, frame: Frame, network: RoadNetwork) -> t
 
 
 def distance_to(
-    actor: Actor, other: Actor | Place, measure: Measure, frame: Frame, *, freespace: bool,
-    network: RoadNetwork,
+    actor: EntityState, other: EntityState | Place, measure: Measure, frame: Frame, *,
+    freespace: bool, network: RoadNetwork,
 ) -> float:  # fmt: skip
     """Distance of an entity from another, or from a place [m], never negative."""
     if measure == "euclidean":
@@ -105,10 +107,10 @@ def distance_to(
     return max(own[0] - others[1], others[0] - own[1], 0.0)
 
 
-def closing_speed(actor: Actor, other: Actor | Place, measure: Measure) -> float:
+def closing_speed(actor: EntityState, other: EntityState | Place, measure: Measure) -> float:
     """Speed at which the distance shrinks [m/s]."""
     vx, vy = actor.velocity
-    ox, oy = other.velocity if isinstance(other, Actor) else (0.0, 0.0)
+    ox, oy = other.velocity if isinstance(other, EntityState) else (0.0, 0.0)
     dx, dy = other.x - actor.x, other.y - actor.y
     if measure == "euclidean":
         distance = math.hypot(dx, dy)
@@ -117,7 +119,7 @@ def closing_speed(actor: Actor, other: Actor | Place, measure: Measure) -> float
     return pick(actor.h, vx - ox, vy - oy) * math.copysign(1.0, pick(actor.h, dx, dy))
 
 
-def corners(actor: Actor) -> list[tuple[float, float]]:
+def corners(actor: EntityState) -> list[tuple[float, float]]:
     """Of its box seen from above, in turn [m]."""
     x, y = actor.middle
     return box_corners_of(x, y, actor.h, actor.size[0], actor.size[1])
@@ -156,8 +158,8 @@ def overlapping(a: list[tuple[float, float]], b: list[tuple[float, float]]) -> b
     return True
 
 
-def _outline(other: Actor | Place) -> list[tuple[float, float]]:
-    return corners(other) if isinstance(other, Actor) else [(other.x, other.y)]
+def _outline(other: EntityState | Place) -> list[tuple[float, float]]:
+    return corners(other) if isinstance(other, EntityState) else [(other.x, other.y)]
 
 
 def _extent(outline: list[tuple[float, float]], h: float, number: int) -> tuple[float, float]:

@@ -20,14 +20,13 @@ from ..agents import Agents, rows_of
 from ..errors import WorldError
 from ..evolve import evolved
 from ..path import Float
-from ..storyboard.driver import ScriptedEntity
-from ..storyboard.run import StoryboardRun
 from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import AgentDriver, Surroundings
 from .drivers import begin_driver
 from .external import External
 from .idm import Idm
 from .replay import ConstantVelocity, Replay
+from .scripted import Script, ScriptedEntity
 from .spawner import PREFIX as SPAWNED
 from .spawner import Spawner
 
@@ -76,7 +75,7 @@ class Traffic:
     randomized: RandomizedDrivers | None = None
     drawn: Mapping[str, float] = field(default_factory=lambda: NOTHING_DRAWN)
     edits_drive: bool = False
-    storyboard: StoryboardRun | None = None
+    storyboard: Script | None = None
 
     @classmethod
     def begin(
@@ -87,7 +86,7 @@ class Traffic:
         *,
         spawner: Spawner | None = None,
         randomized: RandomizedDrivers | None = None,
-        storyboard: StoryboardRun | None = None,
+        storyboard: Script | None = None,
     ) -> Traffic:
         """Objects at the start of an episode.
 

@@ -36,7 +36,7 @@ def board(*events: Any, init: Any = (), car: Any = None, **options: Any) -> dict
         *init,
     ]
     group = {
-        "name": "group", "actors": ["car"], "maneuvers": [{"name": "m", "events": list(events)}],
+        "name": "group", "entities": ["car"], "maneuvers": [{"name": "m", "events": list(events)}],
     }  # fmt: skip
     stories = [{"name": "story", "acts": [{"name": "act", "groups": [group]}]}] if events else []
     box = {"size": (4.6, 1.85, 1.5), "centre": (0.0, 0.0, 0.75)}
@@ -58,7 +58,7 @@ def drive(world: Any, steps: int) -> list[Any]:
 
 
 def actor(world: Any, name: str = "car") -> Any:
-    return world.traffic.storyboard.actors[name]
+    return world.storyboard.entities[name]
 
 
 def speeds(worlds: list[Any], name: str = "car") -> np.ndarray:

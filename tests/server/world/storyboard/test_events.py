@@ -214,7 +214,7 @@ def test_distributions_are_drawn_by_the_seed(make_scene, moving):
 
 def test_actions_of_an_ego_that_the_planner_drives_are_refused(run):
     made = board(event("slow", to_speed(4.0), start=after(1.0)))
-    made["stories"][0]["acts"][0]["groups"][0]["actors"] = ["Ego"]
+    made["stories"][0]["acts"][0]["groups"][0]["entities"] = ["Ego"]
 
     with pytest.raises(WorldError, match="which the planner drives"):
         run(stories=made["stories"])
@@ -222,7 +222,7 @@ def test_actions_of_an_ego_that_the_planner_drives_are_refused(run):
 
 def test_a_storyboard_may_drive_the_ego(run):
     made = board(event("slow", to_speed(4.0, 2.0), start=after(1.0)))
-    made["stories"][0]["acts"][0]["groups"][0]["actors"] = ["Ego"]
+    made["stories"][0]["acts"][0]["groups"][0]["entities"] = ["Ego"]
     worlds = run(stories=made["stories"], drives_ego=True, init=[("Ego", to_speed(8.0, 0.0))])
 
     assert worlds[0].motion.speed == pytest.approx(8.0)

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple, Protocol
 
 from ...edit import ObjectState
 from ...scene import Ground
 from ..evolve import evolved
 from ..traffic.driver import AgentPose, ObservedEgo, level_quaternion
 from .roads import Place, RoadNetwork, Way, straight
-
-if TYPE_CHECKING:
-    from .lateral import Lateral
-    from .longitudinal import Longitudinal
-    from .trajectory import Trajectory
+from .trajectory import Trajectory
 
 ACROSS = math.radians(45.0)
 """Who heads further away than this from either direction of its lane goes straight on instead."""
@@ -24,8 +20,43 @@ SLOW = 0.5
 """Below this speed a drift sideways does not turn it [m/s]."""
 
 
+class Moved(NamedTuple):
+    """Way made [m], speed at the end [m/s], and what goes on changing it; None: done."""
+
+    way: float
+    speed: float
+    then: Longitudinal | None
+
+
+class Longitudinal(Protocol):
+    """Changes a speed. Immutable; ``token`` is of the action that it belongs to."""
+
+    @property
+    def token(self) -> int: ...  # noqa: D102
+
+    def step(self, actor: EntityState, view: Any, h: float) -> Moved:
+        """``h`` seconds on."""
+
+
+class Shifted(NamedTuple):
+    """Offset from the way [m], and what goes on changing it; None: done."""
+
+    offset: float
+    then: Lateral | None
+
+
+class Lateral(Protocol):
+    """Changes an offset. Immutable; ``token`` is of the action that it belongs to."""
+
+    @property
+    def token(self) -> int: ...  # noqa: D102
+
+    def step(self, actor: EntityState, view: Any, way: float, h: float) -> Shifted:
+        """``h`` seconds and ``way`` metres on."""
+
+
 @dataclass(frozen=True, eq=False)
-class Actor:
+class EntityState:
     """An entity at one instant. Immutable.
 
     Attributes:
@@ -93,13 +124,13 @@ class Actor:
         moving = (self.longitudinal, self.lateral, self.trajectory)
         return {m.token for m in moving if m is not None}
 
-    def put(self, place: Place, network: RoadNetwork) -> Actor:
+    def put(self, place: Place, network: RoadNetwork) -> EntityState:
         """At a place, on the lane that is there or going straight on; its speed is left as it
         is."""
         put = evolved(self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None)
         return put.on_lane(network)
 
-    def on_lane(self, network: RoadNetwork) -> Actor:
+    def on_lane(self, network: RoadNetwork) -> EntityState:
         """On the lane that is where it is, if it heads along it; else straight on."""
         found = network.locate(self.x, self.y, self.h)
         turn = math.remainder(self.h - found.h, math.tau) if found is not None else 0.0
@@ -110,7 +141,7 @@ class Actor:
             way = network.way(found.road, found.lane, found.s, along=along)
         return self.on_way(way)
 
-    def on_way(self, way: Way) -> Actor:
+    def on_way(self, way: Way) -> EntityState:
         """On another way, as far beside it as it is."""
         near = way.path.nearest(self.x, self.y)
         s, offset = near.s, near.offset
@@ -120,7 +151,7 @@ class Actor:
             s += dx * math.cos(near.yaw) + dy * math.sin(near.yaw)
         return evolved(self, way=way, s=s, offset=offset)
 
-    def placed(self) -> Actor:
+    def placed(self) -> EntityState:
         """Where its way, s and offset say, turned by its drift."""
         assert self.way is not None
         x, y, _, yaw = self.way.path.at(self.s)
@@ -142,7 +173,7 @@ class Actor:
         )  # fmt: skip
 
 
-def observed(actor: Actor, ego: ObservedEgo, dt: float) -> Actor:
+def observed(actor: EntityState, ego: ObservedEgo, dt: float) -> EntityState:
     """The ego as the planner has moved it in the step of ``dt`` seconds that led here; ``actor``
     is as it was taken to be."""
     ahead = ego.front - ego.length / 2
@@ -151,7 +182,7 @@ def observed(actor: Actor, ego: ObservedEgo, dt: float) -> Actor:
     return evolved(actor, x=x, y=y, h=ego.yaw, speed=ego.speed, acceleration=rate, way=None)
 
 
-def coasting(actor: Actor, h: float) -> Actor:
+def coasting(actor: EntityState, h: float) -> EntityState:
     """The ego ``h`` seconds on, as it goes now."""
     way = actor.speed * h
     return evolved(
