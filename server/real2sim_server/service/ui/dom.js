@@ -16,7 +16,8 @@ export function el(tag, given = {}, ...children) {
 export const row = (label, inputs) =>
   el("div", { class: "row" }, el("label", { textContent: label }), ...inputs);
 
-// A number field; `change` gets the number, or null where it was emptied.
+// A number field; `change` gets the number, or null where it was emptied. What is being typed and
+// not yet entered is marked, so that nobody writes over it.
 export function number(id, value, change, { min, max, placeholder = "", class: kind = "" } = {}) {
   const input = el("input", {
     id,
@@ -31,7 +32,11 @@ export function number(id, value, change, { min, max, placeholder = "", class: k
     input.max = max;
   }
   input.setAttribute("aria-label", id);
-  input.onchange = () => change(input.value === "" ? null : Number(input.value));
+  input.oninput = () => (input.dataset.typing = "yes");
+  input.onchange = () => {
+    delete input.dataset.typing;
+    change(input.value === "" ? null : Number(input.value));
+  };
   return input;
 }
 export const tidy = (v, digits = 3) =>

@@ -49,7 +49,7 @@ export function poseOf(subject) {
   if (model.job && run) {
     return poseAt({ times_us: model.playback.times_us, ...run }, model.t);
   }
-  const pose = poseAt(subject.trajectory, model.t);
+  const pose = scenarioPoseOf(subject);
   const draft = model.draft;
   if (draft?.id !== subject.object_id) {
     return pose;
@@ -60,6 +60,8 @@ export function poseOf(subject) {
     quaternion: multiply(aboutZ(draft.angle), pose.quaternion),
   };
 }
+
+export const scenarioPoseOf = (subject) => poseAt(subject.trajectory, model.t);
 
 export function draftOperations() {
   const draft = model.draft;
@@ -100,12 +102,24 @@ export function timeRange() {
   return undefined;
 }
 
+// Operations, or a function that makes them when their turn has come, of what is there then.
 export async function edit(operations) {
   stopRun();
-  return change("/operations", { operations });
+  const made = typeof operations === "function" ? operations : () => operations;
+  return inTurn(() => {
+    const list = made();
+    return list.length ? change("/operations", { operations: list }) : null;
+  });
 }
-export const undo = () => change("/undo");
-export const redo = () => change("/redo");
+export const undo = () => inTurn(() => change("/undo"));
+export const redo = () => inTurn(() => change("/redo"));
+
+// Changes of this page follow one another, so that each knows the revision that the last has made.
+let turn = Promise.resolve();
+function inTurn(make) {
+  turn = turn.then(make, make);
+  return turn;
+}
 
 async function change(rest, body) {
   try {

@@ -1,5 +1,15 @@
 // The property panel: shows the selected object, turns each changed field into one operation.
-import { model, on, object, poseOf, edit, select, emit, timeRange } from "./model.js";
+import {
+  model,
+  on,
+  object,
+  poseOf,
+  scenarioPoseOf,
+  edit,
+  select,
+  emit,
+  timeRange,
+} from "./model.js";
 import { yawOf, present } from "./poses.js";
 import { el, number, row, tidy } from "./dom.js";
 import { refreshBox, scenePanel } from "./scene_panel.js";
@@ -8,15 +18,22 @@ const MATERIALS = ["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"];
 const page = () => document.getElementById("properties");
 
 export function startProperties() {
-  on("scenario selection run", draw);
-  on("time draft", refreshPose);
+  on("selection", draw);
+  on("scenario", () => (object(drawn) ? refreshFields() : draw()));
+  on("run time draft", refreshFields);
   on("box", refreshBox);
   draw();
 }
+// A panel stays while its object does, so that whoever is typing or tabbing through it can go on.
+let drawn = null;
 function draw() {
-  const subject = object(model.selected);
-  page().replaceChildren(...(subject ? panel(subject) : list()));
-  refreshPose();
+  drawn = model.selected;
+  const focused = page().contains(document.activeElement) ? document.activeElement.id : "";
+  page().replaceChildren(...(object(drawn) ? panel(drawn) : list()));
+  refreshFields();
+  if (focused) {
+    document.getElementById(focused)?.focus();
+  }
 }
 function list() {
   const rows = model.scenario.objects.map((o) =>
@@ -33,33 +50,33 @@ function list() {
     ...scenePanel(),
   ];
 }
-function panel(o) {
-  const id = o.object_id;
-  const physics = o.physics ?? {};
+function panel(id) {
+  const o = object(id);
   const setPhysics = (name, value) =>
-    edit([
-      {
-        op: "set_physics",
-        object_id: id,
-        mass: physics.mass,
-        material: physics.material,
-        friction: physics.friction,
-        restitution: physics.restitution,
-        [name]: value,
-      },
-    ]);
+    edit(() => {
+      const physics = object(id).physics ?? {};
+      return [
+        {
+          op: "set_physics",
+          object_id: id,
+          mass: physics.mass,
+          material: physics.material,
+          friction: physics.friction,
+          restitution: physics.restitution,
+          [name]: value,
+        },
+      ];
+    });
   const material = el(
     "select",
     { id: "material", onchange: (e) => setPhysics("material", e.target.value || null) },
     el("option", { value: "", textContent: "by category" }),
-    ...MATERIALS.map((m) =>
-      el("option", { value: m, textContent: m, selected: m === physics.material }),
-    ),
+    ...MATERIALS.map((m) => el("option", { value: m, textContent: m })),
   );
   material.className = "wide";
   const optional = (name, label, top) =>
     row(label, [
-      number(`p-${name}`, physics[name], (v) => setPhysics(name, v), {
+      number(`p-${name}`, null, (v) => setPhysics(name, v), {
         min: 0,
         max: top,
         placeholder: "default",
@@ -87,38 +104,13 @@ function panel(o) {
       row(
         "x y z [m]",
         ["x", "y", "z"].map((axis, k) =>
-          number(
-            `pose-${axis}`,
-            0,
-            (v) =>
-              v !== null &&
-              edit([
-                {
-                  op: "translate",
-                  object_id: id,
-                  [axis]: v - poseOf(object(id)).position[k],
-                  time_range: timeRange(),
-                },
-              ]),
-          ),
+          number(`pose-${axis}`, 0, (v) => v !== null && moveTo(id, axis, k, v)),
         ),
       ),
       row("heading [°]", [
-        number(
-          "heading",
-          0,
-          (v) =>
-            v !== null &&
-            edit([
-              {
-                op: "rotate",
-                object_id: id,
-                angle: (v * Math.PI) / 180 - yawOf(poseOf(object(id)).quaternion),
-                time_range: timeRange(),
-              },
-            ]),
-          { class: "wide" },
-        ),
+        number("heading", 0, (v) => v !== null && turnTo(id, (v * Math.PI) / 180), {
+          class: "wide",
+        }),
       ]),
       row("holds", [when()]),
     ),
@@ -126,21 +118,15 @@ function panel(o) {
       "fieldset",
       {},
       el("legend", { textContent: "Timing" }),
-      row("later by [s]", [
-        number(
-          "delay",
-          0,
-          (v) => v && edit([{ op: "retime", object_id: id, delay_us: Math.round(v * 1e6) }]),
-          { class: "wide" },
-        ),
+      row("begins at [s]", [
+        number("begins", 0, (v) => v !== null && beginAt(id, v), { class: "wide" }),
       ]),
-      row("speed [×]", [
-        number(
-          "retime-speed",
-          1,
-          (v) => v > 0 && v !== 1 && edit([{ op: "retime", object_id: id, speed: v }]),
-          { class: "wide", min: 0.01, max: 100 },
-        ),
+      row("speed [× recorded]", [
+        number("retime-speed", 1, (v) => v > 0 && driveAt(id, v), {
+          class: "wide",
+          min: 0.01,
+          max: 100,
+        }),
       ]),
     ),
     el(
@@ -153,7 +139,8 @@ function panel(o) {
           number(
             `size-${axis}`,
             o.size[k],
-            (v) => v > 0 && edit([{ op: "scale", object_id: id, [axis]: v / o.size[k] }]),
+            (v) =>
+              v > 0 && edit(() => [{ op: "scale", object_id: id, [axis]: v / object(id).size[k] }]),
           ),
         ),
       ),
@@ -171,10 +158,42 @@ function panel(o) {
       "fieldset",
       {},
       el("legend", { textContent: "Velocity on entering the physics" }),
-      velocity(o),
+      velocity(id),
     ),
   ];
 }
+// What is typed is where the scenario's object will be, also while a run shows it elsewhere.
+function moveTo(id, axis, k, value) {
+  const time_range = timeRange();
+  return edit(() => {
+    const here = scenarioPoseOf(object(id)).position[k];
+    return [{ op: "translate", object_id: id, [axis]: value - here, time_range }];
+  });
+}
+function turnTo(id, yaw) {
+  const time_range = timeRange();
+  return edit(() => {
+    const angle = yaw - yawOf(scenarioPoseOf(object(id)).quaternion);
+    return [{ op: "rotate", object_id: id, angle, time_range }];
+  });
+}
+const beginsAt = (o) => (o.start_us - model.scene.start_us) / 1e6;
+const beginAt = (id, seconds) =>
+  edit(() => {
+    const delay_us = Math.round((seconds - beginsAt(object(id))) * 1e6);
+    return delay_us === 0 ? [] : [{ op: "retime", object_id: id, delay_us }];
+  });
+// Times that the object is as fast as it was recorded; 1 where nobody recorded it.
+function speedOf(o) {
+  const recorded = model.scene.objects.find((r) => r.object_id === (o.recorded_id ?? o.object_id));
+  const lasts = o.end_us - o.start_us;
+  return recorded && lasts > 0 ? (recorded.end_us - recorded.start_us) / lasts : 1;
+}
+const driveAt = (id, times) =>
+  edit(() => {
+    const speed = times / speedOf(object(id));
+    return Math.abs(speed - 1) < 1e-6 ? [] : [{ op: "retime", object_id: id, speed }];
+  });
 export const duplicate = (id) =>
   edit([
     { op: "duplicate", object_id: id, x: object(id).size[0] + 1.5, frame: "object", snap: true },
@@ -201,50 +220,54 @@ function when() {
     ),
   );
 }
-function velocity(o) {
-  const given = o.velocity;
-  const inputs = [0, 1, 2].map((k) =>
-    number(`velocity-${"xyz"[k]}`, given?.linear?.[k], commit, { placeholder: "as is" }),
+function velocity(id) {
+  const inputs = ["x", "y", "z"].map((axis) =>
+    number(`velocity-${axis}`, null, commit, { placeholder: "as is" }),
   );
   const frame = el(
     "select",
-    { id: "velocity-frame", onchange: () => given && commit(), class: "wide" },
+    { id: "velocity-frame", onchange: () => object(id).velocity && commit(), class: "wide" },
     ...["object", "world"].map((f) =>
-      el("option", {
-        value: f,
-        textContent: f === "object" ? "x is forward" : "world axes",
-        selected: f === given?.frame,
-      }),
+      el("option", { value: f, textContent: f === "object" ? "x is forward" : "world axes" }),
     ),
   );
   function commit() {
     const values = inputs.map((i) => i.value);
     const linear = values.every((v) => v === "") ? null : values.map(Number);
-    return edit([
+    return edit(() => [
       {
         op: "set_velocity",
-        object_id: o.object_id,
+        object_id: id,
         linear,
-        angular: given?.angular ?? null,
+        angular: object(id).velocity?.angular ?? null,
         frame: frame.value,
       },
     ]);
   }
   return el("div", {}, row("x y z [m/s]", inputs), row("axes", [frame]));
 }
-function refreshPose() {
-  const subject = object(model.selected);
-  const first = document.getElementById("pose-x");
-  if (!subject || !first) {
+function refreshFields() {
+  const o = object(drawn);
+  if (!o || !document.getElementById("pose-x")) {
     return;
   }
-  const { position, quaternion } = poseOf(subject);
-  ["x", "y", "z"].forEach((axis, k) => put(`pose-${axis}`, position[k], 2));
+  const { position, quaternion } = poseOf(o);
+  const physics = o.physics ?? {};
+  ["x", "y", "z"].forEach((axis, k) => {
+    put(`pose-${axis}`, position[k], 2);
+    put(`size-${axis}`, o.size[k]);
+    put(`velocity-${axis}`, o.velocity?.linear?.[k]);
+  });
   put("heading", (yawOf(quaternion) * 180) / Math.PI, 2);
+  put("begins", beginsAt(o));
+  put("retime-speed", speedOf(o));
+  ["mass", "friction", "restitution"].forEach((name) => put(`p-${name}`, physics[name]));
+  document.getElementById("material").value = physics.material ?? "";
+  document.getElementById("velocity-frame").value = o.velocity?.frame ?? "object";
 }
-function put(id, value, digits) {
+function put(id, value, digits = 3) {
   const input = document.getElementById(id);
-  if (document.activeElement !== input) {
+  if (!input.dataset.typing) {
     input.value = tidy(value, digits);
   }
 }

@@ -46,9 +46,67 @@ def test_a_move_from_now_on_leaves_what_was_before(studio):
 def test_an_object_may_do_the_same_later(studio):
     first(studio)
     start = shown(studio, "model.scenario.objects[0].start_us")
-    enter(studio, "delay", 0.5)
+    enter(studio, "begins", field(studio, "begins") + 0.5)
     kept(studio, 1)
     assert shown(studio, "model.scenario.objects[0].start_us") == start + 500_000
+
+
+def test_the_speed_shown_is_the_one_that_holds_and_entering_it_again_changes_nothing(studio):
+    first(studio)
+    enter(studio, "retime-speed", 2)
+    kept(studio, 1)
+    assert field(studio, "retime-speed") == 2
+    lasts = "model.scenario.objects[0].end_us - model.scenario.objects[0].start_us"
+    half = shown(studio, lasts)
+    enter(studio, "retime-speed", 2)
+    enter(studio, "retime-speed", 1)
+    kept(studio, 2)
+    assert shown(studio, lasts) == pytest.approx(2 * half, abs=2)
+
+
+def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio):
+    target = first(studio)
+    studio.click("#pose-x")
+    studio.keyboard.type("5")
+    for _ in range(3):
+        studio.keyboard.press("Tab")
+    kept(studio, 1)
+    assert studio.evaluate("document.activeElement.id") == "heading"
+    studio.keyboard.press("Delete")
+    studio.keyboard.press("Tab")
+    studio.wait_for_timeout(300)
+    assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
+
+
+def test_two_fields_edited_at_once_both_hold(studio):
+    first(studio)
+    studio.evaluate(
+        """() => ['x', 'y'].forEach((axis, k) => {
+          const input = document.getElementById(`pose-${axis}`);
+          input.value = String(3 + k);
+          input.dispatchEvent(new Event('change'));
+        })"""
+    )
+    kept(studio, 2)
+    assert [field(studio, f"pose-{axis}") for axis in "xy"] == [3, 4]
+
+
+def test_a_pose_typed_while_a_run_is_shown_is_where_the_object_is_put(studio):
+    first(studio)
+    enter(studio, "velocity-x", 4)
+    kept(studio, 1)
+    studio.click("[data-tab=physics]")
+    studio.fill("#duration", "0.3")
+    studio.click("#run")
+    studio.wait_for_selector("#energy")
+    studio.evaluate(
+        "async () => { const { span, setTime } = await import('/ui/model.js');"
+        " setTime(span().end_us); }"
+    )
+    studio.click("[data-tab=properties]")
+    enter(studio, "pose-x", 30)
+    kept(studio, 2)
+    assert field(studio, "pose-x") == 30
 
 
 def test_a_box_erases_stops_and_is_taken_back(studio):
