@@ -41,17 +41,19 @@ LAYERS = (
     "reconstruct",
     "edit",
     "world",
+    "executors",
     "datasets",
     "service",
     "demo",
     "policies",
+    "sweeps",
     "learning",
     "benchmarks",
     "cli",
 )
 """Packages and single modules of the server, lowest first: each imports only those before it."""
 
-PLAY_THEIR_OWN_USER = {"demo", "policies", "benchmarks", "cli"}
+PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "benchmarks", "cli"}
 """Only these use the client SDK, since there the program plays its own user."""
 
 APART = {"logging_setup", "write_openapi"}

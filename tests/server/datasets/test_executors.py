@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import os
 import signal
-import tarfile
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -16,7 +13,7 @@ from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.errors import DatasetError
 from real2sim_server.datasets.executors import RayWorkers, executor_of
 from real2sim_server.datasets.export import export_dataset
-from real2sim_server.datasets.plan import ExportPlan, PlannedClip
+from real2sim_server.datasets.plan import ExportPlan
 from real2sim_server.datasets.variants import Variant
 from real2sim_server.edit import ScenarioState
 from real2sim_server.scene.io import load_scene, save_scene
@@ -117,47 +114,3 @@ def test_ray_gives_the_bytes_of_one_process_also_when_one_dies(scene_file, alone
     mark = tmp_path / "died" if dies else None
     assert made_by("ray", scene_file, tmp_path / "out", mark=mark) == alone
     assert mark is None or mark.exists()
-
-
-class OneFreePlace:
-    """As ``ray``, in a cluster that has room for the first actor only."""
-
-    class exceptions:
-        RayActorError = RuntimeError
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[int, object]] = []
-
-    def actor(self, number: int):
-        def remote(call):
-            return SimpleNamespace(remote=lambda *given: self._called(number, call, given))
-
-        return SimpleNamespace(is_ready=remote("is_ready"), make_archive=remote("make"))
-
-    def _called(self, number, call, given):
-        self.calls.append((number, (call, *given)))
-        return len(self.calls) - 1
-
-    def wait(self, calls, num_returns):
-        done = [call for call in calls if self.calls[call][0] == 0]
-        assert done, "it would wait for ever"
-        return done[:num_returns], []
-
-    def get(self, call):
-        _, (kind, *_given) = self.calls[call]
-        if kind == "is_ready":
-            return True
-        archive = io.BytesIO()
-        tarfile.open(fileobj=archive, mode="w").close()
-        return archive.getvalue()
-
-
-def test_actors_that_a_cluster_has_no_room_for_are_not_waited_for(tmp_path):
-    pytest.importorskip("ray")
-    makers = RayWorkers(partial(variants, tmp_path), workers=2, backend="cpu")
-    makers._ray = cluster = OneFreePlace()
-    clips = [PlannedClip(f"{k:04d}", "train", (0,)) for k in range(3)]
-    done: list[int] = []
-    makers._make_all([cluster.actor(0), cluster.actor(1)], clips, tmp_path, done.append)
-    assert done == [1, 1, 1]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000", "0001", "0002"]

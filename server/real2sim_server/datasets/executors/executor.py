@@ -12,9 +12,6 @@ from ..clips import write_shard
 from ..plan import ExportPlan, PlannedClip
 from ..variants import Variant
 
-MOST_TRIES = 3
-"""A clip whose maker dies is made again by another; that often it is begun."""
-
 
 class Executor(Protocol):
     """Makes clips."""

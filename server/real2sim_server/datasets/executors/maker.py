@@ -37,22 +37,31 @@ class ShardMaker:
         self._cameras = planned_cameras(self._variants[0].drive, plan)
         self._backend = backend
 
-    def is_ready(self) -> bool:
-        """Whether it has been made: an answer at all says so."""
-        return True
-
-    def make(self, clip: PlannedClip, folder: Path) -> None:
-        """Make a clip as ``folder``, which appears when it is whole."""
-        variant = self._variants[clip.variant]
-        write_shard(variant, self._plan, self._cameras, clip, folder, backend=self._backend)
+    def make(self, task: tuple[PlannedClip, Path]) -> None:
+        """Make a clip as a folder, which appears when it is whole; one that is there is left."""
+        clip, folder = task
+        if not folder.exists():
+            self._write(clip, folder)
 
     def make_archive(self, clip: PlannedClip) -> bytes:
         """The files of a clip as a tar, for whoever shares no disk."""
         with tempfile.TemporaryDirectory(prefix="real2sim-clip-") as place:
             folder = Path(place) / clip.name
-            self.make(clip, folder)
+            self._write(clip, folder)
             file = io.BytesIO()
             with tarfile.open(fileobj=file, mode="w") as tar:
                 for path in sorted(p for p in folder.rglob("*") if p.is_file()):
                     tar.add(path, str(path.relative_to(folder)))
             return file.getvalue()
+
+    def _write(self, clip: PlannedClip, folder: Path) -> None:
+        variant = self._variants[clip.variant]
+        write_shard(variant, self._plan, self._cameras, clip, folder, backend=self._backend)
+
+
+class ArchiveMaker(ShardMaker):
+    """The same for whoever shares no disk: clips come back as archives."""
+
+    def make(self, task: PlannedClip) -> bytes:  # type: ignore[override]
+        """The files of a clip as a tar."""
+        return self.make_archive(task)

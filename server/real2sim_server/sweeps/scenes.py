@@ -1,0 +1,30 @@
+"""Scenes of sweeps, found by name on this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..console import CommandError
+from ..demo.street import SHIPPED
+from ..policies.suite import DEMO_SCENE
+from ..scene import Scene
+from ..scene.io import load_scene, read_packed
+
+
+def open_scene(name: str, folder: Path | None = None) -> Scene:
+    """The bundle of that path, or of that name below a folder; the demo's street without one.
+
+    Raises:
+        CommandError: there is none.
+        BundleError: it cannot be read.
+    """
+    places = [Path(name), *([folder / name] if folder is not None else [])]
+    for place in places:
+        if place.is_dir():
+            return load_scene(place)
+    if name == DEMO_SCENE:
+        return read_packed(SHIPPED)
+    raise CommandError(
+        f"no scene {name!r}; give the path of a bundle, its name below the folder of --scenes, or "
+        f"{DEMO_SCENE}"
+    )
