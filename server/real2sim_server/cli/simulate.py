@@ -224,4 +224,5 @@ def _figures(result: SimulationResult) -> dict[str, object]:
     for c in result.contacts:
         figures[f"{c.object_id} by {c.other}: first contact [s]"] = c.first_s
         figures[f"{c.object_id} by {c.other}: delta-v [m/s]"] = c.delta_v
+        figures[f"{c.object_id} by {c.other}: of it beyond its weight [m/s]"] = c.impact_delta_v
     return figures

@@ -67,8 +67,13 @@ class ContactLog:
         """Dissipated by friction so far [J]."""
         return sum(self._friction_work.values())
 
-    def records(self, masses: dict[str, float]) -> tuple[ContactRecord, ...]:
-        """All contacts, in the order they began."""
+    def records(self, masses: dict[str, float], gravity: Float) -> tuple[ContactRecord, ...]:
+        """All contacts, in the order they began.
+
+        Args:
+            masses: of bodies [kg].
+            gravity: [3] acceleration [m/s^2].
+        """
         order = sorted(self._impulses, key=lambda key: (self._times[key][0], key))
         return tuple(
             ContactRecord(
@@ -79,9 +84,21 @@ class ContactLog:
                 first_s=self._times[key][0],
                 last_s=self._times[key][1],
                 heat=self._friction_work[key],
+                impact_delta_v=self._impact_delta_v(key, masses[key[0]], gravity),
             )
             for key in order
         )
+
+    def _impact_delta_v(self, key: tuple[str, str], mass: float, gravity: Float) -> float:
+        """Of the impulse beyond what the weight asks for in the time of contact; only the impulse's
+        part against gravity can be that."""
+        impulse, (first, last) = self._impulses[key] / mass, self._times[key]
+        strength = float(np.linalg.norm(gravity))
+        if strength == 0:
+            return float(np.linalg.norm(impulse))
+        up = -gravity / strength
+        carried = float(np.clip(impulse @ up, 0.0, strength * (last - first)))
+        return float(np.linalg.norm(impulse - carried * up))
 
 
 def _three(vector: Float) -> tuple[float, float, float]:

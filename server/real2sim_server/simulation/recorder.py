@@ -75,7 +75,8 @@ class TrajectoryRecorder:
         """Everything recorded so far."""
         s = self._simulator
         objects = {b.name: self._object(b) for b in s.bodies}
-        contacts = s.contact_log.records({b.name: b.motion.mass for b in s.bodies})
+        masses = {b.name: b.motion.mass for b in s.bodies}
+        contacts = s.contact_log.records(masses, s.gravity)
         impulses = np.zeros((len(self._times), len(contacts), 3))
         for f, totals in enumerate(self._impulses):
             for c, contact in enumerate(contacts):

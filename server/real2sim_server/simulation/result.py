@@ -74,6 +74,8 @@ class ContactRecord:
         object_id, other: who, by whom or what.
         impulse: [3] on the object [N s].
         delta_v: length of the impulse over the object's mass [m/s].
+        impact_delta_v: the same without what has only carried the object's weight while they
+            touched; of results written before it was known the whole [m/s].
         first_s, last_s: when the impulse began and ceased to change [s].
         heat: dissipated by friction [J].
     """
@@ -85,6 +87,7 @@ class ContactRecord:
     first_s: float
     last_s: float
     heat: float
+    impact_delta_v: float
 
 
 @dataclass(frozen=True)
@@ -197,7 +200,10 @@ class SimulationResult:
                 for k, o in document["objects"].items()
             }
             contacts = tuple(
-                ContactRecord(**{**c, "impulse": tuple(c["impulse"])}) for c in document["contacts"]
+                ContactRecord(
+                    **{"impact_delta_v": c["delta_v"], **c, "impulse": tuple(c["impulse"])}
+                )
+                for c in document["contacts"]
             )
             broken = document.get("breakages")
             return cls(

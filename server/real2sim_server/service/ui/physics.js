@@ -117,17 +117,21 @@ export async function show(job) {
   emit("run");
   setTime(model.playback.times_us[0]);
 }
+// What a contact changed beyond carrying a weight; runs of before tell all alike.
+const struck = (contact) => contact.impact_delta_v ?? contact.delta_v;
+const CARRIED = 0.3;
 function results() {
-  const contacts = model.playback.contacts ?? [];
-  const rows = contacts.map((c) =>
-    el(
+  const contacts = [...(model.playback.contacts ?? [])].sort((a, b) => struck(b) - struck(a));
+  const rows = contacts.map((c) => {
+    const what = struck(c) < CARRIED ? "carries it" : `${struck(c).toFixed(2)} m/s`;
+    return el(
       "tr",
       {},
-      ...[c.object_id, c.other, `${c.delta_v.toFixed(2)} m/s`, `${c.first_s.toFixed(2)} s`].map(
-        (t) => el("td", { textContent: t }),
+      ...[c.object_id, c.other, what, `${c.first_s.toFixed(2)} s`].map((t) =>
+        el("td", { textContent: t }),
       ),
-    ),
-  );
+    );
+  });
   return [
     el(
       "fieldset",
