@@ -28,6 +28,8 @@ class InitialiseOptions:
         sky_resolution: edge of a face of the sky's cube map [px].
         feature_images: images of each camera, at most, whose features give points where no LiDAR
             beam went; 0 for none.
+        stereo_images: images of each camera, at most, whose depths are found by sweeping planes
+            where no LiDAR beam went; 0 for none.
 
     Raises:
         ReconstructError: for a value out of range.
@@ -46,9 +48,16 @@ class InitialiseOptions:
     samples: int = 8
     sky_resolution: int = 512
     feature_images: int = 60
+    stereo_images: int = 60
 
     def __post_init__(self) -> None:
-        may_be_zero = {"voxel_per_metre", "box_margin", "ground_clearance", "feature_images"}
+        may_be_zero = {
+            "voxel_per_metre",
+            "box_margin",
+            "ground_clearance",
+            "feature_images",
+            "stereo_images",
+        }
         for name, value in asdict(self).items():
             if not (value > 0 or (value == 0 and name in may_be_zero)) or value == float("inf"):
                 raise ReconstructError(f"{name}={value!r} of InitialiseOptions must be positive")

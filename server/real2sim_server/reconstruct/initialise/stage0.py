@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...geometry.rotation import Float
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
@@ -21,6 +22,7 @@ from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_nei
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
 from .sky_map import SkySamples
+from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
 from .vehicle_body import VehicleBody, faced, fitted_body
@@ -34,6 +36,10 @@ LIDAR_REACH = 0.5
 """Points from images are taken where LiDAR has none so close [m]."""
 FEATURE_HEIGHT = 0.3
 """And from this height over the ground on [m]: road has LiDAR, and reflections lie below it."""
+STEREO_VOXEL, STEREO_PER_METRE = 0.15, 0.01
+"""Points from images are joined in voxels of this edge, larger with the distance by so much."""
+STEREO_WEIGHT = 3
+"""In a voxel must lie so many of them."""
 UNDERSIDE_COLOUR = 0.06
 SKY_FRAMES = 15
 FACED_FRAMES = 20
@@ -75,6 +81,14 @@ class _SurfelSet:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Points from images alone: single features, and [N, 3] whatever planes were swept through."""
+
+    features: TriangulatedPoints
+    swept: NDArray[np.float32]
+
+
 def initialise_scene(
     log: DrivingLog,
     *,
@@ -112,14 +126,16 @@ def initialise_scene(
         measured = accumulate(log, options, lambda f: report_step(f + 1, log.frame_count))
     with stages("features") as report_step:
         features = triangulate(log, max_images=options.feature_images, on_image=report_step)
-    if len(measured.background) + len(features) == 0:
+    with stages("stereo") as report_step:
+        swept = sweep_planes(log, max_images=options.stereo_images, on_image=report_step)
+    if len(measured.background) + len(features) + len(swept) == 0:
         raise ReconstructError(
             f"log {log.name!r} has no usable LiDAR points, and its images have no features in "
             "common that tell a depth; stage 0 builds everything from these"
         )
     with stages("shape"):
         fitted = _fit_ground(log, measured.background.points, features.points)
-        parts = _shape(log, measured, features, fitted, options)
+        parts = _shape(log, measured, _Seen(features, swept), fitted, options)
     with stages("walls") as report_step:
         parts = _keep_real_walls(log, parts, options, report_step)
     with stages("colour") as report_step:
@@ -143,7 +159,7 @@ def _fit_ground(
 def _shape(
     log: DrivingLog,
     measured: Accumulation,
-    features: TriangulatedPoints,
+    from_images: _Seen,
     fitted: GroundFit,
     options: InitialiseOptions,
 ) -> _SurfelSet:
@@ -159,10 +175,8 @@ def _shape(
     above = thin_to(above, options.voxel, limit, levels)
     largest = 0.03 + 0.006 * path_distance(above.points, path)
     structure = fit_surfels(above.points, largest=largest)
-    seen = _beyond_lidar(features, measured.background, fitted.surface)
-    structure = Surfels.join(
-        [structure, round_surfels(seen.points, path_distance(seen.points, path))]
-    )
+    seen = _surfels_of_images(from_images, measured.background, fitted.surface, path, options)
+    structure = Surfels.join([structure, seen])
     walls = continue_walls(structure, measured.limit, max_count=options.max_background // 5)
     surfels = [ground, structure, walls]
     standing = len(ground) + len(structure)
@@ -209,18 +223,37 @@ def _above_ground(background: PointSet, surface: Ground) -> PointSet:
     return background.select(~surface.covers(xy) | (height > ABOVE_GROUND))
 
 
+def _surfels_of_images(
+    seen: _Seen, background: PointSet, surface: Ground, path: Float, options: InitialiseOptions
+) -> Surfels:
+    """What only images show, where the background has no LiDAR point and above the ground."""
+    swept = seen.swept[_beyond_lidar(seen.swept, background, surface)]
+    distance = path_distance(swept, path)
+    held = well_supported(swept, 0.1 + 0.015 * distance)
+    places = swept[held].astype(np.float64)
+    cloud = PointSet.measured(places, np.zeros(len(places), np.float32))
+    levels = voxel_levels(distance[held], STEREO_VOXEL, STEREO_PER_METRE)
+    cloud = thin_to(cloud, STEREO_VOXEL, options.max_background // 4, levels)
+    cloud = cloud.select(cloud.weight >= STEREO_WEIGHT)
+    distance = path_distance(cloud.points, path)
+    dense = fit_surfels(cloud.points, largest=0.03 + 0.012 * distance)
+    single = seen.features.points
+    single = single[_beyond_lidar(single, background, surface)]
+    return Surfels.join([dense, round_surfels(single, path_distance(single, path))])
+
+
 def _beyond_lidar(
-    features: TriangulatedPoints, background: PointSet, surface: Ground
-) -> TriangulatedPoints:
-    """Those above the ground that have no LiDAR point near them."""
+    points: NDArray[np.float32], background: PointSet, surface: Ground
+) -> NDArray[np.bool_]:
+    """Which are above the ground and have no LiDAR point near them."""
     from scipy.spatial import cKDTree
 
-    distance = np.full(len(features), np.inf)
-    if len(background):
-        distance, _ = cKDTree(background.points).query(features.points, workers=-1)
-    xy = features.points[:, :2].astype(np.float64)
-    above = features.points[:, 2] - surface.height_at(xy) > FEATURE_HEIGHT
-    return features.select((distance > LIDAR_REACH) & above)
+    distance = np.full(len(points), np.inf)
+    if len(background) and len(points):
+        distance, _ = cKDTree(background.points).query(points, workers=-1)
+    xy = points[:, :2].astype(np.float64)
+    above = points[:, 2] - surface.height_at(xy) > FEATURE_HEIGHT
+    return np.asarray((distance > LIDAR_REACH) & above)
 
 
 def _object_points(

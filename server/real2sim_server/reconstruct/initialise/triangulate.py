@@ -93,7 +93,7 @@ def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> Tri
     sightings: list[tuple[Float, Float, Float]] = []
     labels: list[NDArray[np.int64]] = []
     first_label, done = 0, 0
-    chosen = {camera.name: _spread_frames(log, camera, max_images) for camera in log.rig}
+    chosen = {camera.name: spread_frames(log, camera, max_images) for camera in log.rig}
     total = sum(len(frames) for frames in chosen.values())
     for camera in log.rig:
         images = []
@@ -108,7 +108,7 @@ def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> Tri
     return _points(sightings, labels)
 
 
-def _spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
+def spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
     """Frames between which the camera has moved, at most ``limit``."""
     kept: list[int] = []
     last: Float | None = None
@@ -140,7 +140,7 @@ def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
     K: Float = shrink @ camera.K
     pose = _pose(log, camera, frame)
     viewmat = invert_transform(pose)
-    free = _free_of_objects(log, log.image_time_us(camera.name, frame), K, viewmat, grey.shape)
+    free = free_of_objects(log, log.image_time_us(camera.name, frame), K, viewmat, grey.shape)
     detector = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.005, edgeThreshold=20)
     keypoints, found = detector.detectAndCompute(grey, free)
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
@@ -150,7 +150,7 @@ def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
     return _Features(K @ viewmat[:3], pose[:3, 3].copy(), pixels, descriptors)
 
 
-def _free_of_objects(
+def free_of_objects(
     log: DrivingLog, t_us: int, K: Float, viewmat: Float, shape: tuple[int, ...]
 ) -> NDArray[np.uint8]:
     """[H, W] 1 outside of the outlines of all boxes."""

@@ -36,6 +36,7 @@ WITHOUT_LOOKS = InitialiseOptions(
     object_voxel=0.05,
     ground_spacing=0.12,
     feature_images=0,
+    stereo_images=0,
     max_colour_frames=8,
     samples=2,
     sky_resolution=32,

@@ -160,7 +160,8 @@ def test_progress_names_the_stages_and_ends_each():
         on_progress=lambda *args: reported.append(args),
         timing_s=timing,
     )
-    assert list(timing) == ["accumulate", "features", "shape", "walls", "colour", "fill"]
+    stages = ["accumulate", "features", "stereo", "shape", "walls", "colour", "fill"]
+    assert list(timing) == stages
     for stage in timing:
         last = [(done, total) for name, done, total in reported if name == stage][-1]
         assert last[0] == last[1]
