@@ -99,6 +99,22 @@ def planners(*, json: JsonFile = None) -> None:
     _report(json, planners.run())
 
 
+@command("search", group=app)
+def search(
+    *,
+    episodes: Annotated[int, typer.Option(min=20, help="Of each search, at most.")] = 300,
+    seeds: Annotated[int, typer.Option(min=1, help="Searches of each planner.")] = 5,
+    policy: Annotated[Path | None, typer.Option(help="Weights, for a trained planner.")] = None,
+    json: JsonFile = None,
+) -> None:
+    """Episodes to a planner's first avoidable failure, searched for and drawn at random."""
+    from ..benchmarks import search
+    from ..benchmarks.search import SearchBenchOptions
+
+    asked = SearchBenchOptions(episodes=episodes, seeds=seeds, policy=policy)
+    _report(json, search.run(asked))
+
+
 @command("learn", group=app)
 def learn(*, json: JsonFile = None) -> None:
     """Steps and small images a second, for learning: batches, sessions at once; with ratios."""

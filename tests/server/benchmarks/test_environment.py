@@ -25,6 +25,7 @@ NAMES = (
     "reconstruct",
     "recovery",
     "render",
+    "search",
     "sensors",
     "serve",
     "soak",

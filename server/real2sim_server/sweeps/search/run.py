@@ -1,0 +1,231 @@
+"""A search from the question to files: failures that replay, what they are, and a page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from real2sim.planners import load_planner, needs_of
+
+from ..._files import atomic_file
+from ...console import CommandError
+from ...policies.film import film_episode
+from ...scene import Scene
+from ...world.recording.recording import first_difference, save_recording
+from ..episode import Driven, drive_episode, recording_of
+from ..parameters import drawn_parameters
+from ..pictures import CameraFeed
+from ..scenes import open_scene
+from ..spec import Space
+from .evaluation import REFUSED, Evaluation, Evaluator
+from .failure import Failure
+from .optimise import SearchBudget, SearchState, search
+from .page import render_page
+from .reference import drive_reference
+from .shrink import boundaries
+from .statistics import Probability, sobol_indices, splitting, wilson
+
+FAILURES, PAGE = "failures.json", "failures.html"
+TAKE_OVERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+"""Seconds before an impact at which the reference tries to take over."""
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What a search does beside searching.
+
+    Attributes:
+        budget: of the search itself.
+        shrink: failures whose boundaries are looked for, from the worst on.
+        probability: episodes for the probability of an at-fault collision in each space; 0: none.
+        films: failures that are filmed, from the worst on.
+        film_width: [px].
+        scenes: folder of bundles.
+    """
+
+    budget: SearchBudget = field(default_factory=SearchBudget)
+    shrink: int = 3
+    probability: int = 0
+    films: int = 0
+    film_width: int = 480
+    scenes: Path | None = None
+
+
+def run_search(
+    spaces: Sequence[Space],
+    planner: str,
+    out: Path,
+    options: SearchOptions | None = None,
+    *,
+    on_progress: Report = lambda _stage, _done, _total: None,
+) -> dict[str, Any]:
+    """Search spaces of one scene for a planner's avoidable failures; write what was found.
+
+    Returns:
+        What ``failures.json`` holds.
+
+    Raises:
+        CommandError: spaces of several scenes, a planner that cannot drive there, no such scene.
+    """
+    options = options or SearchOptions()
+    scene = _scene_of(spaces, options.scenes)
+    _check_planner(planner, scene)
+    evaluate = Evaluator(scene, spaces, planner)
+    state = search(evaluate, options.budget, on_progress=lambda d, t: on_progress("search", d, t))
+    found = state.archive.ordered()
+    failures = []
+    for k, one in enumerate(found):
+        failures.append(_failure(evaluate, one, k, out, options))
+        on_progress("failures", k + 1, len(found))
+    odds = _probabilities(evaluate, options, on_progress)
+    report = _report(evaluate, state, failures, odds, options)
+    with atomic_file(out / FAILURES) as file:
+        file.write(json.dumps(report, indent=2, allow_nan=False).encode())
+    with atomic_file(out / PAGE) as file:
+        file.write(render_page(report, failures).encode())
+    return report
+
+
+def _scene_of(spaces: Sequence[Space], folder: Path | None) -> Scene:
+    names = list(dict.fromkeys(s.case.scene or "" for s in spaces))
+    if len(names) != 1:
+        raise CommandError(
+            f"a search is of one scene; the spaces are of {', '.join(names) or 'none'}"
+        )
+    return open_scene(names[0], folder)
+
+
+def _check_planner(planner: str, scene: Scene) -> None:
+    try:
+        CameraFeed.of(scene, needs_of(load_planner(planner)))
+    except (ValueError, OSError) as error:
+        raise CommandError(f"planner {planner!r}: {error}") from error
+
+
+def _failure(
+    evaluate: Evaluator, found: Evaluation, number: int, out: Path, options: SearchOptions
+) -> Failure:
+    """Recorded, written as a case, shrunk and filmed."""
+    name = f"failure_{number + 1:02d}"
+    driven = drive_episode(
+        evaluate.scene,
+        found.drive,
+        load_planner(found.drive.planner),
+        keep_entries=True,
+        keep_worlds=True,
+    )
+    recording = recording_of(evaluate.scene, driven)
+    save_recording(recording, out / "recordings" / f"{name}.r2e")
+    case = evaluate.spaces[found.space].case_at(found.values)
+    fields = case.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    with atomic_file(_made(out / "cases") / f"{name}.json") as file:
+        file.write(json.dumps({"cases": [fields | {"name": name}]}, indent=2).encode())
+    film = None
+    if number < options.films:
+        film = f"films/{name}.mp4"
+        again = recording.replayer(evaluate.scene)
+        path = _made(out / "films") / f"{name}.mp4"
+        film_episode(recording, again, evaluate.scene, path, width=options.film_width)
+    edges = boundaries(evaluate, found) if number < options.shrink else []
+    replays = first_difference(recording, recording.replayer(evaluate.scene)) is None
+    return Failure(name, found, recording, replays, _avoidable_until(driven), edges, film)
+
+
+def _avoidable_until(driven: Driven) -> float | None:
+    """How long before the impact the reference, taking over from the planner, still avoids it [s];
+    None where it does not at any instant tried, or plans are not trajectories."""
+    for before in TAKE_OVERS:
+        assert driven.world is not None
+        step = len(driven.worlds) - round(before / driven.world.context.dt)
+        if step < 0 or driven.world.spec.action != "trajectory":
+            return None
+        if drive_reference(driven.worlds[step].fork()).survived:
+            return before
+    return None
+
+
+def _probabilities(
+    evaluate: Evaluator, options: SearchOptions, on_progress: Report
+) -> list[Probability | None]:
+    """Of at-fault collisions in each space, as its parameters are distributed: independent
+    episodes, and splitting where none of them fails."""
+    if not options.probability:
+        return [None] * len(evaluate.spaces)
+    found: list[Probability | None] = []
+    rng = np.random.default_rng([options.budget.seed, 1])
+    for space in range(len(evaluate.spaces)):
+        dimensions, failures = evaluate.dimensions(space), 0
+        for k in range(options.probability):
+            failures += evaluate(space, rng.random(dimensions)).at_fault
+            on_progress("probability", k + 1, options.probability)
+        odds = wilson(failures, options.probability)
+        if failures == 0:
+            rare = splitting(
+                lambda u, space=space: _danger(evaluate(space, u)),  # type: ignore[misc]
+                dimensions,
+                seed=options.budget.seed,
+                particles=max(options.probability // 4, 10),
+                most_episodes=4 * options.probability,
+            )
+            odds = rare if rare.value > 0 else odds
+        found.append(odds)
+    return found
+
+
+def _danger(found: Evaluation) -> float:
+    """At least 0 for every collision at fault, avoidable or not."""
+    return max(found.criticality, 0.0) if found.at_fault else min(found.criticality, -1e-9)
+
+
+def _report(
+    evaluate: Evaluator,
+    state: SearchState,
+    failures: Sequence[Failure],
+    odds: Sequence[Probability | None],
+    options: SearchOptions,
+) -> dict[str, Any]:
+    """What failures.json holds."""
+    at_fault = [e for e in state.evaluations if e.at_fault]
+    return {
+        "format": "real2sim-failures",
+        "version": 1,
+        "planner": evaluate.planner,
+        "scene": evaluate.scene.name,
+        "scene_hash": evaluate.scene.content_hash,
+        "seed": options.budget.seed,
+        "episodes": len(state.evaluations),
+        "first_failure": state.archive.first,
+        "at_fault": len(at_fault),
+        "avoidable": sum(e.is_failure for e in at_fault),
+        "cells": len(state.archive.elites),
+        "failures": [f.fields() for f in failures],
+        "spaces": [_space_fields(evaluate, state, k, odds[k]) for k in range(len(evaluate.spaces))],
+    }
+
+
+def _space_fields(
+    evaluate: Evaluator, state: SearchState, number: int, odds: Probability | None
+) -> dict[str, Any]:
+    space = evaluate.spaces[number]
+    mine = [e for e in state.evaluations if e.space == number and e.score > REFUSED]
+    names = list(drawn_parameters(space.parameters))
+    indices = sobol_indices([e.point for e in mine], [e.criticality for e in mine], names)
+    return {
+        "name": space.case.name,
+        "episodes": len(mine),
+        "failures": sum(e.is_failure for e in mine),
+        "sobol": {n: {"first": a, "total": b} for n, (a, b) in indices.items()},
+        "probability": None if odds is None else dataclasses.asdict(odds),
+    }
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
