@@ -42,6 +42,7 @@ LAYERS = (
     "edit",
     "world",
     "executors",
+    "scenarios",
     "datasets",
     "service",
     "demo",

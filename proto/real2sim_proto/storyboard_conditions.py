@@ -141,11 +141,11 @@ class EndOfRoad(Entities):
     duration: Value
 
 
-class RelativeAngle(Entities):
-    """Heading against another entity's, within a tolerance [rad]."""
+class Angle(Entities):
+    """Heading in the world, or against another entity's, within a tolerance [rad]."""
 
-    kind: Literal["relative_angle"] = "relative_angle"
-    entity: Reference
+    kind: Literal["angle"] = "angle"
+    entity: Reference | None = None
     angle: Value
     tolerance: Value
 
@@ -210,7 +210,7 @@ Test = Annotated[
     | StandStill
     | Offroad
     | EndOfRoad
-    | RelativeAngle
+    | Angle
     | StoryboardElementState
     | VariableValue
     | SignalState

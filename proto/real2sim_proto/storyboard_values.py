@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_\-]{0,79}$"
+NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_]{0,79}$"
 
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 """Of a parameter or variable."""
@@ -33,7 +33,7 @@ MAX_DEPTH = 40
 """Of parentheses in an expression."""
 
 _TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>\$?[A-Za-z_][\w\-]*)"
+    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>\$?[A-Za-z_]\w*)"
     r"|(?P<sign>==|!=|<=|>=|[-+*/%()<>,]))"
 )
 _COMPARE: Mapping[str, Callable[[Any, Any], bool]] = {

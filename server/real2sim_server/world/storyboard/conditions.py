@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 from real2sim_proto.storyboard_conditions import (
     Acceleration,
+    Angle,
     Collision,
     Condition,
     Distance,
     EndOfRoad,
     Offroad,
     ReachPosition,
-    RelativeAngle,
     RelativeDistance,
     Rule,
     SignalPhase,
@@ -322,17 +322,16 @@ def _end_of_road(test: EndOfRoad, facts: Facts, since: Mapping[str, float]) -> O
     return _lasting(test, facts, since, at_end)
 
 
-def _relative_angle(test: RelativeAngle, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    other = facts.view.entities[test.entity]
-    return _of_entities(
-        test,
-        facts,
-        since,
-        lambda a: (
-            abs(math.remainder(a.h - other.h - float(test.angle), math.tau))
-            <= float(test.tolerance)
-        ),
-    )
+def _angle(test: Angle, facts: Facts, since: Mapping[str, float]) -> Outcome:
+    base = facts.places.origin[2]
+    if test.entity is not None:
+        base = facts.view.entities[test.entity].h
+
+    def holds(actor: EntityState) -> bool:
+        off = math.remainder(actor.h - base - float(test.angle), math.tau)
+        return abs(off) <= float(test.tolerance)
+
+    return _of_entities(test, facts, since, holds)
 
 
 def _element_state(
@@ -369,7 +368,7 @@ _TESTS: Mapping[type[Any], Callable[[Any, Facts, Mapping[str, float]], Outcome]]
     StandStill: _stand_still,
     Offroad: _offroad,
     EndOfRoad: _end_of_road,
-    RelativeAngle: _relative_angle,
+    Angle: _angle,
     StoryboardElementState: _element_state,
     VariableValue: _variable,
     SignalState: _signal_state,

@@ -1,0 +1,314 @@
+"""Elements of an OpenSCENARIO file, with their lines, and what has been read of them.
+
+Every element and attribute has to be read: what nobody asked for is not supported, and is refused
+by name with its line.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.parsers.expat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from real2sim_proto.storyboard_values import evaluated
+
+from ..errors import ScenarioError
+
+MAX_BYTES, MAX_ELEMENTS, MAX_DEPTH = 64 << 20, 1_000_000, 200
+
+WITHOUT_EFFECT = frozenset({"License", "Properties"})
+"""Elements that hold notes of other programs, and no part of the scenario."""
+
+_NEEDED = {
+    "Event": {"Action"},
+    "Maneuver": {"Event"},
+    "ManeuverGroup": {"Maneuver", "CatalogReference"},
+    "Act": {"ManeuverGroup"},
+    "Story": {"Act"},
+}
+PRUNED = frozenset(
+    {
+        "GlobalAction", "PrivateAction", "AppearanceAction", "Action", "ControllerAction",
+        "Private", "InfrastructureAction", *_NEEDED,
+    }
+)  # fmt: skip
+"""Elements that go with the last of their children that is left out."""
+
+
+@dataclass(eq=False)
+class RawElement:
+    """An element as it stands in the file."""
+
+    tag: str
+    line: int
+    attributes: Mapping[str, str]
+    children: list[RawElement] = field(default_factory=list)
+    read: set[str] = field(default_factory=set)
+    is_read: bool = False
+
+
+class Scope:
+    """Parameters by name, and what stands for each in an expression.
+
+    Args:
+        texts: by name: ``$name`` of one that stays a parameter, a plain text, or ``(expression)``.
+        values: what they evaluate to now.
+    """
+
+    def __init__(self, texts: Mapping[str, str], values: Mapping[str, Any]) -> None:
+        self.texts, self.values = dict(texts), dict(values)
+
+    def expression(self, text: str) -> str:
+        """A text with the parameters of this scope replaced by what stands for them."""
+        if not text.startswith("$"):
+            return text
+        if not text.startswith("${"):
+            found = self._text(text[1:])
+            return f"${{{found}}}" if found.startswith("(") else found
+        return _NAME.sub(lambda m: _atom(self._text(m.group(1))), text)
+
+    def value(self, text: str) -> Any:
+        """A text or expression as it evaluates now."""
+        return evaluated(text, self.values)
+
+    def _text(self, name: str) -> str:
+        if name not in self.texts:
+            known = ", ".join(sorted(self.texts)) or "none"
+            raise ValueError(f"'${name}' names no parameter; there are: {known}")
+        return self.texts[name]
+
+
+_NAME = re.compile(r"\$([A-Za-z_]\w*)")
+
+
+def _atom(text: str) -> str:
+    return text if text.startswith(("$", "(")) else f"({text})"
+
+
+@dataclass(eq=False)
+class Part:
+    """An element that is being read, in a file and a scope."""
+
+    raw: RawElement
+    file: str
+    scope: Scope
+
+    @property
+    def tag(self) -> str:
+        """Its name."""
+        return self.raw.tag
+
+    def error(self, message: str) -> ScenarioError:
+        """An error that names file and line."""
+        return ScenarioError(f"{self.file}, line {self.raw.line}: {message}")
+
+    def within(self, scope: Scope) -> Part:
+        """The same element in another scope."""
+        return Part(self.raw, self.file, scope)
+
+    # --- attributes -----------------------------------------------------------------------------
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """An attribute as it evaluates now."""
+        given = self._given(name, default)
+        value = self._evaluated(name, given)
+        if isinstance(value, bool):
+            return "true" if value else "false"
+        return f"{value:.17g}" if isinstance(value, float) else str(value)
+
+    def optional(self, name: str) -> str | None:
+        """An attribute as it evaluates now; None where it is absent."""
+        return self.text(name) if name in self.raw.attributes else None
+
+    def number(self, name: str, default: float | None = None) -> float | str:
+        """A number, or the expression of parameters that it is."""
+        given = self._given(name, None if default is None else repr(default))
+        value = self._evaluated(name, given)
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise self.error(f"{name} of <{self.tag}> is {given!r}; it must be a number") from None
+        text = self.scope.expression(given)
+        return text if text.startswith("$") and _NAME.search(text) else number
+
+    def number_or_none(self, name: str) -> float | str | None:
+        """A number, or None where it is absent."""
+        return self.number(name) if name in self.raw.attributes else None
+
+    def integer(self, name: str, default: int | None = None) -> int:
+        """A whole number as it evaluates now."""
+        value = self._evaluated(name, self._given(name, None if default is None else str(default)))
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = 0.5
+        if number != int(number):
+            raise self.error(f"{name} of <{self.tag}> is {value!r}; it must be a whole number")
+        return int(number)
+
+    def flag(self, name: str, default: bool | None = None) -> bool:
+        """True or false as it evaluates now."""
+        given = self._given(name, None if default is None else str(default).lower())
+        value = str(self._evaluated(name, given)).lower()
+        if value not in {"true", "false", "1", "0"}:
+            raise self.error(f"{name} of <{self.tag}> is {value!r}; allowed: true, false")
+        return value in {"true", "1"}
+
+    def choice(self, name: str, allowed: Mapping[str, Any], default: str | None = None) -> Any:
+        """What an attribute stands for."""
+        given = self.text(name, default)
+        if given not in allowed:
+            raise self.error(
+                f"{name} of <{self.tag}> is {given!r}, which is not supported; allowed: "
+                f"{', '.join(allowed)}"
+            )
+        return allowed[given]
+
+    def _given(self, name: str, default: str | None) -> str:
+        self.raw.read.add(name)
+        given = self.raw.attributes.get(name, default)
+        if given is None:
+            raise self.error(f"<{self.tag}> lacks its attribute {name}")
+        return given.strip()
+
+    def _evaluated(self, name: str, given: str) -> Any:
+        try:
+            return self.scope.value(given)
+        except ValueError as error:
+            raise self.error(f"{name} of <{self.tag}>: {error}") from error
+
+    # --- children -------------------------------------------------------------------------------
+
+    def children(self, *tags: str) -> list[Part]:
+        """Children of these names in their order; without names all."""
+        found = [c for c in self.raw.children if not tags or c.tag in tags]
+        return [self._of(c) for c in found]
+
+    def find(self, tag: str) -> Part | None:
+        """The child of a name; None where there is none."""
+        found = self.children(tag)
+        if len(found) > 1:
+            raise self.error(f"<{self.tag}> has {len(found)} elements <{tag}>; one is allowed")
+        return found[0] if found else None
+
+    def child(self, tag: str) -> Part:
+        """The child of a name."""
+        found = self.find(tag)
+        if found is None:
+            raise self.error(f"<{self.tag}> lacks <{tag}>")
+        return found
+
+    def only(self, tags: Any = None) -> Part:
+        """The one child that an element which is a choice has; of these names."""
+        here = [c for c in self.raw.children if c.tag not in WITHOUT_EFFECT]
+        if len(here) != 1:
+            raise self.error(f"<{self.tag}> has {len(here)} elements; it needs one")
+        if tags is not None and here[0].tag not in tags:
+            raise self._of(here[0]).refused(tags)
+        return self._of(here[0])
+
+    def refused(self, supported: Any = ()) -> ScenarioError:
+        """The error of an element that is not supported."""
+        hint = f"; supported here: {', '.join(sorted(supported))}" if supported else ""
+        return self.error(
+            f"<{self.tag}> is not supported{hint}. Leave it out of the file, or name it in "
+            "`leave_out`"
+        )
+
+    def _of(self, raw: RawElement) -> Part:
+        raw.is_read = True
+        return Part(raw, self.file, self.scope)
+
+
+def unread(raw: RawElement, file: str) -> Iterator[ScenarioError]:
+    """Errors of what nobody has asked for, in the order of the file."""
+    for name in raw.attributes:
+        if name not in raw.read and ":" not in name and name != "xmlns":
+            yield ScenarioError(
+                f"{file}, line {raw.line}: attribute {name} of <{raw.tag}> is not supported"
+            )
+    for child in raw.children:
+        if child.tag in WITHOUT_EFFECT:
+            continue
+        if not child.is_read:
+            yield Part(child, file, Scope({}, {})).refused()
+        else:
+            yield from unread(child, file)
+
+
+def read_elements(data: bytes, file: str, leave_out: frozenset[str] = frozenset()) -> RawElement:
+    """The root of an XML file.
+
+    Args:
+        data: content.
+        file: name in messages.
+        leave_out: names of elements that are taken out before anything is read.
+
+    Raises:
+        ScenarioError: too large, too deep, no XML, or with a document type of its own.
+    """
+    if len(data) > MAX_BYTES:
+        raise ScenarioError(f"{file}: is larger than {MAX_BYTES >> 20} MiB, the most that is read")
+    builder = _Builder(file)
+    try:
+        builder.parser.Parse(data, True)
+    except xml.parsers.expat.ExpatError as error:
+        raise ScenarioError(f"{file}: is no XML file ({error})") from error
+    if builder.root is None:
+        raise ScenarioError(f"{file}: is empty")
+    _take_out(builder.root, leave_out)
+    builder.root.is_read = True
+    return builder.root
+
+
+def _take_out(raw: RawElement, names: frozenset[str]) -> None:
+    kept = []
+    for child in raw.children:
+        if child.tag in names:
+            continue
+        had = bool(child.children)
+        _take_out(child, names)
+        if names and had and child.tag in PRUNED and not _acts(child):
+            continue
+        kept.append(child)
+    raw.children = kept
+
+
+def _acts(raw: RawElement) -> bool:
+    """Whether something is left for which an element that may be pruned is there."""
+    needed = _NEEDED.get(raw.tag)
+    return any(needed is None or c.tag in needed for c in raw.children)
+
+
+class _Builder:
+    def __init__(self, file: str) -> None:
+        self._file, self._open, self._count = file, list[RawElement](), 0
+        self.root: RawElement | None = None
+        self.parser = xml.parsers.expat.ParserCreate()
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.StartDoctypeDeclHandler = self._doctype
+        self.parser.EntityDeclHandler = self._doctype
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        if self._count > MAX_ELEMENTS or len(self._open) >= MAX_DEPTH:
+            raise ScenarioError(
+                f"{self._file}: more than {MAX_ELEMENTS} elements, or nested deeper than "
+                f"{MAX_DEPTH}"
+            )
+        made = RawElement(tag, self.parser.CurrentLineNumber, attributes)
+        if self._open:
+            self._open[-1].children.append(made)
+        else:
+            self.root = made
+        self._open.append(made)
+
+    def _end(self, _tag: str) -> None:
+        self._open.pop()
+
+    def _doctype(self, *_: Any) -> None:
+        # Entities could blow a small file up to fill the memory, and no scenario needs any.
+        raise ScenarioError(f"{self._file}: declares a document type or entities")

@@ -1,0 +1,404 @@
+"""OpenSCENARIO XML files (ASAM, versions 1.0 to 1.3) as storyboards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from real2sim_proto.storyboard import Storyboard
+
+from ..errors import ScenarioError
+from .catalogs import Catalogs
+from .distributions import read_distributions
+from .elements import Part, RawElement, Scope, read_elements, unread
+from .names import PEDESTRIANS, PRIORITIES, VEHICLES
+from .parameters import top_level
+from .read_actions import Actions
+from .read_conditions import Conditions, plain_value
+from .read_positions import Fields, Positions
+
+EGO_NAMES = frozenset({"ego", "hero", "egovehicle", "ego_vehicle", "vut", "sut"})
+"""Names of entities that are the ego, in lower case, where nobody says which it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioFile:
+    """What a file holds.
+
+    Attributes:
+        board: the storyboard.
+        road_file: the road network that it names, as an absolute path where it is known.
+        notes: what of the file has no effect, in sentences for people.
+        cases: values of parameters of each case of a deterministic distribution.
+    """
+
+    board: Storyboard
+    road_file: Path | None = None
+    notes: tuple[str, ...] = ()
+    cases: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How a file is read.
+
+    Attributes:
+        parameters: values instead of those of the file.
+        leave_out: names of elements to leave out that are not supported.
+        ego: name of the entity that is the ego; None: the one that is called so.
+    """
+
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    leave_out: frozenset[str] = frozenset()
+    ego: str | None = None
+
+
+def read_openscenario(path: Path, options: ReadOptions | None = None) -> ScenarioFile:
+    """The storyboard of a file, with the catalogs that it names.
+
+    A file of a ``ParameterValueDistribution`` gives its scenario with the distribution's first
+    case, and all cases.
+
+    Raises:
+        ScenarioError: no such file, no scenario, or something in it that is not supported, with its
+            line.
+    """
+    options = options or ReadOptions()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
+    root = read_elements(data, path.name, options.leave_out)
+    whole = Part(root, path.name, Scope({}, {}))
+    distribution = whole.find("ParameterValueDistribution")
+    if distribution is None:
+        return _read(root, path.name, path.parent.resolve(), options)
+    _header(whole)
+    target = distribution.child("ScenarioFile").text("filepath")
+    cases, drawn = read_distributions(distribution)
+    _refuse_unread(root, path.name)
+    first = {**(cases[0] if cases else {}), **options.parameters}
+    found = read_openscenario(path.parent / target, replace(options, parameters=first))
+    board = found.board
+    if drawn:
+        fields = board.model_dump() | {"distributions": drawn}
+        board = _validated(fields, path.name)
+    return replace(found, board=board, cases=tuple(cases))
+
+
+def read_openscenario_text(
+    data: bytes, name: str, options: ReadOptions | None = None
+) -> ScenarioFile:
+    """The same of a content that has no folder, and so no catalogs. Raises ScenarioError."""
+    options = options or ReadOptions()
+    return _read(read_elements(data, name, options.leave_out), name, None, options)
+
+
+def _read(root: RawElement, file: str, folder: Path | None, options: ReadOptions) -> ScenarioFile:
+    if root.tag != "OpenSCENARIO":
+        raise ScenarioError(f"{file}: its root is <{root.tag}>, expected <OpenSCENARIO>")
+    whole = Part(root, file, Scope({}, {}))
+    header = _header(whole)
+    declarations = whole.find("ParameterDeclarations")
+    try:
+        scope, parameters = top_level(declarations, options.parameters)
+    except ScenarioError:
+        raise
+    except ValueError as error:
+        raise ScenarioError(str(error)) from error
+    reader = _Reader(whole.within(scope), folder, options)
+    fields = header | {"parameters": parameters} | reader.fields()
+    _refuse_unread(root, file)
+    for raw, name in reader.catalogs.used:
+        _refuse_unread(raw, name)
+    return ScenarioFile(_validated(fields, file), reader.road_file, tuple(reader.notes))
+
+
+def _refuse_unread(root: RawElement, file: str) -> None:
+    for error in unread(root, file):
+        raise error
+
+
+def _validated(fields: Fields, file: str) -> Storyboard:
+    try:
+        return Storyboard.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ScenarioError(f"{file}: {where or 'storyboard'}: {first['msg']}") from error
+
+
+def _header(whole: Part) -> Fields:
+    header = whole.child("FileHeader")
+    major, minor = header.integer("revMajor"), header.integer("revMinor")
+    if major != 1 or not 0 <= minor <= 4:
+        raise header.error(f"is of version {major}.{minor}; versions 1.0 to 1.3 are read")
+    date = header.text("date", "")
+    return {
+        "name": header.text("description", "")[:200], "author": header.text("author", "")[:200],
+        "date": date[:40],
+    }  # fmt: skip
+
+
+class _Reader:
+    """Reads a scenario whose parameters are known."""
+
+    def __init__(self, whole: Part, folder: Path | None, options: ReadOptions) -> None:
+        self._whole, self._folder, self._options = whole, folder, options
+        self.catalogs = Catalogs(folder, options.leave_out)
+        positions = Positions(self.catalogs.entry)
+        self._actions, self._conditions = Actions(positions), Conditions(positions)
+        self.notes, self.road_file = list[str](), None
+
+    road_file: Path | None
+
+    def fields(self) -> Fields:
+        """Of the storyboard, but its header and parameters."""
+        whole = self._whole
+        if (locations := whole.find("CatalogLocations")) is not None:
+            self.catalogs.read(locations)
+        entities = self._entities(whole.child("Entities"))
+        road = self._road_network(whole.find("RoadNetwork"))
+        board = whole.child("Storyboard")
+        init, global_init = self._init(board.child("Init"))
+        return {
+            **road,
+            "variables": self._variables(whole.find("VariableDeclarations")),
+            "entities": entities,
+            "init": init,
+            "global_init": global_init,
+            "stories": [self._story(s) for s in board.children("Story")],
+            "stop": self._conditions.trigger(board.find("StopTrigger")),
+            "ends_episode": board.find("StopTrigger") is not None,
+        }
+
+    def _variables(self, part: Part | None) -> Fields:
+        found = {}
+        for each in part.children("VariableDeclaration") if part is not None else []:
+            kind = each.text("variableType")
+            value = each.text("value")
+            found[each.text("name")] = value if kind == "string" else plain_value(value)
+        return found
+
+    # --- roads and signals ----------------------------------------------------------------------
+
+    def _road_network(self, part: Part | None) -> Fields:
+        if part is None:
+            return {}
+        fields: Fields = {}
+        logic, picture = part.find("LogicFile"), part.find("SceneGraphFile")
+        if picture is not None:
+            picture.text("filepath")
+            self.notes.append("the file's 3D model of the road is not shown")
+        if logic is not None:
+            name = logic.text("filepath")
+            if name:
+                fields["roads"] = {"kind": "map", "file": name}
+                self.road_file = (self._folder / name).resolve() if self._folder else None
+        signals = part.find("TrafficSignals")
+        if signals is None:
+            return fields
+        controllers = [self._controller(c) for c in signals.children("TrafficSignalController")]
+        names = sorted({s for c in controllers for p in c["phases"] for s in p["states"]})
+        return {
+            **fields,
+            "controllers": controllers,
+            "signals": [{"signal_id": name} for name in names],
+        }
+
+    def _controller(self, part: Part) -> Fields:
+        phases = []
+        for phase in part.children("Phase"):
+            states = {
+                s.text("trafficSignalId"): s.text("state")
+                for s in phase.children("TrafficSignalState")
+            }
+            phases.append(
+                {
+                    "name": phase.text("name"), "duration": phase.number("duration"),
+                    "states": states,
+                }
+            )  # fmt: skip
+        return {
+            "name": part.text("name"), "delay": part.number("delay", 0.0),
+            "reference": part.optional("reference"), "phases": phases,
+        }  # fmt: skip
+
+    # --- entities -------------------------------------------------------------------------------
+
+    def _entities(self, part: Part) -> list[Fields]:
+        objects = part.children("ScenarioObject")
+        names = [o.text("name") for o in objects]
+        ego = self._ego_of(names, part)
+        return [self._entity(o, name, ego) for o, name in zip(objects, names, strict=True)]
+
+    def _ego_of(self, names: list[str], part: Part) -> str | None:
+        wanted = self._options.ego
+        if wanted is not None and wanted not in names:
+            raise part.error(f"no entity is called {wanted!r}; there are: {', '.join(names)}")
+        called = [n for n in names if n.lower() in EGO_NAMES]
+        found = wanted or (called[0] if called else None)
+        if found is None:
+            self.notes.append("no entity is the ego; the planner drives as it was recorded")
+        return found
+
+    def _entity(self, part: Part, name: str, ego: str | None) -> Fields:
+        kinds = ("Vehicle", "Pedestrian", "MiscObject", "CatalogReference")
+        holders = part.children(*kinds)
+        if len(holders) != 1:
+            raise part.error(f"<ScenarioObject> needs one of {', '.join(kinds)}")
+        model = holders[0]
+        if model.tag == "CatalogReference":
+            model = self._of_catalog(model)
+        self._object_controllers(part, name, ego)
+        size, centre = _box(model)
+        fields: Fields = {
+            "name": name,
+            "kind": "ego" if name == ego else "new",
+            "model": model.text("name", ""),
+            "box": {"size": size, "centre": centre},
+        }
+        model.optional("model3d")
+        if model.tag == "Vehicle":
+            return fields | self._vehicle(model)
+        fields["mass"] = model.number_or_none("mass")
+        if model.tag == "Pedestrian":
+            model.optional("model")
+            model.optional("role")
+            category = model.choice("pedestrianCategory", PEDESTRIANS)
+            return fields | {"category": category}
+        return fields | {"category": model.text("miscObjectCategory")}
+
+    def _of_catalog(self, part: Part) -> Part:
+        for kind in ("Vehicle", "Pedestrian", "MiscObject"):
+            try:
+                return self.catalogs.entry(part, kind)
+            except ScenarioError as error:
+                last = error
+        raise last
+
+    def _object_controllers(self, part: Part, name: str, ego: str | None) -> None:
+        for each in part.children("ObjectController"):
+            if name != ego:
+                raise each.error(
+                    f"<ObjectController> of {name!r} is not supported: entities are moved by the "
+                    "storyboard's actions. Leave it out of the file, or name it in `leave_out`"
+                )
+            _read_all(each.raw)
+            self.notes.append(f"the controller of {name!r} is the planner")
+
+    def _vehicle(self, part: Part) -> Fields:
+        performance = part.child("Performance")
+        part.optional("role")
+        axles = part.child("Axles")
+        _read_all(axles.raw)
+        for name in ("maxAccelerationRate", "maxDecelerationRate"):
+            performance.optional(name)
+        return {
+            "category": part.choice("vehicleCategory", VEHICLES),
+            "mass": part.number_or_none("mass"),
+            "max_speed": performance.number("maxSpeed"),
+            "max_acceleration": performance.number("maxAcceleration", 10.0),
+            "max_deceleration": performance.number("maxDeceleration", 10.0),
+        }
+
+    # --- storyboard -----------------------------------------------------------------------------
+
+    def _init(self, part: Part) -> tuple[list[Fields], list[Fields]]:
+        actions = part.child("Actions")
+        global_init = list[Fields]()
+        for action in actions.children("GlobalAction"):
+            if (environment := action.find("EnvironmentAction")) is not None:
+                self._environment(environment)
+                continue
+            global_init += self._actions.action(action)
+        init = list[Fields]()
+        for private in actions.children("Private"):
+            entity = private.text("entityRef")
+            for action in private.children("PrivateAction"):
+                init += [{"entity": entity, "action": a} for a in self._actions.action(action)]
+        return init, global_init
+
+    def _environment(self, part: Part) -> None:
+        """Weather has no effect but friction, which is refused where it is not 1."""
+        found = part.only({"Environment", "CatalogReference"})
+        if found.tag == "CatalogReference":
+            found = self.catalogs.entry(found, "Environment")
+        road = found.find("RoadCondition")
+        if road is not None and road.number("frictionScaleFactor", 1.0) != 1.0:
+            raise road.error("frictionScaleFactor is not supported but as 1")
+        _read_all(found.raw)
+        self.notes.append(
+            f"environment {found.text('name', '')!r}: images show the scene in its own weather and "
+            "light"
+        )
+
+    def _story(self, part: Part) -> Fields:
+        if (declarations := part.find("ParameterDeclarations")) is not None:
+            raise declarations.error("<ParameterDeclarations> of a story are not supported")
+        return {"name": part.text("name"), "acts": [self._act(a) for a in part.children("Act")]}
+
+    def _act(self, part: Part) -> Fields:
+        return {
+            "name": part.text("name"),
+            "groups": [self._group(g) for g in part.children("ManeuverGroup")],
+            "start": self._conditions.trigger(part.find("StartTrigger")),
+            "stop": self._conditions.trigger(part.find("StopTrigger")),
+        }
+
+    def _group(self, part: Part) -> Fields:
+        who = part.child("Actors")
+        if who.flag("selectTriggeringEntities", False):
+            raise who.error("selectTriggeringEntities is not supported but as false")
+        maneuvers = list[Fields]()
+        for each in part.children("Maneuver", "CatalogReference"):
+            found = each
+            if each.tag == "CatalogReference":
+                found = self.catalogs.entry(each, "Maneuver")
+            maneuvers.append(self._maneuver(found))
+        return {
+            "name": part.text("name"),
+            "entities": [e.text("entityRef") for e in who.children("EntityRef")],
+            "times": part.integer("maximumExecutionCount", 1),
+            "maneuvers": maneuvers,
+        }
+
+    def _maneuver(self, part: Part) -> Fields:
+        return {
+            "name": part.text("name"),
+            "events": [self._event(e) for e in part.children("Event")],
+        }
+
+    def _event(self, part: Part) -> Fields:
+        actions = list[Fields]()
+        for each in part.children("Action"):
+            name = each.text("name")
+            actions += [{"name": name, "action": a} for a in self._actions.action(each)]
+        return {
+            "name": part.text("name"),
+            "priority": part.choice("priority", PRIORITIES, "override"),
+            "times": part.integer("maximumExecutionCount", 1),
+            "actions": actions,
+            "start": self._conditions.trigger(part.find("StartTrigger")),
+        }
+
+
+def _box(part: Part) -> tuple[list[Any], list[Any]]:
+    box = part.child("BoundingBox")
+    centre, size = box.child("Center"), box.child("Dimensions")
+    return (
+        [size.number("length"), size.number("width"), size.number("height")],
+        [centre.number("x"), centre.number("y"), centre.number("z")],
+    )
+
+
+def _read_all(raw: RawElement) -> None:
+    """Mark an element as read that has no effect, or one of which a note is made."""
+    raw.is_read = True
+    raw.read.update(raw.attributes)
+    for child in raw.children:
+        _read_all(child)
