@@ -17,7 +17,7 @@ import numpy as np
 
 ARRAY_EXT = 1
 ARRAY_DTYPES = ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f2", "<f4", "<f8")
-MAX_DEPTH = 16
+MAX_DEPTH = 48
 MAX_ARRAY_NDIM = 8
 MAX_SERVER_MESSAGE_BYTES = 256 * 1024 * 1024
 """A worker sends messages up to this size, and clients read them: rgb, depth and instance of five

@@ -165,6 +165,9 @@ class _Reader:
         road = self._road_network(whole.find("RoadNetwork"))
         board = whole.child("Storyboard")
         init, global_init = self._init(board.child("Init"))
+        stop = self._conditions.trigger(board.find("StopTrigger"))
+        # The element has to be there; without a condition it says nothing.
+        stop = stop if stop is not None and stop["groups"] else None
         return {
             **road,
             "variables": self._variables(whole.find("VariableDeclarations")),
@@ -172,8 +175,8 @@ class _Reader:
             "init": init,
             "global_init": global_init,
             "stories": [self._story(s) for s in board.children("Story")],
-            "stop": self._conditions.trigger(board.find("StopTrigger")),
-            "ends_episode": board.find("StopTrigger") is not None,
+            "stop": stop,
+            "ends_episode": stop is not None,
         }
 
     def _variables(self, part: Part | None) -> Fields:

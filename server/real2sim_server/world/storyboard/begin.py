@@ -69,7 +69,7 @@ def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
     """Roads of the scene's map where the storyboard is for a map; None: lanes along the route."""
     if not isinstance(board.roads, MapRoads):
         return None
-    graph: LaneGraph | None = getattr(scene, "lane_graph", None)
+    graph: LaneGraph | None = getattr(scene, "lanes", None)
     if graph is None or not graph.roads:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,

@@ -1,0 +1,293 @@
+"""A plain scene for a scenario that comes without one: flat ground, painted lanes, boxes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from real2sim_proto.storyboard import MapRoads, RouteLanes, Storyboard, resolved
+
+from ..geometry.rotation import Float, yaw_quaternion
+from ..maps import read_map
+from ..scene import (
+    Camera,
+    CameraRig,
+    GaussianCloud,
+    Ground,
+    Scene,
+    SceneObject,
+    Sky,
+    Trajectory,
+)
+from ..scene.lane_graph import LaneGraph
+from ..world.path import LoggedPath
+from ..world.storyboard.entities import BOXES
+from ..world.storyboard.graph_roads import GraphNetwork
+from ..world.storyboard.positions import Places
+from ..world.storyboard.roads import Place, RoadNetwork, RouteNetwork, Way, straight
+from .errors import ScenarioError
+
+BEFORE, SECONDS = 60.0, 40.0
+"""How far the road goes back from where the ego begins [m]; length of the recorded drive [s]."""
+
+SLOWEST = 5.0
+"""Of the recorded drive, so that it leads somewhere [m/s]."""
+
+STEP_US = 100_000
+ASPHALT, PAINT, GRASS = (0.33, 0.33, 0.35), (0.92, 0.92, 0.9), (0.42, 0.5, 0.36)
+COLOURS = {
+    "car": (0.75, 0.16, 0.14), "van": (0.85, 0.85, 0.82), "truck": (0.2, 0.35, 0.6),
+    "bus": (0.8, 0.6, 0.15), "motorcycle": (0.12, 0.12, 0.14), "cyclist": (0.15, 0.45, 0.25),
+    "pedestrian": (0.2, 0.3, 0.65), "animal": (0.45, 0.32, 0.2),
+}  # fmt: skip
+SH0 = 0.28209479177387814
+
+
+def flat_scene(
+    board: Storyboard, road_file: Path | None = None, *, seconds: float = SECONDS
+) -> Scene:
+    """A scene on which a storyboard can run by itself.
+
+    Its recorded drive begins where the storyboard puts the ego, and goes along the lane there as
+    fast as the ego begins; without an ego it goes straight on from the origin.
+
+    Args:
+        board: the storyboard.
+        road_file: its road network in OpenDRIVE; without one lanes are those along the route.
+        seconds: length of the drive.
+
+    Raises:
+        ScenarioError: the road network is needed and not there.
+        MapError: it cannot be read.
+        WorldError: the ego is put nowhere on it.
+    """
+    graph = _graph(board, road_file)
+    start, speed = _ego_start(resolved(board), graph)
+    way = _way(start, graph)
+    times = np.arange(int(seconds * 1e6) // STEP_US + 1, dtype=np.int64) * STEP_US
+    near = way.path.nearest(start.x, start.y)
+    places = [way.path.at(near.s + max(speed, SLOWEST) * t * 1e-6) for t in times.tolist()]
+    points = np.array([(x, y, 0.0) for x, y, _, _ in places])
+    quaternions = np.array([yaw_quaternion(h) for *_, h in places])
+    ego = Trajectory(times, points, quaternions)
+    roads: dict[str, Any] = {} if graph is None else {"lanes": graph}
+    background = _merged([*_surface(points, [h for *_, h in places]), *_lane_lines(graph)])
+    return Scene(
+        name="flat",
+        background=background,
+        objects=_looks(),
+        sky=_sky(),
+        rig=CameraRig(_cameras()),
+        ego=ego,
+        frame_times_us=times,
+        stored_ground=_ground(points),
+        provenance={"source": "flat", "storyboard": board.name},
+        **roads,
+    )
+
+
+def _graph(board: Storyboard, road_file: Path | None) -> LaneGraph | None:
+    if not isinstance(board.roads, MapRoads):
+        return None
+    if road_file is None or not road_file.is_file():
+        raise ScenarioError(
+            f"the road network {board.roads.file!r} of the scenario is not there; put it where "
+            "the file says, or run the scenario on a scene"
+        )
+    return read_map(road_file)
+
+
+def _ego_start(board: Storyboard, graph: LaneGraph | None) -> tuple[Place, float]:
+    """Where the storyboard puts the ego, and how fast it is."""
+    ego = next((e.name for e in board.entities if e.kind == "ego"), None)
+    place, speed = Place(0.0, 0.0, 0.0), 0.0
+    network: RoadNetwork = GraphNetwork(graph) if graph is not None else _straight_lanes(board)
+    for entry in board.init:
+        if entry.entity != ego:
+            continue
+        if entry.action.kind == "teleport":
+            place = Places({}, network, board.origin).of(entry.action.position)
+        elif entry.action.kind == "speed" and entry.action.relative_to is None:
+            speed = float(entry.action.speed)
+        elif entry.action.kind == "follow_trajectory":
+            curve = entry.action.curve
+            first = curve.vertices[0].position if curve.shape == "polyline" else None
+            first = getattr(curve, "position", first)
+            if first is not None:
+                place = Places({}, network, board.origin).of(first)
+    return place, speed
+
+
+def _straight_lanes(board: Storyboard) -> RouteNetwork:
+    """Lanes along the x axis of the world, the route at y = 0 and s at x."""
+    lanes = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
+    return RouteNetwork.of(lanes, straight(0.0, 0.0, 0.0))
+
+
+def _way(start: Place, graph: LaneGraph | None) -> Way:
+    if graph is not None:
+        network = GraphNetwork(graph)
+        here = network.locate(start.x, start.y, start.h)
+        if here is not None:
+            along = math.cos(start.h - here.h) >= 0.0
+            return network.way(here.road, here.lane, here.s, along=along)
+    path = straight(start.x, start.y, start.h)
+    return Way("", 0, True, path)
+
+
+# --- what is seen -----------------------------------------------------------------------------
+
+
+def _surface(points: Float, headings: Sequence[float]) -> list[GaussianCloud]:
+    """Road and grass along the drive, with the lines of lanes of 3.5 m."""
+    first, last = points[0, :2], points[-1, :2]
+    h0 = headings[0]
+    back = first - BEFORE * np.array([math.cos(h0), math.sin(h0)])
+    way = np.vstack([back, points[:, :2], last + 60.0 * _unit(headings[-1])])
+    yaws = np.array([h0, *headings, headings[-1]])
+    path = LoggedPath.through(
+        np.column_stack([way, np.zeros(len(way))]), np.unwrap(yaws),
+        np.tile([0.0, 0.0, 1.0], (len(way), 1)),
+    )  # fmt: skip
+    length = min(path.length, 600.0)
+    road = _strip(path, length, np.arange(-6.5, 8.6, 0.7), _Paint(0.8, ASPHALT, -0.02))
+    side = np.concatenate([np.arange(-19.0, -7.0, 1.6), np.arange(9.5, 21.0, 1.6)])
+    grass = _strip(path, length, side, _Paint(1.9, GRASS, -0.04))
+    line, dashed = _Paint(0.35, PAINT, 0.0), _Paint(0.35, PAINT, 0.0, 9.0)
+    lines = [_strip(path, length, np.array([t]), line) for t in (-5.25, 8.75)]
+    dashes = [_strip(path, length, np.array([t]), dashed) for t in (-1.75, 1.75, 5.25)]
+    return [road, grass, *lines, *dashes]
+
+
+class _Paint(NamedTuple):
+    """What a strip looks like: spacing [m], colour, height [m], period of dashes or 0 [m]."""
+
+    step: float
+    colour: tuple[float, float, float]
+    z: float
+    dash: float = 0.0
+
+
+def _strip(path: LoggedPath, length: float, offsets: Float, paint: _Paint) -> GaussianCloud:
+    """Flat Gaussians beside a path."""
+    step, colour, z, dash = paint
+    s = np.arange(0.0, length, step)
+    s = s[(s % dash) < dash / 3] if dash else s
+    places = np.array([path.at(float(v)) for v in s])
+    left = np.stack([-np.sin(places[:, 3]), np.cos(places[:, 3])], axis=1)
+    means = places[:, None, :2] + offsets[None, :, None] * left[:, None]
+    flat = means.reshape(-1, 2)
+    width = step * 0.5 if len(offsets) > 1 else 0.07
+    scales = np.tile([step * 0.5, width, 0.01], (len(flat), 1))
+    quats = np.repeat([yaw_quaternion(h) for h in places[:, 3]], len(offsets), axis=0)
+    return _cloud(np.column_stack([flat, np.full(len(flat), z)]), scales, quats, colour)
+
+
+def _lane_lines(graph: LaneGraph | None) -> list[GaussianCloud]:
+    """Middles of all lanes of a map, thin."""
+    found = []
+    for lane in graph.lanes.values() if graph is not None else ():
+        yaws = np.unwrap(lane.headings)
+        path = LoggedPath.through(lane.centre, yaws, np.tile([0.0, 0.0, 1.0], (len(yaws), 1)))
+        found.append(
+            _strip(path, min(lane.length, 400.0), np.array([0.0]), _Paint(1.0, PAINT, 0.005, 6.0))
+        )
+    return found
+
+
+def _looks() -> dict[str, SceneObject]:
+    """A box of each category, which is nowhere in the drive and lends its look."""
+    found = {}
+    for name, (size, _) in BOXES.items():
+        before = Trajectory(
+            np.array([-2_000_000], np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
+        )
+        cloud = _box(size, COLOURS[name])
+        found[f"look_{name}"] = SceneObject(f"look_{name}", name, size, cloud, before)
+    return found
+
+
+def _box(size: tuple[float, float, float], colour: tuple[float, float, float]) -> GaussianCloud:
+    """Gaussians on the faces of a box about the origin; its upper front half is glass."""
+    clouds = []
+    for axis in range(3):
+        u, v = (k for k in range(3) if k != axis)
+        step = max(min(size[u], size[v]) / 6, 0.08)
+        a = np.arange(-size[u] / 2 + step / 2, size[u] / 2, step)
+        b = np.arange(-size[v] / 2 + step / 2, size[v] / 2, step)
+        grid = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2)
+        for side in (-1, 1):
+            means = np.zeros((len(grid), 3))
+            means[:, u], means[:, v] = grid[:, 0], grid[:, 1]
+            means[:, axis] = side * size[axis] / 2
+            scales = np.full((len(grid), 3), step * 0.55)
+            scales[:, axis] = 0.01
+            shade = {0: 0.8, 1: 0.65, 2: 1.0}[axis]
+            tint = tuple(c * shade for c in colour)
+            quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(grid), 1))
+            clouds.append(_cloud(means, scales, quats, tint))  # type: ignore[arg-type]
+    return _merged(clouds)
+
+
+def _cloud(
+    means: Float, scales: Float, quats: Float, colour: tuple[float, float, float]
+) -> GaussianCloud:
+    count = len(means)
+    sh = (np.array(colour) - 0.5) / SH0
+    return GaussianCloud(
+        means=torch.tensor(means, dtype=torch.float32),
+        quats=torch.tensor(quats, dtype=torch.float32),
+        scales=torch.tensor(scales, dtype=torch.float32),
+        opacities=torch.full((count,), 0.95),
+        sh=torch.tensor(np.tile(sh, (count, 1, 1)), dtype=torch.float32),
+    )
+
+
+def _merged(clouds: list[GaussianCloud]) -> GaussianCloud:
+    def joined(name: str) -> torch.Tensor:
+        return torch.cat([getattr(cloud, name) for cloud in clouds])
+
+    return GaussianCloud(
+        means=joined("means"), quats=joined("quats"), scales=joined("scales"),
+        opacities=joined("opacities"), sh=joined("sh"),
+    )  # fmt: skip
+
+
+def _sky() -> Sky:
+    faces = torch.zeros(6, 4, 4, 3)
+    faces[...] = torch.tensor([0.62, 0.74, 0.88])
+    return Sky(faces)
+
+
+def _cameras() -> tuple[Camera, ...]:
+    """One behind and above the ego, and one that looks ahead from its windscreen."""
+    K = np.array([[460.0, 0.0, 320.0], [0.0, 460.0, 180.0], [0.0, 0.0, 1.0]])
+    return (
+        Camera("chase", 640, 360, K, _looking((-9.0, 0.0, 6.0), math.radians(16.0))),
+        Camera("front", 640, 360, K, _looking((1.6, 0.0, 1.4), 0.0)),
+    )
+
+
+def _looking(position: tuple[float, float, float], down: float) -> Float:
+    """``T_vehicle_camera`` of a camera that looks ahead, so far down [rad]."""
+    cos, sin = math.cos(down), math.sin(down)
+    T = np.eye(4)
+    T[:3, :3] = np.array([[0.0, -sin, cos], [-1.0, 0.0, 0.0], [0.0, -cos, -sin]])
+    T[:3, 3] = position
+    return T
+
+
+def _ground(points: Float) -> Ground:
+    low = points[:, :2].min(axis=0) - 100.0
+    count = np.ceil((points[:, :2].max(axis=0) + 100.0 - low) / 20.0).astype(int) + 2
+    heights = np.zeros(tuple(count.tolist()), np.float32)
+    return Ground(low, 20.0, heights, np.ones(heights.shape, np.bool_))
+
+
+def _unit(h: float) -> Float:
+    return np.array([math.cos(h), math.sin(h)])

@@ -1,0 +1,145 @@
+"""OpenSCENARIO files: what is read, and what is refused by name and line."""
+
+from __future__ import annotations
+
+import pytest
+
+from real2sim_server.scenarios.errors import ScenarioError
+from real2sim_server.scenarios.gallery import corner_case
+from real2sim_server.scenarios.openscenario import (
+    ReadOptions,
+    read_openscenario,
+    read_openscenario_text,
+    write_openscenario,
+)
+
+CASE = write_openscenario(corner_case("ccrb").storyboard()).decode()
+
+
+def read(text, **options):
+    return read_openscenario_text(text.encode(), "case.xosc", ReadOptions(**options)).board
+
+
+def line_of(text, part):
+    return text[: text.index(part)].count("\n") + 1
+
+
+def test_an_element_that_is_not_supported_is_refused_by_name_and_line():
+    text = CASE.replace("<LongitudinalAction>", "<AppearanceAction>", 1).replace(
+        "</LongitudinalAction>", "</AppearanceAction>", 1
+    )
+    line = line_of(text, "<AppearanceAction>")
+
+    with pytest.raises(ScenarioError, match=f"line {line}: <AppearanceAction> is not supported"):
+        read(text)
+    assert len(read(text, leave_out=frozenset({"AppearanceAction"})).init) == 1
+
+
+def test_an_attribute_that_is_not_supported_is_refused_by_name_and_line():
+    text = CASE.replace("dynamicsShape=", 'wobble="2" dynamicsShape=', 1)
+    line = line_of(text, "wobble")
+
+    with pytest.raises(ScenarioError, match=f"line {line}: attribute wobble"):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<OpenSCENARIO>", "is no XML file"),
+        ("<OpenDRIVE/>", "expected <OpenSCENARIO>"),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><OpenSCENARIO/>', "document type"),
+        ("<a>" * 300, "nested deeper|no XML"),
+        (CASE.replace('revMajor="1"', 'revMajor="2"'), "version 2"),
+        (CASE.replace('"$gap', '"$gab').replace("$gap", "$gab"), "names no parameter"),
+    ],
+)
+def test_broken_files_are_refused(text, message):
+    with pytest.raises(ScenarioError, match=message):
+        read(text)
+
+
+def test_given_values_replace_those_of_the_file():
+    assert read(CASE, parameters={"braking": 3.0}).parameters["braking"] == 3.0
+    with pytest.raises(ScenarioError, match="no parameter 'brakes'"):
+        read(CASE, parameters={"brakes": 3.0})
+
+
+def test_derived_parameters_become_expressions_of_those_they_follow_from():
+    text = CASE.replace(
+        "</ParameterDeclarations>",
+        '<ParameterDeclaration name="far" parameterType="double" value="${2 * $gap}" />'
+        "</ParameterDeclarations>",
+    ).replace('ds="${$gap + 6}"', 'ds="${$far + 1}"')
+    board = read(text)
+
+    assert "far" not in board.parameters
+    assert board.init[0].action.position.ds == "${(2 * $gap) + 1}"
+
+
+def test_catalogs_and_distributions_are_read_from_their_folders(tmp_path):
+    vehicle = CASE[CASE.index("<Vehicle ") : CASE.index("</Vehicle>") + len("</Vehicle>")]
+    header = CASE[CASE.index("<FileHeader") : CASE.index("/>", CASE.index("<FileHeader")) + 2]
+    (tmp_path / "catalogs").mkdir()
+    (tmp_path / "catalogs" / "cars.xosc").write_text(
+        f'<OpenSCENARIO>{header}<Catalog name="cars">{vehicle}</Catalog></OpenSCENARIO>'
+    )
+    text = CASE.replace(vehicle, '<CatalogReference catalogName="cars" entryName="ego" />').replace(
+        "<CatalogLocations />",
+        '<CatalogLocations><VehicleCatalog><Directory path="catalogs" /></VehicleCatalog>'
+        "</CatalogLocations>",
+    )
+    (tmp_path / "case.xosc").write_text(text)
+    values = "".join(f'<Element value="{v}" />' for v in (2, 6))
+    (tmp_path / "sweep.xosc").write_text(
+        f'<OpenSCENARIO>{header}<ParameterValueDistribution><ScenarioFile filepath="case.xosc" />'
+        '<Deterministic><DeterministicSingleParameterDistribution parameterName="braking">'
+        f"<DistributionSet>{values}</DistributionSet></DeterministicSingleParameterDistribution>"
+        "</Deterministic></ParameterValueDistribution></OpenSCENARIO>"
+    )
+    found = read_openscenario(tmp_path / "sweep.xosc")
+
+    assert found.cases == ({"braking": 2.0}, {"braking": 6.0})
+    assert found.board.parameters["braking"] == 2.0
+    assert found.board.entities[0].model == "ego"
+
+
+def test_files_of_another_program_mean_the_same(tmp_path):
+    """``scenariogeneration`` writes a lane change that takes 3 s from 1 s on."""
+    xosc = pytest.importorskip("scenariogeneration.xosc", reason="needs scenariogeneration")
+    box = xosc.BoundingBox(1.9, 4.5, 1.5, 1.35, 0, 0.75)
+    car = xosc.Vehicle(
+        "car", xosc.VehicleCategory.car, box, xosc.Axle(0.5, 0.6, 1.6, 2.7, 0.3),
+        xosc.Axle(0, 0.6, 1.6, 0, 0.3), 60, 10, 10,
+    )  # fmt: skip
+    entities = xosc.Entities()
+    entities.add_scenario_object("Ego", car)
+    entities.add_scenario_object("other", car)
+    init = xosc.Init()
+    for name, s in (("Ego", 10), ("other", 40)):
+        init.add_init_action(name, xosc.TeleportAction(xosc.LanePosition(s, 0, -1, "0")))
+        step = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0)
+        init.add_init_action(name, xosc.AbsoluteSpeedAction(10, step))
+    smooth = xosc.TransitionDynamics(xosc.DynamicsShapes.sinusoidal, xosc.DynamicsDimension.time, 3)
+    at = xosc.ValueTrigger(
+        "at", 0, xosc.ConditionEdge.none, xosc.SimulationTimeCondition(1, xosc.Rule.greaterThan)
+    )
+    event = xosc.Event("change", xosc.Priority.override)
+    event.add_trigger(at)
+    event.add_action("change", xosc.AbsoluteLaneChangeAction(-2, smooth))
+    maneuver = xosc.Maneuver("maneuver")
+    maneuver.add_event(event)
+    board = xosc.StoryBoard(init)
+    board.add_maneuver(maneuver, "other")
+    scenario = xosc.Scenario(
+        "case", "test", xosc.ParameterDeclarations(), entities, board, xosc.RoadNetwork(),
+        xosc.Catalog(),
+    )  # fmt: skip
+    scenario.write_xml(str(tmp_path / "case.xosc"))
+    found = read_openscenario(tmp_path / "case.xosc").board
+
+    act = found.stories[0].acts[0]
+    change = act.groups[0].maneuvers[0].events[0]
+    assert change.actions[0].action.lane == -2
+    assert change.actions[0].action.dynamics.shape == "sinusoidal"
+    assert change.start.groups[0].conditions[0].test.value == 1.0
