@@ -39,6 +39,8 @@ SLOWEST = 5.0
 """Of the recorded drive, so that it leads somewhere [m/s]."""
 
 STEP_US = 100_000
+AWAY = (-1000.0, 0.0, -50.0)
+"""Where objects are that only lend their looks, out of sight [m]."""
 ASPHALT, PAINT, GRASS = (0.33, 0.33, 0.35), (0.92, 0.92, 0.9), (0.42, 0.5, 0.36)
 COLOURS = {
     "car": (0.75, 0.16, 0.14), "van": (0.85, 0.85, 0.82), "truck": (0.2, 0.35, 0.6),
@@ -201,11 +203,12 @@ def _lane_lines(graph: LaneGraph | None) -> list[GaussianCloud]:
 
 
 def _looks() -> dict[str, SceneObject]:
-    """A box of each category, which is nowhere in the drive and lends its look."""
+    """A box of each category, which lends its look. It stands out of sight before the drive; what
+    stands may be taken to do so for longer where an episode goes on beyond the log."""
     found = {}
     for name, (size, _) in BOXES.items():
         before = Trajectory(
-            np.array([-2_000_000], np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
+            np.array([-2_000_000], np.int64), np.array([AWAY]), np.array([[1.0, 0.0, 0.0, 0.0]])
         )
         cloud = _box(size, COLOURS[name])
         found[f"look_{name}"] = SceneObject(f"look_{name}", name, size, cloud, before)
