@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from real2sim_proto import CodecError, decode, encode
+from real2sim_server.console import CommandError
 from real2sim_server.scene import Asset, SceneError
 from real2sim_server.scene.io import (
     import_splats,
@@ -454,7 +455,49 @@ def _targets() -> list[Target]:
             "feather", table_sample(".feather"), plain(".feather"), read_feather_file, log_errors
         ),
         Target("message", message_sample, _message, read_message, (CodecError,)),
+        Target(
+            "sweep_space", sweep_space_sample, plain(".yaml"), read_sweep_space, (CommandError,)
+        ),
+        Target("episode_journal", journal_sample, plain(".journal"), read_journal, (ValueError,)),
     ]
+
+
+def sweep_space_sample(_folder: Path) -> list[Parts]:
+    """A space of each kind of parameter."""
+    text = b"""case: {name: c, scene: s, reset: {agents: {drivers: {a: {kind: hard_brake}}}}}
+parameters:
+  gap: {path: agents.drivers.a.gap, low: 5, high: 20}
+  lanes: {kind: int, low: 1, high: 3}
+  late: {kind: normal, mean: 1, std: 1, low: 0, high: 2}
+  kind: {values: [1, 2]}
+  half: {expression: sqrt(gap) / 2}
+method: {kind: sobol, count: 8}
+"""
+    return [{"file": text}]
+
+
+def read_sweep_space(path: Path) -> Any:
+    """As ``real2sim sweep`` begins."""
+    from real2sim_server.sweeps import load_sweep
+
+    return load_sweep(path)
+
+
+def journal_sample(folder: Path) -> list[Parts]:
+    """Three rows."""
+    from real2sim_server.sweeps.journal import Journal
+
+    with Journal(folder / "journal") as journal:
+        for k in range(3):
+            journal.add(f"key{k}", {"x": k / 3, "reason": "horizon"})
+    return [{"file": (folder / "journal").read_bytes()}]
+
+
+def read_journal(path: Path) -> Any:
+    """As a sweep goes on."""
+    from real2sim_server.sweeps.journal import Journal
+
+    return Journal(path).rows
 
 
 def spz_as_it_is(folder: Path) -> list[Parts]:

@@ -29,6 +29,7 @@ NAMES = (
     "ply", "playcanvas_ply", "spz", "spz_packed", "spz4", "splat", "bundle", "asset", "packed",
     "packed_zip", "recording", "recording_zip", "mcap", "pickle", "checkpoint", "checkpoint_zip",
     "old_checkpoint", "image", "sweep", "protobuf", "tfrecord", "parquet", "feather", "message",
+    "sweep_space", "episode_journal",
 )  # fmt: skip
 
 

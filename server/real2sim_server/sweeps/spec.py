@@ -158,7 +158,8 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(fields, dict):
         raise ValueError(f"its top level is a {type(fields).__name__}, no mapping")
     # Kinds may be left out where they are plain.
-    for parameter in (fields.get("parameters") or {}).values():
+    given = fields.get("parameters")
+    for parameter in given.values() if isinstance(given, dict) else ():
         if isinstance(parameter, dict) and "kind" not in parameter:
             parameter["kind"] = "derived" if "expression" in parameter else "float"
             if "values" in parameter:

@@ -211,6 +211,7 @@ def test_files_may_leave_plain_kinds_out(tmp_path):
         ("case: [", "is no sweep"),
         ("a: &x [1]\nb: *x", "aliases"),
         ("case: {name: c, scene: tiny}\nparameters: {}", "parameters"),
+        ("case: {name: c, scene: tiny}\nparameters: gap", "parameters"),
         ("case: {name: c, scenario: s}\nparameters: {x: {low: 0, high: 1}}", "names a scene"),
         ("!!python/object/apply:os.system ['true']", "is no sweep"),
     ],
