@@ -21,6 +21,7 @@ from real2sim_proto.jobs import (
     JobList,
     SimulateRequest,
 )
+from real2sim_proto.lanes import SceneLanes
 from real2sim_proto.operations import Operation
 from real2sim_proto.scenarios import (
     History,
@@ -86,6 +87,10 @@ def list_scenes() -> Call[SceneList]:
 
 def get_scene(scene: str) -> Call[SceneInfo]:
     return Call(Request("GET", f"/v1/scenes/{segment(scene)}"), model_of(SceneInfo))
+
+
+def scene_lanes(scene: str) -> Call[SceneLanes]:
+    return Call(Request("GET", f"/v1/scenes/{segment(scene)}/lanes"), model_of(SceneLanes))
 
 
 def load_scene(scene: str) -> Call[None]:

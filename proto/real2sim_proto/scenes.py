@@ -80,6 +80,7 @@ class SceneInfo(Reply):
     has_uncertainties: bool = Field(
         default=False, description="whether it has images of modality `uncertainty`"
     )
+    lane_count: int = Field(default=0, description="lanes of `GET /v1/scenes/{scene}/lanes`")
 
 
 class SceneList(Reply):

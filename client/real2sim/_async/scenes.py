@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from real2sim_proto.base import Pose
+from real2sim_proto.lanes import SceneLanes
 from real2sim_proto.scenes import SceneInfo, SceneState
 from real2sim_proto.views import FreeCamera, SceneView
 
@@ -53,6 +54,19 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
             (['front', 'left'], 2000000)
         """
         return await self._transport.send(_requests.get_scene(scene_name(scene)))
+
+    async def lanes(self, scene: SceneRef) -> SceneLanes:
+        """The lanes of a scene: centre lines, neighbours, stop lines, signals, roads.
+
+        Raises:
+            NotFoundError: no such scene, or it has no lanes: ``get(scene).lane_count`` is 0.
+
+        Examples:
+            >>> street = await client.scenes.get("street")
+            >>> street.lane_count and len((await client.scenes.lanes(street)).lanes)
+            0
+        """
+        return await self._transport.send(_requests.scene_lanes(scene_name(scene)))
 
     async def load(self, scene: SceneRef, *, timeout: float | None = None) -> SceneInfo:
         """Bring a scene into the worker's memory and wait until it is there.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
-from ..scene import CameraRig, Trajectory
+from ..scene import CameraRig, LaneGraph, Trajectory
 
 
 class LogError(ValueError):
@@ -111,6 +111,7 @@ class DrivingLog:
         provenance: dataset, sequence, licence, reader (JSON values only).
         image_times_us: [F] int64 [us] by camera, when its images were really taken, where that
             differs from the frame's time stamp; see :meth:`image_time_us`.
+        lanes: of the map that the log comes with, in its world frame; None without one.
     """
 
     name: str
@@ -122,6 +123,7 @@ class DrivingLog:
     ego_size: tuple[float, float, float] = (4.6, 1.85, 1.6)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     image_times_us: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    lanes: LaneGraph | None = field(default=None, repr=False)
 
     @property
     def frame_count(self) -> int:

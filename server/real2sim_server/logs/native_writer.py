@@ -14,9 +14,10 @@ import numpy as np
 
 from ..scene import Camera, Trajectory
 from ..scene.io.document import OpticsPart
+from ..scene.io.lane_document import lane_document
 from .driving_log import DrivingLog, LogError
 from .images import write_image
-from .readers.native import FORMAT, MANIFEST, VERSION
+from .readers.native import FORMAT, LANES, MANIFEST, VERSION
 
 
 def write_native_log(
@@ -50,6 +51,9 @@ def write_native_log(
     try:
         has_lidar = _write_frames(log, partial, image_format, on_progress)
         manifest = json.dumps(_manifest(log, has_lidar), indent=1)
+        if log.lanes is not None:
+            document = lane_document(log.lanes)
+            (partial / LANES).write_text(document.model_dump_json(), encoding="utf-8")
         (partial / MANIFEST).write_text(manifest, encoding="utf-8")
         partial.chmod(0o755)
         os.replace(partial, target)

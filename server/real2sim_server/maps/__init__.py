@@ -1,15 +1,22 @@
 """Maps of other programs as lane graphs, one reader a format; what fits none is refused by name."""
 
+from .align import Alignment, align, driven_poses, laid_on
 from .errors import MapError
+from .from_log import lanes_from_log
 from .opendrive import OpenDriveReader
 from .read import MAP_READERS, read_map, register_map_reader
 from .reader import MapReader
 
 __all__ = [
     "MAP_READERS",
+    "Alignment",
     "MapError",
     "MapReader",
     "OpenDriveReader",
+    "align",
+    "driven_poses",
+    "laid_on",
+    "lanes_from_log",
     "read_map",
     "register_map_reader",
 ]

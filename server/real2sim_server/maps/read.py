@@ -8,10 +8,11 @@ from pathlib import Path
 from ..scene.errors import SceneError
 from ..scene.lane_graph import LaneGraph
 from .errors import MapError
+from .native import NativeMapReader
 from .opendrive import OpenDriveReader
 from .reader import MapReader
 
-MAP_READERS: list[MapReader] = [OpenDriveReader()]
+MAP_READERS: list[MapReader] = [NativeMapReader(), OpenDriveReader()]
 """All registered readers; the first that recognises a file reads it."""
 
 

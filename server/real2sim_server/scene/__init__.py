@@ -18,10 +18,12 @@ from .errors import (
     UnknownObjectError,
 )
 from .ground import Ground
+from .lane_graph import Area, Lane, LaneGraph, LanePlace, Signal, StopLine
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .lidar import Beams, Detection, Lidar
 from .lidar_surfaces import LidarSurfaces, Reflector, RingResponse
 from .radar import Radar
+from .road import Road, RoadLane
 from .scene import Scene, SceneObject
 from .shutter import Shutter
 from .sky import Sky
@@ -29,6 +31,7 @@ from .trajectory import Trajectory
 
 __all__ = [
     "UNSEEN",
+    "Area",
     "Asset",
     "Beams",
     "BrownConrady",
@@ -42,6 +45,9 @@ __all__ = [
     "Fisheye",
     "GaussianCloud",
     "Ground",
+    "Lane",
+    "LaneGraph",
+    "LanePlace",
     "Lens",
     "Lidar",
     "LidarError",
@@ -51,11 +57,15 @@ __all__ = [
     "RadarError",
     "Reflector",
     "RingResponse",
+    "Road",
+    "RoadLane",
     "Scene",
     "SceneError",
     "SceneObject",
     "Shutter",
+    "Signal",
     "Sky",
+    "StopLine",
     "TimeColour",
     "TimeOutOfRangeError",
     "Trajectory",

@@ -8,19 +8,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
 from ..geometry.rotation import Float
 from .errors import SceneError
 from .lane_kernels import count_cells, fill_cells, inside_any, nearest_lanes
 from .road import Road, turned
 
-LaneKind = Literal["driving", "bus", "bicycle", "shoulder", "parking", "sidewalk", "other"]
-AreaKind = Literal["drivable", "crosswalk", "junction", "parking", "sidewalk", "other"]
-SignalKind = Literal["traffic_light", "stop", "yield", "speed_limit", "other"]
 LANE_KINDS: tuple[str, ...] = get_args(LaneKind)
 AREA_KINDS: tuple[str, ...] = get_args(AreaKind)
 SIGNAL_KINDS: tuple[str, ...] = get_args(SignalKind)

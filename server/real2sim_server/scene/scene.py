@@ -20,6 +20,7 @@ from .colour import TimeColour
 from .errors import SceneError, UnknownObjectError
 from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
+from .lane_graph import LaneGraph
 from .lidar_surfaces import LidarSurfaces
 from .sky import Sky
 from .trajectory import Trajectory
@@ -114,6 +115,7 @@ class Scene:
         stored_ground: as the reconstruction fitted it; None where nobody has so far. Ask
             :attr:`ground`.
         lidar: what LiDARs see in its place, or None: they see the same Gaussians as cameras.
+        lanes: of its roads, from a map or the log; None where nobody has given it any.
     """
 
     name: str
@@ -128,6 +130,7 @@ class Scene:
     content_hash: str = ""
     stored_ground: Ground | None = field(default=None, repr=False)
     lidar: LidarSurfaces | None = field(default=None, repr=False)
+    lanes: LaneGraph | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS:
@@ -187,12 +190,13 @@ class Scene:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all Gaussians, the sky, the stored ground and what LiDARs see [bytes]."""
+        """Memory of all Gaussians, sky, stored ground, lanes and what LiDARs see [bytes]."""
         sky = self.sky.nbytes if self.sky else 0
         ground = self.stored_ground.nbytes if self.stored_ground else 0
         objects = sum(o.nbytes for o in self.objects.values())
         lidar = self.lidar.nbytes if self.lidar else 0
-        return self.background.nbytes + sky + ground + objects + lidar
+        lanes = self.lanes.nbytes if self.lanes else 0
+        return self.background.nbytes + sky + ground + objects + lidar + lanes
 
     @property
     def start_us(self) -> int:

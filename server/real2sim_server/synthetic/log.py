@@ -20,6 +20,7 @@ from ..scene import Camera, CameraMotion, CameraRig, Lidar
 from .bvh import build_geometry
 from .casting import Instances
 from .config import SyntheticConfig
+from .lanes import street_lanes
 from .sensors import shoot_image, shoot_lidar, shoot_rays
 from .shading import RaycastWorld
 from .surroundings import build_surroundings
@@ -334,6 +335,7 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
         ego=drive.ego,
         tracks=_tracks(drive.vehicles),
         source=source,
+        lanes=street_lanes(drive.street),
         provenance={
             "dataset": "synthetic street",
             "licence": "free to use",

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from ..._npy import read_entries, read_npy
-from ...scene import Camera, CameraRig, SceneError, Trajectory
+from ...scene import Camera, CameraRig, LaneGraph, SceneError, Trajectory
 from ...scene.camera import Optics
 from ...scene.io.document import OpticsPart
+from ...scene.io.lane_document import read_lanes
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image
 from .formats.tables import check_ego_covers, check_frame_times, check_images
@@ -24,6 +25,7 @@ from .formats.tables import check_ego_covers, check_frame_times, check_images
 FORMAT = "real2sim-log"
 VERSION = 1
 MANIFEST = "log.json"
+LANES = "lanes.json"
 MAX_SWEEP_BYTES = 1 << 30
 """Of a sweep when unpacked: thirty million points."""
 LIDAR_SHAPES = {"points": (3,), "intensity": (), "offset_us": ()}
@@ -66,7 +68,18 @@ class NativeReader:
             ego_size=ego.size("size"),
             provenance=dict(content.get("provenance", dict)),
             image_times_us=_read_image_times(content, rig, times_us, trajectory),
+            lanes=_read_lanes(path / LANES),
         )
+
+
+def _read_lanes(path: Path) -> LaneGraph | None:
+    """Of a log that has a map; None without the file."""
+    if not path.exists():
+        return None
+    try:
+        return read_lanes(path)
+    except SceneError as error:
+        raise LogError(str(error)) from error
 
 
 def _load(manifest: Path) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from real2sim_proto.lanes import LaneKind
+
 from ...geometry.rotation import Float
-from ...scene.lane_graph import LaneKind
 from ..errors import MapError
 from ..xml_files import integer, number
 from .plan_view import PlanView, read_plan_view

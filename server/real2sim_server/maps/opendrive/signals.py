@@ -9,8 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from real2sim_proto.lanes import SignalKind
+
 from ...geometry.rotation import Float
-from ...scene.lane_graph import TRAVELLED, Area, Signal, SignalKind, StopLine
+from ...scene.lane_graph import TRAVELLED, Area, Signal, StopLine
 from ...scene.road import Road, RoadLane
 from ..xml_files import integer, number
 from .roads import SPEED_UNITS, OpenDriveRoad

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...logs import DrivingLog, ObjectTrack
+from ...maps import laid_on
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
 from ...scene.spherical_harmonics import SH_C0
@@ -144,7 +145,8 @@ def initialise_scene(
         colours = _inpaint(log, parts, fitted.surface, colours, known)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
     scene = _assemble(log, parts, colours, sky, options)
-    return replace(scene, stored_ground=fitted.ground)
+    lanes = None if log.lanes is None else laid_on(log.lanes, fitted.ground)
+    return replace(scene, stored_ground=fitted.ground, lanes=lanes)
 
 
 def _fit_ground(

@@ -20,6 +20,7 @@ from ..colour import TimeColour
 from ..errors import BundleError, SceneError
 from ..ground import Ground, of_bundle
 from ..ground_fit import BoxTrack, fit_scene_ground
+from ..lane_graph import LaneGraph
 from ..lidar_surfaces import RANGE_STEPS, LidarSurfaces, Reflector, RingResponse
 from ..scene import Scene, SceneObject
 from ..sky import Sky
@@ -34,6 +35,7 @@ from .document import (
     ColourPart,
     EgoPart,
     GroundPart,
+    LanesPart,
     LidarPart,
     ObjectPart,
     ReflectorPart,
@@ -43,6 +45,7 @@ from .document import (
     SkyPart,
     TrajectoryPart,
 )
+from .lane_document import pack, unpack
 from .tensors import (
     TensorFile,
     cloud_shapes,
@@ -57,6 +60,7 @@ OBJECTS_FILE = "objects.safetensors"
 SKY_FILE = "sky.safetensors"
 GROUND_FILE = "ground.safetensors"
 LIDAR_FILE = "lidar.safetensors"
+LANES_FILE = "lanes.safetensors"
 ASSET_FILE = "asset.safetensors"
 
 _UNWRITTEN = {"format": "", "version": 0, "content_hash": "0" * 64, "files": {}}
@@ -84,6 +88,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
     colours = [_outgoing_colour(o) for o in scene.objects.values()]
     sky = _outgoing_sky(scene.sky)
     ground = _outgoing_ground(scene.ground)
+    lanes, lane_tensors = _outgoing_lanes(scene.lanes)
     content = SceneContent(
         cameras=[CameraPart.of(c) for c in scene.rig],
         ego=EgoPart(size=scene.ego_size, trajectory=TrajectoryPart.of(scene.ego)),
@@ -96,6 +101,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         sky=SkyPart(resolution=sky["faces"].shape[1], tensors=tensor_hashes(sky)) if sky else None,
         ground=_ground_part(scene.ground, ground),
         lidar=_lidar_part(scene.lidar),
+        lanes=lanes,
     )
     document = SceneDocument(
         kind="scene",
@@ -112,6 +118,8 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         files[SKY_FILE] = sky
     if scene.lidar is not None:
         files[LIDAR_FILE] = _lidar_tensors(scene.lidar)
+    if lane_tensors:
+        files[LANES_FILE] = lane_tensors
     written = write_container(document, Path(path), tensors=files, overwrite=overwrite)
     return replace(scene, content_hash=written.content_hash, stored_ground=scene.ground)
 
@@ -149,6 +157,7 @@ def load_scene(
             content_hash=document.content_hash,
             stored_ground=_ground(folder, document, verify) if content.ground else None,
             lidar=_lidar(folder, document, verify) if content.lidar else None,
+            lanes=_lanes(folder, document, verify) if content.lanes else None,
         )
     return scene.to(device)
 
@@ -172,6 +181,24 @@ def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
         if document.content.ground is not None:
             return of_bundle(content_hash, lambda: _read_ground(folder, document, verify=True))
         return of_bundle(content_hash, lambda: _fit_ground(folder, document))
+
+
+def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None:
+    """The lanes of a scene bundle, without its scene; None where it has none.
+
+    Args:
+        path: folder of the bundle.
+        content_hash: that the bundle must have.
+
+    Raises:
+        BundleError: as :func:`load_scene`, or it is another bundle by now.
+    """
+    folder = Path(path)
+    document = read_container(folder, SceneDocument, verify=False)
+    if document.content_hash != content_hash:
+        raise BundleError(f"{folder}: another bundle stands here now; read its summary again")
+    with _as_bundle_error(folder):
+        return _lanes(folder, document, verify=True) if document.content.lanes else None
 
 
 def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = False) -> Asset:
@@ -238,6 +265,15 @@ def _outgoing_ground(ground: Ground) -> dict[str, Tensor]:
         "heights": torch.from_numpy(ground.heights.copy()),
         "is_ground": torch.from_numpy(ground.is_ground.astype(np.uint8)),
     }
+
+
+def _outgoing_lanes(lanes: LaneGraph | None) -> tuple[LanesPart | None, dict[str, Tensor]]:
+    if lanes is None:
+        return None, {}
+    document, arrays = pack(lanes)
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    counts = {name: len(array) for name, array in arrays.items()}
+    return LanesPart(**counts, tensors=tensor_hashes(tensors), document=document), tensors
 
 
 def _ground_part(ground: Ground, tensors: Mapping[str, Tensor]) -> GroundPart:
@@ -390,6 +426,16 @@ def _lidar(folder: Path, document: SceneDocument, verify: bool) -> LidarSurfaces
     }
     background = _reflector(file, "background.", part.background, "lidar of the background")
     return LidarSurfaces(background, objects, part.incidence, _response(part.response))
+
+
+def _lanes(folder: Path, document: SceneDocument, verify: bool) -> LaneGraph:
+    part = document.content.lanes
+    assert part is not None
+    file = _open(folder, LANES_FILE, document.files, verify)
+    shapes: dict[str, tuple[int, ...]] = {"points": (part.points, 3), "values": (part.values,)}
+    dtypes = dict.fromkeys(shapes, torch.float64)
+    taken = file.take("", shapes=shapes, hashes=part.tensors, dtypes=dtypes)
+    return unpack(part.document, {name: tensor.numpy() for name, tensor in taken.items()})
 
 
 def _response(part: ResponsePart | None) -> RingResponse | None:

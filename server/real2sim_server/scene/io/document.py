@@ -230,12 +230,24 @@ class LidarPart(_Part):
     response: ResponsePart | None = None
 
 
+class LanesPart(_Part):
+    """Lanes of a scene; ``document`` is that of ``lanes.json`` with lengths in the place of its
+    arrays, which lie in the tensor file one after the other.
+    """
+
+    points: Count
+    values: Count
+    tensors: dict[str, Sha256]
+    document: dict[str, Any]
+
+
 class SceneContent(_Part):
     """Everything that makes a scene what it is; the content hash is taken over this.
 
     Attributes:
         ground: left out of the JSON where there is none, as versions 1 and 2 of the format ask.
         lidar: left out of the JSON where there is none, as versions 1 to 4 of the format ask.
+        lanes: left out of the JSON where there are none, as versions 1 to 5 of the format ask.
     """
 
     cameras: list[CameraPart]
@@ -246,11 +258,12 @@ class SceneContent(_Part):
     sky: SkyPart | None
     ground: GroundPart | None = None
     lidar: LidarPart | None = None
+    lanes: LanesPart | None = None
 
     @model_serializer(mode="wrap")
     def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        for name in ("ground", "lidar"):
+        for name in ("ground", "lidar", "lanes"):
             if values.get(name) is None:
                 values.pop(name, None)
         return values
@@ -258,6 +271,8 @@ class SceneContent(_Part):
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
+        if self.lanes is not None:
+            return 6
         stored = [self.background.tensors, *(o.cloud.tensors for o in self.objects)]
         stored += [] if self.sky is None else [self.sky.tensors]
         if self.lidar is not None or any(UNCERTAINTIES in tensors for tensors in stored):

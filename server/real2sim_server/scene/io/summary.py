@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ..camera import CameraRig
 from ..errors import BundleError, SceneError
 from ..ground import Ground
+from ..lane_graph import LaneGraph
 from ..trajectory import Trajectory
-from .bundle import load_ground
+from .bundle import load_ground, load_lanes
 from .container import read_container
 from .document import UNCERTAINTIES, AssetDocument, Bounds, SceneDocument, Vector3
 from .tensors import check_file, cloud_shapes
@@ -52,6 +53,7 @@ class SceneSummary:
         bounds: lowest and highest Gaussian centre of the background [m], None without any.
         nbytes: bytes of the tensor files, nearly what the scene takes in memory.
         has_uncertainties: as of Scene.
+        lane_count: lanes of its graph; 0 without one.
     """
 
     path: Path
@@ -68,6 +70,7 @@ class SceneSummary:
     bounds: Bounds | None
     nbytes: int
     has_uncertainties: bool
+    lane_count: int
 
     @cached_property
     def ground(self) -> Ground:
@@ -77,6 +80,15 @@ class SceneSummary:
             BundleError: the bundle is damaged, or another one stands there by now.
         """
         return load_ground(self.path, self.content_hash)
+
+    @cached_property
+    def lanes(self) -> LaneGraph | None:
+        """The lanes of the scene, read when first asked for; None where it has none.
+
+        Raises:
+            BundleError: the bundle is damaged, or another one stands there by now.
+        """
+        return load_lanes(self.path, self.content_hash) if self.lane_count else None
 
     @property
     def gaussian_count(self) -> int:
@@ -170,4 +182,5 @@ def _summary(folder: Path, document: SceneDocument) -> SceneSummary:
         sky_resolution=content.sky.resolution if content.sky else 0,
         bounds=document.bounds,
         nbytes=sum(document.files.values()),
+        lane_count=len(content.lanes.document.get("lanes", ())) if content.lanes else 0,
     )

@@ -45,6 +45,7 @@ def scene_info(
         ego=track(summary.ego) if tracks else None,
         provenance=dict(summary.provenance),
         has_uncertainties=summary.has_uncertainties,
+        lane_count=summary.lane_count,
     )
 
 

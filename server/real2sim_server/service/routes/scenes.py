@@ -11,10 +11,12 @@ from fastapi import APIRouter, Header, Request, Response
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo
+from real2sim_proto.lanes import SceneLanes
 from real2sim_proto.scenes import SceneInfo, SceneList, SceneState
 from real2sim_proto.views import SceneView
 
 from ...edit import ScenarioState
+from ...scene.io.lane_document import lane_document
 from ..http.auth import TokenRoute
 from ..http.clients import ClientName
 from ..http.disconnects import cancel_on_disconnect
@@ -58,6 +60,23 @@ async def list_scenes(worker: WorkerOf) -> Response:
 async def describe(worker: WorkerOf, scene: Identifier) -> Response:
     """One scene with cameras, objects and their trajectories, extent and the recorded ego path."""
     return await scene_response(worker, scene)
+
+
+@router.get("/scenes/{scene}/lanes", response_model=SceneLanes)
+async def lanes(worker: WorkerOf, scene: Identifier, roads: bool = True) -> Response:
+    """The lanes of a scene: centre lines, neighbours, stop lines, signals; 404 where it has none.
+
+    `roads=false` leaves out reference lines of roads.
+    """
+    summary = await worker.scene_cache.summary(scene)
+    graph = await asyncio.to_thread(lambda: summary.lanes)
+    if graph is None:
+        raise ServiceError(
+            ErrorCode.NOT_FOUND,
+            f"scene {scene!r} has no lanes",
+            hint="give it some with `real2sim map SCENE --from FILE`",
+        )
+    return await large_response(lambda: lane_document(graph, with_roads=roads))
 
 
 @router.put(

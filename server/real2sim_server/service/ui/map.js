@@ -3,6 +3,7 @@ import { model, on, emit, object, poseOf, select, edit, draftOperations } from "
 import { yawOf, poseAt, present } from "./poses.js";
 import { fromAbove } from "./colliders.js";
 import { drawSweepAbove } from "./sweep.js";
+import { drawLanes } from "./lanes.js";
 import { colourOf } from "./categories.js";
 
 let canvas;
@@ -59,6 +60,9 @@ function draw() {
   pen.fillStyle = "#0f141c";
   pen.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
   grid();
+  if (model.lanes) {
+    drawLanes(pen, toScreen, model.lanes);
+  }
   line(model.scene.ego.positions, "#3f5a46", 2);
   drawSweepAbove(pen, toScreen, poseAt(model.scene.ego, model.t));
   for (const o of shown()) {

@@ -5,6 +5,7 @@ import { notify } from "./messages.js";
 
 export const model = {
   scene: null,
+  lanes: null,
   scenario: null,
   history: null,
   camera: null,
@@ -30,6 +31,9 @@ const path = (rest = "") => `/v1/scenarios/${model.scenario.scenario_id}${rest}`
 export async function open(id) {
   model.scenario = await get(`/v1/scenarios/${id}`);
   model.scene = await get(`/v1/scenes/${model.scenario.scene}`);
+  model.lanes = model.scene.lane_count
+    ? await get(`/v1/scenes/${model.scenario.scene}/lanes?roads=false`)
+    : null;
   model.history = await get(path("/operations"));
 }
 

@@ -1,0 +1,85 @@
+// Lanes of the scene's map from above: surface, middle, direction, stop lines, signals.
+const SURFACES = {
+  driving: "#1c2533",
+  bus: "#2a2030",
+  bicycle: "#182b22",
+  parking: "#18202b",
+  shoulder: "#18202b",
+  sidewalk: "#151b24",
+  other: "#141a22",
+};
+const RIM = "#3d4b5f";
+const MIDDLE = "#55657c";
+
+export function drawLanes(pen, toScreen, lanes) {
+  const shapes = lanes.lanes.map((lane) => ({ lane, ...rims(lane) }));
+  for (const { lane, left, right } of shapes) {
+    trace(pen, [...left, ...right.slice().reverse()].map(toScreen), true);
+    pen.fillStyle = SURFACES[lane.kind] ?? SURFACES.other;
+    pen.fill();
+  }
+  for (const area of lanes.areas) {
+    trace(pen, area.outline.map(toScreen), true);
+    pen.fillStyle = area.kind === "crosswalk" ? "#d8dee930" : "#8a97a810";
+    pen.fill();
+  }
+  pen.lineWidth = 1;
+  for (const { lane, left, right } of shapes) {
+    stroke(pen, left.map(toScreen), RIM);
+    stroke(pen, right.map(toScreen), RIM);
+    if (lane.kind === "driving" || lane.kind === "bus") {
+      pen.setLineDash([5, 6]);
+      stroke(pen, lane.centre.map(toScreen), MIDDLE);
+      pen.setLineDash([]);
+      arrow(pen, toScreen, lane.centre);
+    }
+  }
+  pen.lineWidth = 2;
+  lanes.stop_lines.forEach((line) => stroke(pen, line.points.map(toScreen), "#e06c75"));
+  for (const signal of lanes.signals) {
+    const [x, y] = toScreen(signal.position);
+    pen.fillStyle = signal.kind === "traffic_light" ? "#e5c07b" : "#8a97a8";
+    pen.fillRect(x - 3, y - 3, 6, 6);
+  }
+}
+
+// Half the width to each side of the centre line, across the mean of its neighbouring pieces.
+function rims({ centre, widths }) {
+  const left = [];
+  const right = [];
+  centre.forEach(([x, y], i) => {
+    const a = centre[Math.max(i - 1, 0)];
+    const b = centre[Math.min(i + 1, centre.length - 1)];
+    const length = Math.hypot(b[0] - a[0], b[1] - a[1]) || 1;
+    const aside = widths[i] / 2 / length;
+    const [dx, dy] = [-(b[1] - a[1]) * aside, (b[0] - a[0]) * aside];
+    left.push([x + dx, y + dy]);
+    right.push([x - dx, y - dy]);
+  });
+  return { left, right };
+}
+function arrow(pen, toScreen, centre) {
+  const k = Math.floor(centre.length / 2);
+  const [x0, y0] = toScreen(centre[k - 1]);
+  const [x1, y1] = toScreen(centre[k]);
+  const angle = Math.atan2(y1 - y0, x1 - x0);
+  pen.strokeStyle = MIDDLE;
+  pen.beginPath();
+  for (const side of [-2.6, 2.6]) {
+    pen.moveTo(x1, y1);
+    pen.lineTo(x1 + 8 * Math.cos(angle + side), y1 + 8 * Math.sin(angle + side));
+  }
+  pen.stroke();
+}
+function trace(pen, points, closed) {
+  pen.beginPath();
+  points.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+  if (closed) {
+    pen.closePath();
+  }
+}
+function stroke(pen, points, colour) {
+  trace(pen, points, false);
+  pen.strokeStyle = colour;
+  pen.stroke();
+}
